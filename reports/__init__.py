@@ -1,0 +1,1 @@
+"""Statistics, verdicts, figures and pages: reads stored results only."""

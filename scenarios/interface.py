@@ -1,0 +1,63 @@
+"""What a campaign knows of a scenario: its parameters, what it prepares once, and how one case runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from pydantic import BaseModel
+
+from sim.streams import Streams
+
+#: A value that can stand in a column of the results.
+Scalar = float | int | str | bool
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """One case, run and scored.
+
+    Attributes
+    ----------
+    outcome
+        The name of the outcome: a member of the estimate's enumeration.
+    answered
+        Whether the algorithm under test reported an answer (the population `valid` of requirements).
+    row
+        What is stored of the case: scored errors (NaN where nothing was reported) and the drawn values as read back
+        from the simulated objects. Columns that may differ between two runs of one case have `time` in their name.
+    products
+        Arrays and texts from which the case's figures are drawn; kept only for cases that the campaign retains.
+    """
+
+    outcome: str
+    answered: bool
+    row: Mapping[str, Scalar]
+    products: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Scenario(Protocol):
+    """A family of cases. Implementations are stateless: everything a case depends on is in its arguments."""
+
+    @property
+    def name(self) -> str:
+        """The name by which campaign files ask for the scenario."""
+        ...
+
+    @property
+    def parameters_type(self) -> type[BaseModel]:
+        """The model (pydantic, extra keys forbidden, frozen) of every value that a campaign may set or disperse."""
+        ...
+
+    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
+        """Numbers of the inputs that many cases share and that `prepare` builds once (the terrains of a bank)."""
+        ...
+
+    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
+        """Builds one shared input into the cache on disk; does nothing if it is there. Safe to call in parallel."""
+        ...
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """Runs one case with its parameters (dispersions already drawn into them) and its random streams."""
+        ...
