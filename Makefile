@@ -1,0 +1,44 @@
+# Marsyard's tasks. `make` alone lists them. Each sets up what it needs first; doing so again costs nothing.
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint format bench validate constraints clean distclean
+
+BIN := .venv/bin
+# More words for pytest, as in: make test PYTEST_ARGS="-k camera"
+PYTEST_ARGS ?=
+
+help: ## List the tasks
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: ## Install system libraries and the environment in .venv
+	@tools/setup.sh
+
+demo: setup ## Run a small rendered descent campaign and write its report
+	@tools/demo.sh
+
+test: setup ## Run all checks and tests
+	@tools/lint.sh
+	@tools/test.sh $(PYTEST_ARGS)
+
+lint: setup ## Run the static checks: ruff, mypy, import-linter
+	@tools/lint.sh
+
+format: setup ## Rewrite the sources in the project's format, mending what can be mended
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+
+bench: setup ## Measure speed and memory
+	$(BIN)/python -m benchmarks
+
+validate: setup ## Compare with the papers' published results
+	$(BIN)/python -m benchmarks.validation
+
+constraints: ## Renew the pinned versions in constraints.txt
+	@tools/constraints.sh
+
+clean: ## Remove runs, caches and build products; keep .venv
+	rm -rf runs build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .coverage
+	find . -name .venv -prune -o -name .git -prune -o -type d -name __pycache__ -exec rm -rf {} +
+
+distclean: clean ## Remove all that is not source, .venv included
+	rm -rf .venv *.egg-info

@@ -1,0 +1,39 @@
+"""The run-time check of shapes is on in the tests, and leaves compiled kernels alone."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import jaxtyping
+import numpy as np
+import pytest
+
+from sim.frames import direction, rigid
+
+
+def test_a_wrong_shape_is_refused() -> None:
+    rotation = importlib.import_module("scipy.spatial.transform").Rotation.identity()
+    with pytest.raises(jaxtyping.TypeCheckError):
+        rigid(rotation, np.zeros(4))
+
+
+def test_a_right_shape_passes() -> None:
+    assert direction(0.0, 0.0).shape == (3,)
+
+
+def test_kernels_are_not_wrapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = "def f(x: int) -> int:\n    return x\n"
+    for package, module in (("algorithms", "kernels"), ("algorithms", "ordinary")):
+        (tmp_path / f"{module}.py").write_text(source)
+        monkeypatch.delitem(sys.modules, f"{package}.{module}", raising=False)
+    monkeypatch.setattr(importlib.import_module("algorithms"), "__path__", [str(tmp_path)])
+    kernel = importlib.import_module("algorithms.kernels").f
+    checked = importlib.import_module("algorithms.ordinary").f
+    monkeypatch.delitem(sys.modules, "algorithms.kernels")
+    monkeypatch.delitem(sys.modules, "algorithms.ordinary")
+
+    assert kernel("a text") == "a text"
+    with pytest.raises(jaxtyping.TypeCheckError):
+        checked("a text")

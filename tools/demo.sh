@@ -1,0 +1,22 @@
+#!/usr/bin/env bash
+# Runs the small rendered campaign and says what came of it. Succeeds when the campaign ran and no requirement failed:
+# 24 cases are rarely enough for a verdict, and INSUFFICIENT (exit code 3) is then the honest one.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+campaign=${CAMPAIGN:-dimes-smoke}
+out=${OUT:-runs/$campaign-$(date -u +%Y%m%dT%H%M%SZ)}
+backends=$(.venv/bin/python tools/gl_backends.py)
+export MARSYARD_GL=${MARSYARD_GL:-${backends%% *}}
+
+status=0
+.venv/bin/marsyard run "$campaign" --out "$out" || status=$?
+case $status in
+    0) verdict=PASS ;;
+    3) verdict=INSUFFICIENT ;;
+    *)
+        echo "demo: the campaign failed with exit code $status (1: a requirement failed or a case crashed; 2: it could not run)" >&2
+        exit "$status"
+        ;;
+esac
+[ -f "$out/report.html" ] || { echo "demo: the campaign ran but wrote no $out/report.html" >&2; exit 1; }
+echo "demo: verdict $verdict, report $out/report.html"

@@ -1,0 +1,32 @@
+#!/usr/bin/env bash
+# The static checks: all of them, or those named (lint format types imports). pre-commit and `make lint` run the same.
+set -uo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+bin=.venv/bin
+[ -x "$bin/ruff" ] || { echo "lint: no environment yet: run 'make setup' first" >&2; exit 2; }
+
+check() {
+    case "$1" in
+        lint) "$bin/ruff" check . ;;
+        format) "$bin/ruff" format --check . ;;
+        types) "$bin/mypy" ;;
+        imports) "$bin/lint-imports" --no-logo ;;
+        *) echo "lint: no check named $1 (lint, format, types, imports)" >&2; return 2 ;;
+    esac
+}
+
+failed=()
+for name in "${@:-}"; do
+    [ -n "$name" ] || continue
+    check "$name" || failed+=("$name")
+done
+if [ $# -eq 0 ]; then
+    for name in lint format types imports; do
+        echo "== $name"
+        check "$name" || failed+=("$name")
+    done
+fi
+if [ ${#failed[@]} -gt 0 ]; then
+    echo "lint: failed: ${failed[*]}" >&2
+    exit 1
+fi
