@@ -1,0 +1,402 @@
+"""``marsyard doctor``: whether a campaign can run here, and how to mend what is amiss.
+
+Whatever may end a process (a driver, a broken library) is tried in a process of its own. Nothing of Marsyard but the
+probe is imported before it is known to be ours: this is what people run when imports fail.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from marsyard import gl_probe
+
+#: The checkout, or site-packages: the folder that all of Marsyard's packages lie in.
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports", "marsyard")
+#: Distributions that import under another name than their own.
+MODULES = {"opencv-python-headless": "cv2", "pyrender2": "pyrender"}
+#: Distributions that write into the same folder as one of ours, ours first.
+RIVALS = (("pyrender2", "pyrender"), ("opencv-python-headless", "opencv-python"))
+#: The GL backends, the preferred one first, and their Debian packages.
+BACKENDS = {"osmesa": "libosmesa6", "egl": "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"}
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+REINSTALL = "make setup, or: pip install -c constraints.txt -e ."
+MEBI = 2**20
+PROBE_LIMIT_S = 30.0
+
+
+class Verdict(Enum):
+    """What a check came to; only FAIL keeps a campaign from running."""
+
+    OK = "green"
+    WARN = "yellow"
+    FAIL = "red"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the examination: what was looked at, what was found, and how to mend it where it is amiss."""
+
+    name: str
+    found: str
+    verdict: Verdict = Verdict.OK
+    mend: str = ""
+
+
+def run(console: Console) -> int:
+    """Examines the machine and the installation and prints a table; 0 if a campaign can run here, otherwise 1."""
+    checks = list(examine())
+    table = Table(title=f"Marsyard {importlib.metadata.version('marsyard')} in {ROOT}", title_justify="left")
+    for heading in ("check", "found", "verdict"):
+        table.add_column(heading, overflow="fold")
+    for check in checks:
+        table.add_row(Text(check.name), Text(check.found), Text(check.verdict.name.lower(), check.verdict.value))
+    console.print(table)
+    for check in checks:
+        if check.mend:
+            console.print(Text(f"{check.name}: {check.mend}"), soft_wrap=True)
+    failed = [check.name for check in checks if check.verdict is Verdict.FAIL]
+    if failed:
+        console.print(Text(f"A campaign cannot run here: {', '.join(failed)}.", "red"), soft_wrap=True)
+        return 1
+    console.print("A campaign can run here.")
+    return 0
+
+
+def examine() -> Iterator[Check]:
+    """All checks, in the order of the table; the slow ones run side by side."""
+    with ThreadPoolExecutor() as pool:
+        rendering = {backend: pool.submit(probe_backend, backend) for backend in BACKENDS}
+        imports = pool.submit(import_failures, _dependency_modules())
+        yield check_python()
+        yield check_optimisation(__debug__)
+        yield from check_shadowing()
+        yield from check_dependencies(imports.result())
+        yield from check_rendering({backend: future.result() for backend, future in rendering.items()})
+    yield check_numba_cache()
+    yield from check_disk()
+    yield check_machine()
+    yield check_threads(os.environ, _cores())
+
+
+# --- Python and its packages ------------------------------------------------------------------------------------------
+
+
+def check_python() -> Check:
+    """Interpreter and operating system."""
+    found = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    wanted = importlib.metadata.metadata("marsyard")["Requires-Python"]
+    if platform.python_version() not in SpecifierSet(wanted):
+        return Check("python", f"{found}; {wanted} is needed", Verdict.FAIL, f"install Python {wanted}")
+    if sys.platform != "linux":
+        return Check("python", found, Verdict.WARN, "Marsyard is tested on Linux only")
+    return Check("python", found)
+
+
+def check_optimisation(assertions: bool) -> Check:
+    """Whether `assert` statements run: pyrender makes GL calls inside them."""
+    if assertions:
+        return Check("assertions", "on")
+    return Check("assertions", "off (python -O)", Verdict.FAIL, "run Python without -O and unset PYTHONOPTIMIZE")
+
+
+def check_shadowing() -> Iterator[Check]:
+    """Whether each of our packages is the one that Python imports, and no distribution lies over another."""
+    elsewhere = []
+    for package in PACKAGES:
+        origin = _origin(package)
+        if origin != ROOT / package:
+            elsewhere.append(f"{package} from {origin}")
+    if elsewhere:
+        mend = "uninstall what brought it, unset PYTHONPATH, or leave the folder that holds it; then " + REINSTALL
+        yield Check("package shadowing", f"another package comes first: {'; '.join(elsewhere)}", Verdict.FAIL, mend)
+    else:
+        yield Check("package shadowing", f"{', '.join(PACKAGES)} are ours")
+    owners = importlib.metadata.packages_distributions()
+    strangers = {
+        package: others
+        for package in PACKAGES
+        if (others := sorted({canonicalize_name(owner) for owner in owners.get(package, [])} - {"marsyard"}))
+    }
+    for package, others in strangers.items():
+        yield Check(
+            "package names",
+            f"{', '.join(others)} also installs a package named {package}",
+            Verdict.WARN,
+            f"pip uninstall {' '.join(others)}, then {REINSTALL}",
+        )
+    for ours, rival in RIVALS:
+        if _version(rival) is not None:
+            yield Check(
+                "package names",
+                f"{rival} is installed over {ours}, into the same folder",
+                Verdict.FAIL,
+                f"pip uninstall -y {rival} {ours}, then {REINSTALL}",
+            )
+
+
+def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
+    """Versions of the dependencies against pyproject.toml and constraints.txt; `failures` by module, from importing."""
+    pins = _pins()
+    sound, unpinned = 0, []
+    for requirement in _requirements():
+        name = canonicalize_name(requirement.name)
+        version = _version(name)
+        if version is None:
+            yield Check(name, "not installed", Verdict.FAIL, REINSTALL)
+        elif not requirement.specifier.contains(version, prereleases=True):
+            yield Check(name, f"{version}, but {requirement} is needed", Verdict.FAIL, REINSTALL)
+        elif (fault := failures.get(_module(name))) is not None:
+            yield Check(name, f"{version} cannot be imported: {fault}", Verdict.FAIL, REINSTALL)
+        else:
+            sound += 1
+            if pins.get(name, version) != version:
+                unpinned.append(f"{name} {version} (pinned {pins[name]})")
+    yield Check("dependencies", f"{sound} import, in versions that Marsyard takes")
+    if unpinned:
+        yield Check("pinned versions", ", ".join(unpinned), Verdict.WARN, REINSTALL)
+
+
+def import_failures(modules: Iterable[str]) -> dict[str, str]:
+    """What went wrong with importing each module in a process of its own, by module; sound ones are left out."""
+    waiting = list(modules)
+    failures: dict[str, str] = {}
+    while waiting:
+        ended = _child("-c", _IMPORT_ALL, *waiting)
+        reached = [json.loads(line) for line in ended.stdout.splitlines()]
+        failures |= {name: fault for name, fault in reached if fault}
+        waiting = waiting[len(reached) :]
+        if waiting:  # this one took the process with it
+            failures[waiting.pop(0)] = _last_words(ended)
+    return failures
+
+
+_IMPORT_ALL = """
+import importlib, json, sys
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+        fault = ""
+    except Exception as error:
+        fault = f"{type(error).__name__}: {error}"
+    print(json.dumps([name, fault]), flush=True)
+"""
+
+
+def _requirements() -> list[Requirement]:
+    """What the installed distribution needs, extras left out."""
+    requirements = [Requirement(text) for text in importlib.metadata.requires("marsyard") or []]
+    return [r for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
+
+
+def _pins() -> dict[str, str]:
+    """The versions of constraints.txt by canonical name; none where there is no checkout."""
+    file = ROOT / "constraints.txt"
+    lines = file.read_text().split() if file.is_file() else []
+    return {canonicalize_name(name): version for name, _, version in (line.partition("==") for line in lines)}
+
+
+def _module(distribution: str) -> str:
+    return MODULES.get(distribution, distribution.replace("-", "_"))
+
+
+def _dependency_modules() -> list[str]:
+    """Modules to import; pyrender is left to the rendering of a frame, as it loads a GL library at once."""
+    names = (_module(canonicalize_name(requirement.name)) for requirement in _requirements())
+    return [name for name in names if name != "pyrender"]
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _origin(package: str) -> Path | None:
+    """The folder that Python would import a top-level package from."""
+    spec = importlib.util.find_spec(package)
+    if spec is None:
+        return None
+    if spec.origin is not None:
+        return Path(spec.origin).resolve().parent
+    return next((Path(place).resolve() for place in spec.submodule_search_locations or ()), None)
+
+
+# --- rendering --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Probe:
+    """How rendering a frame with one backend ended: what was measured, or why there is nothing."""
+
+    measured: Mapping[str, Any] | None
+    fault: str = ""
+
+
+def probe_backend(backend: str) -> Probe:
+    """Renders a frame with this backend in a process of its own."""
+    ended = _child("-P", str(Path(gl_probe.__file__)), backend)
+    try:
+        return Probe(json.loads(ended.stdout.splitlines()[-1]))
+    except (IndexError, ValueError):
+        return Probe(None, _last_words(ended))
+
+
+def check_rendering(probes: Mapping[str, Probe]) -> Iterator[Check]:
+    """One line a backend, and one for the backend that a campaign would use."""
+    sound = []
+    for backend, probe in probes.items():
+        check = _check_backend(backend, probe)
+        if check.verdict is Verdict.OK:
+            sound.append(backend)
+        yield check
+    wanted = os.environ.get("MARSYARD_GL", next(iter(BACKENDS))).lower()
+    if wanted not in BACKENDS:
+        fault = f"MARSYARD_GL is '{wanted}'; allowed: {', '.join(BACKENDS)}"
+        yield Check("GL backend in use", fault, Verdict.FAIL, "unset MARSYARD_GL")
+    elif wanted in sound:
+        yield Check("GL backend in use", wanted)
+    elif sound:
+        mend = f"export MARSYARD_GL={sound[0]}, or install {BACKENDS[wanted]}"
+        yield Check("GL backend in use", f"{wanted}, which does not work; {sound[0]} does", Verdict.WARN, mend)
+    else:
+        yield Check("GL backend in use", "none works", Verdict.FAIL, f"sudo apt-get install {BACKENDS[wanted]}")
+
+
+def _check_backend(backend: str, probe: Probe) -> Check:
+    name = f"GL: {backend}"
+    mend = f"sudo apt-get install {BACKENDS[backend]}"
+    if probe.measured is None:
+        return Check(name, probe.fault, Verdict.WARN, mend)
+    measured = probe.measured
+    found = f"{measured['renderer']}, {measured['version']}"
+    error_m, offset = measured["depth_error_m"], measured["offset_px"]
+    if not measured["lit"] or error_m > gl_probe.DEPTH_TOLERANCE_M:
+        fault = f"; wrong picture: depth of a known plane off by {error_m:.3g} m"
+        return Check(name, found + fault, Verdict.WARN, "use the other backend, or another driver")
+    found += f"; depth right to {error_m * 1e3:.2g} mm at {gl_probe.DISTANCE_M:.0f} m"
+    if max(map(abs, offset)) > gl_probe.OFFSET_TOLERANCE_PX:
+        found += (
+            f"; pyrender alone samples it ({offset[0]:+.3f}, {offset[1]:+.3f}) px off-centre, Marsyard at the centre"
+        )
+    return Check(name, found)
+
+
+# --- the machine ------------------------------------------------------------------------------------------------------
+
+
+def check_numba_cache() -> Check:
+    """Whether compiled kernels can be kept; where not, every process compiles them anew."""
+    configured = os.environ.get("NUMBA_CACHE_DIR")
+    candidates = [Path(configured)] if configured else [ROOT / "sim" / "__pycache__", Path.home() / ".cache" / "numba"]
+    for place in candidates:
+        if _writable(place):
+            return Check("numba cache", f"{place} is writable")
+    mend = "export NUMBA_CACHE_DIR=FOLDER, one that you may write to"
+    return Check("numba cache", f"cannot write to {' nor '.join(map(str, candidates))}", Verdict.WARN, mend)
+
+
+def check_disk() -> Iterator[Check]:
+    """Room where campaigns are written, and where terrains are kept."""
+    yield _check_room("disk, this folder", Path.cwd(), "free some, or run campaigns elsewhere with --out")
+    mend = "export MARSYARD_CACHE=FOLDER, one with room that you may write to"
+    try:
+        from sim.cache import cache_directory
+
+        cache = cache_directory("terrain")
+    except (ImportError, OSError) as error:
+        yield Check("disk, cache", str(error), Verdict.FAIL, mend)
+        return
+    yield _check_room("disk, cache", cache, mend)
+
+
+def _check_room(name: str, folder: Path, mend: str) -> Check:
+    free = shutil.disk_usage(folder).free // MEBI
+    found = f"{free} MiB free in {folder}"
+    if not _writable(folder):
+        return Check(name, f"cannot write to {folder}", Verdict.FAIL, mend)
+    if free < 100:
+        return Check(name, found, Verdict.FAIL, mend)
+    return Check(name, found, Verdict.WARN if free < 1024 else Verdict.OK, mend if free < 1024 else "")
+
+
+def check_machine() -> Check:
+    """Cores and memory; a worker needs about half a GiB."""
+    cores, memory = _cores(), _memory_mib()
+    found = f"{cores} cores, {memory} MiB of memory"
+    if memory < 512 * cores:
+        return Check("cores and memory", found, Verdict.WARN, f"run with --jobs {max(1, memory // 512)}")
+    return Check("cores and memory", found)
+
+
+def check_threads(environment: Mapping[str, str], cores: int) -> Check:
+    """Thread counts asked for by the environment: more than cores only makes workers wait for each other."""
+    asked = {name: environment[name] for name in THREAD_VARIABLES if environment.get(name)}
+    found = ", ".join(f"{name}={value}" for name, value in asked.items()) or "left to the libraries"
+    if any(not value.isdigit() or int(value) > cores for value in asked.values()):
+        return Check("threads", found, Verdict.WARN, f"unset {' '.join(asked)}")
+    return Check("threads", found)
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _memory_mib() -> int:
+    """Memory of the machine, or of the control group where that has less."""
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    group = Path("/sys/fs/cgroup/memory.max")
+    if group.is_file() and (text := group.read_text().strip()).isdigit():
+        limits.append(int(text))
+    return min(limits) // MEBI
+
+
+def _writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+# --- processes --------------------------------------------------------------------------------------------------------
+
+
+def _child(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Runs this Python with these arguments; a process that hangs is ended and counts as failed."""
+    command = [sys.executable, *arguments]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=PROBE_LIMIT_S, check=False)  # noqa: S603
+    except subprocess.TimeoutExpired as expired:
+        printed = expired.stdout.decode() if isinstance(expired.stdout, bytes) else ""
+        return subprocess.CompletedProcess(command, -1, printed, f"no answer within {PROBE_LIMIT_S:.0f} s")
+
+
+def _last_words(ended: subprocess.CompletedProcess[str]) -> str:
+    """The last line that a failed process wrote, or how it ended."""
+    lines = [line.strip() for line in ended.stderr.splitlines() if line.strip()]
+    return lines[-1] if lines else f"the process ended with status {ended.returncode}"

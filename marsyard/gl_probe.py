@@ -1,0 +1,69 @@
+"""Renders one small frame with one GL backend and checks its depth: ``python -P gl_probe.py osmesa``.
+
+A program of its own, because a backend is chosen by the environment before PyOpenGL is first imported, and because a
+broken driver ends the process it runs in. It imports nothing of Marsyard: set-up runs it too. The result is one line of
+JSON on standard output.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from typing import Any
+
+COLUMNS, ROWS = 96, 64
+FOCAL_PX = 96.0
+NEAR_M, FAR_M = 40.0, 400.0
+#: The planes ``z = -DISTANCE_M + TILT x`` and ``z = -DISTANCE_M + TILT y`` before a camera that looks along -z.
+DISTANCE_M, TILT = 100.0, 0.5
+#: Depth may be wrong by this much, metres: 24 bits between near and far resolve 1e-5 m here.
+DEPTH_TOLERANCE_M = 2e-3
+#: A backend that samples the depth farther than this from the pixel's centre is reported to do so, pixels.
+OFFSET_TOLERANCE_PX = 0.01
+
+
+def probe(backend: str) -> dict[str, Any]:
+    """Renders two tilted planes with the backend and compares the depth of every pixel with their equations."""
+    os.environ["PYOPENGL_PLATFORM"] = backend
+    import numpy as np
+    import pyrender
+    import trimesh
+    from OpenGL import GL
+
+    x, y = (axis.ravel() for axis in np.meshgrid([-400.0, 400.0], [-400.0, 400.0]))
+    # pyrender counts pixels from the image's corner, so a pixel's centre lies at +0.5; its y axis points up
+    u, v = np.meshgrid(np.arange(COLUMNS) + 0.5 - COLUMNS / 2, np.arange(ROWS) + 0.5 - ROWS / 2)
+    camera = pyrender.IntrinsicsCamera(FOCAL_PX, FOCAL_PX, COLUMNS / 2, ROWS / 2, znear=NEAR_M, zfar=FAR_M)
+    renderer = pyrender.OffscreenRenderer(COLUMNS, ROWS)
+    offsets_px, errors_m, lit = [], [], True
+    try:
+        for axis, pixels in ((x, u), (y, -v)):
+            corners = np.column_stack([x, y, -DISTANCE_M + TILT * axis])
+            plane = trimesh.Trimesh(corners, [[0, 1, 3], [0, 3, 2]], process=False)
+            scene = pyrender.Scene(ambient_light=[1.0, 1.0, 1.0], bg_color=[0.0, 0.0, 0.0, 0.0])
+            scene.add(pyrender.Mesh.from_trimesh(plane, smooth=False))
+            scene.add(camera, pose=np.eye(4))
+            colour, depth = renderer.render(scene)
+            # where on the plane the depth was taken: a sample beside the pixel's centre sees another place
+            sampled = (DISTANCE_M / depth - 1.0) * FOCAL_PX / TILT
+            offset = float(np.mean(sampled - pixels))
+            offsets_px.append(offset)
+            errors_m.append(float(np.abs(depth - DISTANCE_M / (1.0 + TILT * (pixels + offset) / FOCAL_PX)).max()))
+            lit = lit and bool(colour.any())
+        found = {name: GL.glGetString(getattr(GL, f"GL_{name}")).decode() for name in ("RENDERER", "VERSION")}
+    finally:
+        renderer.delete()
+    return {
+        "renderer": found["RENDERER"],
+        "version": found["VERSION"],
+        "depth_error_m": max(errors_m),
+        "offset_px": [offsets_px[0], -offsets_px[1]],
+        "lit": lit,
+    }
+
+
+if __name__ == "__main__":
+    result = probe(sys.argv[1])
+    print(json.dumps(result))
+    sys.exit(not (result["lit"] and result["depth_error_m"] <= DEPTH_TOLERANCE_M))
