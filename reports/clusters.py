@@ -1,0 +1,128 @@
+"""Success rates from cases that share a terrain: such cases are not independent, and n overstates the evidence.
+
+Korn & Graubard ("Confidence intervals for proportions with small expected number of positive counts estimated from
+survey data", Survey Methodology 24, 1998) put an effective sample size into the Clopper-Pearson interval: n divided by
+the design effect, which the terrains' own failure rates show. With few failures the design effect cannot be estimated
+and the method passes falsely; then whole terrains are counted, each as one case.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import stats
+
+from reports.statistics import proportion_lower, proportion_upper
+
+#: Fewest terrains, and fewest terrains with a failure (and with a success), for which the design effect is estimated.
+#: Chosen by simulation (`tests/reports/test_clusters.py`): with these the bounds keep their confidence.
+FEWEST_TERRAINS = 50
+FEWEST_MIXED_TERRAINS = 10
+
+
+class ClusterMethod(StrEnum):
+    """How the bounds of clustered cases were found."""
+
+    KORN_GRAUBARD = "Korn-Graubard effective sample size"
+    TERRAIN_COUNT = "whole terrains counted"
+
+
+@dataclass(frozen=True)
+class ClusteredEvidence:
+    """What cases that share terrains show of a success rate.
+
+    Attributes
+    ----------
+    terrains
+        Distinct terrains behind the cases.
+    failed_terrains
+        Terrains on which at least one case failed.
+    method
+        How the bounds were found.
+    design_effect
+        Variance of the success rate over that of as many independent cases; NaN where it cannot be estimated.
+    effective_n
+        The number of independent cases that the evidence is worth: terrains where whole terrains are counted.
+    lower, upper
+        One-sided bounds of the success rate of a case, each at the requirement's confidence.
+    """
+
+    terrains: int
+    failed_terrains: int
+    method: ClusterMethod
+    design_effect: float
+    effective_n: float
+    lower: float
+    upper: float
+
+
+def clustered_evidence(
+    success: Bool[np.ndarray, " n"], terrain: Int[np.ndarray, " n"], confidence: float
+) -> ClusteredEvidence:
+    """Bounds of a success rate for cases that share terrains.
+
+    Parameters
+    ----------
+    success
+        Whether each case succeeded, shape (n,), n at least 1.
+    terrain
+        The terrain's number of each case, shape (n,).
+    confidence
+        Confidence of each one-sided bound.
+    """
+    _, index = np.unique(terrain, return_inverse=True)
+    sizes = np.bincount(index).astype(np.float64)
+    successes = np.bincount(index, weights=success.astype(np.float64))
+    failed, succeeded = int((successes < sizes).sum()), int((successes > 0).sum())
+    design_effect = _design_effect(successes, sizes)
+    if sizes.size >= FEWEST_TERRAINS and min(failed, succeeded) >= FEWEST_MIXED_TERRAINS:
+        return _korn_graubard(successes, sizes, design_effect, confidence)
+    # A terrain has a failure at least as often as a case fails, and a success at least as often as a case succeeds:
+    # both bounds are safe.
+    terrains = sizes.size
+    return ClusteredEvidence(
+        terrains,
+        failed,
+        ClusterMethod.TERRAIN_COUNT,
+        float("nan"),
+        float(terrains),
+        proportion_lower(terrains - failed, terrains, confidence),
+        proportion_upper(succeeded, terrains, confidence),
+    )
+
+
+def _design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
+    """Variance of the rate over terrains (Taylor linearisation) by the binomial one; NaN where either is 0."""
+    terrains, n = sizes.size, sizes.sum()
+    rate = successes.sum() / n
+    if terrains < 2 or not 0.0 < rate < 1.0:
+        return float("nan")
+    residuals = successes - rate * sizes
+    variance = terrains / (terrains - 1) * float((residuals**2).sum()) / n**2
+    return float(variance / (rate * (1.0 - rate) / n))
+
+
+def _korn_graubard(
+    successes: Float[np.ndarray, " terrains"],
+    sizes: Float[np.ndarray, " terrains"],
+    design_effect: float,
+    confidence: float,
+) -> ClusteredEvidence:
+    """Clopper-Pearson with the effective sample size of Korn & Graubard 1998, never larger than n."""
+    n, terrains = float(sizes.sum()), sizes.size
+    # The second factor pays for estimating the variance from so many terrains only.
+    freedom = (stats.t.ppf(confidence, n - 1) / stats.t.ppf(confidence, terrains - 1)) ** 2
+    effective_n = min(n, n / max(design_effect, 1e-9) * float(freedom))
+    effective_successes = successes.sum() / n * effective_n
+    return ClusteredEvidence(
+        terrains,
+        int((successes < sizes).sum()),
+        ClusterMethod.KORN_GRAUBARD,
+        design_effect,
+        effective_n,
+        proportion_lower(effective_successes, effective_n, confidence),
+        proportion_upper(effective_successes, effective_n, confidence),
+    )

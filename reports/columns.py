@@ -1,0 +1,126 @@
+"""What the names of stored columns say: units, axes of an error, what drove it, and how to put it into words."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+#: Endings of column names and the unit they stand for, longest first.
+_UNITS = (
+    ("_m_s2", "m/s²"),
+    ("_deg_s", "deg/s"),
+    ("_rad_s", "rad/s"),
+    ("_m_s", "m/s"),
+    ("_deg", "deg"),
+    ("_rad", "rad"),
+    ("_km", "km"),
+    ("_mm", "mm"),
+    ("_cm", "cm"),
+    ("_px", "px"),
+    ("_dn", "DN"),
+    ("_ms", "ms"),
+    ("_m", "m"),
+    ("_s", "s"),
+)
+_AXES = ("x", "y", "z")
+#: Columns that describe the run rather than the case.
+_BOOKKEEPING = re.compile(
+    r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|^place_|estimated|_true_"
+)
+#: Drivers that a review board asks for first: the worst pictures of the paper are the oblique, smeared and high ones.
+_FIRST_DRIVERS = ("off_nadir_max", "attitude_rate_max", "altitude_1", "wind_speed", "horizontal_speed", "sun_elevation")
+_LARGEST_CATEGORY = 6
+
+
+def split_unit(column: str) -> tuple[str, str]:
+    """The name without its unit, and the unit; an empty unit where the name has none.
+
+    >>> split_unit("attitude_rate_max_deg_s")
+    ('attitude_rate_max', 'deg/s')
+    """
+    for ending, unit in _UNITS:
+        if column.endswith(ending) and len(column) > len(ending):
+            return column.removesuffix(ending), unit
+    return column, ""
+
+
+def label(column: str) -> str:
+    """The column in words, with its unit: ``velocity error (m/s)``."""
+    name, unit = split_unit(column)
+    words = name.replace("_", " ").replace(".", " ")
+    return f"{words} ({unit})" if unit else words
+
+
+def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
+    """The signed parts of a metric among the columns: ``velocity_error_x_m_s`` for ``velocity_error_m_s``."""
+    name, _ = split_unit(metric)
+    ending = metric[len(name) :]
+    return [part for axis in _AXES if (part := f"{name}_{axis}{ending}") in columns]
+
+
+def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> str | None:
+    """The metric that the page is about: the first requirement's, else the first error column; None without one."""
+    asked = [str(requirement.get("metric", "")) for requirement in requirements]
+    errors = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
+    return next((name for name in [*asked, *errors] if name in frame and _is_number(frame, name)), None)
+
+
+def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
+    """A column as float64; NaN where there is no number or no column."""
+    if column not in frame:
+        return np.full(len(frame), np.nan)
+    values = pd.to_numeric(frame[column], errors="coerce")
+    return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan), dtype=np.float64)
+
+
+def driver_columns(frame: pd.DataFrame, metric: str, most: int = 6) -> list[str]:
+    """Columns that may explain a metric: those a review asks for first, then those that rank with it most."""
+    candidates = [str(column) for column in frame.columns if _may_drive(frame, str(column), metric)]
+    first = [name for start in _FIRST_DRIVERS for name in candidates if name.startswith(start)]
+    magnitude = np.abs(numbers(frame, metric))
+    rest = sorted(
+        (name for name in candidates if name not in first),
+        key=lambda name: -abs(np.nan_to_num(rank_correlation(numbers(frame, name), magnitude))),
+    )
+    return [*first, *rest][:most]
+
+
+def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:
+    """Spearman's rank correlation over the cases where both are known; NaN for fewer than four or for a constant."""
+    both = np.isfinite(x) & np.isfinite(y)
+    if both.sum() < 4:
+        return float("nan")
+    ranks_x, ranks_y = (pd.Series(values[both]).rank().to_numpy() for values in (x, y))
+    if np.ptp(ranks_x) == 0 or np.ptp(ranks_y) == 0:
+        return float("nan")
+    return float(np.corrcoef(ranks_x, ranks_y)[0, 1])
+
+
+def category_column(frame: pd.DataFrame) -> str | None:
+    """The column that sorts cases into a few kinds (text, else few terrains); None where there is none."""
+    texts = [str(column) for column in frame.columns if _is_text(frame, str(column))]
+    names = [name for name in texts if not _BOOKKEEPING.search(name)]
+    names += ["terrain"] if "terrain" in frame else []
+    return next((name for name in names if 2 <= frame[name].nunique() <= _LARGEST_CATEGORY), None)
+
+
+def _is_number(frame: pd.DataFrame, column: str) -> bool:
+    kind = frame[column].dtype
+    return pd.api.types.is_numeric_dtype(kind) and not pd.api.types.is_bool_dtype(kind)
+
+
+def _is_text(frame: pd.DataFrame, column: str) -> bool:
+    kind = frame[column].dtype
+    return pd.api.types.is_string_dtype(kind) or pd.api.types.is_object_dtype(kind)
+
+
+def _may_drive(frame: pd.DataFrame, column: str, metric: str) -> bool:
+    parts = {metric, *axis_columns(metric, [str(name) for name in frame.columns])}
+    if column in parts or column == "terrain" or _BOOKKEEPING.search(column) or not _is_number(frame, column):
+        return False
+    return frame[column].nunique() > 1

@@ -1,0 +1,119 @@
+"""What the terminal shows: verdicts, outcomes and error statistics as Rich tables.
+
+Texts from files are put into `Text` objects, never into markup: a name in square brackets stays a name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pandas as pd
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from reports.columns import axis_columns, label, numbers
+from reports.statistics import ErrorSummary, summarize
+from reports.verdicts import ENGINE_FAILURES, Status, Verdict
+from reports.wording import NOTHING, interval, number, percent, stated
+
+_STYLES = {Status.PASS: "bold green", Status.FAIL: "bold red", Status.INSUFFICIENT: "bold yellow"}
+
+
+def verdict_table(verdicts: Sequence[Verdict]) -> Table:
+    """Every requirement with its verdict and evidence, legible from 80 columns on."""
+    table = Table(title="Verdict", box=box.SIMPLE_HEAD, expand=False, title_justify="left", caption_justify="left")
+    table.add_column("Requirement", overflow="fold", ratio=None, min_width=18)
+    table.add_column("Verdict", no_wrap=True)
+    table.add_column("Failed", justify="right", no_wrap=True)
+    table.add_column("Succeeded", justify="right", no_wrap=True)
+    table.add_column("Bounds", justify="right", no_wrap=True)
+    table.add_column("More", justify="right", no_wrap=True)
+    for verdict in verdicts:
+        table.add_row(
+            _requirement(verdict),
+            Text(str(verdict.status), style=_STYLES[verdict.status]),
+            f"{verdict.failures} of {verdict.n}",
+            percent(verdict.estimate),
+            NOTHING if verdict.n == 0 else f"≥ {percent(verdict.lower)}\n≤ {percent(verdict.upper)}",
+            NOTHING if verdict.further_cases is None else str(verdict.further_cases),
+        )
+    if not verdicts:
+        table.add_row(Text("none asked"), "", "", "", "", "")
+    table.caption = _caption(verdicts)
+    return table
+
+
+def outcome_counts(frame: pd.DataFrame) -> list[tuple[str, int]]:
+    """Outcomes and how many cases ended so: VALID first, the engine's failures last, the others by number."""
+    if "outcome" not in frame:
+        return []
+    counts = frame["outcome"].astype("object").fillna("(none)").astype(str).value_counts()
+    pairs = [(str(name), int(count)) for name, count in counts.items()]
+    return sorted(pairs, key=lambda pair: (pair[0] in ENGINE_FAILURES, pair[0] != "VALID", -pair[1], pair[0]))
+
+
+def outcome_table(frame: pd.DataFrame) -> Table:
+    """How the cases ended."""
+    table = Table(title="Outcomes", box=box.SIMPLE_HEAD, title_justify="left")
+    table.add_column("Outcome")
+    table.add_column("Cases", justify="right")
+    table.add_column("Share", justify="right")
+    for name, count in outcome_counts(frame):
+        table.add_row(Text(name), str(count), percent(count / len(frame)))
+    return table
+
+
+def error_summaries(frame: pd.DataFrame, metric: str) -> list[tuple[str, ErrorSummary]]:
+    """Summaries of a metric and of its signed parts, over all cases that have one."""
+    parts = [metric, *axis_columns(metric, [str(column) for column in frame.columns])]
+    return [(label(part), summarize(numbers(frame, part))) for part in parts]
+
+
+def error_table(frame: pd.DataFrame, metric: str) -> Table:
+    """Statistics of a metric and of its signed parts, a column each."""
+    summaries = error_summaries(frame, metric)
+    table = Table(title="Errors", box=box.SIMPLE_HEAD, title_justify="left")
+    table.add_column("Statistic")
+    for name, _ in summaries:
+        table.add_column(Text(name), justify="right")
+    for row in statistics_rows([summary for _, summary in summaries]):
+        table.add_row(*row)
+    return table
+
+
+def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
+    """Rows of a table of statistics: the statistic's name, then its value in each summary."""
+    if not summaries:
+        return []
+    confidence = f"{summaries[0].confidence:.0%}"
+    rows = [
+        ["cases", *(str(s.n) for s in summaries)],
+        ["mean", *(number(s.mean) for s in summaries)],
+        [f"mean, {confidence} interval", *(interval(s.mean_lower, s.mean_upper) for s in summaries)],
+        ["standard deviation", *(number(s.sd) for s in summaries)],
+        ["robust standard deviation", *(number(s.robust_sd) for s in summaries)],
+        ["root mean square", *(number(s.rms) for s in summaries)],
+    ]
+    for index, quantile in enumerate(summaries[0].quantiles):
+        name = "median" if quantile.probability == 0.5 else f"{quantile.probability:.0%} quantile"
+        of_each = [summary.quantiles[index] for summary in summaries]
+        rows.append([name, *(number(q.estimate) for q in of_each)])
+        rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in of_each)])
+    return [*rows, ["largest magnitude", *(number(s.largest) for s in summaries)]]
+
+
+def _requirement(verdict: Verdict) -> Text:
+    text = Text(verdict.requirement_id, style="bold")
+    asked = f"|{verdict.metric}| <= {verdict.bound:g} in {stated(verdict.probability)} of {verdict.population} cases"
+    text.append(f"\n{asked}, {stated(verdict.confidence)} confidence", style="dim")
+    return text
+
+
+def _caption(verdicts: Sequence[Verdict]) -> Text:
+    """What the columns mean, and what a reader must know before trusting them."""
+    lines = []
+    if verdicts:
+        lines.append("Bounds: one-sided Clopper-Pearson at the stated confidence. More: further cases if no more fail.")
+    lines += [f"{verdict.requirement_id}: {verdict.note}" for verdict in verdicts if verdict.note]
+    return Text("\n".join(lines), style="dim", justify="left")

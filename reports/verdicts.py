@@ -1,0 +1,305 @@
+"""Verdicts on requirements: what stored rows show, at what confidence, and how much more evidence it takes.
+
+A requirement asks that `metric <= bound` (in magnitude) holds for a stated fraction of a population of cases, at a
+stated confidence. Its status follows from one-sided Clopper-Pearson bounds of the success rate, as for independent
+cases. Where cases share terrains they are not independent: the verdict then says so and carries the bounds that hold
+nevertheless.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Int
+
+from reports.clusters import ClusteredEvidence, clustered_evidence
+from reports.statistics import further_cases_needed, proportion_lower, proportion_upper
+from reports.wording import count, percent, stated
+
+#: Outcomes of cases that the engine could not finish; the algorithm under test may be innocent of them.
+ENGINE_FAILURES = frozenset({"CRASHED", "HUNG", "KILLED", "TIMED_OUT", "TIMEOUT"})
+
+
+class Status(StrEnum):
+    """What the evidence says of a requirement."""
+
+    PASS = "PASS"  # noqa: S105  (a verdict, not a password)
+    FAIL = "FAIL"
+    INSUFFICIENT = "INSUFFICIENT"
+
+
+class Population(StrEnum):
+    """Which cases a requirement is about."""
+
+    ALL = "all"
+    COMPLETED = "completed"
+    VALID = "valid"
+
+    @property
+    def meaning(self) -> str:
+        """The population in words."""
+        return _POPULATION_MEANINGS[self]
+
+
+_POPULATION_MEANINGS = {
+    Population.ALL: "every case, crashed ones included",
+    Population.COMPLETED: "every case that ran to its end",
+    Population.VALID: "every case with an answer",
+}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One requirement judged.
+
+    Attributes
+    ----------
+    requirement_id, statement, metric, bound, probability, confidence, population
+        The requirement, as the campaign states it; NaN for a number that is missing or is none.
+    status
+        PASS where the lower bound reaches the probability, FAIL where the upper bound is below it, else INSUFFICIENT.
+    n, failures
+        Cases of the population, and those that did not succeed (a metric that is missing or NaN is a failure).
+    estimate, lower, upper
+        Success rate and its one-sided Clopper-Pearson bounds, each at the confidence; NaN for an empty population.
+    further_cases
+        Cases still needed if no more fail, where that can be said; None for PASS and FAIL.
+    reason
+        Why nothing could be judged; empty where it could.
+    terrains
+        Distinct terrains behind the population; None where the rows do not say.
+    clustered
+        What the cases show when terrains are shared between them; None where none is.
+    """
+
+    requirement_id: str
+    statement: str
+    metric: str
+    bound: float
+    probability: float
+    confidence: float
+    population: str
+    status: Status
+    n: int
+    failures: int
+    estimate: float
+    lower: float
+    upper: float
+    further_cases: int | None
+    reason: str = ""
+    terrains: int | None = None
+    clustered: ClusteredEvidence | None = None
+
+    @property
+    def clustered_status(self) -> Status | None:
+        """The status by the bounds that allow for shared terrains; None where no terrain is shared."""
+        if self.clustered is None:
+            return None
+        return _status(self.clustered.lower, self.clustered.upper, self.probability)
+
+    @property
+    def note(self) -> str:
+        """What a reader must know before trusting the verdict; empty where there is nothing to say."""
+        if self.reason:
+            return self.reason
+        if self.clustered is None:
+            return ""
+        shared = self.clustered
+        return (
+            f"{count(self.n, 'case')} share {count(shared.terrains, 'terrain')} and so are not independent, as the "
+            f"verdict takes them to be. Allowing for that ({shared.method}, effective n {shared.effective_n:.4g}), the "
+            f"success rate is at least {percent(shared.lower)} at {stated(self.confidence)} confidence: "
+            f"{self.clustered_status}."
+        )
+
+
+@dataclass(frozen=True)
+class Overall:
+    """A campaign's verdict in one word and one sentence.
+
+    `status` is None where no requirement was asked.
+    """
+
+    status: Status | None
+    crashed: int
+    sentence: str
+
+    @property
+    def word(self) -> str:
+        """The headline."""
+        return "NO REQUIREMENT" if self.status is None else str(self.status)
+
+
+def judge_campaign(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> list[Verdict]:
+    """Judges every requirement on the stored rows of a campaign; never raises for what rows or requirements lack."""
+    return [_judge(frame, requirement) for requirement in requirements]
+
+
+def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame) -> Overall:
+    """The campaign's verdict: FAIL if any requirement failed, else INSUFFICIENT if any is open, else PASS."""
+    crashed = crashed_cases(frame)
+    statuses = [verdict.status for verdict in verdicts]
+    tail = f" {count(crashed, 'case')} crashed." if crashed else ""
+    if not statuses:
+        return Overall(None, crashed, "The campaign asks for no requirement." + tail)
+    worst = next((status for status in (Status.FAIL, Status.INSUFFICIENT) if status in statuses), Status.PASS)
+    sentence = {
+        Status.PASS: f"{count(len(statuses), 'requirement')} met.",
+        Status.FAIL: f"{statuses.count(Status.FAIL)} of {count(len(statuses), 'requirement')} not met.",
+        Status.INSUFFICIENT: (
+            f"{statuses.count(Status.INSUFFICIENT)} of {count(len(statuses), 'requirement')} "
+            f"cannot be decided by {count(len(frame), 'case')}."
+        ),
+    }[worst]
+    return Overall(worst, crashed, sentence + tail)
+
+
+def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
+    """The exit code of a campaign: 1 a requirement failed or a case crashed, 3 not enough cases to say, 0 otherwise."""
+    statuses = {verdict.status for verdict in verdicts}
+    if crashed or Status.FAIL in statuses:
+        return 1
+    return 3 if Status.INSUFFICIENT in statuses else 0
+
+
+def crashed_cases(frame: pd.DataFrame) -> int:
+    """How many cases the engine could not finish."""
+    return int(_engine_failed(frame).sum())
+
+
+def succeeded(frame: pd.DataFrame, metric: str, bound: float) -> Bool[np.ndarray, " n"]:
+    """Whether |metric| <= bound, case by case; False where the metric is missing or is not a number."""
+    values = pd.to_numeric(frame[metric], errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+    return np.asarray(np.abs(values) <= bound, dtype=np.bool_)
+
+
+def members(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
+    """Which cases belong to a population.
+
+    Raises
+    ------
+    ValueError
+        Where the population is unknown or the rows do not tell who belongs to it.
+    """
+    if population == Population.ALL:
+        return np.ones(len(frame), dtype=np.bool_)
+    if population == Population.COMPLETED:
+        return ~_engine_failed(frame)
+    if population != Population.VALID:
+        raise ValueError(f"the population {population!r} is unknown; known are {', '.join(Population)}")
+    if "answered" not in frame:
+        raise ValueError("the rows have no column 'answered', by which the population 'valid' is known")
+    return frame["answered"].eq(True).fillna(False).to_numpy(dtype=np.bool_)
+
+
+def _engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
+    if "outcome" not in frame:
+        return np.zeros(len(frame), dtype=np.bool_)
+    return frame["outcome"].isin(ENGINE_FAILURES).to_numpy(dtype=np.bool_)
+
+
+def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any]) -> Verdict:
+    open_verdict = _unjudged(requirement)
+    fault = _fault(frame, open_verdict)
+    if fault:
+        return replace(open_verdict, reason=fault)
+    try:
+        chosen = frame[members(frame, open_verdict.population)]
+    except ValueError as error:
+        return replace(open_verdict, reason=_sentence(str(error)))
+    if chosen.empty:
+        further = further_cases_needed(0, 0, open_verdict.probability, open_verdict.confidence)
+        reason = f"No case belongs to the population '{open_verdict.population}'."
+        return replace(open_verdict, reason=reason, further_cases=further)
+    return _weighed(open_verdict, chosen)
+
+
+def _weighed(verdict: Verdict, chosen: pd.DataFrame) -> Verdict:
+    """The verdict by the cases of its population, of which there is at least one."""
+    success = succeeded(chosen, verdict.metric, verdict.bound)
+    n, failures = success.size, int((~success).sum())
+    lower = proportion_lower(n - failures, n, verdict.confidence)
+    upper = proportion_upper(n - failures, n, verdict.confidence)
+    status = _status(lower, upper, verdict.probability)
+    undecided = status is Status.INSUFFICIENT
+    groups = _terrain_groups(chosen)
+    shared = groups is not None and int(groups.max()) + 1 < n
+    return replace(
+        verdict,
+        status=status,
+        n=n,
+        failures=failures,
+        estimate=(n - failures) / n,
+        lower=lower,
+        upper=upper,
+        further_cases=further_cases_needed(n, failures, verdict.probability, verdict.confidence) if undecided else None,
+        terrains=None if groups is None else int(chosen["terrain"].nunique()),
+        clustered=clustered_evidence(success, groups, verdict.confidence) if shared and groups is not None else None,
+    )
+
+
+def _status(lower: float, upper: float, probability: float) -> Status:
+    if lower >= probability:
+        return Status.PASS
+    return Status.FAIL if upper < probability else Status.INSUFFICIENT
+
+
+def _terrain_groups(chosen: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
+    """Which cases share a terrain, from 0; None where no row says. A case of unknown terrain stands alone."""
+    if "terrain" not in chosen or bool(chosen["terrain"].isna().all()):
+        return None
+    codes, known = pd.factorize(chosen["terrain"])
+    groups = np.array(codes, dtype=np.int64)
+    alone = groups < 0
+    groups[alone] = len(known) + np.arange(int(alone.sum()))
+    return groups
+
+
+def _fault(frame: pd.DataFrame, verdict: Verdict) -> str:
+    """What keeps a requirement from being judged; empty if nothing does."""
+    for name in ("probability", "confidence"):
+        value = getattr(verdict, name)
+        if not 0.0 < value < 1.0:
+            return f"The requirement's {name} is {value}; it must lie between 0 and 1, both excluded."
+    if not math.isfinite(verdict.bound):
+        return "The requirement states no bound."
+    if verdict.metric not in frame:
+        return f"The rows have no column '{verdict.metric}', which is the requirement's metric."
+    return ""
+
+
+def _unjudged(requirement: Mapping[str, Any]) -> Verdict:
+    """The requirement without evidence."""
+    return Verdict(
+        requirement_id=str(requirement.get("id", "?")),
+        statement=str(requirement.get("statement", "")),
+        metric=str(requirement.get("metric", "?")),
+        bound=_number(requirement.get("bound")),
+        probability=_number(requirement.get("probability")),
+        confidence=_number(requirement.get("confidence")),
+        population=str(requirement.get("population", Population.ALL)),
+        status=Status.INSUFFICIENT,
+        n=0,
+        failures=0,
+        estimate=math.nan,
+        lower=math.nan,
+        upper=math.nan,
+        further_cases=None,
+    )
+
+
+def _number(value: object) -> float:
+    try:
+        return float(value)  # type: ignore[arg-type]  # anything a JSON file may hold
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + "."

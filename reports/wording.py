@@ -1,0 +1,53 @@
+"""Numbers as a reader should see them: digits that mean something, and never a success rate rounded up to certainty."""
+
+from __future__ import annotations
+
+import math
+
+#: Stands where there is nothing to say.
+NOTHING = "–"
+
+
+def number(value: float) -> str:
+    """A number with about three significant digits; a dash where there is none.
+
+    >>> number(1.23456), number(123.456), number(0.0)
+    ('1.235', '123.5', '0.000')
+    """
+    if math.isnan(value):
+        return NOTHING
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    magnitude = abs(value)
+    if magnitude != 0.0 and (magnitude >= 1e5 or magnitude < 1e-3):
+        return f"{value:.2e}"
+    return f"{value:.{3 if magnitude < 10 else 2 if magnitude < 100 else 1}f}"
+
+
+def interval(lower: float, upper: float) -> str:
+    """Two bounds; a dash on the side where the sample is too small to give one."""
+    sides = (NOTHING if not math.isfinite(bound) else number(bound) for bound in (lower, upper))
+    return " to ".join(sides) if math.isfinite(lower) or math.isfinite(upper) else NOTHING
+
+
+def percent(fraction: float) -> str:
+    """A measured fraction in per cent, never rounded up to 100 nor down to 0; a dash for NaN."""
+    if math.isnan(fraction):
+        return NOTHING
+    if fraction in (0.0, 1.0):
+        return f"{100.0 * fraction:.0f} %"
+    for decimals in range(2, 8):
+        text = f"{100.0 * fraction:.{decimals}f}"
+        if 0.0 < float(text) < 100.0:
+            return f"{text} %"
+    return f"{100.0 * fraction} %"
+
+
+def stated(fraction: float) -> str:
+    """A fraction that was stated, in per cent with the digits that it was stated with."""
+    return NOTHING if math.isnan(fraction) else f"{100.0 * fraction:.10g} %"
+
+
+def count(quantity: int, noun: str) -> str:
+    """A quantity and what is counted: ``1 case``, ``24 cases``."""
+    return f"{quantity:,} {noun}{'' if quantity == 1 else 's'}"
