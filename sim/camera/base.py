@@ -53,10 +53,10 @@ class CameraModel(ABC):
         (columns, rows) of the image.
     """
 
-    c: Float[np.ndarray, " 3"]
-    a: Float[np.ndarray, " 3"]
-    h: Float[np.ndarray, " 3"]
-    v: Float[np.ndarray, " 3"]
+    c: Float[np.ndarray, "3"]
+    a: Float[np.ndarray, "3"]
+    h: Float[np.ndarray, "3"]
+    v: Float[np.ndarray, "3"]
     size: tuple[int, int]
 
     # ----- what a model defines: x, y, z are the coordinates of P - C, all arguments and results of shape (n,) -----
@@ -266,12 +266,12 @@ class CameraModel(ABC):
         )
 
     @property
-    def right(self) -> Float[np.ndarray, " 3"]:
+    def right(self) -> Float[np.ndarray, "3"]:
         """Unit vector H', perpendicular to A, along which u grows."""
         return _unit(self.h - self.image_centre[0] * self.a)
 
     @property
-    def down(self) -> Float[np.ndarray, " 3"]:
+    def down(self) -> Float[np.ndarray, "3"]:
         """Unit vector V', perpendicular to A, along which v grows."""
         return _unit(self.v - self.image_centre[1] * self.a)
 
@@ -291,12 +291,12 @@ class CameraModel(ABC):
         right, bottom = self.size[0] - 0.5, self.size[1] - 0.5
         return self.rays(np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]]))
 
-    def boresight(self) -> Float[np.ndarray, " 3"]:
+    def boresight(self) -> Float[np.ndarray, "3"]:
         """Unit direction in which the middle of the frame looks."""
         return self.rays(np.array([(self.size[0] - 1) / 2, (self.size[1] - 1) / 2]))[1]
 
     def half_angle(self) -> float:
-        """Half angle of the cone about `boresight` that holds the whole frame, radians; NaN if any of it sees nothing."""
+        """Half angle of the cone about `boresight` that holds the whole frame, radians; NaN if any of it is blind."""
         directions = self.rays(self.border(64))[1]
         axis = self.boresight()
         across = np.linalg.norm(np.cross(directions, axis), axis=-1)
@@ -365,7 +365,8 @@ M = TypeVar("M", bound=CameraModel)
 
 def dot(vector: NDArray[np.float64], x: Vector, y: Vector, z: Vector) -> Vector:
     """Scalar product of one vector with n, the same for each whatever n is (a BLAS product need not be)."""
-    return vector[0] * x + vector[1] * y + vector[2] * z
+    product: Vector = vector[0] * x + vector[1] * y + vector[2] * z
+    return product
 
 
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:

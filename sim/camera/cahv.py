@@ -25,10 +25,10 @@ class Cahv(CameraModel):
         If a vector is not finite, A is not a unit vector, A, H and V do not span space or the size is not positive.
     """
 
-    c: Float[np.ndarray, " 3"]
-    a: Float[np.ndarray, " 3"]
-    h: Float[np.ndarray, " 3"]
-    v: Float[np.ndarray, " 3"]
+    c: Float[np.ndarray, "3"]
+    a: Float[np.ndarray, "3"]
+    h: Float[np.ndarray, "3"]
+    v: Float[np.ndarray, "3"]
     size: tuple[int, int]
 
     def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:

@@ -22,8 +22,8 @@ class RadialModel(CameraModel):
     that the models differ in is kappa.
     """
 
-    o: Float[np.ndarray, " 3"]
-    r: Float[np.ndarray, " 3"]
+    o: Float[np.ndarray, "3"]
+    r: Float[np.ndarray, "3"]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -103,12 +103,12 @@ class Cahvor(RadialModel):
         As `Cahv`; or if O is not a unit vector or does not look to A's side, or rho0 <= -1.
     """
 
-    c: Float[np.ndarray, " 3"]
-    a: Float[np.ndarray, " 3"]
-    h: Float[np.ndarray, " 3"]
-    v: Float[np.ndarray, " 3"]
-    o: Float[np.ndarray, " 3"]
-    r: Float[np.ndarray, " 3"]
+    c: Float[np.ndarray, "3"]
+    a: Float[np.ndarray, "3"]
+    h: Float[np.ndarray, "3"]
+    v: Float[np.ndarray, "3"]
+    o: Float[np.ndarray, "3"]
+    r: Float[np.ndarray, "3"]
     size: tuple[int, int]
 
     @classmethod

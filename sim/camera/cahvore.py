@@ -23,13 +23,13 @@ class Cahvore(RadialModel):
     """A wide-angle camera whose entrance pupil moves along the optical axis.
 
     A ray that makes the angle theta with O starts at C + s O, with
-    s = (theta / sin theta - 1) (e0 + e1 theta^2 + e2 theta^4). It is imaged as if its distance from the axis were chi, with L the linearity:
+    s = (theta / sin theta - 1) (e0 + e1 theta^2 + e2 theta^4). Its "distance" chi from the axis, with L the linearity, is
 
         chi = tan(L theta) / L   (L > 0; L = 1 is a perspective lens)
         chi = theta              (L = 0, an equidistant fisheye)
         chi = sin(L theta) / L   (L < 0; L = -1 is orthographic)
 
-    moved to (1 + rho0) chi + rho1 chi^3 + rho2 chi^5 and projected linearly. Points outside the range in which this is
+    It is moved to (1 + rho0) chi + rho1 chi^3 + rho2 chi^5 and projected linearly. Points outside the range in which this is
     one-to-one, or so near that the pupil's motion leaves no ray or several, are not visible.
 
     Attributes
@@ -49,13 +49,13 @@ class Cahvore(RadialModel):
         As `Cahvor`; or if the linearity is not from -1 to 1.
     """
 
-    c: Float[np.ndarray, " 3"]
-    a: Float[np.ndarray, " 3"]
-    h: Float[np.ndarray, " 3"]
-    v: Float[np.ndarray, " 3"]
-    o: Float[np.ndarray, " 3"]
-    r: Float[np.ndarray, " 3"]
-    e: Float[np.ndarray, " 3"]
+    c: Float[np.ndarray, "3"]
+    a: Float[np.ndarray, "3"]
+    h: Float[np.ndarray, "3"]
+    v: Float[np.ndarray, "3"]
+    o: Float[np.ndarray, "3"]
+    r: Float[np.ndarray, "3"]
+    e: Float[np.ndarray, "3"]
     linearity: float = field(kw_only=True)
     size: tuple[int, int] = field(kw_only=True)
 

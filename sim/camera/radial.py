@@ -1,7 +1,6 @@
 """The radial polynomial of CAHVOR and CAHVORE and its inverse.
 
-Both models move a ray from its "distance" chi off the optical axis O (the tangent of its angle from it for a perspective
-lens) to
+Both models move a ray from its "distance" chi off the optical axis (for a perspective lens its angle's tangent) to
 
     f(chi) = (1 + rho0) chi + rho1 chi^3 + rho2 chi^5
 
