@@ -1,1 +1,1 @@
-"""Marsyard: a virtual Mars Yard that runs vision software through rendered, truth-known cases and says whether requirements are met."""
+"""Marsyard: a virtual Mars Yard that runs vision software through rendered, truth-known cases, and says whether it holds."""

@@ -1,0 +1,167 @@
+"""Worker processes, each running one task at a time, so that one that dies takes nothing but its own task with it.
+
+Each worker is a loky executor (joblib's) of one process. With one process an executor that breaks says which task broke
+it, and the others go on undisturbed; `jobs=1` is the same set-up with one of them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Generic, Self, TypeVar
+
+from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals.loky.process_executor import BrokenProcessPool
+
+Result = TypeVar("Result")
+
+#: Set before a worker loads any library: one thread each, and an order of sets that does not change from run to run.
+WORKER_ENVIRONMENT: Mapping[str, str] = {
+    **dict.fromkeys(
+        (
+            "OMP_NUM_THREADS",
+            "OPENBLAS_NUM_THREADS",
+            "MKL_NUM_THREADS",
+            "NUMBA_NUM_THREADS",
+            "NUMEXPR_NUM_THREADS",
+            "VECLIB_MAXIMUM_THREADS",
+            "OPENCV_FOR_THREADS_NUM",
+            "LP_NUM_THREADS",
+        ),
+        "1",
+    ),
+    "PYTHONHASHSEED": "0",
+}
+
+#: Times that a task is given to a fresh worker before its death is laid to the task.
+_ATTEMPTS = 2
+
+
+class WorkerDiedError(Exception):
+    """A task took its worker process down, and again in a fresh one."""
+
+
+@dataclass(frozen=True)
+class Done(Generic[Result]):
+    """A task that ended: its item, and its result or the error that kept it from one."""
+
+    item: int
+    result: Result | None
+    error: Exception | None
+
+
+def available_cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def limit_threads() -> None:
+    """Keeps the numerical libraries that are loaded by now to one thread; the environment does so for later ones."""
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(1)
+    if "numba" in sys.modules:
+        sys.modules["numba"].set_num_threads(1)
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    """Ctrl-C reaches every process of a terminal; the parent stops the workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+class _Worker:
+    """One process, replaced when it dies."""
+
+    def __init__(self) -> None:
+        self._executor = self._start()
+
+    @staticmethod
+    def _start() -> Any:
+        return ProcessPoolExecutor(
+            max_workers=1, initializer=_leave_interrupts_to_the_parent, env=dict(WORKER_ENVIRONMENT)
+        )
+
+    def submit(self, task: Callable[[int], Result], item: int) -> Future[Result]:
+        """Gives the worker a task; in a fresh process where the last one died while idle."""
+        try:
+            future: Future[Result] = self._executor.submit(task, item)
+        except BrokenProcessPool:
+            self.replace()
+            future = self._executor.submit(task, item)
+        return future
+
+    def replace(self) -> None:
+        """Leaves the dead process and starts another."""
+        self._executor.shutdown(wait=False)
+        self._executor = self._start()
+
+    def stop(self, *, kill: bool, join: bool) -> None:
+        """Ends the process."""
+        self._executor.shutdown(wait=join, kill_workers=kill)
+
+
+class Workers:
+    """A number of worker processes, as a context: left normally they end, left by an exception they are killed."""
+
+    def __init__(self, jobs: int) -> None:
+        self._workers = [_Worker() for _ in range(jobs)]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        kill = kind is not None
+        for worker in self._workers:
+            worker.stop(kill=kill, join=False)
+
+    def run(self, task: Callable[[int], Result], items: Iterable[int]) -> Iterator[Done[Result]]:
+        """Runs a task on every item, and yields each as it ends, in no particular order."""
+        idle = deque(self._workers)
+        waiting: deque[tuple[int, int]] = deque()
+        source = iter(items)
+        running: dict[Future[Result], tuple[_Worker, int, int]] = {}
+        while True:
+            while idle:
+                if not waiting and (item := next(source, None)) is not None:
+                    waiting.append((item, 1))
+                if not waiting:
+                    break
+                item, attempt = waiting.popleft()
+                worker = idle.popleft()
+                running[worker.submit(task, item)] = (worker, item, attempt)
+            if not running:
+                return
+            ended, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in ended:
+                worker, item, attempt = running.pop(future)
+                idle.append(worker)
+                error = future.exception()
+                if isinstance(error, BrokenProcessPool):
+                    worker.replace()
+                    if attempt < _ATTEMPTS:
+                        waiting.append((item, attempt + 1))
+                        continue
+                yield _done(item, future)
+
+
+def _done(item: int, future: Future[Result]) -> Done[Result]:
+    """What a future holds."""
+    error = future.exception()
+    if error is None:
+        return Done(item, future.result(), None)
+    if isinstance(error, BrokenProcessPool):
+        codes = re.findall(r"([A-Z]+)\((-?\d+)\)", str(error))
+        reason = ", ".join(f"{name} ({code})" for name, code in codes) or "no exit status"
+        return Done(item, None, WorkerDiedError(f"the worker process died: {reason}"))
+    return Done(item, None, error if isinstance(error, Exception) else RuntimeError(repr(error)))

@@ -1,0 +1,65 @@
+"""From a campaign's stored rows to its verdict, its report and the exit status."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from campaigns import record
+from campaigns.errors import StoreError
+from campaigns.store import TABLE_FILE
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Console
+
+
+def conclude(directory: Path, console: Console) -> int:
+    """Judges a campaign, writes its report, prints both, and returns the exit status.
+
+    Raises
+    ------
+    StoreError
+        Where the folder holds no campaign with rows, or the report cannot be written.
+    """
+    from reports.campaign import write_report
+
+    from reports.tables import verdict_table
+    from reports.verdicts import exit_code, judge_campaign, overall
+
+    stored = record.read(directory)
+    frame = read_frame(directory)
+    verdicts = judge_campaign(frame, stored["requirements"])
+    whole = overall(verdicts, frame)
+    status = exit_code(verdicts, bool(whole.crashed))
+    record.update(directory, {"exit_code": status})
+    try:
+        page = write_report(directory)
+    except OSError as error:
+        raise StoreError(f"the report cannot be written: {error}") from error
+    console.print(verdict_table(verdicts))
+    lines = [f"verdict: {whole.word}", whole.sentence, f"report: {page}"]
+    if stored["state"] != "finished":
+        lines.insert(0, f"the campaign is {stored['state']}: {len(frame)} of {stored['cases']} cases")
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return status
+
+
+def read_frame(directory: Path) -> pd.DataFrame:
+    """The stored rows of a campaign.
+
+    Raises
+    ------
+    StoreError
+        Where there are none.
+    """
+    import pandas as pd
+
+    path = directory / TABLE_FILE
+    if not path.is_file():
+        raise StoreError(f"{directory} has no {TABLE_FILE}: the campaign did not end")
+    try:
+        return pd.read_parquet(path)
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: not a table of cases: {error}") from error

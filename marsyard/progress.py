@@ -1,0 +1,124 @@
+"""Tells of a running campaign: a bar with rate and time left on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Protocol, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+#: Seconds between two plain lines.
+LINE_INTERVAL_S = 10.0
+
+
+def rate_text(done: int, elapsed_s: float) -> str:
+    """Steps a second, or seconds a step where that is the easier number."""
+    if done == 0 or elapsed_s <= 0.0:
+        return ""
+    rate = done / elapsed_s
+    return f"{rate:.1f} /s" if rate >= 1.0 else f"{1.0 / rate:.1f} s each"
+
+
+class _RateColumn(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        return Text(rate_text(int(task.completed), task.elapsed or 0.0))
+
+
+class CampaignProgress(Protocol):
+    """A context in which a campaign is told of; also the engine's `Watch`."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def begin(self, stage: str, total: int) -> None: ...  # noqa: D102
+    def step(self) -> None: ...  # noqa: D102
+    def note(self, text: str) -> None: ...  # noqa: D102
+
+
+class BarProgress:
+    """A bar for each stage."""
+
+    def __init__(self, console: Console) -> None:
+        self._bars = Progress(
+            TextColumn("{task.description:<10}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            _RateColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+        )
+        self._task = self._bars.add_task("starting", visible=False)
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    def begin(self, stage: str, total: int) -> None:
+        """See `campaigns.engine.Watch`."""
+        self._task = self._bars.add_task(stage, total=total)
+
+    def step(self) -> None:
+        """See `campaigns.engine.Watch`."""
+        self._bars.advance(self._task)
+
+    def note(self, text: str) -> None:
+        """See `campaigns.engine.Watch`."""
+        self._bars.console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
+
+
+class LineProgress:
+    """A line when a stage begins, every so often, and when it ends."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._stage, self._total, self._done = "", 0, 0
+        self._began = self._told = 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+    def begin(self, stage: str, total: int) -> None:
+        """See `campaigns.engine.Watch`."""
+        self._stage, self._total, self._done = stage, total, 0
+        self._began = self._told = time.monotonic()
+        self._line(f"{stage}: {total}")
+
+    def step(self) -> None:
+        """See `campaigns.engine.Watch`."""
+        self._done += 1
+        now = time.monotonic()
+        if self._done < self._total and now - self._told < LINE_INTERVAL_S:
+            return
+        self._told, elapsed = now, now - self._began
+        text = f"{self._stage}: {self._done}/{self._total}, {rate_text(self._done, elapsed)}"
+        left = elapsed / self._done * (self._total - self._done)
+        self._line(f"{text}, {left:.0f} s left" if self._done < self._total else f"{text}, {elapsed:.1f} s")
+
+    def note(self, text: str) -> None:
+        """See `campaigns.engine.Watch`."""
+        self._line(f"note: {text}")
+
+    def _line(self, text: str) -> None:
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def campaign_progress(console: Console) -> CampaignProgress:
+    """What suits the console: a bar on a terminal, lines elsewhere."""
+    return BarProgress(console) if console.is_terminal else LineProgress(console)

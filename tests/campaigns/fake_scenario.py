@@ -1,0 +1,82 @@
+"""A scenario without a world: fast, exact, and able to fail in every way that a user's can."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from scenarios.interface import CaseResult
+from sim.streams import Streams
+
+
+class Wind(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    east_m_s: float = Field(default=0.0, ge=-50.0, le=50.0)
+    north_m_s: float = Field(default=0.0, ge=-50.0, le=50.0)
+
+
+class FakeParameters(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    altitude_m: float = Field(default=2000.0, gt=0.0)
+    lowest_altitude_m: float = Field(default=0.0, ge=0.0)
+    terrain: int = Field(default=0, ge=0, le=9)
+    kind: str = Field(default="plain", pattern="^[a-z]+$")
+    wind: Wind = Wind()
+    heights_m: tuple[float, float] = (1.0, 2.0)
+    raising_cases: frozenset[int] = frozenset()
+    aborting_cases: frozenset[int] = frozenset()
+    silent_cases: frozenset[int] = frozenset()
+    shared: int = 0
+    fail_prepare: bool = False
+    cache: str = ""
+    sleep_s: float = 0.0
+    error_scale: float = 1.0
+    products: str = "good"
+
+    @model_validator(mode="after")
+    def _above_the_lowest(self) -> FakeParameters:
+        if self.altitude_m < self.lowest_altitude_m:
+            raise ValueError("altitude_m must be above lowest_altitude_m")
+        return self
+
+
+class FakeScenario:
+    name = "fake"
+    parameters_type = FakeParameters
+
+    def shared_inputs(self, parameters: FakeParameters) -> tuple[int, ...]:
+        return tuple(range(parameters.shared))
+
+    def prepare(self, parameters: FakeParameters, shared_input: int) -> None:
+        if parameters.fail_prepare:
+            raise OSError("no room for the terrain")
+        Path(parameters.cache, f"shared-{shared_input}").touch()
+
+    def run(self, parameters: FakeParameters, streams: Streams) -> CaseResult:
+        time.sleep(parameters.sleep_s)
+        if streams.case in parameters.raising_cases:
+            raise ZeroDivisionError(f"case {streams.case} of {object()!r}")
+        if streams.case in parameters.aborting_cases:
+            os.abort()
+        answered = streams.case not in parameters.silent_cases
+        error = parameters.error_scale * streams.generator("noise").normal(size=2) if answered else np.full(2, np.nan)
+        row = {
+            "velocity_error_m_s": np.hypot(*error),
+            "velocity_error_x_m_s": error[0],
+            "altitude_m": parameters.altitude_m,
+            "wind_east_m_s": parameters.wind.east_m_s,
+            "terrain": np.int64(parameters.terrain),
+            "kind": parameters.kind,
+            "clear": np.bool_(parameters.terrain == 0),
+            "threads": os.environ["OMP_NUM_THREADS"],
+            "hash_of_text": hash("marsyard") % 2**31,
+        }
+        products = {"picture": np.arange(6, dtype=np.uint16).reshape(2, 3), "title": "a", "nested": [{"x": np.eye(2)}]}
+        kept = {"thing": object()} if parameters.products == "bad" else products
+        return CaseResult("VALID" if answered else "SILENT", answered, row, kept)
