@@ -1,0 +1,228 @@
+"""Pictures of one DIMES case, laid out as Figs. 7 to 9 of the field test's paper (`papers/dimes-field-test.txt`).
+
+Two image pairs side by side. Below, the pictures as delivered, with the templates as red squares and the tracked places
+as green ones; above, the rectified templates and their windows framed in blue, with the template's place in green.
+A square drawn with dashes belongs to a track that failed a validity check.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, FigureBase
+from matplotlib.patches import Rectangle
+
+from reports.svg import INK, in_page_style
+
+TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
+#: Side of a template's square on a delivered picture where the products do not tell it, pixels.
+_DEFAULT_SIDE = 15.0
+_PAIRS = (0, 1)
+_MOST_TRACKS = 2
+
+
+@dataclass(frozen=True)
+class Track:
+    """One template and what became of it.
+
+    Attributes
+    ----------
+    pair, template
+        Numbers of the image pair and of the template in it, from 0.
+    valid
+        Whether it passed the validity checks.
+    values
+        Everything that the products hold of it, by name.
+    patch, window
+        The rectified template and search window, None where not kept.
+    place
+        Row and column of the template's upper left corner in the window, None where not kept.
+    """
+
+    pair: int
+    template: int
+    valid: bool
+    values: Mapping[str, float]
+    patch: Float[np.ndarray, "_ _"] | None
+    window: Float[np.ndarray, "_ _"] | None
+    place: tuple[float, float] | None
+
+
+def is_dimes_case(products: Mapping[str, Any]) -> bool:
+    """Whether products hold the three pictures of a DIMES case."""
+    return all(_plane(products, f"image_{number}") is not None for number in (1, 2, 3))
+
+
+def tracks(products: Mapping[str, Any]) -> list[Track]:
+    """The tracks of a case, those that the products hold in a form that can be read."""
+    try:
+        table = np.atleast_2d(np.asarray(products.get("tracks", ()), dtype=np.float64))
+        names = [str(name) for name in np.asarray(products.get("tracks_columns", ())).ravel()]
+    except (TypeError, ValueError):
+        return []
+    if table.size == 0 or table.shape[1] != len(names):
+        return []
+    rows = [dict(zip(names, (float(value) for value in row), strict=True)) for row in table]
+    counts = dict.fromkeys(_PAIRS, 0)
+    found = []
+    for row in rows:
+        pair = int(np.nan_to_num(row.get("pair", -1.0), nan=-1.0))
+        if pair in counts:
+            found.append(_track(products, pair, counts[pair], row))
+            counts[pair] += 1
+    return found
+
+
+@in_page_style
+def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
+    """Both image pairs of a case, side by side.
+
+    Raises
+    ------
+    ValueError
+        Where the products do not hold the three pictures; see `is_dimes_case`.
+    """
+    figure = Figure(figsize=(12.0, 6.1), layout="constrained")
+    for pair, part in zip(_PAIRS, figure.subfigures(1, 2, wspace=0.03).ravel(), strict=True):
+        _draw_pair(part, products, pair)
+    return figure
+
+
+@in_page_style
+def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
+    """One image pair of a case, 0 or 1; raises as `draw_dimes_case` does."""
+    figure = Figure(figsize=(6.0, 6.1), layout="constrained")
+    _draw_pair(figure, products, pair)
+    return figure
+
+
+def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> None:
+    pictures = [_picture(products, f"image_{number}") for number in (pair + 1, pair + 2)]
+    ours = [track for track in tracks(products) if track.pair == pair][:_MOST_TRACKS]
+    grid = figure.add_gridspec(2, 1, height_ratios=(1.0, 2.05))
+    upper = grid[0].subgridspec(1, 2 * _MOST_TRACKS)
+    for place in range(_MOST_TRACKS):
+        track = ours[place] if place < len(ours) else None
+        _draw_template(figure.add_subplot(upper[2 * place]), track)
+        _draw_window(figure.add_subplot(upper[2 * place + 1]), track)
+    lower = grid[1].subgridspec(1, 2)
+    for side, (picture, stem, colour) in enumerate(
+        zip(pictures, ("template", "match"), (TEMPLATE, MATCH), strict=True)
+    ):
+        axes = figure.add_subplot(lower[side])
+        _show(axes, picture)
+        _mark(axes, ours, stem, colour)
+        axes.set_title(f"Picture {pair + side + 1}: {'templates' if side == 0 else 'tracked'}", fontsize=9)
+
+
+def _draw_template(axes: Axes, track: Track | None) -> None:
+    if track is None or track.patch is None:
+        axes.set_axis_off()
+        return
+    _show(axes, track.patch)
+    _frame(axes, TEMPLATE, track.valid)
+    axes.set_title(f"Template {track.template + 1}", fontsize=9)
+
+
+def _draw_window(axes: Axes, track: Track | None) -> None:
+    if track is None or track.window is None:
+        axes.set_axis_off()
+        return
+    _show(axes, track.window)
+    _frame(axes, WINDOW, True)
+    if track.place is not None and track.patch is not None:
+        height, width = track.patch.shape
+        _square(axes, (track.place[1] - 0.5, track.place[0] - 0.5), (width, height), MATCH, track.valid)
+    axes.set_title("Window", fontsize=9)
+
+
+def _mark(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
+    """Squares at the tracks' places in a delivered picture, numbered."""
+    for track in ours:
+        u, v = track.values.get(f"{stem}_u", np.nan), track.values.get(f"{stem}_v", np.nan)
+        if not np.isfinite((u, v)).all():
+            continue
+        side = track.values.get("template_side_px", _DEFAULT_SIDE)
+        _square(axes, (u - side / 2, v - side / 2), (side, side), colour, track.valid)
+        number = str(track.template + 1)
+        axes.annotate(
+            number,
+            (u, v - side / 2),
+            xytext=(0, 2),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            color=colour,
+            fontsize=9,
+            fontweight="bold",
+            annotation_clip=True,
+        )
+
+
+def _square(axes: Axes, corner: tuple[float, float], size: tuple[float, float], colour: str, valid: bool) -> None:
+    line = "-" if valid else (0, (2, 1.5))
+    axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=1.8, linestyle=line))
+
+
+def _frame(axes: Axes, colour: str, valid: bool) -> None:
+    for spine in axes.spines.values():
+        spine.set(visible=True, edgecolor=colour, linewidth=2.2, linestyle="-" if valid else (0, (2, 1.5)))
+
+
+def _show(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
+    """A picture in grey, its contrast stretched between the 1 % and the 99 % quantile."""
+    finite = picture[np.isfinite(picture)]
+    low, high = np.quantile(finite, (0.01, 0.99)) if finite.size else (0.0, 1.0)
+    levels = np.clip((np.nan_to_num(picture, nan=low) - low) / max(high - low, 1e-9), 0.0, 1.0)
+    grey = np.round(255.0 * levels).astype(np.uint8)
+    axes.imshow(np.repeat(grey[..., None], 3, axis=2), interpolation="none", aspect="equal")
+    axes.set(xticks=[], yticks=[], facecolor=INK)
+    axes.grid(visible=False)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def _track(products: Mapping[str, Any], pair: int, template: int, row: Mapping[str, float]) -> Track:
+    key = f"{pair}_{template}"
+    place = _numbers(products.get(f"match_{key}"))
+    return Track(
+        pair=pair,
+        template=template,
+        valid=row.get("valid", 0.0) == 1.0,
+        values=row,
+        patch=_plane(products, f"template_{key}"),
+        window=_plane(products, f"window_{key}"),
+        place=(float(place[0]), float(place[1])) if place is not None and place.size == 2 else None,
+    )
+
+
+def _picture(products: Mapping[str, Any], key: str) -> Float[np.ndarray, "_ _"]:
+    """A delivered picture with its columns binned in software as DIMES bins them, so that pixels are square."""
+    counts = _plane(products, key)
+    if counts is None:
+        raise ValueError(f"the products hold no picture '{key}'")
+    rows, columns = counts.shape
+    binning = columns // rows
+    if binning < 2 or columns % rows:
+        return counts
+    return np.asarray(counts.reshape(rows, rows, binning).mean(axis=2), dtype=np.float64)
+
+
+def _plane(products: Mapping[str, Any], key: str) -> Float[np.ndarray, "_ _"] | None:
+    """A two-dimensional array of the products; None where it is missing or is something else."""
+    values = _numbers(products.get(key))
+    return values if values is not None and values.ndim == 2 and values.size else None
+
+
+def _numbers(value: object) -> Float[np.ndarray, "..."] | None:
+    if value is None:
+        return None
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None

@@ -1,0 +1,263 @@
+"""Figures of a campaign's rows: where errors lie, how often, what drives them, and how cases ended."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
+
+from reports.columns import axis_columns, category_column, label, numbers, rank_correlation, split_unit
+from reports.svg import (
+    INK,
+    LARGEST_VECTOR_SAMPLE,
+    MARKERS,
+    MUTED,
+    REQUIREMENT,
+    SERIES,
+    in_page_style,
+    new_axes,
+)
+from reports.tables import outcome_counts
+from reports.verdicts import ENGINE_FAILURES
+
+#: Errors beyond this many times the bound are drawn at the edge, or one of them would hide all others.
+_FARTHEST = 3.0
+
+
+@dataclass(frozen=True)
+class Category:
+    """Cases of one kind: what to call them, which they are, and how they are marked."""
+
+    name: str
+    chosen: Bool[np.ndarray, " n"]
+    colour: str
+    marker: str
+
+
+def categories(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Category]:
+    """The kinds by which points are marked: a column of few values, else within and beyond the bound."""
+    column = category_column(frame)
+    if column is not None:
+        values = sorted(frame[column].dropna().unique(), key=lambda value: (isinstance(value, str), value))
+        of_each = [(f"{label(column)} {_plain(value)}", frame[column].eq(value).fillna(False)) for value in values]
+        kinds = [(name, chosen.to_numpy(dtype=np.bool_)) for name, chosen in of_each]
+    elif bound is not None:
+        magnitude = np.abs(numbers(frame, metric))
+        kinds = [("within the bound", magnitude <= bound), ("beyond the bound", magnitude > bound)]
+        kinds = [(name, chosen) for name, chosen in kinds if chosen.any()]
+    else:
+        kinds = [("cases", np.ones(len(frame), dtype=np.bool_))]
+    return [Category(name, chosen, SERIES[k], MARKERS[k]) for k, (name, chosen) in enumerate(kinds)]
+
+
+@in_page_style
+def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, close: bool = False) -> Figure | None:
+    """Signed errors against each other, with the requirement's circle (the paper's Fig. 10).
+
+    Parameters
+    ----------
+    frame, metric
+        The rows, and the radial error whose x and y parts are drawn.
+    bound
+        Radius of the requirement's circle.
+    close
+        Draws the errors' own extent, without the circle where it lies outside.
+
+    Returns
+    -------
+    The figure; None where there are no parts, or no case has them.
+    """
+    parts = axis_columns(metric, [str(column) for column in frame.columns])[:2]
+    if len(parts) < 2:
+        return None
+    points = np.column_stack([numbers(frame, part) for part in parts])
+    known = np.isfinite(points).all(axis=1)
+    if not known.any():
+        return None
+    reach = _reach(points[known], bound, close)
+    figure, axes = new_axes(5.0, 4.9)
+    for kind in categories(frame, metric, bound):
+        x, y = np.clip(points[kind.chosen & known], -reach, reach).T
+        _draw_points(axes, x, y, kind)
+    if bound is not None:
+        axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
+        if bound <= reach:
+            _note(axes, 0.0, bound, f"requirement {bound:g} {split_unit(metric)[1]}")
+    _cross(axes)
+    axes.set(xlim=(-reach * 1.04, reach * 1.04), ylim=(-reach * 1.04, reach * 1.04), aspect="equal")
+    axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))
+    _legend(axes)
+    return figure
+
+
+def off_scale(frame: pd.DataFrame, metric: str, bound: float | None) -> int:
+    """How many errors are too large for the scatter's axes and are drawn at its edge."""
+    if bound is None or bound <= 0:
+        return 0
+    return int((np.abs(numbers(frame, metric)) > _FARTHEST * bound).sum())
+
+
+def worth_a_closer_look(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
+    """Whether all errors are so small against the bound that the circle's figure shows only a blot."""
+    magnitude = np.abs(numbers(frame, metric))
+    known = magnitude[np.isfinite(magnitude)]
+    return bound is not None and known.size > 0 and 0.0 < float(known.max()) < 0.6 * bound
+
+
+@in_page_style
+def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Figure | None:
+    """How often each magnitude of error occurred; None where no case has one."""
+    magnitude, edge = _magnitudes(frame, metric, bound)
+    if magnitude.size == 0:
+        return None
+    figure, axes = new_axes(5.0, 3.4)
+    bins = np.linspace(0.0, edge, 1 + int(np.clip(2 * math.sqrt(magnitude.size), 10, 60)))
+    axes.hist(np.minimum(magnitude, edge), bins=list(bins), color=SERIES[0], alpha=0.85)
+    _bound_line(axes, metric, bound)
+    axes.set(xlabel=f"|{label(metric)}|", ylabel="cases", xlim=(0.0, edge * 1.02))
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    return figure
+
+
+@in_page_style
+def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) -> Figure | None:
+    """Fraction of cases with an error up to each magnitude; None where no case has one."""
+    magnitude, edge = _magnitudes(frame, metric, bound)
+    if magnitude.size == 0:
+        return None
+    figure, axes = new_axes(5.0, 3.4)
+    ordered = np.sort(magnitude)
+    if ordered.size > 2000:  # the steps are finer than the line is wide
+        ordered = np.quantile(ordered, np.linspace(0.0, 1.0, 2000))
+    share = np.arange(1, ordered.size + 1) / ordered.size
+    steps = np.concatenate([[0.0], ordered, [max(edge, float(ordered[-1]))]])
+    axes.plot(steps, np.concatenate([[0.0], share, [1.0]]), drawstyle="steps-post", color=SERIES[0], linewidth=1.8)
+    _bound_line(axes, metric, bound)
+    axes.set(xlabel=f"|{label(metric)}|", ylabel="fraction of cases with an error", xlim=(0.0, edge * 1.02))
+    axes.set_ylim(0.0, 1.03)
+    return figure
+
+
+@in_page_style
+def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> Figure | None:
+    """Errors against what may drive them; cases without an error are ticks on the upper edge. None without numbers."""
+    x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
+    known = np.isfinite(x) & np.isfinite(magnitude)
+    silent = np.isfinite(x) & ~np.isfinite(magnitude)
+    if not (known | silent).any():
+        return None
+    figure, axes = new_axes(4.2, 3.2)
+    top = 1.12 * (float(magnitude[known].max()) if known.any() else 1.0)
+    top = max(top, 1.12 * bound) if bound is not None and top > 0.6 * bound else top
+    top = min(top, _FARTHEST * bound) if bound else top
+    top = top or 1.0
+    for kind in categories(frame, metric, bound):
+        chosen = kind.chosen & known
+        _draw_points(axes, x[chosen], np.minimum(magnitude[chosen], top), kind)
+    if bound is not None and bound <= top:
+        axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
+    raster = bool(silent.sum() > LARGEST_VECTOR_SAMPLE)
+    axes.plot(x[silent], np.full(silent.sum(), top), "|", color=INK, markersize=9, clip_on=False, rasterized=raster)
+    correlation = rank_correlation(x, magnitude)
+    axes.set_title("" if math.isnan(correlation) else f"rank correlation {correlation:+.2f}", fontweight="normal")
+    axes.set(xlabel=label(driver), ylabel=f"|{label(metric)}|", ylim=(0.0, top))
+    return figure
+
+
+@in_page_style
+def outcome_bars(frame: pd.DataFrame) -> Figure | None:
+    """How many cases ended in which way; None where there are no rows."""
+    counts = outcome_counts(frame)
+    if not counts:
+        return None
+    figure, axes = new_axes(6.4, 0.75 + 0.36 * len(counts))
+    styles: Mapping[str, Any]
+    for place, (name, count) in enumerate(counts):
+        if name in ENGINE_FAILURES:
+            styles = {"color": "none", "edgecolor": REQUIREMENT, "hatch": "xxxx"}
+        elif name == "VALID":
+            styles = {"color": SERIES[0]}
+        else:
+            styles = {"color": "none", "edgecolor": SERIES[1], "hatch": "////"}
+        axes.barh(place, count, height=0.66, **styles)
+        axes.annotate(f" {count:,}", (count, place), va="center", color=INK, fontsize=9)
+    axes.set_yticks(range(len(counts)), [name for name, _ in counts])
+    axes.set(xlabel="cases", xlim=(0.0, 1.12 * max(count for _, count in counts)))
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return figure
+
+
+def _reach(points: Float[np.ndarray, "n 2"], bound: float | None, close: bool) -> float:
+    """Half the width of the scatter's axes."""
+    extent = 1.08 * float(np.abs(points).max()) or 1.0
+    if bound is None or bound <= 0.0:
+        return extent
+    return extent if close else min(max(extent, 1.15 * bound), _FARTHEST * bound)
+
+
+def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[Float[np.ndarray, " known"], float]:
+    """Magnitudes of the errors that are known, and the right edge of an axis that shows them beside the bound."""
+    magnitude = np.abs(numbers(frame, metric))
+    known = magnitude[np.isfinite(magnitude)]
+    edge = float(known.max()) if known.size else 0.0
+    if bound is not None and bound > 0.0:
+        edge = min(max(edge, 1.1 * bound), _FARTHEST * bound)
+    return known, edge or 1.0
+
+
+def _draw_points(axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], kind: Category) -> None:
+    many = x.size > LARGEST_VECTOR_SAMPLE
+    axes.plot(
+        x,
+        y,
+        linestyle="",
+        marker=kind.marker,
+        markersize=3.0 if many else 5.5,
+        alpha=0.55 if many else 0.85,
+        markeredgewidth=0.0,
+        color=kind.colour,
+        label=kind.name,
+        rasterized=many,
+        zorder=2,
+    )
+
+
+def _bound_line(axes: Axes, metric: str, bound: float | None) -> None:
+    if bound is None:
+        return
+    axes.axvline(bound, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3)
+    place = {"xy": (bound, 1.0), "xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+    text = f"requirement {bound:g} {split_unit(metric)[1]}"
+    axes.annotate(text, xytext=(-5, -3), ha="right", va="top", color=INK, fontsize=9, **place)  # type: ignore[arg-type]
+
+
+def _note(axes: Axes, x: float, y: float, text: str) -> None:
+    place = {"xytext": (0, 4), "textcoords": "offset points"}
+    axes.annotate(text, (x, y), ha="center", va="bottom", color=INK, fontsize=9, **place)  # type: ignore[arg-type]
+
+
+def _cross(axes: Axes) -> None:
+    axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1)
+    axes.axvline(0.0, color=MUTED, linewidth=0.8, zorder=1)
+
+
+def _legend(axes: Axes) -> None:
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, handletextpad=0.2)
+
+
+def _plain(value: object) -> str:
+    """A category's value as text: whole numbers without a decimal point."""
+    if isinstance(value, float) and value.is_integer():
+        return str(int(value))
+    return str(value)
