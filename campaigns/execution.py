@@ -12,7 +12,7 @@ from typing import Any
 
 from campaigns.configuration import CRASHED, CampaignConfiguration
 from campaigns.sampling import Campaign
-from campaigns.workers import Workers, limit_threads
+from campaigns.workers import WorkerDiedError, Workers, limit_threads
 from scenarios.interface import CaseResult, Scalar
 from scenarios.registry import scenario
 
@@ -61,6 +61,7 @@ def run_case(configuration: str, keep_products: bool, case: int) -> CompletedCas
     wall, cpu = time.perf_counter(), time.process_time()
     try:
         campaign = _campaign(configuration)
+        wall, cpu = time.perf_counter(), time.process_time()
         result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
         row = _scored(case, result)
         products = result.products if keep_products else {}
@@ -86,7 +87,8 @@ def run_cases(
             yield done.result
         elif done.error is not None:
             times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
-            yield CompletedCase({**crashed_row(done.item, done.error, ""), **times})
+            trace = _above_engine(done.error.trace) if isinstance(done.error, WorkerDiedError) else ""
+            yield CompletedCase({**crashed_row(done.item, done.error, trace), **times})
 
 
 def crashed_row(case: int, error: BaseException, trace: str) -> Row:
@@ -98,6 +100,13 @@ def crashed_row(case: int, error: BaseException, trace: str) -> Row:
         "error": _without_addresses(f"{type(error).__name__}: {error}"),
         "traceback": _without_addresses(trace),
     }
+
+
+def _above_engine(trace: str) -> str:
+    """The frames of a dump down to the one in which the engine called the scenario."""
+    lines = trace.splitlines()
+    last = next((place for place, line in enumerate(lines) if line.endswith(" in run_case")), len(lines))
+    return "\n".join(lines[: last + 1])
 
 
 def _without_addresses(text: str) -> str:

@@ -6,6 +6,8 @@ it, and the others go on undisturbed; `jobs=1` is the same set-up with one of th
 
 from __future__ import annotations
 
+import ctypes
+import faulthandler
 import os
 import re
 import signal
@@ -14,6 +16,8 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
 
@@ -40,12 +44,22 @@ WORKER_ENVIRONMENT: Mapping[str, str] = {
     "PYTHONHASHSEED": "0",
 }
 
+#: Of Linux's `prctl`: the signal that a process gets when its parent dies.
+_PR_SET_PDEATHSIG = 1
+
 #: Times that a task is given to a fresh worker before its death is laid to the task.
 _ATTEMPTS = 2
 
 
 class WorkerDiedError(Exception):
-    """A task took its worker process down, and again in a fresh one."""
+    """A task took its worker process down, and again in a fresh one.
+
+    `trace` is where in Python the process stood, if it had the time to tell.
+    """
+
+    def __init__(self, reason: str, trace: str) -> None:
+        super().__init__(f"the worker process died: {reason}")
+        self.trace = trace
 
 
 @dataclass(frozen=True)
@@ -73,21 +87,33 @@ def limit_threads() -> None:
         sys.modules["numba"].set_num_threads(1)
 
 
-def _leave_interrupts_to_the_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; the parent stops the workers."""
+def _begin_worker(parent: int, last_words: str) -> None:
+    """Sets a fresh worker process up.
+
+    Ctrl-C, which reaches every process of a terminal, is left to the parent; where the parent is killed the worker goes
+    with it; a process that dies of a signal writes down where it stood.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
+    faulthandler.enable(os.open(last_words, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600))
 
 
 class _Worker:
     """One process, replaced when it dies."""
 
-    def __init__(self) -> None:
+    def __init__(self, last_words: Path) -> None:
+        self._last_words = last_words
         self._executor = self._start()
 
-    @staticmethod
-    def _start() -> Any:
+    def _start(self) -> Any:
         return ProcessPoolExecutor(
-            max_workers=1, initializer=_leave_interrupts_to_the_parent, env=dict(WORKER_ENVIRONMENT)
+            max_workers=1,
+            initializer=_begin_worker,
+            initargs=(os.getpid(), str(self._last_words)),
+            env=dict(WORKER_ENVIRONMENT),
         )
 
     def submit(self, task: Callable[[int], Result], item: int) -> Future[Result]:
@@ -98,6 +124,13 @@ class _Worker:
             self.replace()
             future = self._executor.submit(task, item)
         return future
+
+    def last_words(self) -> str:
+        """What the process that died wrote of where it stood: the reason, and the thread in which it happened."""
+        text = self._last_words.read_text(errors="replace") if self._last_words.exists() else ""
+        reason, _, threads = text.partition("\n\n")
+        current = next((part for part in threads.split("\n\n") if part.startswith("Current thread")), "")
+        return f"{reason}\n{current}".strip()
 
     def replace(self) -> None:
         """Leaves the dead process and starts another."""
@@ -113,7 +146,8 @@ class Workers:
     """A number of worker processes, as a context: left normally they end, left by an exception they are killed."""
 
     def __init__(self, jobs: int) -> None:
-        self._workers = [_Worker() for _ in range(jobs)]
+        self._folder = TemporaryDirectory(prefix="marsyard-")
+        self._workers = [_Worker(Path(self._folder.name) / str(number)) for number in range(jobs)]
 
     def __enter__(self) -> Self:
         return self
@@ -124,6 +158,7 @@ class Workers:
         kill = kind is not None
         for worker in self._workers:
             worker.stop(kill=kill, join=False)
+        self._folder.cleanup()
 
     def run(self, task: Callable[[int], Result], items: Iterable[int]) -> Iterator[Done[Result]]:
         """Runs a task on every item, and yields each as it ends, in no particular order."""
@@ -148,20 +183,19 @@ class Workers:
                 idle.append(worker)
                 error = future.exception()
                 if isinstance(error, BrokenProcessPool):
+                    death = WorkerDiedError(_exit_status(error), worker.last_words())
                     worker.replace()
                     if attempt < _ATTEMPTS:
                         waiting.append((item, attempt + 1))
-                        continue
-                yield _done(item, future)
+                    else:
+                        yield Done(item, None, death)
+                elif error is not None:
+                    yield Done(item, None, error if isinstance(error, Exception) else RuntimeError(repr(error)))
+                else:
+                    yield Done(item, future.result(), None)
 
 
-def _done(item: int, future: Future[Result]) -> Done[Result]:
-    """What a future holds."""
-    error = future.exception()
-    if error is None:
-        return Done(item, future.result(), None)
-    if isinstance(error, BrokenProcessPool):
-        codes = re.findall(r"([A-Z]+)\((-?\d+)\)", str(error))
-        reason = ", ".join(f"{name} ({code})" for name, code in codes) or "no exit status"
-        return Done(item, None, WorkerDiedError(f"the worker process died: {reason}"))
-    return Done(item, None, error if isinstance(error, Exception) else RuntimeError(repr(error)))
+def _exit_status(error: BaseException) -> str:
+    """How a worker ended, from loky's account of it: ``SIGABRT (-6)``."""
+    codes = re.findall(r"([A-Z]+)\((-?\d+)\)", str(error))
+    return ", ".join(f"{name} ({code})" for name, code in codes) or "exit status unknown"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import signal
 import sys
 import traceback
 import warnings
@@ -73,10 +74,10 @@ def _says_what_is_wrong(command: Callable[Parameters, None]) -> Callable[Paramet
 @_says_what_is_wrong
 def run(
     campaign: CampaignArgument,
-    cases: Annotated[int | None, typer.Option("-n", "--cases", min=1, metavar="N", help="Number of cases.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, metavar="S", help="Root seed.")] = None,
+    cases: Annotated[int | None, typer.Option("-n", "--cases", metavar="N", help="Number of cases.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", metavar="S", help="Root seed.")] = None,
     jobs: Annotated[
-        int | None, typer.Option("--jobs", min=1, metavar="J", help="Worker processes; by default one a core.")
+        int | None, typer.Option("--jobs", metavar="J", help="Worker processes; by default one a core.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder; by default runs/<campaign>-<UTC time>.")
@@ -90,9 +91,12 @@ def run(
     from marsyard.outcome import conclude
     from marsyard.progress import campaign_progress
 
+    if jobs is not None and jobs < 1:
+        raise CampaignError(f"--jobs {jobs}: at least one worker process is needed")
     loaded = load_campaign(campaign, override or [], cases, seed)
     directory = out if out is not None else _default_directory(loaded.configuration.name)
     errors = _console(stderr=True)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with campaign_progress(errors) as progress:
             run_campaign(loaded, directory, jobs or available_cores(), progress)
@@ -129,7 +133,7 @@ def replay(
     save_replay(target, replayed)
     typer.echo(f"case {case}: {replayed.row['outcome']}")
     if replayed.row["error"]:
-        typer.echo(f"{replayed.row['traceback']}{replayed.row['error']}")
+        typer.echo(replayed.row["traceback"] or replayed.row["error"])
     typer.echo(f"products: {target}")
     if replayed.stored is None:
         typer.echo("the campaign has no row of this case to compare with")
