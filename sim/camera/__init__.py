@@ -1,8 +1,33 @@
-"""Camera models of the CAHV family, their files and their conversions."""
+"""Camera models of the CAHV family, their files and their conversions.
 
+`Cahv` is linear, `Cahvor` adds radial distortion, `Cahvore` a wide-angle lens with a moving entrance pupil. All three
+are immutable, take arrays of any leading dimensions and share the interface `CameraModel`. Pixels are (u, v), column
+and row, with the centre of the upper left pixel at (0, 0).
+"""
+
+from sim.camera.assembly import CameraFileError
 from sim.camera.base import CameraModel
 from sim.camera.cahv import Cahv
 from sim.camera.cahvor import Cahvor
 from sim.camera.cahvore import Cahvore
+from sim.camera.files import read_camera, read_cameras
+from sim.camera.opencv import OpenCVIntrinsics, Residual, from_opencv, to_opencv
+from sim.camera.pds_labels import read_pds3
+from sim.camera.text_files import read_cahvor, write_cahvor
 
-__all__ = ["Cahv", "Cahvor", "Cahvore", "CameraModel"]
+__all__ = [
+    "Cahv",
+    "Cahvor",
+    "Cahvore",
+    "CameraFileError",
+    "CameraModel",
+    "OpenCVIntrinsics",
+    "Residual",
+    "from_opencv",
+    "read_cahvor",
+    "read_camera",
+    "read_cameras",
+    "read_pds3",
+    "to_opencv",
+    "write_cahvor",
+]

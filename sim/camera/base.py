@@ -26,16 +26,13 @@ from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-Vector = NDArray[np.float64]
-Gradient = tuple[Vector, Vector, Vector]
+from sim.camera.vectors import Gradient, Vector, blocks, checked_size, frozen_vector, unit
 
 #: Labels round A and O to six digits or fewer.
 UNIT_TOLERANCE = 1e-4
-#: Points handled at once: few enough for the processor's cache, enough to hide NumPy's cost per call.
-BLOCK = 16384
 
 
 class CameraModel(ABC):
@@ -102,7 +99,7 @@ class CameraModel(ABC):
         pixels = np.empty((len(flat), 2))
         visible = np.empty(len(flat), dtype=np.bool_)
         with np.errstate(all="ignore"):
-            for block in _blocks(len(flat)):
+            for block in blocks(len(flat)):
                 u, v, seen = self._image(*self._from_centre(flat[block]))
                 pixels[block, 0] = u
                 pixels[block, 1] = v
@@ -118,7 +115,7 @@ class CameraModel(ABC):
         flat = points.reshape(-1, 3)
         jacobian = np.empty((len(flat), 2, 3))
         with np.errstate(all="ignore"):
-            for block in _blocks(len(flat)):
+            for block in blocks(len(flat)):
                 coordinates = self._from_centre(flat[block])
                 for row, gradient in enumerate(self._image_gradient(*coordinates)):
                     for column, derivative in enumerate(gradient):
@@ -148,7 +145,7 @@ class CameraModel(ABC):
         directions = np.empty((len(flat), 3))
         origins: NDArray[np.float64] | None = None
         with np.errstate(all="ignore"):
-            for block in _blocks(len(flat)):
+            for block in blocks(len(flat)):
                 u, v = np.array(flat[block].T, dtype=np.float64, order="C")
                 sight, shift = self._sight(u, v)
                 length = np.sqrt(sight[0] * sight[0] + sight[1] * sight[1] + sight[2] * sight[2])
@@ -241,6 +238,18 @@ class CameraModel(ABC):
             )
         return self._with_image_map((1.0, 1.0), (-float(column), -float(row)), size)
 
+    @abstractmethod
+    def linearized(self, *, inside: bool = False) -> CameraModel:
+        """A `Cahv` of the same size that covers the whole view, or with `inside` only what fills its frame.
+
+        Its axes are square; A is the mean direction of the frame's pixels (see `sim.camera.linearisation`).
+
+        Raises
+        ------
+        ValueError
+            If part of the frame's edge is blind, or 90 degrees or more from A without `inside`.
+        """
+
     def _with_image_map(self, scale: tuple[float, float], shift: tuple[float, float], size: tuple[int, int]) -> Self:
         """The camera whose pixels are scale * pixel + shift."""
         return self._with(h=scale[0] * self.h + shift[0] * self.a, v=scale[1] * self.v + shift[1] * self.a, size=size)
@@ -268,12 +277,12 @@ class CameraModel(ABC):
     @property
     def right(self) -> Float[np.ndarray, "3"]:
         """Unit vector H', perpendicular to A, along which u grows."""
-        return _unit(self.h - self.image_centre[0] * self.a)
+        return unit(self.h - self.image_centre[0] * self.a)
 
     @property
     def down(self) -> Float[np.ndarray, "3"]:
         """Unit vector V', perpendicular to A, along which v grows."""
-        return _unit(self.v - self.image_centre[1] * self.a)
+        return unit(self.v - self.image_centre[1] * self.a)
 
     @property
     def theta(self) -> float:
@@ -314,8 +323,8 @@ class CameraModel(ABC):
     def __post_init__(self) -> None:
         for field in fields(cast(Any, self)):
             if field.name not in ("size", "linearity"):
-                object.__setattr__(self, field.name, _frozen_vector(field.name, getattr(self, field.name)))
-        object.__setattr__(self, "size", _checked_size(self.size))
+                object.__setattr__(self, field.name, frozen_vector(field.name, getattr(self, field.name)))
+        object.__setattr__(self, "size", checked_size(self.size))
         length = float(np.linalg.norm(self.a))
         if abs(length - 1) > UNIT_TOLERANCE:
             raise ValueError(f"a must be a unit vector (to {UNIT_TOLERANCE:g}); its length is {length!r}")
@@ -363,36 +372,5 @@ class CameraModel(ABC):
 M = TypeVar("M", bound=CameraModel)
 
 
-def dot(vector: NDArray[np.float64], x: Vector, y: Vector, z: Vector) -> Vector:
-    """Scalar product of one vector with n, the same for each whatever n is (a BLAS product need not be)."""
-    product: Vector = vector[0] * x + vector[1] * y + vector[2] * z
-    return product
-
-
-def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(vector / np.linalg.norm(vector))
-
-
-def _blocks(count: int) -> list[slice]:
-    return [slice(start, min(start + BLOCK, count)) for start in range(0, count, BLOCK)]
-
-
 def _rebuilt(model: type[M], values: Mapping[str, Any]) -> M:
     return model(**values)
-
-
-def _frozen_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    vector = np.asarray(value, dtype=np.float64) + 0.0  # a copy; turns -0.0 into 0.0, so that equal cameras hash alike
-    if vector.shape != (3,):
-        raise ValueError(f"{name} must have three components, not shape {vector.shape}")
-    if not np.all(np.isfinite(vector)):
-        raise ValueError(f"{name} must be finite, not {vector.tolist()}")
-    vector.flags.writeable = False
-    return vector
-
-
-def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
-    columns, rows = size
-    if int(columns) != columns or int(rows) != rows or columns < 1 or rows < 1:
-        raise ValueError(f"size must be two positive integers (columns, rows), not {size}")
-    return int(columns), int(rows)

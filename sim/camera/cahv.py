@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike, NDArray
 
-from sim.camera.base import CameraModel, Gradient, Vector, dot
+from sim.camera.base import CameraModel
+from sim.camera.vectors import Gradient, Vector, dot
 
 _ORIGIN = (0.0, 0.0, 0.0)
 
@@ -42,6 +43,10 @@ class Cahv(CameraModel):
 
     def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
         return self._image_plane_direction(u, v), None
+
+    def linearized(self, *, inside: bool = False) -> Cahv:
+        """The camera itself: it is linear."""
+        return self
 
     @classmethod
     def from_axes(

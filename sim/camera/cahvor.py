@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike, NDArray
 
-from sim.camera.base import UNIT_TOLERANCE, CameraModel, Gradient, Vector, dot
+from sim.camera.base import UNIT_TOLERANCE, CameraModel
 from sim.camera.cahv import Cahv
+from sim.camera.linearisation import linearised
 from sim.camera.radial import RadialPolynomial
+from sim.camera.vectors import Gradient, Vector, dot
 
 
 class RadialModel(CameraModel):
@@ -36,6 +38,10 @@ class RadialModel(CameraModel):
             raise ValueError(
                 f"r must begin with a number above -1 (1 + r[0] scales the image), not {float(self.r[0])!r}"
             )
+
+    def linearized(self, *, inside: bool = False) -> Cahv:
+        """See `CameraModel.linearized`."""
+        return linearised(self, inside=inside)
 
     @cached_property
     def _axis(self) -> NDArray[np.float64]:

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike, NDArray
 
-from sim.camera.base import Gradient, Vector, dot
 from sim.camera.cahv import Cahv
 from sim.camera.cahvor import RadialModel
+from sim.camera.vectors import Gradient, Vector, dot
 
 _NEWTON_STEPS = 30
 
@@ -23,14 +23,14 @@ class Cahvore(RadialModel):
     """A wide-angle camera whose entrance pupil moves along the optical axis.
 
     A ray that makes the angle theta with O starts at C + s O, with
-    s = (theta / sin theta - 1) (e0 + e1 theta^2 + e2 theta^4). Its "distance" chi from the axis, with L the linearity, is
+    s = (theta / sin theta - 1) (e0 + e1 theta^2 + e2 theta^4). Its "distance" from the axis, L being the linearity, is
 
         chi = tan(L theta) / L   (L > 0; L = 1 is a perspective lens)
         chi = theta              (L = 0, an equidistant fisheye)
         chi = sin(L theta) / L   (L < 0; L = -1 is orthographic)
 
-    It is moved to (1 + rho0) chi + rho1 chi^3 + rho2 chi^5 and projected linearly. Points outside the range in which this is
-    one-to-one, or so near that the pupil's motion leaves no ray or several, are not visible.
+    It is moved to (1 + rho0) chi + rho1 chi^3 + rho2 chi^5 and projected linearly. Points outside the range in which
+    this is one-to-one, or so near that the pupil's motion leaves no ray or several, are not visible.
 
     Attributes
     ----------

@@ -1,0 +1,94 @@
+"""What the readers of camera files share: their error, and putting a camera together from what was read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sim.camera.base import CameraModel
+from sim.camera.cahv import Cahv
+from sim.camera.cahvor import Cahvor
+from sim.camera.cahvore import Cahvore
+
+
+class CameraFileError(ValueError):
+    """A camera file that cannot be used. The message names the file, the field and what is allowed."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """The file that is being read, for messages."""
+
+    path: str
+
+    def error(self, field: str, fault: str, allowed: str) -> CameraFileError:
+        """The error to raise for a field."""
+        return CameraFileError(f"{self.path}: {field}: {fault}; allowed: {allowed}")
+
+    def text(self) -> str:
+        """The whole file.
+
+        Raises
+        ------
+        CameraFileError
+            If it cannot be read.
+        """
+        return self.head(None).decode("latin-1")
+
+    def head(self, count: int | None) -> bytes:
+        """The file's first bytes; all of it for None."""
+        try:
+            with Path(self.path).open("rb") as file:
+                return file.read(-1 if count is None else count)
+        except OSError as fault:
+            raise self.error("file", f"cannot be read ({fault.strerror})", "a readable camera file") from fault
+
+
+#: The models by their names, whose letters are the names of their vectors.
+MODELS = ("CAHV", "CAHVOR", "CAHVORE")
+
+
+def linearity_of_type(kind: float | None, parameter: float | None, field: str, source: Source) -> float:
+    """CAHVORE's linearity from its type (1 perspective, 2 fish-eye, 3 general) and, for type 3, its parameter."""
+    if kind == 1:
+        return 1.0
+    if kind == 2:
+        return 0.0
+    if kind != 3:
+        raise source.error(field, f"CAHVORE's type is {'missing' if kind is None else kind}", "type 1, 2 or 3")
+    if parameter is None:
+        raise source.error(field, "CAHVORE of type 3 has no parameter", "type 3 with its linearity, from -1 to 1")
+    return parameter
+
+
+def assembled(
+    name: str,
+    vectors: Mapping[str, Sequence[float]],
+    size: tuple[int, int],
+    linearity: float | None,
+    source: Source,
+) -> CameraModel:
+    """The camera from what a file holds: the name of its model, and its vectors by their letters.
+
+    Raises
+    ------
+    CameraFileError
+        If the camera refuses it.
+    """
+    c, a, h, v, *lens = (np.array(vectors[letter], dtype=np.float64) for letter in name)
+    try:
+        if name == "CAHV":
+            return Cahv(c, a, h, v, size)
+        if name == "CAHVOR":
+            return Cahvor(c, a, h, v, lens[0], lens[1], size)
+        if linearity is None:
+            raise ValueError("linearity is missing")
+        return Cahvore(c, a, h, v, lens[0], lens[1], lens[2], linearity=linearity, size=size)
+    except ValueError as fault:
+        field, _, _ = str(fault).partition(" ")
+        raise source.error(
+            field.upper(), str(fault), "a camera model of unit A and O and independent H, V, A"
+        ) from fault

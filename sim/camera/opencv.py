@@ -1,0 +1,318 @@
+"""Conversion to and from OpenCV's cameras, with a stated residual.
+
+OpenCV's camera looks along z with x right and y down, and its pixels count as ours do. Its pinhole camera distorts
+about the direction z with k1, k2, k3 (radial) and p1, p2 (tangential):
+
+    r^2 = x^2 + y^2        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
+                           y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+and its fisheye moves a ray at the angle theta from z to the distance theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 +
+k4 theta^8) (Kannala & Brandt 2006). CAHVOR about O = A is the pinhole camera with k3 = p1 = p2 = 0. When O differs from
+A (the image plane is not square to the lens), or CAHVORE's lens is meant, OpenCV can only be fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from sim.camera.base import CameraModel
+from sim.camera.cahv import Cahv
+from sim.camera.cahvor import Cahvor
+from sim.camera.cahvore import Cahvore
+
+Array = NDArray[np.float64]
+
+#: Samples of the frame along each side, its outer edge included.
+_SAMPLES = 33
+#: A closed form that reproduces the frame to this is not fitted, pixels.
+_EXACT_PX = 1e-9
+#: What a pixel counts that a camera under trial does not see.
+_BLIND_PX = 1e3
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Distance between two cameras' pixels over the frame, pixels: its root mean square, and the largest."""
+
+    rms_px: float
+    max_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class OpenCVIntrinsics:
+    """A camera as OpenCV takes it.
+
+    Attributes
+    ----------
+    model
+        "pinhole" for `cv2.projectPoints`, "fisheye" for `cv2.fisheye.projectPoints`.
+    matrix
+        Camera matrix, pixels, shape (3, 3).
+    distortion
+        (k1, k2, p1, p2, k3) for the pinhole, (k1, k2, k3, k4) for the fisheye.
+    camera_from_world
+        Takes points from the frame of the original camera's vectors to OpenCV's axes.
+    size
+        (columns, rows).
+    residual
+        Against the original camera over its whole frame, for points far away.
+    """
+
+    model: Literal["pinhole", "fisheye"]
+    matrix: Float[np.ndarray, "3 3"]
+    distortion: Float[np.ndarray, "coefficients"]
+    camera_from_world: RigidTransform
+    size: tuple[int, int]
+    residual: Residual
+
+
+def to_opencv(camera: CameraModel) -> OpenCVIntrinsics:
+    """OpenCV's camera nearest to a camera, by least squares over its frame.
+
+    Exact for `Cahv` with square axes and for `Cahvor` whose O is A; otherwise fitted, and the residual says how well.
+    `Cahvore` becomes OpenCV's fisheye with its pupil at C, which is right for points far away only; the fit covers
+    angles beyond 90 degrees, at which `cv2.fisheye.projectPoints` itself is wrong.
+
+    Raises
+    ------
+    ValueError
+        If the picture is a mirror image, or part of the frame sees nothing: OpenCV has no such camera.
+    """
+    if not camera.right_handed:
+        raise ValueError("OpenCV has no mirrored camera: u right, v down and A forward must be right-handed")
+    pixels = _frame_samples(camera.size)
+    directions = camera.rays(pixels)[1]
+    if not np.all(np.isfinite(directions)):
+        raise ValueError("part of the frame sees nothing: crop the camera first")
+    fisheye = isinstance(camera, Cahvore)
+    initial = _Candidate.of(camera)
+    candidate = initial
+    if not _residual(initial.pixels(directions) - pixels).max_px <= _EXACT_PX:
+
+        def differences(change: Array) -> Array:
+            return (initial.changed(change).pixels(directions) - pixels).ravel()
+
+        candidate = initial.changed(_fitted(differences, initial.scales()))
+    fx, fy, cx, cy = candidate.scale_centre
+    rotation = Rotation.from_matrix(candidate.camera_from_world)
+    return OpenCVIntrinsics(
+        model="fisheye" if fisheye else "pinhole",
+        matrix=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+        distortion=candidate.distortion,
+        camera_from_world=RigidTransform.from_components(-(candidate.camera_from_world @ camera.c), rotation),
+        size=camera.size,
+        residual=_residual(candidate.pixels(directions) - pixels),
+    )
+
+
+def from_opencv(
+    matrix: Float[np.ndarray, "3 3"],
+    distortion: Float[np.ndarray, "coefficients"],
+    size: tuple[int, int],
+    camera_from_world: RigidTransform | None = None,
+) -> tuple[Cahvor, Residual]:
+    """The CAHVOR camera nearest to OpenCV's pinhole camera, and how near it is over the frame.
+
+    Exact when k3, p1 and p2 vanish; otherwise fitted by least squares.
+
+    Parameters
+    ----------
+    matrix
+        Camera matrix, pixels, shape (3, 3); may have a skew.
+    distortion
+        None, (k1, k2, p1, p2) or (k1, k2, p1, p2, k3).
+    size
+        (columns, rows).
+    camera_from_world
+        Takes points of the new camera's frame of reference to OpenCV's axes; the identity if not given.
+
+    Raises
+    ------
+    ValueError
+        If the matrix is no camera matrix, there are other coefficients, or the distortion folds over within the frame.
+    """
+    coefficients = _five_coefficients(distortion)
+    linear = _linear(matrix, size, RigidTransform.identity() if camera_from_world is None else camera_from_world)
+    pixels = _frame_samples(size)
+    axes = np.stack([_perpendicular(linear.a), np.cross(linear.a, _perpendicular(linear.a)), linear.a])
+    points = _undistorted(_normalised(pixels, matrix), coefficients)
+    inverse = RigidTransform.identity() if camera_from_world is None else camera_from_world.inv()
+    directions = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ inverse.as_matrix()[:3, :3].T
+    start = Cahvor.from_cahv(linear, r=(0.0, coefficients[0], coefficients[1]))
+    camera, residual = start, _residual(_far_pixels(start, directions) - pixels)
+    if not residual.max_px <= _EXACT_PX:
+        scales = np.array([1e-3, 1e-3, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1.0, 1.0])
+
+        def differences(change: Array) -> Array:
+            there = _far_pixels(_varied(start, axes, change), directions)
+            return np.nan_to_num(there - pixels, nan=_BLIND_PX).ravel()
+
+        camera = _varied(start, axes, _fitted(differences, scales))
+        residual = _residual(_far_pixels(camera, directions) - pixels)
+    return camera, residual
+
+
+# ----- to OpenCV -----
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """OpenCV's camera during the fit: rotation matrix, (fx, fy, cx, cy) and coefficients."""
+
+    camera_from_world: Array
+    scale_centre: Array
+    distortion: Array
+
+    @classmethod
+    def of(cls, camera: CameraModel) -> _Candidate:
+        """Looking along A; right but for the tilt of O, and for a fisheye but for the details of its lens."""
+        axis = camera.a / np.linalg.norm(camera.a)
+        rotation = np.stack([camera.right, np.cross(axis, camera.right), axis])
+        scale_centre = np.array([*camera.focal_lengths, *camera.image_centre])
+        if isinstance(camera, Cahvore):
+            scale_centre[:2] *= 1 + camera.r[0]
+            return cls(rotation, scale_centre, np.zeros(4))
+        coefficients = np.zeros(5)
+        if isinstance(camera, Cahvor):
+            gain = 1 + float(camera.r[0])
+            scale_centre[:2] *= gain
+            coefficients[:2] = camera.r[1:] / gain
+        return cls(rotation, scale_centre, coefficients)
+
+    def scales(self) -> Array:
+        """Sizes of change that matter alike: angles, pixels, coefficients."""
+        return np.array([1e-3] * 3 + [1.0] * 4 + [1e-3] * len(self.distortion))
+
+    def changed(self, change: Array) -> _Candidate:
+        turned = Rotation.from_rotvec(change[:3]).as_matrix() @ self.camera_from_world
+        return _Candidate(turned, self.scale_centre + change[3:7], self.distortion + change[7:])
+
+    def pixels(self, directions: Array) -> Array:
+        x, y, z = (directions @ self.camera_from_world.T).T
+        if len(self.distortion) == 5:
+            distorted = _distorted(np.stack([x / z, y / z], axis=-1), self.distortion)[0]
+        else:
+            across = np.hypot(x, y)
+            theta = np.arctan2(across, z)
+            square = theta * theta
+            k1, k2, k3, k4 = self.distortion
+            gain = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
+            ratio = np.divide(theta * gain, across, out=np.ones_like(theta), where=across > 0)
+            distorted = np.stack([x * ratio, y * ratio], axis=-1)
+        pixels: Array = self.scale_centre[:2] * distorted + self.scale_centre[2:]
+        return pixels
+
+
+# ----- from OpenCV -----
+
+
+def _five_coefficients(distortion: Array) -> Array:
+    if len(distortion) not in (0, 4, 5) or not np.all(np.isfinite(distortion)):
+        raise ValueError(f"distortion must be none, (k1, k2, p1, p2) or (k1, k2, p1, p2, k3), finite, not {distortion}")
+    return np.concatenate([distortion, np.zeros(5 - len(distortion))])
+
+
+def _linear(matrix: Array, size: tuple[int, int], camera_from_world: RigidTransform) -> Cahv:
+    allowed = matrix[1, 0] == 0 and np.array_equal(matrix[2], [0.0, 0.0, 1.0])
+    if not (allowed and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+        raise ValueError("matrix must be ((fx, skew, cx), (0, fy, cy), (0, 0, 1)) with fx and fy positive")
+    world_from_camera = camera_from_world.inv().as_matrix()
+    rotation = world_from_camera[:3, :3]
+    return Cahv(world_from_camera[:3, 3], rotation[:, 2], rotation @ matrix[0], rotation @ matrix[1], size)
+
+
+def _varied(start: Cahvor, axes: Array, change: Array) -> Cahvor:
+    """A camera near `start`: image plane turned, H and V rescaled and shifted, O tilted, rho1 and rho2 changed."""
+    (tilt_x, tilt_y, *rho), turn, (scale_u, scale_v, shift_u, shift_v) = change[:4], change[4:7], change[7:11]
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    o = start.o + tilt_x * axes[0] + tilt_y * axes[1]
+    return Cahvor(
+        start.c,
+        rotation @ start.a,
+        rotation @ (start.h * (1 + scale_u) + shift_u * start.a),
+        rotation @ (start.v * (1 + scale_v) + shift_v * start.a),
+        o / np.linalg.norm(o),
+        start.r + np.array([0.0, *rho]),
+        start.size,
+    )
+
+
+def _far_pixels(camera: CameraModel, directions: Array) -> Array:
+    return camera.project(camera.c + directions)[0]
+
+
+def _normalised(pixels: Array, matrix: Array) -> Array:
+    y = (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1]
+    return np.stack([(pixels[:, 0] - matrix[0, 2] - matrix[0, 1] * y) / matrix[0, 0], y], axis=-1)
+
+
+def _undistorted(distorted: Array, coefficients: Array) -> Array:
+    """Newton in two dimensions."""
+    points = distorted.copy()
+    for _ in range(50):
+        there, slope = _distorted(points, coefficients)
+        step = np.linalg.solve(slope, (there - distorted)[..., np.newaxis])[..., 0]
+        points -= step
+        if np.max(np.abs(step)) < 1e-14:
+            break
+    there, slope = _distorted(points, coefficients)
+    if not (np.max(np.abs(there - distorted)) < 1e-9 and np.all(np.linalg.det(slope) > 0)):
+        raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
+    return points
+
+
+# ----- both -----
+
+
+def _fitted(differences: Callable[[Array], Array], scales: Array) -> Array:
+    """The change from zero that makes the differences least; `scales` are changes that matter alike."""
+    fit = least_squares(differences, np.zeros(len(scales)), method="lm", x_scale=scales, xtol=1e-14, ftol=1e-14)
+    return np.asarray(fit.x)
+
+
+def _distorted(points: Array, coefficients: Array) -> tuple[Array, Array]:
+    """OpenCV's pinhole distortion of (x, y), shape (n, 2), and its derivative, shape (n, 2, 2)."""
+    k1, k2, p1, p2, k3 = coefficients
+    x, y = points.T
+    square = x * x + y * y
+    gain = 1 + square * (k1 + square * (k2 + square * k3))
+    slope = k1 + square * (2 * k2 + square * 3 * k3)
+    across = 2 * (x * y * slope + p1 * x + p2 * y)
+    distorted = np.stack(
+        [x * gain + 2 * p1 * x * y + p2 * (square + 2 * x * x), y * gain + p1 * (square + 2 * y * y) + 2 * p2 * x * y],
+        axis=-1,
+    )
+    derivative = np.stack(
+        [
+            np.stack([gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, across], axis=-1),
+            np.stack([across, gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1),
+        ],
+        axis=-2,
+    )
+    return distorted, derivative
+
+
+def _frame_samples(size: tuple[int, int]) -> Array:
+    columns, rows = (np.linspace(-0.5, extent - 0.5, _SAMPLES) for extent in size)
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+
+
+def _residual(differences: Array) -> Residual:
+    squares = np.sum(differences * differences, axis=-1)
+    return Residual(rms_px=float(np.sqrt(np.mean(squares))), max_px=float(np.sqrt(np.max(squares))))
+
+
+def _perpendicular(axis: Array) -> Array:
+    """A unit vector perpendicular to a unit vector."""
+    smallest = np.zeros(3)
+    smallest[np.argmin(np.abs(axis))] = 1.0
+    vector = np.cross(axis, smallest)
+    return np.asarray(vector / np.linalg.norm(vector))

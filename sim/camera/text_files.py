@@ -1,0 +1,132 @@
+"""JPL's text files of camera models (.cahv, .cahvor, .cahvore), as written by the calibration program CCALADJ and cmod.
+
+    Model = CAHVOR = perspective, distortion
+    Dimensions = 1024 1024
+    C =  0.442604 -0.0611635 -1.25106
+    A = ...
+
+and likewise H, V, O, R, E, as far as the model has them. CAHVORE carries its type (1 perspective, 2 fish-eye,
+3 general) and for type 3 the linearity: ``Model = CAHVORE3,0.37 = general``. The derived lines Hs, Hc, Vs, Vc and
+Theta, the covariance matrices ``S`` and ``S internal`` and unknown lines are not read: the vectors say everything.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from sim.camera.assembly import Source, assembled, linearity_of_type
+from sim.camera.base import CameraModel
+from sim.camera.cahvore import Cahvore
+
+_TYPE_NAMES = {
+    "CAHV": "CAHV = perspective, linear",
+    "CAHVOR": "CAHVOR = perspective, distortion",
+    1.0: "CAHVORE1 = perspective, distortion, pupil",
+    0.0: "CAHVORE2 = fish-eye",
+}
+_ASSIGNMENT = re.compile(r"\s*(?P<name>[A-Za-z][A-Za-z_ ]*?)\s*=\s*(?P<value>.*?)\s*$")
+_MODEL = re.compile(r"(?P<name>CAHV|CAHVOR|CAHVORE(?P<type>\d+)?)(?:\s*,\s*(?P<parameter>[^\s=]+))?\s*(?:=.*)?$")
+
+
+@dataclass(frozen=True)
+class _Line:
+    number: int
+    value: str
+
+
+def read_cahvor(path: str | Path) -> CameraModel:
+    """Read a JPL text file; whichever of the three models it holds.
+
+    Raises
+    ------
+    CameraFileError
+        If the file cannot be read, or a line is missing, repeated or wrong; it names file, field and what is allowed.
+    """
+    source = Source(str(path))
+    lines = _assignments(source.text(), source)
+    name, linearity = _model(_required(lines, "Model", source), source)
+    size = _dimensions(_required(lines, "Dimensions", source), source)
+    vectors = {letter: _vector(letter, _required(lines, letter, source), source) for letter in name}
+    return assembled(name, vectors, size, linearity, source)
+
+
+def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "") -> None:
+    """Write a JPL text file that `read_cahvor` reads back as an equal camera.
+
+    Parameters
+    ----------
+    camera
+        A `Cahv`, `Cahvor` or `Cahvore`.
+    path
+        The file, which is overwritten.
+    comment
+        Text for the first lines, which begin with '#'.
+    """
+    if isinstance(camera, Cahvore):
+        model = _TYPE_NAMES.get(camera.linearity, f"CAHVORE3,{camera.linearity!r} = general")
+    else:
+        model = _TYPE_NAMES[type(camera).__name__.upper()]
+    (hs, vs), (hc, vc), theta = camera.focal_lengths, camera.image_centre, camera.theta
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    lines += [f"Model = {model}", "", f"Dimensions = {camera.size[0]} {camera.size[1]}", ""]
+    for letter in type(camera).__name__.upper():
+        lines.append(f"{letter} = " + " ".join(repr(float(number)) for number in getattr(camera, letter.lower())))
+    lines += ["", f"Hs    = {hs!r}", f"Hc    = {hc!r}", f"Vs    = {vs!r}", f"Vc    = {vc!r}"]
+    lines += [f"Theta = {theta!r} ({theta * 57.29577951308232:.6f} deg)"]
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _assignments(text: str, source: Source) -> dict[str, _Line]:
+    lines: dict[str, _Line] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        match = _ASSIGNMENT.match(line.partition("#")[0])
+        if match is None:
+            continue
+        name = match["name"]
+        if name in lines:
+            raise source.error(name, f"given twice, in lines {lines[name].number} and {number}", "once")
+        lines[name] = _Line(number, match["value"])
+    return lines
+
+
+def _required(lines: dict[str, _Line], name: str, source: Source) -> _Line:
+    if name not in lines:
+        raise source.error(name, "missing", f"a line '{name} = ...'")
+    return lines[name]
+
+
+def _model(line: _Line, source: Source) -> tuple[str, float | None]:
+    match = _MODEL.match(line.value)
+    allowed = "CAHV, CAHVOR, CAHVORE1, CAHVORE2 or CAHVORE3,<linearity>"
+    if match is None:
+        raise source.error("Model", f"{line.value!r} in line {line.number}", allowed)
+    if not match["name"].startswith("CAHVORE"):
+        return match["name"], None
+    parameter = None if match["parameter"] is None else _number("Model", match["parameter"], line, source)
+    kind = None if match["type"] is None else int(match["type"])
+    return "CAHVORE", linearity_of_type(kind, parameter, "Model", source)
+
+
+def _dimensions(line: _Line, source: Source) -> tuple[int, int]:
+    words = line.value.split()
+    if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
+        raise source.error(
+            "Dimensions", f"{line.value!r} in line {line.number}", "two positive integers, columns and rows"
+        )
+    return int(words[0]), int(words[1])
+
+
+def _vector(name: str, line: _Line, source: Source) -> list[float]:
+    words = line.value.split()
+    if len(words) != 3:
+        raise source.error(name, f"{len(words)} words in line {line.number}", "three finite numbers")
+    return [_number(name, word, line, source) for word in words]
+
+
+def _number(name: str, word: str, line: _Line, source: Source) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise source.error(name, f"{word!r} in line {line.number} is not a number", "finite numbers") from None
