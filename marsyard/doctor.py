@@ -39,7 +39,10 @@ MODULES = {"opencv-python-headless": "cv2", "pyrender2": "pyrender"}
 #: Distributions that write into the same folder as one of ours, ours first.
 RIVALS = (("pyrender2", "pyrender"), ("opencv-python-headless", "opencv-python"))
 #: The GL backends, the preferred one first, and their Debian packages.
-BACKENDS = {"osmesa": "libosmesa6", "egl": "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"}
+BACKENDS = {
+    "osmesa": "libosmesa6 libgl1 libxrender1",
+    "egl": "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libxrender1",
+}
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 REINSTALL = "make setup, or: pip install -c constraints.txt -e ."
 MEBI = 2**20

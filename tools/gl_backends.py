@@ -19,15 +19,14 @@ def loads(*names: str) -> bool:
 
 def loadable_backends() -> list[str]:
     """Names of the backends, as PyOpenGL calls them."""
+    # pyrender imports its viewer with itself, and that loads these, window or not
+    if not (loads("libGL.so.1") and loads("libX11.so.6") and loads("libXrender.so.1")):
+        return []
     backends = []
     if loads("libOSMesa.so.8", "libOSMesa.so.7", "libOSMesa.so.6", "libOSMesa.so"):
         backends.append("osmesa")
-    # libEGL only passes on to a vendor's library, and needs an OpenGL beside it
-    if (
-        loads("libEGL.so.1")
-        and loads("libEGL_mesa.so.0", "libEGL_nvidia.so.0")
-        and loads("libOpenGL.so.0", "libGL.so.1")
-    ):
+    # libEGL only passes on to a vendor's library
+    if loads("libEGL.so.1") and loads("libEGL_mesa.so.0", "libEGL_nvidia.so.0"):
         backends.append("egl")
     return backends
 

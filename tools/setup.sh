@@ -8,7 +8,12 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 venv=.venv
 stamp=$venv/.setup-done             # what the environment was made from, written last
-unfinished=$venv/.setup-unfinished  # there while pip is at work: whoever finds it starts over
+unfinished=$venv/.setup-unfinished # there while pip is at work: whoever finds it starts over
+
+# What each GL backend needs of Debian. The libraries beside Mesa's are for pyrender, which loads its viewer with itself.
+osmesa=(libosmesa6 libgl1 libxrender1)
+egl=(libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libxrender1)
+either="install ${osmesa[*]}, or else ${egl[*]} (sudo apt-get install ...)"
 
 say() { printf 'setup: %s\n' "$*"; }
 fail() { printf 'setup: %s\n' "$*" >&2; exit 1; }
@@ -82,10 +87,10 @@ need() {
 install_gl_libraries() {
     local loadable
     loadable=" $("$1" tools/gl_backends.py) "
-    case "$loadable" in *" osmesa "*) ;; *) need libosmesa6 || true ;; esac
-    case "$loadable" in *" egl "*) ;; *) need libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri || true ;; esac
+    case "$loadable" in *" osmesa "*) ;; *) need "${osmesa[@]}" || true ;; esac
+    case "$loadable" in *" egl "*) ;; *) need "${egl[@]}" || true ;; esac
     if [ -z "$("$1" tools/gl_backends.py)" ]; then
-        fail "nothing to render with: install libosmesa6, or else libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri (sudo apt-get install ...)"
+        fail "nothing to render with: $either"
     fi
 }
 
@@ -122,7 +127,7 @@ check_rendering() {
             say "pyrender renders nothing with $backend; 'marsyard doctor' says more"
         fi
     done
-    [ -n "$works" ] || fail "no GL backend renders a picture: install libosmesa6, or else libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
+    [ -n "$works" ] || fail "no GL backend renders a picture: $either"
 }
 
 # One set-up at a time in one folder.

@@ -107,14 +107,14 @@ def test_a_moved_checkout_is_set_up_anew(checkout: Path) -> None:
 def test_a_missing_backend_is_named_in_one_line_and_not_fatal(checkout: Path) -> None:
     done = setup(checkout)
     assert done.returncode == 0
-    assert done.stdout.count("sudo apt-get install libosmesa6\n") == 1
+    assert done.stdout.count("sudo apt-get install libosmesa6 libgl1 libxrender1\n") == 1
 
 
 def test_no_backend_at_all_is_fatal(checkout: Path) -> None:
     executable(checkout / "tools" / "gl_backends.py", "print('')\n")
     done = setup(checkout)
     assert done.returncode == 1
-    assert "nothing to render with: install libosmesa6, or else libegl1" in done.stderr
+    assert "nothing to render with: install libosmesa6 libgl1 libxrender1, or else libegl1" in done.stderr
     assert lines(checkout.parent / "pip.log") == 0
 
 
