@@ -1,1 +1,1 @@
-"""What is being validated: estimators that see measurements only. Of `sim` they import frames, camera and measurements."""
+"""What is being validated: estimators that see measurements only (of `sim`: frames, camera, measurements)."""

@@ -1,0 +1,117 @@
+"""From delivered pictures to the binned views that DIMES works on (section II.A, first sentence)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from algorithms.dimes.options import DimesOptions
+from sim.camera import CameraModel
+from sim.frames import rigid
+from sim.measurements import DescentMeasurements, DetectorCalibration, DetectorImage
+
+
+@dataclass(frozen=True)
+class View:
+    """One binned picture and where it was taken from.
+
+    Attributes
+    ----------
+    signal
+        Counts above the offset, averaged over the pixels binned by software, shape (rows, columns); not yet corrected.
+    flat_field
+        Relative response, binned likewise.
+    camera
+        Camera model of the binned picture in the view's ground frame: axes east, north, up; the ground is the plane
+        z = 0 at the measured altitude below the body's origin, and the origin lies straight below the camera.
+    centre
+        The camera's place in that frame, metres: (0, 0, height).
+    time_s
+        Time tag of the middle of the exposure.
+    calibration
+        The detector's calibration.
+    rows_summed
+        Physical rows in one row of `signal`, on the chip and by software together.
+    """
+
+    signal: Float[np.ndarray, "rows columns"]
+    flat_field: Float[np.ndarray, "rows columns"]
+    camera: CameraModel
+    centre: Float[np.ndarray, "3"]
+    time_s: float
+    calibration: DetectorCalibration
+    rows_summed: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows of the binned picture."""
+        return (self.signal.shape[1], self.signal.shape[0])
+
+
+def bin_factors(shape: tuple[int, int], binned_size: tuple[int, int]) -> tuple[int, int]:
+    """Columns and rows to average by software for a delivered picture of `shape` to get `binned_size` (columns, rows).
+
+    Raises
+    ------
+    ValueError
+        If the delivered picture is no whole multiple of the binned one.
+    """
+    rows, columns = shape
+    if columns % binned_size[0] or rows % binned_size[1]:
+        raise ValueError(
+            f"a delivered picture of {columns} x {rows} pixels does not bin to {binned_size[0]} x {binned_size[1]}"
+        )
+    return columns // binned_size[0], rows // binned_size[1]
+
+
+def bin_mean(
+    image: Float[np.ndarray, "rows columns"], columns: int, rows: int
+) -> Float[np.ndarray, "binned_rows binned_columns"]:
+    """Averages over blocks of `columns` x `rows` pixels."""
+    height, width = image.shape
+    blocks = image.reshape(height // rows, rows, width // columns, columns)
+    return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float32))
+
+
+def view(image: DetectorImage, world_from_body: Rotation, altitude_m: float, binned_size: tuple[int, int]) -> View:
+    """The binned picture, with its camera placed above the ground plane by measured attitude and altitude.
+
+    The altitude is taken as that of the body's origin; the camera's own height follows from its place in the body.
+    """
+    columns, rows = bin_factors(image.counts.shape, binned_size)
+    lever = world_from_body.as_matrix() @ image.camera.c
+    placed = rigid(world_from_body, np.array([-lever[0], -lever[1], altitude_m]))
+    return View(
+        signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(image.calibration.offset_dn),
+        flat_field=bin_mean(np.asarray(image.calibration.flat_field, dtype=np.float32), columns, rows),
+        camera=image.camera.binned(columns, rows).moved(placed),
+        centre=np.array([0.0, 0.0, altitude_m + lever[2]]),
+        time_s=image.time_s,
+        calibration=image.calibration,
+        rows_summed=image.calibration.rows_summed * rows,
+    )
+
+
+def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, "3"]:
+    """Measured altitudes carried from their own time tags to those of the pictures, metres.
+
+    The vertical velocity is the inertial one: that of the first interval for the first picture, of the second for the
+    third, and the mean of both for the second.
+    """
+    vertical = measurements.interval_velocities_m_s[:, 2]
+    rates = np.array([vertical[0], vertical.mean(), vertical[1]])
+    lags = np.array([i.time_s - a.time_s for i, a in zip(measurements.images, measurements.altitudes, strict=True)])
+    return np.asarray(np.array([a.altitude_m for a in measurements.altitudes], dtype=np.float64) + rates * lags)
+
+
+def views(measurements: DescentMeasurements, options: DimesOptions) -> tuple[View, View, View]:
+    """The three binned pictures, each above its own ground plane."""
+    altitudes = altitudes_at_images(measurements)
+    first, second, third = (
+        view(image, attitude.world_from_body, float(altitude), options.binned_size)
+        for image, attitude, altitude in zip(measurements.images, measurements.attitudes, altitudes, strict=True)
+    )
+    return first, second, third

@@ -1,0 +1,90 @@
+"""Every number of DIMES that could have been another one, with why it is what it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class DimesOptions:
+    """Options of the DIMES estimator (paper: section II of 'Field Testing of the MER DIMES').
+
+    Attributes
+    ----------
+    binned_size
+        Columns and rows of the picture that DIMES works on (paper: 256 x 256).
+    max_speed_m_s
+        Largest horizontal speed expected (paper: 30 m/s); with the time between pictures it sets the search range.
+    search_margin_px
+        Rectified pixels searched beyond that on each side: attitude and altitude errors shift the match too (0.3 deg of
+        attitude between two pictures is 9 m, 1.6 px, at 1700 m), and a peak must not lie on the border.
+    template_px
+        Side of the rectified template, odd. 31 px is 172 m at 1700 m.
+    max_off_nadir_rad
+        Ground seen further from the nadir than this is not used: at 55 deg a pixel covers three times the ground along
+        the line of sight that it covers at the nadir, and an altitude error shifts the ground by 1.4 times itself.
+    border_px
+        Binned pixels that templates and windows keep from the picture's border (spline interpolation needs neighbours,
+        and the straight sides of a window bend by lens distortion between the points that are checked).
+    zero_phase_radius_rad
+        Angle from the anti-solar point within which the ground is masked. The opposition surge of soils has a half
+        width of a few degrees and the shadow of lander and parachute is under 1 deg; what is left of the surge beyond
+        4 deg is smooth over a template, and removing the local mean takes most of it out.
+    grid_step_px
+        Step of the coarse grid of candidate templates, binned pixels of the first picture.
+    templates_per_pair
+        Templates selected in each pair of pictures (paper: 2).
+    exclusion_px
+        The second template's centre keeps this far (in column or row, binned pixels) from the first's, so that the two
+        share no ground and fail independently.
+    subpixel
+        Whether the correlation peak is refined below a pixel (the paper does not say that DIMES did).
+    align
+        Whether the refined peak is followed by Gauss-Newton alignment, which removes the lean of the biquadratic fit
+        towards whole pixels.
+    min_contrast
+        Least Harris interest of a template divided by its mean signal, per binned pixel.
+    min_peak
+        Least correlation at the peak.
+    max_peak_width_px
+        Largest full width of the peak at three quarters of its height, rectified pixels.
+    max_second_peak_ratio
+        Largest ratio of the second highest local maximum to the peak.
+    second_peak_exclusion_px
+        Local maxima within this distance of the peak belong to it. 3 px are 16.7 m at 1700 m, 4.4 m/s: confusion with a
+        maximum so near stays within the requirement of 5 m/s.
+    imu_threshold_m_s
+        Largest horizontal difference between the change of velocity from a first-pair to a second-pair track and that
+        of the IMU.
+    """
+
+    binned_size: tuple[int, int] = (256, 256)
+    max_speed_m_s: float = 30.0
+    search_margin_px: int = 4
+    template_px: int = 31
+    max_off_nadir_rad: float = float(np.deg2rad(55.0))
+    border_px: float = 3.0
+    zero_phase_radius_rad: float = float(np.deg2rad(4.0))
+    grid_step_px: int = 6
+    templates_per_pair: int = 2
+    exclusion_px: float = 31.0
+    subpixel: bool = True
+    align: bool = True
+    min_contrast: float = 0.002
+    min_peak: float = 0.5
+    max_peak_width_px: float = 16.0
+    max_second_peak_ratio: float = 0.8
+    second_peak_exclusion_px: float = 3.0
+    imu_threshold_m_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        if self.template_px < 5 or self.template_px % 2 == 0:
+            raise ValueError(f"template_px is {self.template_px}; it must be odd and at least 5")
+        if self.search_margin_px < 1:
+            raise ValueError(f"search_margin_px is {self.search_margin_px}; it must be at least 1")
+        if self.grid_step_px < 1 or self.templates_per_pair < 1:
+            raise ValueError("grid_step_px and templates_per_pair must be at least 1")
+        if not 0.0 < self.max_off_nadir_rad < np.pi / 2:
+            raise ValueError(f"max_off_nadir_rad is {self.max_off_nadir_rad}; it must lie between 0 and pi/2")

@@ -1,0 +1,51 @@
+"""Rectification: patches of a view as a virtual camera would see them that looks straight down (section II.A).
+
+The virtual camera's pixels are squares of ground, `gsd_m` on a side, in the plane at the altitude measured with the
+view; rows run from north to south and columns from west to east. Both views of a pair are rectified to the same virtual
+camera on the assumption of no horizontal motion: a patch is named by the ground point in its middle, east and north of
+the point below the camera that took the picture. What the paper does by a homography is done here point by point
+through the full camera model, with a cubic spline between pixels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from algorithms.dimes.binning import View
+from algorithms.dimes.ground import pixels_from_ground
+from algorithms.dimes.radiometry import corrected_patch
+
+#: Pixels around the samples that the spline's coefficients are computed from; what is beyond changes them by 1e-6.
+SPLINE_MARGIN = 10
+
+
+def ground_lattice(centre: Float[np.ndarray, "2"], side_px: int, gsd_m: float) -> Float[np.ndarray, "side side 2"]:
+    """Ground points (east, north) of the pixels of a square patch about `centre`, shape (side, side, 2), metres."""
+    steps = (np.arange(side_px) - 0.5 * (side_px - 1)) * gsd_m
+    east, north = np.meshgrid(centre[0] + steps, centre[1] - steps)
+    return np.stack([east, north], axis=-1)
+
+
+def _span(values: Float[np.ndarray, "*shape"], size: int) -> slice:
+    """Whole pixels around the values, with the spline's margin, within 0 .. size."""
+    low, high = np.clip([values.min() - SPLINE_MARGIN, values.max() + SPLINE_MARGIN + 1], 0, size).astype(int)
+    return slice(int(min(low, size - 1)), int(max(high, 1)))
+
+
+def rectified_patch(
+    view: View, centre: Float[np.ndarray, "2"], side_px: int, gsd_m: float
+) -> Float[np.ndarray, "side side"]:
+    """The patch of `side_px` pixels about the ground point `centre` (east, north), radiometrically corrected, counts.
+
+    Only what the patch needs is corrected and interpolated. Points out of the picture take the value of its border;
+    points that the camera cannot see take its upper left corner's. (Candidates are chosen so that there are none.)
+    """
+    pixels, visible = pixels_from_ground(view, ground_lattice(centre, side_px, gsd_m))
+    columns, rows = view.size
+    pixels = np.clip(np.where(visible[..., None], pixels, 0.0), 0.0, [columns - 1.0, rows - 1.0])
+    in_rows, in_columns = _span(pixels[..., 1], rows), _span(pixels[..., 0], columns)
+    patch = corrected_patch(view, in_rows, in_columns)
+    places = np.stack([pixels[..., 1] - in_rows.start, pixels[..., 0] - in_columns.start])
+    return np.asarray(ndimage.map_coordinates(patch, places, order=3, mode="mirror"))

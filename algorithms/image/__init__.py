@@ -1,0 +1,1 @@
+"""Image operators that more than one algorithm uses: interest, correlation, peaks, alignment."""

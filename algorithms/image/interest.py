@@ -1,0 +1,49 @@
+"""Interest operators: where a picture has structure enough to be found again."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+
+def structure_tensor(
+    image: Float[np.ndarray, "rows columns"], support: int
+) -> tuple[
+    Float[np.ndarray, "rows columns"],
+    Float[np.ndarray, "rows columns"],
+    Float[np.ndarray, "rows columns"],
+]:
+    """Mean products of the picture's gradients over a square of `support` pixels about every pixel.
+
+    Returns the means of ``g_u g_u``, ``g_v g_v`` and ``g_u g_v`` in squared counts per squared pixel, each of shape
+    (rows, columns). The gradient is Sobel's, scaled so that a ramp of one count per pixel gives one. Borders reflect.
+    """
+    values = image.astype(np.float32, copy=False)
+    gradient_u = cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    gradient_v = cv2.Sobel(values, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
+    size = (support, support)
+    return (
+        np.asarray(cv2.sqrBoxFilter(gradient_u, cv2.CV_32F, size)),
+        np.asarray(cv2.sqrBoxFilter(gradient_v, cv2.CV_32F, size)),
+        np.asarray(cv2.boxFilter(gradient_u * gradient_v, cv2.CV_32F, size)),
+    )
+
+
+def harris_interest(image: Float[np.ndarray, "rows columns"], support: int) -> Float[np.ndarray, "rows columns"]:
+    """Harris interest over a square of `support` pixels, in counts per pixel.
+
+    It is Noble's form of the Harris operator, ``determinant / trace`` of the mean structure tensor, which needs no
+    constant to be chosen; ``sqrt(2 determinant / trace)`` is the root mean square gradient per axis when structure is
+    the same in all directions, and near zero when there is none, or when it runs in one direction only.
+    """
+    uu, vv, uv = structure_tensor(image, support)
+    determinant = np.maximum(uu * vv - uv * uv, 0.0)
+    trace = uu + vv
+    ratio = np.divide(2.0 * determinant, trace, out=np.zeros_like(trace), where=trace > 0)
+    return np.asarray(np.sqrt(ratio))
+
+
+def local_mean(image: Float[np.ndarray, "rows columns"], support: int) -> Float[np.ndarray, "rows columns"]:
+    """Mean over a square of `support` pixels about every pixel; borders reflect."""
+    return np.asarray(cv2.blur(image.astype(np.float32, copy=False), (support, support)))

@@ -1,0 +1,185 @@
+"""A descent over a flat, textured plane, rendered exactly: every physical pixel's ray is cast to the ground.
+
+Independent of what it tests: it goes from pixels to ground (DIMES goes the other way) and follows every physical row of
+the detector through clearing, exposure and transfer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from scipy import fft, ndimage
+from scipy.spatial.transform import Rotation
+
+from sim.camera import Cahv, Cahvor
+from sim.frames import direction, rigid
+from sim.measurements import (
+    AltitudeMeasurement,
+    AttitudeMeasurement,
+    DescentMeasurements,
+    DetectorCalibration,
+    DetectorImage,
+)
+
+#: MER descent camera: 14.67 mm, 12 um, 1024 x 1024; distortion of several pixels in the corners, off-centre.
+CAMERA = Cahvor.from_cahv(
+    Cahv.from_focal_length(
+        0.01467, 12e-6, (1024, 1024), axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0), image_centre=(515.0, 508.5)
+    ),
+    r=(0.0, -0.05, 0.02),
+    o=np.array([0.002, -0.003, -1.0]) / np.linalg.norm([0.002, -0.003, -1.0]),
+)
+ROWS_SUMMED = 4
+FULL_SCALE = 4095
+INTERVAL_S = 3.75
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Brightness of the plane, a periodic bilinear surface; `values[i, j]` lies at north = -i step, east = j step."""
+
+    values: np.ndarray
+    step_m: float
+
+    def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
+        rows, columns = -north / self.step_m, east / self.step_m
+        size = np.array(self.values.shape, dtype=np.float64)
+        rows, columns = np.mod(rows, size[0]).astype(np.float32), np.mod(columns, size[1]).astype(np.float32)
+        return ndimage.map_coordinates(self.values, [rows, columns], order=1, mode="grid-wrap")
+
+
+@cache
+def terrain(seed: int = 1, contrast: float = 0.15, slope: float = 1.2, size: int = 2048, step_m: float = 1.5) -> Texture:
+    """Random texture of mean 1 and RMS `contrast`, amplitudes falling as frequency to the power `slope`."""
+    rng = np.random.default_rng(seed)
+    frequency = np.hypot(*np.meshgrid(fft.fftfreq(size), fft.rfftfreq(size), indexing="ij"))
+    frequency[0, 0] = np.inf
+    shape = np.where(frequency > 4.0 / size, frequency**-slope, 0.0) * (frequency < 0.3)
+    values = fft.irfft2(shape * fft.rfft2(rng.standard_normal((size, size)), workers=1), (size, size))
+    return Texture((1.0 + contrast * values / values.std()).astype(np.float32), step_m)
+
+
+def waves(wavelength_m: float, contrast: float = 0.2, size: int = 2048, step_m: float = 1.5) -> Texture:
+    """Repetitive terrain: two crossed waves of about this length (a whole number of them per period)."""
+    turns = 2.0 * np.pi * np.round(size * step_m / wavelength_m) * np.arange(size) / size
+    values = 1.0 + contrast * (np.sin(turns)[:, None] + np.sin(turns)[None, :]) / 2.0
+    return Texture(values.astype(np.float32), step_m)
+
+
+@cache
+def body_rays() -> np.ndarray:
+    """Directions of all physical pixels' rays in the body frame, shape (1024, 1024, 3)."""
+    return CAMERA.rays(CAMERA.pixel_grid())[1]
+
+
+@cache
+def fall_off() -> np.ndarray:
+    """Relative response of the physical pixels: cosine to the fourth, shape (1024, 1024)."""
+    return np.clip(body_rays() @ CAMERA.a, 0.0, 1.0) ** 4
+
+
+def calibration(transfer_row_s: float = 5e-6, clear_row_s: float = 2e-6) -> DetectorCalibration:
+    return DetectorCalibration(
+        flat_field=fall_off().reshape(-1, ROWS_SUMMED, 1024).mean(axis=1),
+        exposure_s=0.004,
+        transfer_row_s=transfer_row_s,
+        clear_row_s=clear_row_s,
+        rows_summed=ROWS_SUMMED,
+        offset_dn=20.0,
+        full_scale_dn=FULL_SCALE,
+    )
+
+
+def scene(texture: Texture, world_from_body: Rotation, position: np.ndarray, sky: float = 0.0) -> np.ndarray:
+    """Radiance of every physical pixel, shape (1024, 1024)."""
+    rays = body_rays().reshape(-1, 3) @ world_from_body.as_matrix().T
+    down = -rays[:, 2] > 0.05
+    slant = position[2] / np.where(down, -rays[:, 2], 1.0)
+    ground = position[:2] + slant[:, None] * rays[:, :2]
+    return np.where(down, texture(ground[:, 0], ground[:, 1]), sky).reshape(1024, 1024)
+
+
+def delivered(
+    radiance: np.ndarray, known: DetectorCalibration, noise: np.random.Generator | None = None, level: float = 1600.0
+) -> np.ndarray:
+    """Counts of a still scene; `level` counts for radiance 1 on the axis. Noise is that of 11,000 electrons at 1600."""
+    rate = radiance * fall_off()
+    before = np.cumsum(rate, axis=0) - rate
+    after = rate.sum(axis=0) - before - rate
+    charge = rate + (known.transfer_row_s * before + known.clear_row_s * after) / known.exposure_s
+    counts = level * charge.reshape(-1, known.rows_summed, charge.shape[1]).mean(axis=1)
+    if noise is not None:
+        electrons = noise.poisson(counts * 11000.0 / 1600.0) + 50.0 * noise.standard_normal(counts.shape)
+        counts = electrons * 1600.0 / 11000.0
+    return np.clip(np.rint(counts + known.offset_dn), 0, known.full_scale_dn).astype(np.uint16)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A triple: true positions (3, 3), attitudes, and the sun."""
+
+    positions: np.ndarray
+    attitudes: tuple[Rotation, Rotation, Rotation]
+    sun: np.ndarray = field(default_factory=lambda: direction(np.deg2rad(250.0), np.deg2rad(10.0)))
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """True mean velocities over the two intervals, shape (2, 3)."""
+        return np.diff(self.positions, axis=0) / INTERVAL_S
+
+
+def tilted(tilt_deg: float, azimuth_deg: float, roll_deg: float) -> Rotation:
+    """Body that leans by `tilt_deg` after a roll about its own vertical."""
+    lean = Rotation.from_euler("ZYZ", [azimuth_deg, tilt_deg, -azimuth_deg], degrees=True)
+    return lean * Rotation.from_euler("z", roll_deg, degrees=True)
+
+
+def flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: float = 30.0) -> Flight:
+    """Random rolls, leans that wander by a few degrees about a random one, wind in any direction with a change of it."""
+    wind = max_wind * np.sqrt(rng.uniform()) * np.array([*_unit(rng), 0.0])
+    change = np.array([*rng.normal(0.0, 1.0, 2), 0.0])
+    first = np.array([*rng.uniform(0.0, 3000.0, 2), rng.uniform(1900.0, 2100.0)])
+    fall = np.array([0.0, 0.0, -75.0])
+    steps = np.stack([np.zeros(3), wind + fall, 2.0 * (wind + fall) + change])
+    base = max_tilt_deg * np.sqrt(rng.uniform()) * _unit(rng)
+    attitudes = []
+    for _ in range(3):
+        x, y = base + rng.uniform(-5.0, 5.0, 2)
+        attitudes.append(tilted(np.hypot(x, y), np.degrees(np.arctan2(y, x)), rng.uniform(0.0, 360.0)))
+    return Flight(first + INTERVAL_S * steps, (attitudes[0], attitudes[1], attitudes[2]))
+
+
+def _unit(rng: np.random.Generator) -> np.ndarray:
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def measurements_of(flown: Flight, counts: list[np.ndarray], known: DetectorCalibration) -> DescentMeasurements:
+    """Exact measurements of a flight with these pictures; the inertial velocities carry a common error of (40, -25)."""
+    camera = CAMERA.binned(1, known.rows_summed)
+    times = [100.0 + INTERVAL_S * i for i in range(3)]
+    images = [DetectorImage(c, t, camera, known) for c, t in zip(counts, times, strict=True)]
+    attitudes = [AttitudeMeasurement(a, t) for a, t in zip(flown.attitudes, times, strict=True)]
+    altitudes = [AltitudeMeasurement(float(p[2]), t) for p, t in zip(flown.positions, times, strict=True)]
+    return DescentMeasurements(
+        images=(images[0], images[1], images[2]),
+        attitudes=(attitudes[0], attitudes[1], attitudes[2]),
+        altitudes=(altitudes[0], altitudes[1], altitudes[2]),
+        interval_velocities_m_s=flown.velocities + np.array([40.0, -25.0, 0.0]),
+        sun_direction=flown.sun,
+    )
+
+
+def render(
+    flown: Flight, texture: Texture | None = None, noise: np.random.Generator | None = None, level: float = 1600.0
+) -> DescentMeasurements:
+    """The three pictures of a flight with exact measurements."""
+    known = calibration()
+    ground = terrain() if texture is None else texture
+    counts = [
+        delivered(scene(ground, attitude, position), known, noise, level)
+        for attitude, position in zip(flown.attitudes, flown.positions, strict=True)
+    ]
+    return measurements_of(flown, counts, known)
