@@ -88,8 +88,9 @@ def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
         Where the products do not hold the three pictures; see `is_dimes_case`.
     """
     figure = Figure(figsize=(12.0, 6.1), layout="constrained")
-    for pair, part in zip(_PAIRS, figure.subfigures(1, 2, wspace=0.03).ravel(), strict=True):
-        _draw_pair(part, products, pair)
+    halves = figure.add_gridspec(1, 2)
+    for pair in _PAIRS:
+        _draw_pair(figure.add_subfigure(halves[pair]), products, pair)
     return figure
 
 

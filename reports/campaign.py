@@ -1,0 +1,154 @@
+"""A campaign's report: a page to be read, `report.html`, and its machine-readable twin, `report.json`."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from reports import gallery, sections
+from reports.columns import primary_metric
+from reports.stored import StoredRun, read_run
+from reports.tables import error_summaries, outcome_counts
+from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overall
+
+#: Version of the layout of `report.json`.
+SCHEMA = 1
+
+PAGE_FILE = "report.html"
+TWIN_FILE = "report.json"
+
+
+def write_report(directory: Path) -> Path:
+    """Writes a campaign's report into its folder, from the files there alone.
+
+    Parameters
+    ----------
+    directory
+        The folder of a campaign that was run.
+
+    Returns
+    -------
+    The page's path: one file that needs no other and asks nothing of the network.
+
+    Raises
+    ------
+    campaigns.errors.StoreError
+        Where the folder holds no rows.
+    OSError
+        Where the report cannot be written.
+    """
+    run = read_run(directory)
+    verdicts = judge_campaign(run.frame, run.requirements)
+    whole = overall(verdicts, run.frame)
+    _write(directory / TWIN_FILE, json.dumps(summary(run, verdicts, whole), indent=2, allow_nan=False) + "\n")
+    page = directory / PAGE_FILE
+    _write(page, _environment().get_template("report.html.j2").render(page_context(run, verdicts, whole)))
+    return page
+
+
+def page_context(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) -> dict[str, Any]:
+    """Everything that the page's template is given."""
+    metric = primary_metric(run.frame, run.requirements)
+    bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
+    context: dict[str, Any] = {
+        "run": run,
+        "description": str(run.said("description") or ""),
+        "whole": whole,
+        "interrupted": run.said("state") not in (None, "finished"),
+        "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
+        "metric": metric,
+        "bound": bound,
+        "outcomes": sections.outcome_grid(run.frame),
+        "outcome_plates": gallery.outcome_plates(run.frame),
+        "crashed": sections.crashed_rows(run),
+        "dispersions": sections.dispersion_grid(run),
+        "shown": gallery.shown_cases(run),
+        "provenance": sections.provenance(run),
+        "versions": sections.versions(run),
+        "configuration": sections.configuration_text(run),
+        "rerun": sections.rerun_command(run),
+        "replay": sections.replay_command(run, "CASE"),
+    }
+    return {**context, **_error_sections(run, metric, bound)}
+
+
+def summary(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) -> dict[str, Any]:
+    """The report as plain data; NaN and infinities are null."""
+    metric = primary_metric(run.frame, run.requirements)
+    summaries = error_summaries(run.frame, metric) if metric is not None else []
+    twin = {
+        "schema": SCHEMA,
+        "campaign": run.name,
+        "state": run.said("state"),
+        "seed": run.said("seed"),
+        "git_commit": run.said("git_commit"),
+        "started_utc": run.said("started_utc"),
+        "finished_utc": run.said("finished_utc"),
+        "cases": len(run.frame),
+        "crashed": whole.crashed,
+        "verdict": whole.word,
+        "sentence": whole.sentence,
+        "exit_code": exit_code(verdicts, bool(whole.crashed)),
+        "verdicts": [
+            {**asdict(verdict), "note": verdict.note, "clustered_status": verdict.clustered_status}
+            for verdict in verdicts
+        ],
+        "outcomes": dict(outcome_counts(run.frame)),
+        "metric": metric,
+        "statistics": {name: asdict(summarized) for name, summarized in summaries},
+        "worst_cases": [] if metric is None else [row.case for row in sections.worst_cases(run, metric).rows],
+        "showcases": run.showcases,
+    }
+    plain: dict[str, Any] = _plain(twin)
+    return plain
+
+
+def _error_sections(run: StoredRun, metric: str | None, bound: float | None) -> dict[str, Any]:
+    """What is said of the page's metric; empty where no column is one."""
+    if metric is None:
+        none = sections.CaseTable((), ())
+        grid = sections.Grid((), ())
+        return {"error_plates": [], "driver_plates": [], "statistics": grid, "worst": none, "silent": none}
+    return {
+        "error_plates": gallery.error_plates(run.frame, metric, bound),
+        "driver_plates": gallery.driver_plates(run.frame, metric, bound),
+        "statistics": sections.statistics_grid(run.frame, metric),
+        "worst": sections.worst_cases(run, metric),
+        "silent": sections.silent_cases(run, metric),
+    }
+
+
+def _environment() -> Environment:
+    """Jinja with escaping on for every template: what comes from files is shown as text."""
+    return Environment(
+        autoescape=True,
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        lstrip_blocks=True,
+        trim_blocks=True,
+        undefined=StrictUndefined,
+    )
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON has it."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, str | int | bool) else str(value)
+
+
+def _write(path: Path, text: str) -> None:
+    """Writes a file whole or not at all."""
+    partial = path.with_suffix(path.suffix + ".partial")
+    # Lone surrogates, which JSON can carry, cannot be written as UTF-8.
+    partial.write_text(text, encoding="utf-8", errors="replace")
+    partial.replace(path)

@@ -1,0 +1,278 @@
+"""What the report's page says, section by section: plain values and finished figures, in the order they are read."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from reports.columns import axis_columns, driver_columns, label, numbers
+from reports.stored import StoredRun, table
+from reports.tables import error_summaries, outcome_counts, statistics_rows
+from reports.verdicts import ENGINE_FAILURES, Verdict, members
+from reports.wording import NOTHING, count, number, percent, stated
+
+#: Rows of the tables of single cases; the rows that are left out are counted.
+_MOST_CASES = 10
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A success rate's interval drawn to scale: places in per cent of the strip's width."""
+
+    left: str
+    lower: float
+    upper: float
+    estimate: float
+    asked: float
+
+
+@dataclass(frozen=True)
+class VerdictRow:
+    """A verdict in words, with its strip; None where there is no evidence to draw."""
+
+    verdict: Verdict
+    asked: str
+    evidence: str
+    bounds: str
+    further: str
+    strip: Strip | None
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table of texts: headings, rows, and how many rows were left out."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left_out: int = 0
+
+
+@dataclass(frozen=True)
+class CaseRow:
+    """A single case: its number, its values as texts, how to run it again, and what it said when it crashed."""
+
+    case: str
+    kept: bool
+    values: Sequence[str]
+    command: str
+    message: str = ""
+    trace: str = ""
+
+
+@dataclass(frozen=True)
+class CaseTable:
+    """Single cases with the headings of their values, and how many were left out."""
+
+    head: Sequence[str]
+    rows: Sequence[CaseRow]
+    left_out: int = 0
+
+
+def verdict_row(verdict: Verdict) -> VerdictRow:
+    """A verdict as the page shows it."""
+    asked = (
+        f"|{label(verdict.metric)}| ≤ {verdict.bound:g} in at least {stated(verdict.probability)} of "
+        f"{verdict.population} cases, at {stated(verdict.confidence)} confidence"
+    )
+    bounds = NOTHING if verdict.n == 0 else f"{percent(verdict.lower)} to {percent(verdict.upper)}"
+    further = NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}"
+    evidence = f"{count(verdict.n, 'case')}, {verdict.failures:,} failed"
+    return VerdictRow(verdict, asked, evidence, bounds, further, _strip(verdict))
+
+
+def _strip(verdict: Verdict) -> Strip | None:
+    if verdict.n == 0:
+        return None
+    lowest = min(verdict.lower, verdict.probability)
+    left = max(0.0, lowest - 0.25 * (1.0 - lowest))
+    scale = 100.0 / max(1.0 - left, 1e-12)
+    places = [scale * (value - left) for value in (verdict.lower, verdict.upper, verdict.estimate, verdict.probability)]
+    return Strip(f"{100.0 * left:.3g} %", *places)
+
+
+def statistics_grid(frame: pd.DataFrame, metric: str) -> Grid:
+    """Statistics of a metric and of its parts, a column each."""
+    summaries = error_summaries(frame, metric)
+    return Grid(["", *(name for name, _ in summaries)], statistics_rows([summary for _, summary in summaries]))
+
+
+def outcome_grid(frame: pd.DataFrame) -> Grid:
+    """How many cases ended in which way."""
+    rows = [[name, f"{cases:,}", percent(cases / len(frame))] for name, cases in outcome_counts(frame)]
+    return Grid(["Outcome", "Cases", "Share"], rows)
+
+
+def worst_cases(run: StoredRun, metric: str) -> CaseTable:
+    """The cases with the largest errors, largest first."""
+    magnitude = np.abs(numbers(run.frame, metric))
+    known = np.flatnonzero(np.isfinite(magnitude))
+    order = known[np.argsort(-magnitude[known], kind="stable")][:_MOST_CASES]
+    columns = [metric, *axis_columns(metric, [str(name) for name in run.frame.columns])]
+    return _case_table(run, order, columns, metric, known.size - order.size)
+
+
+def silent_cases(run: StoredRun, metric: str) -> CaseTable:
+    """Cases that ran to their end without an error to score: no answer was given."""
+    silent = ~np.isfinite(numbers(run.frame, metric)) & members(run.frame, "completed")
+    order = np.flatnonzero(silent)
+    return _case_table(run, order[:_MOST_CASES], [], metric, max(0, order.size - _MOST_CASES))
+
+
+def crashed_rows(run: StoredRun) -> CaseTable:
+    """Cases that the engine could not finish, with what they said."""
+    order = np.flatnonzero(~members(run.frame, "completed"))
+    head = ["Case", "Outcome"]
+    rows = [
+        CaseRow(
+            case=_case(run.frame, index),
+            kept=False,
+            values=[_text(run.frame, "outcome", index)],
+            command=replay_command(run, _case(run.frame, index)),
+            message=_text(run.frame, "error", index),
+            trace=_text(run.frame, "traceback", index),
+        )
+        for index in order[:_MOST_CASES]
+    ]
+    return CaseTable(head, rows, max(0, order.size - _MOST_CASES))
+
+
+def dispersion_grid(run: StoredRun) -> Grid:
+    """Dispersions as stated, and the values as the rows show them applied."""
+    rows = []
+    for path, dispersion in table(run.said("dispersions")).items():
+        column = _drawn_column(run.frame, str(path))
+        drawn = [NOTHING] * 3 if column is None else _extent(run.frame[column])
+        stated_as = _distribution(table(dispersion))
+        rows.append([str(path), stated_as, *drawn, str(table(dispersion).get("source") or NOTHING)])
+    return Grid(["Parameter", "Distribution", "Least", "Mean", "Greatest", "Source"], rows)
+
+
+def provenance(run: StoredRun) -> list[tuple[str, str]]:
+    """What was run, by which program, on which machine."""
+    environment = table(run.said("environment"))
+    facts = [
+        ("Campaign", run.name),
+        ("Scenario", run.said("scenario")),
+        ("State", run.said("state")),
+        ("Root seed", run.said("seed")),
+        ("Cases asked", run.said("cases")),
+        ("Cases stored", len(run.frame)),
+        ("Started", run.said("started_utc")),
+        ("Finished", run.said("finished_utc")),
+        ("Worker processes", run.said("jobs")),
+        ("Processor time of a case", _mean_time(run.frame, "cpu_time_s")),
+        ("Commit", run.said("git_commit")),
+        ("Marsyard", table(run.said("versions")).get("marsyard")),
+        *((f"Machine: {name}", value) for name, value in environment.items() if value not in ({}, None)),
+        ("GL backend", _only_values(run.frame, "gl_backend")),
+        ("GL version", _only_values(run.frame, "gl_version")),
+    ]
+    return [(name, _plain(value)) for name, value in facts if value not in (None, "")]
+
+
+def versions(run: StoredRun) -> list[tuple[str, str]]:
+    """Packages and their versions."""
+    return [(str(name), _plain(version)) for name, version in table(run.said("versions")).items()]
+
+
+def configuration_text(run: StoredRun) -> str:
+    """The configuration as run, as indented JSON."""
+    return json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str)
+
+
+def replay_command(run: StoredRun, case: str) -> str:
+    """The command that runs a stored case again."""
+    return shlex.join(["marsyard", "replay", str(run.directory), case])
+
+
+def rerun_command(run: StoredRun) -> str:
+    """The command that runs the campaign again, into a folder of its own."""
+    words = ["marsyard", "run", run.name]
+    for option, key in (("-n", "cases"), ("--seed", "seed")):
+        if run.said(key) is not None:
+            words += [option, str(run.said(key))]
+    return shlex.join(words)
+
+
+def _case_table(
+    run: StoredRun, order: np.ndarray[Any, np.dtype[np.intp]], columns: Sequence[str], metric: str, left_out: int
+) -> CaseTable:
+    shown = [name for name in [*columns, "terrain", *driver_columns(run.frame, metric, most=3)] if name in run.frame]
+    rows = [
+        CaseRow(
+            case=_case(run.frame, index),
+            kept=_case(run.frame, index) in {str(case) for case in run.showcases},
+            values=[_text(run.frame, "outcome", index), *(_text(run.frame, name, index) for name in shown)],
+            command=replay_command(run, _case(run.frame, index)),
+        )
+        for index in order
+    ]
+    return CaseTable(["Case", "Outcome", *(label(name) for name in shown)], rows, left_out)
+
+
+def _case(frame: pd.DataFrame, index: int) -> str:
+    return str(frame["case"].iloc[index]) if "case" in frame else str(index)
+
+
+def _text(frame: pd.DataFrame, column: str, index: int) -> str:
+    """A stored value as text; a dash where there is none."""
+    if column not in frame:
+        return NOTHING
+    value = frame[column].iloc[index]
+    return NOTHING if pd.isna(value) or value == "" else _plain(value)
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name}={inner}" for name, inner in value.items())
+    if isinstance(value, float | np.floating) and not float(value).is_integer():
+        return number(float(value))
+    return str(value)
+
+
+def _drawn_column(frame: pd.DataFrame, path: str) -> str | None:
+    """The column that holds what a dispersed parameter became: by its whole path, or by its end."""
+    parts = path.split(".")
+    names = ["_".join(parts[start:]) for start in range(len(parts))]
+    return next((name for name in [path, *names] if name in frame), None)
+
+
+def _extent(drawn: pd.Series) -> list[str]:
+    """Least, mean and greatest of what was drawn; how many kinds where it is no number."""
+    values = pd.to_numeric(drawn, errors="coerce").dropna()
+    if values.empty or pd.api.types.is_bool_dtype(drawn.dtype):
+        return [NOTHING, f"{drawn.nunique()} kinds", NOTHING]
+    return [_plain(float(value)) for value in (values.min(), values.mean(), values.max())]
+
+
+def _distribution(dispersion: Mapping[str, Any]) -> str:
+    """A distribution and its parameters in one line."""
+    told = {
+        name: value
+        for name, value in dispersion.items()
+        if name not in ("distribution", "source") and value is not None
+    }
+    return f"{dispersion.get('distribution', '?')}({', '.join(f'{name}={value}' for name, value in told.items())})"
+
+
+def _mean_time(frame: pd.DataFrame, column: str) -> str | None:
+    values = numbers(frame, column)
+    known = values[np.isfinite(values)]
+    return f"{number(float(known.mean()))} s on average" if known.size else None
+
+
+def _only_values(frame: pd.DataFrame, column: str) -> str | None:
+    if column not in frame:
+        return None
+    return "; ".join(str(value) for value in frame[column].dropna().unique()[:3])
+
+
+def engine_failures(frame: pd.DataFrame) -> list[str]:
+    """Names of the engine's failures among the outcomes."""
+    return [name for name, _ in outcome_counts(frame) if name in ENGINE_FAILURES]

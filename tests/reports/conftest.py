@@ -1,0 +1,164 @@
+"""Synthetic run folders: rows with known statistics, as a campaign would store them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from campaigns.products import save_products
+
+VELOCITY: Mapping[str, Any] = {
+    "id": "DIMES-VEL",
+    "statement": "The horizontal velocity is known within 5 m/s.",
+    "metric": "velocity_error_m_s",
+    "bound": 5.0,
+    "probability": 0.99,
+    "confidence": 0.9,
+    "population": "valid",
+}
+MakeRun = Callable[..., Path]
+
+
+def synthetic_frame(
+    cases: int, *, answered: float = 0.9, crashed: int = 0, spread: float = 1.0, terrains: int = 4, seed: int = 1
+) -> pd.DataFrame:
+    """Rows of a made-up descent campaign."""
+    rng = np.random.default_rng(seed)
+    valid = rng.random(cases) < answered
+    outcome = np.where(valid, "VALID", rng.choice(["NO_TEMPLATE_AREA", "NO_VALID_TRACK", "IMU_MISMATCH"], cases))
+    off_nadir = rng.uniform(0.0, 30.0, cases)
+    error = rng.normal(0.0, spread * (0.5 + off_nadir[:, None] / 30.0), (cases, 2))
+    error[~valid] = np.nan
+    frame = pd.DataFrame(
+        {
+            "case": np.arange(cases),
+            "outcome": outcome,
+            "answered": valid,
+            "velocity_error_m_s": np.hypot(*error.T),
+            "velocity_error_x_m_s": error[:, 0],
+            "velocity_error_y_m_s": error[:, 1],
+            "terrain": rng.integers(0, terrains, cases),
+            "sun_elevation_deg": rng.uniform(20.0, 60.0, cases),
+            "horizontal_speed_m_s": rng.uniform(0.0, 30.0, cases),
+            "altitude_1_m": rng.normal(2000.0, 20.0, cases),
+            "off_nadir_max_deg": off_nadir,
+            "attitude_rate_max_deg_s": rng.uniform(0.0, 60.0, cases),
+            "image_hash": [f"{case:064x}" for case in range(cases)],
+            "gl_backend": "osmesa",
+            "gl_version": "Mesa 22.3.6 llvmpipe",
+            "wall_time_s": rng.uniform(1.0, 2.0, cases),
+            "cpu_time_s": rng.uniform(1.0, 2.0, cases),
+            "error": "",
+            "traceback": "",
+        }
+    )
+    return _crash(frame, crashed)
+
+
+def _crash(frame: pd.DataFrame, crashed: int) -> pd.DataFrame:
+    """The last rows as a case that raised leaves them: nothing but its message."""
+    if not crashed:
+        return frame
+    rows = frame.index[-crashed:]
+    numbers = frame.select_dtypes("number").columns.difference(["case", "wall_time_s", "cpu_time_s"])
+    frame = frame.astype(dict.fromkeys(numbers, "float64"))
+    frame.loc[rows, numbers] = np.nan
+    frame.loc[rows, ["image_hash", "gl_backend", "gl_version"]] = None
+    frame.loc[rows, ["outcome", "answered"]] = ["CRASHED", False]
+    frame.loc[rows, "error"] = "RuntimeError: the context is lost"
+    frame.loc[rows, "traceback"] = 'Traceback (most recent call last):\n  File "x.py", line 1\nRuntimeError: lost'
+    return frame
+
+
+def synthetic_products(seed: int = 1) -> dict[str, Any]:
+    """Products of a made-up DIMES case: textured pictures, two tracks a pair, one of them not valid."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[0:256, 0:1024]
+    products: dict[str, Any] = {}
+    for number in (1, 2, 3):
+        ground = 1500 + 500 * np.sin(u / 70 + number) * np.cos(v / 23) + rng.normal(0, 120, u.shape)
+        products[f"image_{number}"] = np.clip(ground, 0, 4095).astype(np.uint16)
+    columns = ["pair", "template", "template_u", "template_v", "match_u", "match_v", "contrast", "peak", "peak_width"]
+    columns += ["second_peak_ratio", "valid", "velocity_east", "velocity_north"]
+    rows = []
+    for pair in (0, 1):
+        for k in (0, 1):
+            u0, v0 = rng.uniform(60, 200, 2)
+            valid = float((pair, k) != (1, 1))
+            rows.append([pair, k, u0, v0, u0 + 12, v0 - 9, 5e4, 0.93, 2.1, 0.45, valid, 14.2, -8.8])
+            products[f"window_{pair}_{k}"] = rng.normal(1500, 300, (61, 61)).astype(np.float32)
+            products[f"template_{pair}_{k}"] = rng.normal(1500, 300, (17, 17)).astype(np.float32)
+            products[f"match_{pair}_{k}"] = np.array([25.4, 31.2])
+    products |= {"tracks": np.array(rows), "tracks_columns": columns}
+    return products | {
+        "velocity_estimated_m_s": np.array([14.1, -8.9]),
+        "velocity_true_m_s": np.array([14.6, -9.2]),
+    }
+
+
+def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """`campaign.json` as the engine writes it."""
+    configuration = {
+        "name": "dimes-synthetic",
+        "scenario": "descent",
+        "description": "Parachute descents over rough terrain, made up to try the report on.",
+        "cases": len(frame),
+        "seed": 7,
+        "dispersions": {
+            "place.terrain": {"distribution": "integer", "low": 0, "high": 3, "source": "bank of four terrains"},
+            "sun.elevation_deg": {"distribution": "uniform", "low": 20.0, "high": 60.0, "source": "landing season"},
+            "descent.altitude_first_m": {"distribution": "normal", "mean": 2000.0, "sd": 20.0, "source": "paper, I"},
+            "descent.horizontal_speed_m_s": {"distribution": "uniform", "low": 0.0, "high": 30.0, "source": "II.A"},
+        },
+        "requirements": list(requirements),
+    }
+    return {
+        "schema": 1,
+        "name": "dimes-synthetic",
+        "state": "finished",
+        "started_utc": "2025-01-01T00:00:00Z",
+        "finished_utc": "2025-01-01T00:01:00Z",
+        "cases": len(frame),
+        "seed": 7,
+        "jobs": 2,
+        "requirements": list(requirements),
+        "configuration": configuration,
+        "showcase": 3,
+        "versions": {"marsyard": "0.1.0", "numpy": "2.4.0", "scipy": "1.17.0"},
+        "git_commit": "0123456789abcdef0123456789abcdef01234567",
+        "environment": {"python": "3.11.7", "platform": "Linux", "processor": "made up"},
+    }
+
+
+def write_run(
+    directory: Path,
+    frame: pd.DataFrame,
+    requirements: Sequence[Mapping[str, Any]] = (VELOCITY,),
+    *,
+    products: Mapping[str, Any] | None = None,
+    **changes: Any,
+) -> Path:
+    """Writes a run folder; `changes` go into the record."""
+    directory.mkdir(parents=True, exist_ok=True)
+    frame.to_parquet(directory / "cases.parquet")
+    record = {**synthetic_record(frame, requirements), **changes}
+    (directory / "campaign.json").write_text(json.dumps(record), encoding="utf-8")
+    if products is not None:
+        save_products(directory / "cases" / "3", products)
+    return directory
+
+
+@pytest.fixture
+def make_run(tmp_path: Path) -> MakeRun:
+    """Writes a run folder into the test's own folder; see `write_run`."""
+
+    def make(frame: pd.DataFrame, *args: Any, name: str = "run", **kwargs: Any) -> Path:
+        return write_run(tmp_path / name, frame, *args, **kwargs)
+
+    return make
