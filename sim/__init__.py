@@ -1,1 +1,1 @@
-"""The simulated world and its instruments: terrain, light, cameras, detectors, dynamics. Truth lives here and nowhere else."""
+"""The simulated world and its instruments. Truth lives here and nowhere else."""

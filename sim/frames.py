@@ -5,12 +5,12 @@ Frames
 world
     Local level, right-handed: x east, y north, z up, metres. Terrain heights are z.
 body
-    Fixed to the vehicle. With the identity attitude its axes coincide with the world's: x east ("forward"), y north ("left"),
-    z up. A descent camera looks along -z.
+    Fixed to the vehicle. With the identity attitude its axes coincide with the world's: x to the east ("forward"),
+    y to the north ("left"), z up. A descent camera looks along -z.
 site
     The rover operations' frame (x north, y east, z down). Used only when files are read or written.
 
-Transforms are SciPy's `RigidTransform` and `Rotation`, named so that an equation reads from right to left:
+Transforms are SciPy's `RigidTransform` and `Rotation`, named so that equations read from right to left:
 ``world_from_body.apply(points_body)`` gives ``points_world``. Arrays of quaternions carry their order in the name
 (``quaternion_xyzw``, SciPy's order, or ``quaternion_wxyz``, the order of PDS labels).
 """

@@ -1,0 +1,175 @@
+"""The OpenGL context: the only module that knows which library draws.
+
+OpenGL is asked for one thing, the depth of every pixel of a pinhole view. pyrender does it, off-screen, through OSMesa
+or EGL. The platform has to be chosen before pyrender or PyOpenGL is first imported in a process, and a process has one
+renderer: contexts survive neither fork nor threads.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+if TYPE_CHECKING:
+    import trimesh
+
+Backend = Literal["osmesa", "egl"]
+BACKENDS: tuple[Backend, ...] = ("osmesa", "egl")
+#: Environment variable that names the backend where a campaign does not.
+BACKEND_VARIABLE = "MARSYARD_GL"
+
+
+class RenderingError(RuntimeError):
+    """OpenGL cannot draw here; the message says why and what to do."""
+
+
+def default_backend() -> Backend:
+    """The backend of the environment variable ``MARSYARD_GL``, or OSMesa."""
+    wanted = os.environ.get(BACKEND_VARIABLE, "osmesa").lower()
+    for backend in BACKENDS:
+        if wanted == backend:
+            return backend
+    raise RenderingError(f"{BACKEND_VARIABLE} is '{wanted}'; allowed: {', '.join(BACKENDS)}")
+
+
+@dataclass(frozen=True)
+class PinholeView:
+    """A pinhole view to be drawn.
+
+    Attributes
+    ----------
+    world_from_view
+        4 x 4 pose; the view's axes are x right, y down, z forward, its origin the centre of projection.
+    focal_px
+        Focal length in samples of the depth picture; the principal point is the picture's centre.
+    near_m, far_m
+        Depths between which the ground may lie, metres.
+    """
+
+    world_from_view: Float[np.ndarray, "4 4"]
+    focal_px: float
+    near_m: float
+    far_m: float
+
+
+#: OpenGL's camera looks along -z with y up.
+_VIEW_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+class DepthRenderer:
+    """Draws the depth of a triangle mesh, one sample at the centre of each pixel.
+
+    Parameters
+    ----------
+    side_px
+        Width and height of the depth picture. Fixed for the life of the renderer: resizing costs more than drawing.
+    backend
+        Which library provides the context.
+
+    Raises
+    ------
+    RenderingError
+        No context could be had.
+    """
+
+    def __init__(self, side_px: int, backend: Backend) -> None:
+        self.side_px = side_px
+        self.backend = backend
+        pyrender = _import_pyrender(backend)
+        try:
+            self._offscreen = pyrender.OffscreenRenderer(side_px, side_px)
+        except Exception as error:
+            raise RenderingError(
+                f"no OpenGL context through {backend} ({error}); run 'marsyard doctor' to see what is missing"
+            ) from error
+        _draw_single_sampled(self._offscreen._renderer)
+        self._flags = pyrender.RenderFlags.DEPTH_ONLY
+        self._pyrender = pyrender
+        self._scene: Any = None
+
+    def load(self, mesh: trimesh.Trimesh) -> None:
+        """Makes this mesh (world coordinates) the one that is drawn; the one before is released."""
+        if self._scene is not None:
+            self._scene.clear()
+        # pyrender frees what no scene holds when it next draws
+        primitive = self._pyrender.Primitive(
+            positions=mesh.vertices.view(np.ndarray).astype(np.float32),
+            indices=mesh.faces.view(np.ndarray).astype(np.uint32),
+            mode=self._pyrender.GLTF.TRIANGLES,
+        )
+        self._scene = self._pyrender.Scene()
+        self._scene.add(self._pyrender.Mesh([primitive]))
+
+    def draw(self, view: PinholeView) -> Float32[np.ndarray, "side side"]:
+        """Depth along the view's axis, metres; 0 where there is no ground. Row 0 is the top of the view."""
+        if self._scene is None:
+            raise RenderingError("no mesh has been loaded")
+        # pyrender counts pixels from the corner of the first, whose centre is at 0.5: the middle is at side / 2
+        middle = self.side_px / 2.0
+        camera = self._pyrender.IntrinsicsCamera(
+            view.focal_px, view.focal_px, middle, middle, znear=view.near_m, zfar=view.far_m
+        )
+        node = self._scene.add(camera, pose=view.world_from_view @ _VIEW_FROM_GL)
+        try:
+            depth: Float32[np.ndarray, "side side"] = self._offscreen.render(self._scene, flags=self._flags)
+        finally:
+            self._scene.remove_node(node)
+        return np.ascontiguousarray(depth)
+
+    def description(self) -> str:
+        """Renderer and version strings of OpenGL."""
+        from OpenGL.GL import GL_RENDERER, GL_VERSION, glGetString
+
+        self._offscreen._platform.make_current()
+        return " / ".join(glGetString(name).decode() for name in (GL_RENDERER, GL_VERSION))
+
+    def close(self) -> None:
+        """Releases the context."""
+        self._offscreen.delete()
+
+
+def _import_pyrender(backend: Backend) -> Any:
+    if not __debug__:
+        raise RenderingError("pyrender makes OpenGL calls inside assert statements: run Python without -O")
+    chosen = os.environ.get("PYOPENGL_PLATFORM")
+    if "OpenGL" in sys.modules and chosen != backend:
+        raise RenderingError(
+            f"this process already uses OpenGL through {chosen}; a process can use one backend: "
+            f"start another for {backend}"
+        )
+    os.environ["PYOPENGL_PLATFORM"] = backend
+    try:
+        import pyrender
+    except ImportError as error:
+        raise RenderingError(
+            f"OpenGL through {backend} cannot be loaded ({error}); run 'marsyard doctor' to see what is missing"
+        ) from error
+    return pyrender
+
+
+def _draw_single_sampled(renderer: Any) -> None:
+    """Makes pyrender draw into a buffer with one sample a pixel, at its centre.
+
+    pyrender draws into a buffer with four samples a pixel and reads the depth of one of them, which lies off-centre
+    where the driver honours multisampling (EGL): every picture would be shifted by about (0.125, 0.375) pixel.
+    """
+    configure = renderer._configure_main_framebuffer
+
+    def configure_single_sampled() -> None:
+        from OpenGL import GL
+
+        existing = renderer._main_fb
+        configure()
+        if renderer._main_fb == existing:
+            return
+        size = (renderer.viewport_width, renderer.viewport_height)
+        for buffer, kind in ((renderer._main_cb_ms, GL.GL_RGBA), (renderer._main_db_ms, GL.GL_DEPTH_COMPONENT24)):
+            GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, buffer)
+            GL.glRenderbufferStorage(GL.GL_RENDERBUFFER, kind, *size)
+
+    renderer._configure_main_framebuffer = configure_single_sampled

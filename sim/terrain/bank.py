@@ -1,0 +1,85 @@
+"""The terrains that a campaign draws from, built once and shared by its workers through the disk."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from sim.cache import cache_directory
+from sim.terrain import kernels, surface, synthesis
+from sim.terrain.surface import SMALLEST_LEVEL, Surface
+from sim.terrain.synthesis import TerrainParameters, synthesise
+
+
+@cache
+def _code_version() -> str:
+    """Hash of the code that makes a terrain: a change of it makes cached terrains unknown, never wrong."""
+    digest = hashlib.sha256(np.__version__.encode())
+    for module in (kernels, surface, synthesis):
+        digest.update(Path(str(module.__file__)).read_bytes())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class TerrainBank:
+    """Numbered terrains of one kind.
+
+    Terrain k is a pure function of the parameters, the seed and k. On disk it is one array of all levels, memory-mapped
+    by every worker that uses it, so workers share its pages.
+    """
+
+    parameters: TerrainParameters
+    seed: int
+
+    def terrain(self, number: int) -> Surface:
+        """Terrain `number`, from the disk if it is there, otherwise built and kept."""
+        path = self._path(number)
+        if not self._is_whole(path):
+            self._build(number, path)
+        return self._read(path)
+
+    def _path(self, number: int) -> Path:
+        identity = f"{self.parameters.model_dump_json()} {self.seed} {number} {_code_version()}"
+        return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
+
+    def _build(self, number: int, path: Path) -> None:
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))
+        built = synthesise(self.parameters, rng)
+        # Written aside and moved into place, so that neither an interruption nor a second builder leaves half a file.
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
+            try:
+                np.save(part, np.concatenate([level.reshape(-1) for level in built.levels]))
+                part.close()
+                Path(part.name).replace(path)
+            except BaseException:
+                Path(part.name).unlink(missing_ok=True)
+                raise
+
+    def _sides(self) -> list[int]:
+        sides = [self.parameters.samples]
+        while sides[-1] > SMALLEST_LEVEL:
+            sides.append(sides[-1] // 2)
+        return sides
+
+    def _is_whole(self, path: Path) -> bool:
+        if not path.exists():
+            return False
+        try:
+            size = int(np.load(path, mmap_mode="r").size)
+        except (ValueError, EOFError):
+            return False
+        return size == 2 * sum(side**2 for side in self._sides())
+
+    def _read(self, path: Path) -> Surface:
+        flat = np.load(path, mmap_mode="r").view(np.ndarray)
+        levels, start = [], 0
+        for side in self._sides():
+            stop = start + 2 * side**2
+            levels.append(flat[start:stop].reshape(side, side, 2))
+            start = stop
+        return Surface(tuple(levels), self.parameters.spacing_m)

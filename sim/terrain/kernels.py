@@ -1,0 +1,142 @@
+"""Compiled kernels of the terrain: cubic B-spline evaluation, pyramid reduction, crater stamping."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+#: A level of the pyramid, shape (side, side, 2): height and albedo; side is a power of two.
+Level = NDArray[np.float32]
+Array = NDArray[np.float64]
+Eight = tuple[float, float, float, float, float, float, float, float]
+
+
+@njit(cache=True, inline="always")
+def bspline_weights(t: float) -> Eight:
+    """Weights of the four control values around a point at fraction t of its cell, and their derivatives."""
+    s = 1.0 - t
+    t2 = t * t
+    s2 = s * s
+    w0 = s2 * s / 6.0
+    w3 = t2 * t / 6.0
+    w1 = (2.0 / 3.0) - 0.5 * t2 * (2.0 - t)
+    w2 = 1.0 - w0 - w1 - w3
+    d0 = -0.5 * s2
+    d3 = 0.5 * t2
+    d1 = t * (1.5 * t - 2.0)
+    d2 = -d0 - d1 - d3
+    return w0, w1, w2, w3, d0, d1, d2, d3
+
+
+@njit(cache=True, inline="always")
+def sample(field: Level, inverse_spacing: float, x: float, y: float) -> tuple[float, float, float, float]:
+    """Height, its slopes along x and y, and albedo of one level at one place."""
+    side = field.shape[0]
+    mask = side - 1
+    gx = x * inverse_spacing
+    gy = y * inverse_spacing
+    fx = math.floor(gx)
+    fy = math.floor(gy)
+    j = int(fx)
+    i = int(fy)
+    wx0, wx1, wx2, wx3, dx0, dx1, dx2, dx3 = bspline_weights(gx - fx)
+    wy = bspline_weights(gy - fy)
+    j0 = (j - 1) & mask
+    j1 = j & mask
+    j2 = (j + 1) & mask
+    j3 = (j + 2) & mask
+    height = 0.0
+    slope_x = 0.0
+    slope_y = 0.0
+    albedo = 0.0
+    for k in range(4):
+        row = field[(i + k - 1) & mask]
+        h0 = row[j0, 0]
+        h1 = row[j1, 0]
+        h2 = row[j2, 0]
+        h3 = row[j3, 0]
+        across = wx0 * h0 + wx1 * h1 + wx2 * h2 + wx3 * h3
+        height += wy[k] * across
+        slope_y += wy[k + 4] * across
+        slope_x += wy[k] * (dx0 * h0 + dx1 * h1 + dx2 * h2 + dx3 * h3)
+        albedo += wy[k] * (wx0 * row[j0, 1] + wx1 * row[j1, 1] + wx2 * row[j2, 1] + wx3 * row[j3, 1])
+    return height, slope_x * inverse_spacing, slope_y * inverse_spacing, albedo
+
+
+@njit(cache=True)
+def evaluate_field(field: Level, spacing: float, x: Array, y: Array) -> Array:
+    """Height, slopes and albedo at many places; shape (n, 4)."""
+    out = np.empty((x.size, 4), dtype=np.float64)
+    inverse_spacing = 1.0 / spacing
+    for n in range(x.size):
+        height, slope_x, slope_y, albedo = sample(field, inverse_spacing, x[n], y[n])
+        out[n, 0] = height
+        out[n, 1] = slope_x
+        out[n, 2] = slope_y
+        out[n, 3] = albedo
+    return out
+
+
+@njit(cache=True)
+def reduce_level(fine: Level) -> Level:
+    """The next coarser level: binomial (1 4 6 4 1)/16 along both axes, every second sample kept, periodic."""
+    side = fine.shape[0]
+    half = side // 2
+    mask = side - 1
+    weights = np.array([1.0, 4.0, 6.0, 4.0, 1.0], dtype=np.float32) / np.float32(16.0)
+    narrow = np.zeros((side, half, 2), dtype=np.float32)
+    for i in range(side):
+        for j in range(half):
+            for k in range(5):
+                source = (2 * j + k - 2) & mask
+                for c in range(2):
+                    narrow[i, j, c] += weights[k] * fine[i, source, c]
+    coarse = np.zeros((half, half, 2), dtype=np.float32)
+    for i in range(half):
+        for k in range(5):
+            source = (2 * i + k - 2) & mask
+            for j in range(half):
+                for c in range(2):
+                    coarse[i, j, c] += weights[k] * narrow[source, j, c]
+    return coarse
+
+
+@njit(cache=True)
+def stamp_craters(
+    height: NDArray[np.floating], spacing: float, craters: Array, rim_fraction: float, ejecta_reach: float
+) -> None:
+    """Adds bowls, rims and ejecta to a periodic height map, in place and in order.
+
+    `craters` has rows (x, y, radius, depth, softness), metres and a share. The bowl is a paraboloid, the ejecta blanket
+    falls off with the cube of the distance (McGetchin et al. 1973) and is brought to zero at `ejecta_reach` radii.
+    Where they meet at the rim the lower of the two is taken, rounded over a height of `softness * depth`: a fresh rim
+    is sharp, a degraded one round.
+    """
+    side = height.shape[0]
+    mask = side - 1
+    for n in range(craters.shape[0]):
+        x, y, radius, depth, softness = craters[n]
+        rim = rim_fraction * depth
+        rounding = softness * depth
+        reach = ejecta_reach * radius
+        first_i = math.ceil((y - reach) / spacing)
+        last_i = math.floor((y + reach) / spacing)
+        first_j = math.ceil((x - reach) / spacing)
+        last_j = math.floor((x + reach) / spacing)
+        for i in range(first_i, last_i + 1):
+            dy = i * spacing - y
+            for j in range(first_j, last_j + 1):
+                dx = j * spacing - x
+                r = math.sqrt(dx * dx + dy * dy) / radius
+                if r >= ejecta_reach:
+                    continue
+                bowl = (rim + depth) * r * r - depth
+                outside = max(r, 0.5)
+                fade = min((ejecta_reach - r) / (ejecta_reach - 1.0), 1.0)
+                blanket = rim / (outside * outside * outside) * fade
+                overlap = max(rounding - abs(bowl - blanket), 0.0)
+                change = min(bowl, blanket) - overlap * overlap / (4.0 * max(rounding, 1e-9))
+                height[i & mask, j & mask] += change

@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from sim.terrain import Surface
+
+
+@pytest.fixture(scope="module")
+def surface() -> Surface:
+    samples = np.random.default_rng(5).normal(size=(64, 64, 2)).astype(np.float32)
+    return Surface.from_samples(samples, spacing_m=3.0)
+
+
+@pytest.fixture(scope="module")
+def places() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(6)
+    # several periods to either side: the ground repeats
+    return rng.uniform(-500.0, 500.0, 400), rng.uniform(-500.0, 500.0, 400)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_is_the_cubic_b_spline_that_scipy_evaluates(surface, places, level) -> None:
+    x, y = places
+    spacing = surface.spacing_m * 2**level
+    for channel, ours in ((0, surface.height(x, y, level)), (1, surface.albedo(x, y, level))):
+        control = surface.levels[level][..., channel].astype(np.float64)
+        theirs = map_coordinates(control, [y / spacing, x / spacing], order=3, mode="grid-wrap", prefilter=False)
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+
+
+def test_gradient_is_the_derivative_of_height(surface, places) -> None:
+    x, y = places
+    # central differences of a piecewise cubic: the error is h^2/6 times a third derivative of order 1
+    step = 1e-4
+    along_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
+    along_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
+    np.testing.assert_allclose(surface.gradient(x, y), np.stack([along_x, along_y], axis=-1), atol=1e-7)
+
+
+def test_repeats_with_its_period(surface, places) -> None:
+    x, y = places
+    np.testing.assert_allclose(
+        surface.height(x + surface.period_m, y - 2 * surface.period_m), surface.height(x, y), atol=1e-11
+    )
+
+
+def test_levels_of_a_smooth_ground_agree_in_place() -> None:
+    """A long wave keeps its phase on every level: levels are not shifted against each other."""
+    side, spacing = 256, 2.0
+    period = side * spacing
+    x = np.arange(side) * spacing
+    samples = np.zeros((side, side, 2), dtype=np.float32)
+    samples[..., 0] = np.sin(2 * np.pi * x / period)[None, :] + np.cos(2 * np.pi * x / period)[:, None]
+    surface = Surface.from_samples(samples, spacing)
+    t = np.linspace(0.0, period, 512, endpoint=False)
+    for level in range(len(surface.levels) - 1):
+        wave = surface.height(t, np.zeros_like(t), level)
+        phase = np.angle(np.sum(wave * np.exp(-2j * np.pi * t / period))) + np.pi / 2
+        assert abs(phase) < 1e-5, f"level {level}"
+
+
+@pytest.mark.parametrize("shape", [(8, 8, 2), (48, 48, 2), (64, 32, 2)])
+def test_refuses_shapes_it_cannot_halve(shape) -> None:
+    with pytest.raises(ValueError, match="power of two"):
+        Surface.from_samples(np.zeros(shape, dtype=np.float32), 1.0)

@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from sim.terrain import TerrainParameters, synthesise
+from sim.terrain.kernels import stamp_craters
+from sim.terrain.synthesis import Spectrum, draw_craters
+
+
+def test_same_stream_same_bytes() -> None:
+    parameters = TerrainParameters(samples=128)
+    first = synthesise(parameters, np.random.default_rng(3))
+    again = synthesise(parameters, np.random.default_rng(3))
+    other = synthesise(parameters, np.random.default_rng(4))
+    for a, b in zip(first.levels, again.levels, strict=True):
+        assert a.tobytes() == b.tobytes()
+    assert first.levels[0].tobytes() != other.levels[0].tobytes()
+
+
+def test_variance_is_as_expected_on_average() -> None:
+    # 200 draws of about ten independent large-scale modes each: the mean variance is good to about 3 %
+    spectrum = Spectrum.power_law(128, 1.0, 0.5, 60.0)
+    variances = [spectrum.field(np.random.default_rng(seed), 2.0).var() for seed in range(200)]
+    assert np.mean(variances) == pytest.approx(4.0, rel=0.04)
+
+
+@pytest.mark.parametrize("hurst", [0.5, 0.8])
+def test_slope_over_the_baseline_and_hurst_exponent(hurst) -> None:
+    """The structure function gives the RMS slope asked for at the baseline, and grows with the Hurst exponent."""
+    parameters = TerrainParameters(
+        samples=1024, hurst=hurst, rms_slope_deg=3.0, slope_baseline_m=30.0, outer_scale_m=20000.0, craters_per_km2=0.0
+    )
+    lags = np.array([4, 8, 20])
+    roughness = np.zeros(3)
+    for seed in range(6):
+        z = synthesise(parameters, np.random.default_rng(seed)).levels[0][..., 0].astype(np.float64)
+        roughness += [
+            np.mean((np.roll(z, -lag, axis=1) - z) ** 2 + (np.roll(z, -lag, axis=0) - z) ** 2) for lag in lags
+        ]
+    rms = np.sqrt(roughness / 12.0)
+    slope_deg = np.degrees(np.arctan(rms[2] / (lags[2] * parameters.spacing_m)))
+    assert slope_deg == pytest.approx(3.0, rel=0.1)
+    measured_hurst = np.polyfit(np.log(lags), np.log(rms), 1)[0]
+    # the band limits of the grid bend the structure function by a few hundredths
+    assert measured_hurst == pytest.approx(hurst, abs=0.05)
+
+
+def test_albedo_has_the_stated_mean_and_contrast() -> None:
+    parameters = TerrainParameters(samples=1024, albedo=0.25, albedo_contrast=0.1, outer_scale_m=200.0)
+    albedo = synthesise(parameters, np.random.default_rng(1)).levels[0][..., 1]
+    assert albedo.mean() == pytest.approx(0.25, rel=0.02)
+    assert np.log(albedo).std() == pytest.approx(0.1, rel=0.1)
+
+
+def test_crater_sizes_follow_the_power_law() -> None:
+    parameters = TerrainParameters(craters_per_km2=200.0, crater_diameter_min_m=10.0, crater_exponent=2.0)
+    area_km2 = (parameters.samples * parameters.spacing_m / 1000.0) ** 2
+    diameters = 2 * draw_craters(parameters, np.random.default_rng(2))[:, 2]
+    expected = 200.0 * area_km2
+    assert diameters.size == pytest.approx(expected, abs=4 * np.sqrt(expected))
+    above = np.count_nonzero(diameters > 20.0)
+    assert above == pytest.approx(expected / 4, abs=4 * np.sqrt(expected / 4))
+    assert diameters.min() >= 10.0
+    assert diameters.max() <= parameters.crater_diameter_max_m
+
+
+def test_a_crater_has_its_depth_rim_and_place_across_the_border() -> None:
+    height = np.zeros((256, 256))
+    radius, depth = 20.0, 8.0
+    # sharp rim; centred on the corner, so that it is cut by the periodic border
+    stamp_craters(height, 1.0, np.array([[0.0, 0.0, radius, depth, 0.0]]), 0.25, 3.0)
+    centred = np.roll(height, (128, 128), axis=(0, 1))
+    assert centred[128, 128] == pytest.approx(-depth)
+    assert np.unravel_index(centred.argmin(), centred.shape) == (128, 128)
+    assert centred[128, 128 + 20] == pytest.approx(0.25 * depth)
+    np.testing.assert_allclose(centred[1:, 1:], centred[1:, 1:][::-1, ::-1], atol=1e-12)
+    assert np.count_nonzero(centred[:, :60]) == 0
+
+
+def test_refuses_crater_sizes_in_the_wrong_order() -> None:
+    parameters = TerrainParameters(samples=64, crater_diameter_min_m=50.0, crater_diameter_max_m=20.0)
+    with pytest.raises(ValueError, match="must be larger than crater_diameter_min_m"):
+        synthesise(parameters, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("wrong", [{"samples": 4}, {"spacing_m": -1.0}, {"hurst": 1.5}, {"relief": 3.0}])
+def test_refuses_impossible_parameters(wrong) -> None:
+    with pytest.raises(ValidationError):
+        TerrainParameters(**wrong)
