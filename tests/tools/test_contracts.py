@@ -1,0 +1,20 @@
+"""The contracts of imports say what they mean to, whatever modules are added."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+#: All that an algorithm may know of the simulated world (docs/architecture.md).
+OPEN_TO_ALGORITHMS = {"sim.frames", "sim.camera", "sim.measurements"}
+
+
+def test_all_of_sim_but_the_flight_interface_is_closed_to_algorithms() -> None:
+    children = [
+        path for path in (ROOT / "sim").iterdir() if path.suffix in ("", ".py") and not path.name.startswith("_")
+    ]
+    modules = {f"sim.{path.stem}" for path in children}
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    closed = next(set(c["forbidden_modules"]) for c in contracts if c["type"] == "forbidden")
+    assert closed == modules - OPEN_TO_ALGORITHMS
