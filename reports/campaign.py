@@ -60,6 +60,7 @@ def page_context(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) ->
         "run": run,
         "description": str(run.said("description") or ""),
         "whole": whole,
+        "cautions": sections.cautions(verdicts, whole),
         "interrupted": run.said("state") not in (None, "finished"),
         "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
         "metric": metric,

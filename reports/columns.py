@@ -52,8 +52,13 @@ def split_unit(column: str) -> tuple[str, str]:
 def label(column: str) -> str:
     """The column in words, with its unit: ``velocity error (m/s)``."""
     name, unit = split_unit(column)
-    words = name.replace("_", " ").replace(".", " ")
-    return f"{words} ({unit})" if unit else words
+    return f"{_words(name)} ({unit})" if unit else _words(name)
+
+
+def magnitude_label(column: str) -> str:
+    """The magnitude of a column in words, with its unit: ``|velocity error| (m/s)``."""
+    name, unit = split_unit(column)
+    return f"|{_words(name)}| ({unit})" if unit else f"|{_words(name)}|"
 
 
 def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
@@ -107,6 +112,10 @@ def category_column(frame: pd.DataFrame) -> str | None:
     names = [name for name in texts if not _BOOKKEEPING.search(name)]
     names += ["terrain"] if "terrain" in frame else []
     return next((name for name in names if 2 <= frame[name].nunique() <= _LARGEST_CATEGORY), None)
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ").replace(".", " ")
 
 
 def _is_number(frame: pd.DataFrame, column: str) -> bool:

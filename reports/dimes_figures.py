@@ -87,7 +87,7 @@ def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
     ValueError
         Where the products do not hold the three pictures; see `is_dimes_case`.
     """
-    figure = Figure(figsize=(12.0, 6.1), layout="constrained")
+    figure = Figure(figsize=(12.0, 4.95), layout="constrained")
     halves = figure.add_gridspec(1, 2)
     for pair in _PAIRS:
         _draw_pair(figure.add_subfigure(halves[pair]), products, pair)
@@ -97,7 +97,7 @@ def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
 @in_page_style
 def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
     """One image pair of a case, 0 or 1; raises as `draw_dimes_case` does."""
-    figure = Figure(figsize=(6.0, 6.1), layout="constrained")
+    figure = Figure(figsize=(6.0, 4.95), layout="constrained")
     _draw_pair(figure, products, pair)
     return figure
 
@@ -105,7 +105,7 @@ def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
 def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> None:
     pictures = [_picture(products, f"image_{number}") for number in (pair + 1, pair + 2)]
     ours = [track for track in tracks(products) if track.pair == pair][:_MOST_TRACKS]
-    grid = figure.add_gridspec(2, 1, height_ratios=(1.0, 2.05))
+    grid = figure.add_gridspec(2, 1, height_ratios=(1.0, 1.95))
     upper = grid[0].subgridspec(1, 2 * _MOST_TRACKS)
     for place in range(_MOST_TRACKS):
         track = ours[place] if place < len(ours) else None
@@ -154,7 +154,7 @@ def _mark(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
         axes.annotate(
             number,
             (u, v - side / 2),
-            xytext=(0, 2),
+            xytext=(0, 3),
             textcoords="offset points",
             ha="center",
             va="bottom",
@@ -162,6 +162,7 @@ def _mark(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
             fontsize=9,
             fontweight="bold",
             annotation_clip=True,
+            bbox={"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0},
         )
 
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
-from reports.columns import axis_columns, category_column, label, numbers, rank_correlation, split_unit
+from reports.columns import axis_columns, category_column, label, magnitude_label, numbers, split_unit
 from reports.svg import (
     INK,
     LARGEST_VECTOR_SAMPLE,
@@ -91,7 +91,9 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
     if bound is not None:
         axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
         if bound <= reach:
-            _note(axes, 0.0, bound, f"requirement {bound:g} {split_unit(metric)[1]}")
+            text = f"requirement {bound:g} {split_unit(metric)[1]}"
+            place = (0.0, 1.02 * bound)
+            axes.annotate(text, place, ha="center", va="bottom", color=INK, fontsize=9, backgroundcolor="none")
     _cross(axes)
     axes.set(xlim=(-reach * 1.04, reach * 1.04), ylim=(-reach * 1.04, reach * 1.04), aspect="equal")
     axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))
@@ -119,11 +121,12 @@ def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Fi
     magnitude, edge = _magnitudes(frame, metric, bound)
     if magnitude.size == 0:
         return None
-    figure, axes = new_axes(5.0, 3.4)
-    bins = np.linspace(0.0, edge, 1 + int(np.clip(2 * math.sqrt(magnitude.size), 10, 60)))
-    axes.hist(np.minimum(magnitude, edge), bins=list(bins), color=SERIES[0], alpha=0.85)
-    _bound_line(axes, metric, bound)
-    axes.set(xlabel=f"|{label(metric)}|", ylabel="cases", xlim=(0.0, edge * 1.02))
+    figure, axes = new_axes(5.0, 2.7)
+    drawn = np.minimum(magnitude, edge)
+    bins = np.linspace(0.0, float(drawn.max()) or 1.0, 1 + int(np.clip(2 * math.sqrt(drawn.size), 6, 60)))
+    axes.hist(drawn, bins=list(bins), color=SERIES[0], alpha=0.85)
+    _bound_line(axes, metric, bound, 0.98)
+    axes.set(xlabel=magnitude_label(metric), ylabel="cases", xlim=(0.0, edge * 1.02))
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
 
@@ -134,15 +137,15 @@ def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) ->
     magnitude, edge = _magnitudes(frame, metric, bound)
     if magnitude.size == 0:
         return None
-    figure, axes = new_axes(5.0, 3.4)
+    figure, axes = new_axes(5.0, 2.7)
     ordered = np.sort(magnitude)
     if ordered.size > 2000:  # the steps are finer than the line is wide
         ordered = np.quantile(ordered, np.linspace(0.0, 1.0, 2000))
     share = np.arange(1, ordered.size + 1) / ordered.size
     steps = np.concatenate([[0.0], ordered, [max(edge, float(ordered[-1]))]])
     axes.plot(steps, np.concatenate([[0.0], share, [1.0]]), drawstyle="steps-post", color=SERIES[0], linewidth=1.8)
-    _bound_line(axes, metric, bound)
-    axes.set(xlabel=f"|{label(metric)}|", ylabel="fraction of cases with an error", xlim=(0.0, edge * 1.02))
+    _bound_line(axes, metric, bound, 0.1)
+    axes.set(xlabel=magnitude_label(metric), ylabel="fraction of cases with an error", xlim=(0.0, edge * 1.02))
     axes.set_ylim(0.0, 1.03)
     return figure
 
@@ -167,9 +170,7 @@ def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | 
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
     raster = bool(silent.sum() > LARGEST_VECTOR_SAMPLE)
     axes.plot(x[silent], np.full(silent.sum(), top), "|", color=INK, markersize=9, clip_on=False, rasterized=raster)
-    correlation = rank_correlation(x, magnitude)
-    axes.set_title("" if math.isnan(correlation) else f"rank correlation {correlation:+.2f}", fontweight="normal")
-    axes.set(xlabel=label(driver), ylabel=f"|{label(metric)}|", ylim=(0.0, top))
+    axes.set(xlabel=label(driver), ylabel=magnitude_label(metric), ylim=(0.0, top))
     return figure
 
 
@@ -189,7 +190,9 @@ def outcome_bars(frame: pd.DataFrame) -> Figure | None:
         else:
             styles = {"color": "none", "edgecolor": SERIES[1], "hatch": "////"}
         axes.barh(place, count, height=0.66, **styles)
-        axes.annotate(f" {count:,}", (count, place), va="center", color=INK, fontsize=9)
+        axes.annotate(
+            f"{count:,}", (count, place), xytext=(4, 0), textcoords="offset points", va="center", color=INK, fontsize=9
+        )
     axes.set_yticks(range(len(counts)), [name for name, _ in counts])
     axes.set(xlabel="cases", xlim=(0.0, 1.12 * max(count for _, count in counts)))
     axes.invert_yaxis()
@@ -233,18 +236,22 @@ def _draw_points(axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " 
     )
 
 
-def _bound_line(axes: Axes, metric: str, bound: float | None) -> None:
+def _bound_line(axes: Axes, metric: str, bound: float | None, height: float) -> None:
+    """The requirement, with its name at a height in fractions of the axes."""
     if bound is None:
         return
     axes.axvline(bound, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3)
-    place = {"xy": (bound, 1.0), "xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
-    text = f"requirement {bound:g} {split_unit(metric)[1]}"
-    axes.annotate(text, xytext=(-5, -3), ha="right", va="top", color=INK, fontsize=9, **place)  # type: ignore[arg-type]
-
-
-def _note(axes: Axes, x: float, y: float, text: str) -> None:
-    place = {"xytext": (0, 4), "textcoords": "offset points"}
-    axes.annotate(text, (x, y), ha="center", va="bottom", color=INK, fontsize=9, **place)  # type: ignore[arg-type]
+    axes.annotate(
+        f"requirement {bound:g} {split_unit(metric)[1]}",
+        (bound, height),
+        xycoords=("data", "axes fraction"),
+        xytext=(-5, 0),
+        textcoords="offset points",
+        ha="right",
+        va="top",
+        color=INK,
+        fontsize=9,
+    )
 
 
 def _cross(axes: Axes) -> None:

@@ -10,7 +10,7 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from reports.columns import driver_columns, label
+from reports.columns import driver_columns, label, numbers, rank_correlation
 from reports.dimes_figures import Track, draw_dimes_pair, is_dimes_case, tracks
 from reports.figures import (
     error_against,
@@ -77,7 +77,16 @@ def error_plates(frame: pd.DataFrame, metric: str, bound: float | None) -> list[
 def driver_plates(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Plate]:
     """A metric against what may drive it."""
     drivers = enumerate(driver_columns(frame, metric))
-    return _plates([(f"driver{k}", error_against(frame, metric, name, bound), label(name)) for k, name in drivers])
+    return _plates(
+        [(f"driver{k}", error_against(frame, metric, d, bound), _ranks(frame, metric, d)) for k, d in drivers]
+    )
+
+
+def _ranks(frame: pd.DataFrame, metric: str, driver: str) -> str:
+    correlation = rank_correlation(numbers(frame, driver), np.abs(numbers(frame, metric)))
+    if np.isnan(correlation):
+        return f"{label(driver)}."
+    return f"{label(driver)}: rank correlation {number(correlation)}."
 
 
 def outcome_plates(frame: pd.DataFrame) -> list[Plate]:

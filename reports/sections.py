@@ -14,7 +14,7 @@ import pandas as pd
 from reports.columns import axis_columns, driver_columns, label, numbers
 from reports.stored import StoredRun, table
 from reports.tables import error_summaries, outcome_counts, statistics_rows
-from reports.verdicts import ENGINE_FAILURES, Verdict, members
+from reports.verdicts import Overall, Verdict, members
 from reports.wording import NOTHING, count, number, percent, stated
 
 #: Rows of the tables of single cases; the rows that are left out are counted.
@@ -38,7 +38,7 @@ class VerdictRow:
 
     verdict: Verdict
     asked: str
-    evidence: str
+    evidence: Sequence[str]
     bounds: str
     further: str
     strip: Strip | None
@@ -82,7 +82,7 @@ def verdict_row(verdict: Verdict) -> VerdictRow:
     )
     bounds = NOTHING if verdict.n == 0 else f"{percent(verdict.lower)} to {percent(verdict.upper)}"
     further = NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}"
-    evidence = f"{count(verdict.n, 'case')}, {verdict.failures:,} failed"
+    evidence = [count(verdict.n, "case"), f"{verdict.failures:,} failed"]
     return VerdictRow(verdict, asked, evidence, bounds, further, _strip(verdict))
 
 
@@ -94,6 +94,19 @@ def _strip(verdict: Verdict) -> Strip | None:
     scale = 100.0 / max(1.0 - left, 1e-12)
     places = [scale * (value - left) for value in (verdict.lower, verdict.upper, verdict.estimate, verdict.probability)]
     return Strip(f"{100.0 * left:.3g} %", *places)
+
+
+def cautions(verdicts: Sequence[Verdict], whole: Overall) -> list[str]:
+    """What the headline alone would hide: crashed cases, and verdicts that shared terrains put in question."""
+    said = []
+    if whole.crashed:
+        said.append(f"{count(whole.crashed, 'case')} crashed: the campaign is not in order, whatever its verdict.")
+    changed = [verdict for verdict in verdicts if verdict.clustered_status not in (None, verdict.status)]
+    return said + [
+        f"{verdict.requirement_id} is {verdict.status} only if cases on one terrain are independent; allowing for "
+        f"{count(verdict.terrains or 0, 'shared terrain')} it is {verdict.clustered_status}."
+        for verdict in changed
+    ]
 
 
 def statistics_grid(frame: pd.DataFrame, metric: str) -> Grid:
@@ -231,8 +244,8 @@ def _text(frame: pd.DataFrame, column: str, index: int) -> str:
 def _plain(value: object) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{name}={inner}" for name, inner in value.items())
-    if isinstance(value, float | np.floating) and not float(value).is_integer():
-        return number(float(value))
+    if isinstance(value, float | np.floating):
+        return f"{value:.0f}" if float(value).is_integer() else number(float(value))
     return str(value)
 
 
@@ -271,8 +284,3 @@ def _only_values(frame: pd.DataFrame, column: str) -> str | None:
     if column not in frame:
         return None
     return "; ".join(str(value) for value in frame[column].dropna().unique()[:3])
-
-
-def engine_failures(frame: pd.DataFrame) -> list[str]:
-    """Names of the engine's failures among the outcomes."""
-    return [name for name, _ in outcome_counts(frame) if name in ENGINE_FAILURES]

@@ -86,7 +86,7 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
     """Rows of a table of statistics: the statistic's name, then its value in each summary."""
     if not summaries:
         return []
-    confidence = f"{summaries[0].confidence:.0%}"
+    confidence = stated(summaries[0].confidence)
     rows = [
         ["cases", *(str(s.n) for s in summaries)],
         ["mean", *(number(s.mean) for s in summaries)],
@@ -96,7 +96,7 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
         ["root mean square", *(number(s.rms) for s in summaries)],
     ]
     for index, quantile in enumerate(summaries[0].quantiles):
-        name = "median" if quantile.probability == 0.5 else f"{quantile.probability:.0%} quantile"
+        name = "median" if quantile.probability == 0.5 else f"{stated(quantile.probability)} quantile"
         of_each = [summary.quantiles[index] for summary in summaries]
         rows.append([name, *(number(q.estimate) for q in of_each)])
         rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in of_each)])

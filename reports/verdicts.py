@@ -112,7 +112,7 @@ class Verdict:
             return ""
         shared = self.clustered
         return (
-            f"{count(self.n, 'case')} share {count(shared.terrains, 'terrain')} and so are not independent, as the "
+            f"{count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} and so are not independent, as the "
             f"verdict takes them to be. Allowing for that ({shared.method}, effective n {shared.effective_n:.4g}), the "
             f"success rate is at least {percent(shared.lower)} at {stated(self.confidence)} confidence: "
             f"{self.clustered_status}."
@@ -154,7 +154,7 @@ def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame) -> Overall:
         Status.FAIL: f"{statuses.count(Status.FAIL)} of {count(len(statuses), 'requirement')} not met.",
         Status.INSUFFICIENT: (
             f"{statuses.count(Status.INSUFFICIENT)} of {count(len(statuses), 'requirement')} "
-            f"cannot be decided by {count(len(frame), 'case')}."
+            f"cannot be decided by {count(len(frame), 'case')}.{_further(verdicts)}"
         ),
     }[worst]
     return Overall(worst, crashed, sentence + tail)
@@ -303,3 +303,9 @@ def _number(value: object) -> float:
 
 def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + "."
+
+
+def _further(verdicts: Sequence[Verdict]) -> str:
+    """How many cases would decide what is open, where that can be said."""
+    needed = [verdict.further_cases for verdict in verdicts if verdict.further_cases is not None]
+    return f" {count(max(needed), 'further case')} would do if no more fail." if needed else ""

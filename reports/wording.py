@@ -16,6 +16,10 @@ def number(value: float) -> str:
     """
     if math.isnan(value):
         return NOTHING
+    return _digits(value).replace("-", "−")
+
+
+def _digits(value: float) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else "-∞"
     magnitude = abs(value)
@@ -25,9 +29,12 @@ def number(value: float) -> str:
 
 
 def interval(lower: float, upper: float) -> str:
-    """Two bounds; a dash on the side where the sample is too small to give one."""
-    sides = (NOTHING if not math.isfinite(bound) else number(bound) for bound in (lower, upper))
-    return " to ".join(sides) if math.isfinite(lower) or math.isfinite(upper) else NOTHING
+    """Two bounds; one alone, or a dash, where the sample is too small to give both."""
+    if math.isfinite(lower) and math.isfinite(upper):
+        return f"{number(lower)} to {number(upper)}"
+    if math.isfinite(lower):
+        return f"≥ {number(lower)}"
+    return f"≤ {number(upper)}" if math.isfinite(upper) else NOTHING
 
 
 def percent(fraction: float) -> str:
