@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -38,9 +39,14 @@ def _outline(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, np.ndarray):
         if value.dtype.hasobject:
             raise TypeError(f"{path} is an array of objects; only numbers and texts are stored")
-        arrays[path] = value
-        return {_ARRAY: path}
+        name = re.sub(r"[^A-Za-z0-9_.-]", "_", path)
+        while name in arrays:
+            name += "_"
+        arrays[name] = value
+        return {_ARRAY: name}
     if isinstance(value, Mapping):
+        if _ARRAY in value:
+            raise TypeError(f"{path} has a key {_ARRAY}, which is taken")
         return {str(name): _outline(inner, f"{path}.{name}", arrays) for name, inner in value.items()}
     if isinstance(value, list | tuple):
         return [_outline(inner, f"{path}.{place}", arrays) for place, inner in enumerate(value)]

@@ -14,7 +14,7 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -137,9 +137,9 @@ class _Worker:
         self._executor.shutdown(wait=False)
         self._executor = self._start()
 
-    def stop(self, *, kill: bool, join: bool) -> None:
-        """Ends the process."""
-        self._executor.shutdown(wait=join, kill_workers=kill)
+    def stop(self, *, kill: bool) -> None:
+        """Ends the process and waits until it is gone."""
+        self._executor.shutdown(wait=True, kill_workers=kill)
 
 
 class Workers:
@@ -156,8 +156,8 @@ class Workers:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         kill = kind is not None
-        for worker in self._workers:
-            worker.stop(kill=kill, join=False)
+        with ThreadPoolExecutor(len(self._workers)) as pool:
+            list(pool.map(lambda worker: worker.stop(kill=kill), self._workers))
         self._folder.cleanup()
 
     def run(self, task: Callable[[int], Result], items: Iterable[int]) -> Iterator[Done[Result]]:

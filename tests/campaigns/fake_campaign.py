@@ -1,0 +1,63 @@
+"""A campaign of the fake scenario, written to a file as a user writes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+HEAD = """
+name = "fake"
+scenario = "fake_scenario:FakeScenario"
+description = "a campaign without a world"
+cases = 12
+seed = 5
+"""
+DISPERSIONS = """
+[dispersions]
+"wind.east_m_s" = {distribution = "uniform", low = -30, high = 30, source = "test"}
+altitude_m = {distribution = "normal", mean = 2000, sd = 100, truncate = [1700, 2200]}
+terrain = {distribution = "integer", low = 0, high = 3}
+kind = {distribution = "choice", values = ["rough", "plain"], weights = [1, 3]}
+"heights_m.1" = {distribution = "normal", mean = 3, sd = 1}
+"""
+REQUIREMENT = """
+[[requirements]]
+id = "velocity"
+statement = "the error is small"
+metric = "velocity_error_m_s"
+bound = 5.0
+probability = 0.99
+confidence = 0.9
+"""
+
+
+def write_campaign(
+    folder: Path,
+    parameters: str = "",
+    *,
+    head: str = HEAD,
+    dispersions: str = DISPERSIONS,
+    requirement: str = REQUIREMENT,
+    more: str = "",
+) -> Path:
+    path = folder / "fake.toml"
+    path.write_text(f"{head}\n[parameters]\n{parameters}\n{dispersions}\n{requirement}\n{more}\n")
+    return path
+
+
+class Silence:
+    """A watch that only keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.steps: dict[str, int] = {}
+        self._stage = ""
+
+    def begin(self, stage: str, total: int) -> None:
+        self._stage = stage
+        self.steps[stage] = 0
+
+    def step(self) -> None:
+        self.steps[self._stage] += 1
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)

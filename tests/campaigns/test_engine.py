@@ -1,0 +1,257 @@
+"""Campaigns run to their end whatever their cases do, and give the same rows however they are run."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from fake_campaign import Silence, write_campaign
+
+from campaigns import record
+from campaigns.engine import run_campaign, showcase_case
+from campaigns.errors import CampaignError, ConfigurationError, StoreError
+from campaigns.loading import load_campaign
+from campaigns.products import load_products
+from campaigns.replay import differing_columns, replay
+from campaigns.store import read_rows
+
+CampaignFile = Callable[..., Path]
+TROUBLE = "raising_cases = [3]\naborting_cases = [5, 6]\nsilent_cases = [2]"
+
+pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
+
+
+def rows_of(directory: Path) -> list[Mapping[str, Any]]:
+    return read_rows(directory / "cases.parquet")
+
+
+def run(path: Path, directory: Path, watch: Silence, *overrides: str, jobs: int = 2) -> Path:
+    run_campaign(load_campaign(str(path), overrides), directory, jobs, watch)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def troubled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign in which one case raises, two abort their process and one has no answer; to be left as it is."""
+    folder = tmp_path_factory.mktemp("campaign")
+    return run(write_campaign(folder, TROUBLE), folder / "troubled", Silence())
+
+
+def test_a_troubled_campaign_comes_to_its_end(
+    troubled: Path, campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+) -> None:
+    rows = rows_of(troubled)
+    assert [row["case"] for row in rows] == list(range(12))
+    outcomes = [row["outcome"] for row in rows]
+    assert [case for case, outcome in enumerate(outcomes) if outcome == "CRASHED"] == [3, 5, 6]
+    assert outcomes[2] == "SILENT"
+    assert not rows[2]["answered"]
+    assert rows[3]["error"] == "ZeroDivisionError: case 3 of <object object at 0x...>"
+    assert "in run" in rows[3]["traceback"]
+    assert rows[5]["error"] == "WorkerDiedError: the worker process died: SIGABRT (-6)"
+    assert "fake_scenario.py" in rows[5]["traceback"]
+    # One worker, and a rerun of any case alone, give the same rows; healthy cases do not notice the others.
+    single = rows_of(run(campaign_file(TROUBLE), tmp_path / "single", watch, jobs=1))
+    assert [differing_columns(row, other) for row, other in zip(rows, single, strict=True)] == [()] * 12
+    healthy = rows_of(run(campaign_file("silent_cases = [2]"), tmp_path / "healthy", watch))
+    for case in (0, 1, 2, 4, 7, 8, 9, 10, 11):
+        assert differing_columns(rows[case], healthy[case]) == ()
+    for case in (3, 5, 7):
+        replayed = replay(troubled, case)
+        assert replayed.stored is not None
+        assert replayed.differing == ()
+    assert watch.notes == []
+
+
+def test_the_table_keeps_types_and_nan(troubled: Path) -> None:
+    schema = pq.read_schema(troubled / "cases.parquet")
+    kinds = {name: str(schema.field(name).type) for name in schema.names}
+    assert list(kinds)[:3] == ["case", "outcome", "answered"]
+    assert list(kinds)[-4:] == ["wall_time_s", "cpu_time_s", "error", "traceback"]
+    expected = {"case": "int64", "answered": "bool", "velocity_error_m_s": "double", "terrain": "int64"}
+    assert expected.items() <= kinds.items()
+    assert (kinds["kind"], kinds["clear"], kinds["wall_time_s"]) == ("string", "bool", "double")
+    frame = pd.read_parquet(troubled / "cases.parquet")
+    assert frame["velocity_error_m_s"].isna().tolist() == [case in (2, 3, 5, 6) for case in range(12)]
+    assert pq.read_table(troubled / "cases.parquet")["velocity_error_m_s"].null_count == 0
+    assert frame["error"][0] == ""
+
+
+def test_the_record_says_what_was_run(troubled: Path) -> None:
+    stored = record.read(troubled)
+    assert (stored["schema"], stored["state"], stored["exit_code"]) == (1, "finished", None)
+    assert (stored["cases_finished"], stored["cases_crashed"], stored["seed"]) == (12, 3, 5)
+    assert stored["configuration"]["parameters"]["lowest_altitude_m"] == 0.0
+    assert stored["configuration"]["dispersions"]["wind.east_m_s"]["source"] == "test"
+    assert stored["requirements"][0]["population"] == "all"
+    assert stored["versions"]["numpy"] == np.__version__
+    assert {"python", "platform", "processor", "processor_features"} <= set(stored["environment"])
+    assert stored["started_utc"] <= stored["finished_utc"]
+    assert sorted(path.name for path in troubled.iterdir()) == ["campaign.json", "cases", "cases.parquet"]
+
+
+def test_the_worst_answered_case_is_kept_for_show(troubled: Path) -> None:
+    rows = rows_of(troubled)
+    worst = max((row for row in rows if row["answered"]), key=lambda row: row["velocity_error_m_s"])["case"]
+    assert record.read(troubled)["showcase"] == worst
+    kept = troubled / "cases" / str(worst)
+    assert differing_columns(json.loads((kept / "row.json").read_text()), rows[worst]) == ()
+    products = load_products(kept)
+    assert products["picture"].dtype == np.uint16
+    assert products["picture"].tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert np.array_equal(products["nested"][0]["x"], np.eye(2))
+    assert products["title"] == "a"
+
+
+def test_which_case_is_shown(campaign_file: CampaignFile) -> None:
+    rows: list[dict[str, Any]] = [
+        {"case": 0, "outcome": "CRASHED", "answered": False},
+        {"case": 1, "outcome": "SILENT", "answered": False, "velocity_error_m_s": math.nan},
+        {"case": 2, "outcome": "VALID", "answered": True, "velocity_error_m_s": 1.0},
+        {"case": 3, "outcome": "VALID", "answered": True, "velocity_error_m_s": -2.0},
+    ]
+    worst = load_campaign(str(campaign_file())).configuration
+    first = load_campaign(str(campaign_file()), ["retain.showcase=first"]).configuration
+    none = load_campaign(str(campaign_file()), ["retain.showcase=none"]).configuration
+    unasked = load_campaign(str(campaign_file(requirement=""))).configuration
+    assert [showcase_case(asked, rows) for asked in (worst, first, none, unasked)] == [3, 1, None, 1]
+    assert showcase_case(worst, rows[:2]) == 1
+    assert showcase_case(worst, rows[:1]) is None
+
+
+def test_products_that_cannot_be_kept_stop_nothing(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> None:
+    directory = run(campaign_file(), tmp_path / "run", watch, "products=bad", "cases=2", jobs=1)
+    assert record.read(directory)["state"] == "finished"
+    assert "products.thing is a object; allowed" in watch.notes[0]
+
+
+def test_threads_and_hashes_are_pinned_in_workers(troubled: Path) -> None:
+    rows = [row for row in rows_of(troubled) if row["outcome"] != "CRASHED"]
+    assert {row["threads"] for row in rows} == {"1"}
+    assert len({row["hash_of_text"] for row in rows}) == 1
+
+
+def test_shared_inputs_are_prepared_once(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> None:
+    stated = f"shared = 3\ncache = '{tmp_path}'"
+    run(campaign_file(stated), tmp_path / "run", watch, "cases=1", "retain.showcase=none")
+    assert len(list(tmp_path.glob("shared-*"))) == 3
+    assert watch.steps == {"preparing": 3, "cases": 1}
+
+
+def test_shared_inputs_that_fail_are_noted(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> None:
+    run(campaign_file("shared = 1\nfail_prepare = true"), tmp_path / "run", watch, "cases=1", jobs=1)
+    note = "shared input 0 could not be prepared: OSError: no room for the terrain"
+    assert watch.notes == [note]
+
+
+def test_a_folder_with_a_campaign_is_refused(
+    campaign_file: CampaignFile, troubled: Path, tmp_path: Path, watch: Silence
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in troubled.rglob("*")}
+    with pytest.raises(StoreError, match="already holds a campaign"):
+        run(campaign_file(), troubled, watch)
+    assert {path: path.stat().st_mtime_ns for path in troubled.rglob("*")} == before
+    for name in ("report.html", "cases.sqlite"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).touch()
+        with pytest.raises(StoreError, match=name):
+            run(campaign_file(), tmp_path / name, watch)
+    with pytest.raises(StoreError, match="cannot be written"):
+        run(campaign_file(), tmp_path / "fake.toml" / "run", watch)
+
+
+def test_a_metric_that_no_case_has_stops_the_campaign_early(
+    campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+) -> None:
+    requirement = "[[requirements]]\nid='a'\nmetric='velocity_eror_m_s'\nbound=1\nprobability=0.9\nconfidence=0.9"
+    with pytest.raises(ConfigurationError) as caught:
+        run(campaign_file(requirement=requirement), tmp_path / "run", watch, jobs=1)
+    assert "unknown column 'velocity_eror_m_s' (did you mean 'velocity_error_m_s'?)" in str(caught.value)
+    assert record.read(tmp_path / "run")["state"] == "interrupted"
+    assert len(rows_of(tmp_path / "run")) == 1
+
+
+def test_where_every_case_crashes_the_metric_still_has_its_column(
+    campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+) -> None:
+    directory = run(campaign_file("raising_cases = [0, 1]"), tmp_path / "run", watch, "cases=2", jobs=1)
+    frame = pd.read_parquet(directory / "cases.parquet")
+    assert frame["velocity_error_m_s"].isna().all()
+    assert record.read(directory)["showcase"] is None
+
+
+def test_replay_says_what_differs(troubled: Path, tmp_path: Path) -> None:
+    troubled = shutil.copytree(troubled, tmp_path / "copy")
+    frame = pd.read_parquet(troubled / "cases.parquet")
+    frame.loc[4, "altitude_m"] = np.nextafter(frame.loc[4, "altitude_m"], np.inf)
+    frame.to_parquet(troubled / "cases.parquet")
+    assert replay(troubled, 4).differing == ("altitude_m",)
+    with pytest.raises(CampaignError, match="has no case 12; allowed: 0 to 11"):
+        replay(troubled, 12)
+    with pytest.raises(StoreError, match="does not hold a campaign"):
+        replay(troubled / "cases", 0)
+
+
+def _started(path: Path, directory: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "marsyard", "run", str(path), "--jobs", "2", "--out", str(directory)]
+    process = subprocess.Popen([*command, "--set", "sleep_s=0.2", "-n", "500"], stderr=subprocess.PIPE)
+    deadline = time.monotonic() + 30.0
+    # The write-ahead log has two pages (of 4 KiB and a header) for the empty table, and more with the first rows.
+    log = directory / "cases.sqlite-wal"
+    while not (log.exists() and log.stat().st_size > 4 * 4200) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return process
+
+
+def _children(process: subprocess.Popen[bytes]) -> list[int]:
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return [int(child) for child in children if "loky_posix" in Path(f"/proc/{child}/cmdline").read_text()]
+
+
+def _gone(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp_path: Path, kind: int) -> None:
+    process = _started(campaign_file(dispersions=""), tmp_path / "run")
+    workers = _children(process)
+    process.send_signal(kind)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert b"interrupted; the rows so far are in" in errors
+    assert b"Traceback" not in errors
+    stored = record.read(tmp_path / "run")
+    assert stored["state"] == "interrupted"
+    assert 0 < stored["cases_finished"] == len(rows_of(tmp_path / "run")) < 500
+    assert (tmp_path / "run" / "cases.sqlite").exists()
+    assert len(workers) == 2
+    assert all(map(_gone, workers))
+
+
+def test_workers_go_with_a_killed_parent(campaign_file: CampaignFile, tmp_path: Path) -> None:
+    process = _started(campaign_file(dispersions=""), tmp_path / "run")
+    workers = _children(process)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    deadline = time.monotonic() + 10.0
+    while not all(map(_gone, workers)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert len(workers) == 2
+    assert all(map(_gone, workers))

@@ -1,0 +1,255 @@
+"""The command line as a user runs it: what it prints, where, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from fake_campaign import HEAD, REQUIREMENT, write_campaign
+
+from marsyard import cli
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
+    # Figures are the reports' own business.
+    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
+]
+
+
+@dataclass(frozen=True)
+class Ended:
+    status: int
+    out: str
+    err: str
+
+
+Command = Callable[..., Ended]
+
+
+@pytest.fixture
+def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs a command in this process."""
+
+    def command(*arguments: object) -> Ended:
+        monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        captured = capfd.readouterr()
+        return Ended(int(ended.value.code or 0), captured.out, captured.err)
+
+    return command
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small campaign, run by the real command."""
+    folder = tmp_path_factory.mktemp("campaign")
+    path = write_campaign(folder, "silent_cases = [2]", requirement=REQUIREMENT)
+    command = [str(Path(sys.executable).with_name("marsyard")), "run", str(path), "--jobs", "2", "-n", "6"]
+    ended = subprocess.run([*command, "--out", str(folder / "run")], capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 3, ended.stderr
+    (folder / "stdout.txt").write_text(ended.stdout)
+    (folder / "stderr.txt").write_text(ended.stderr)
+    return folder / "run"
+
+
+def test_a_run_ends_with_table_verdict_and_report(finished: Path) -> None:
+    out = (finished.parent / "stdout.txt").read_text()
+    assert "velocity" in out
+    assert "1 of 6" in out
+    lines = out.rstrip().splitlines()
+    assert "verdict: INSUFFICIENT" in lines
+    assert lines[-1] == f"report: {finished / 'report.html'}"
+    assert (finished / "report.html").stat().st_size > 1000
+    assert json.loads((finished / "campaign.json").read_text())["exit_code"] == 3
+    progress = (finished.parent / "stderr.txt").read_text()
+    assert re.search(r"^cases: 6/6, [\d.]+ (/s|s each), [\d.]+ s$", progress, re.MULTILINE)
+    assert "\x1b" not in out + progress
+
+
+def test_report_judges_what_is_stored(finished: Path, marsyard: Command) -> None:
+    (finished / "report.html").unlink()
+    ended = marsyard("report", finished)
+    assert (ended.status, ended.err) == (3, "")
+    assert "verdict: INSUFFICIENT" in ended.out
+    assert (finished / "report.html").exists()
+
+
+def test_replay_compares_with_what_is_stored(finished: Path, marsyard: Command, tmp_path: Path) -> None:
+    ended = marsyard("replay", finished, 2, "--out", tmp_path / "products")
+    assert (ended.status, ended.err) == (0, "")
+    assert "case 2: SILENT" in ended.out
+    assert "the row equals the stored one" in ended.out
+    assert (tmp_path / "products" / "products.npz").exists()
+
+
+def test_replay_fails_where_rows_differ(finished: Path, marsyard: Command, tmp_path: Path) -> None:
+    (tmp_path / "campaign.json").write_bytes((finished / "campaign.json").read_bytes())
+    frame = pd.read_parquet(finished / "cases.parquet")
+    frame.loc[1, "altitude_m"] += 1.0
+    frame.to_parquet(tmp_path / "cases.parquet")
+    ended = marsyard("replay", tmp_path, 1)
+    assert ended.status == 1
+    assert "the row differs from the stored one in: altitude_m" in ended.out
+
+
+def _crash(case: int) -> str:
+    return f"raising_cases = [{case}]"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "requirement", "status", "word"),
+    [
+        ("", "", 0, "NO REQUIREMENT"),
+        (_crash(1), "", 1, "NO REQUIREMENT"),
+        ("", REQUIREMENT.replace("0.99", "0.3"), 0, "PASS"),
+        ("error_scale = 1e3", REQUIREMENT, 1, "FAIL"),
+        ("", REQUIREMENT, 3, "INSUFFICIENT"),
+        (_crash(1), REQUIREMENT, 1, "INSUFFICIENT"),
+    ],
+)
+def test_exit_status(
+    tmp_path: Path, marsyard: Command, parameters: str, requirement: str, status: int, word: str
+) -> None:
+    path = write_campaign(tmp_path, parameters, dispersions="", requirement=requirement)
+    ended = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
+    assert (ended.status, f"verdict: {word}" in ended.out) == (status, True), ended.out + ended.err
+    # From the files alone it is the same.
+    again = marsyard("report", tmp_path / "run")
+    assert (again.status, f"verdict: {word}" in again.out) == (status, True)
+
+
+def test_what_is_wrong_goes_before_what_failed(tmp_path: Path, marsyard: Command) -> None:
+    wrong = REQUIREMENT.replace("velocity_error_m_s", "velocity_error_m")
+    path = write_campaign(tmp_path, _crash(0), dispersions="", requirement=wrong)
+    ended = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
+    assert ended.status == 2
+    assert "unknown column 'velocity_error_m' (did you mean 'velocity_error_m_s'?)" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run", "dimes-smok"], "unknown campaign 'dimes-smok'"),
+        (["run", "{folder}/none.toml"], "none.toml: no such file"),
+        (["run", "{file}", "-n", "0"], "-n 0: cases: input should be greater than or equal to 1"),
+        (["run", "{file}", "-n", "x"], "Invalid value for '-n'"),
+        (["run", "{file}", "--seed", "-1"], "--seed -1: seed: input should be greater than or equal to 0"),
+        (["run", "{file}", "--jobs", "0"], "--jobs 0: at least one worker process is needed"),
+        (["run", "{file}", "--set", "altitude_m=-2"], "parameters.altitude_m: input should be greater than 0, got -2"),
+        (["run", "{file}", "--set", "altitud_m=2"], "unknown key (did you mean 'altitude_m'?)"),
+        (["run", "{file}", "--out", "{run}"], "already holds a campaign"),
+        (["run", "{file}", "--out", "{file}/run"], "cannot be written: Not a directory"),
+        (["run", "{file}", "--out", "/proc/run"], "cannot be written"),
+        (["run"], "Missing argument"),
+        (["run", "{file}", "--job", "1"], "No such option"),
+        (["fly"], "No such command 'fly'"),
+        (["show", "dimes-smok"], "unknown campaign 'dimes-smok'"),
+        (["report", "{folder}/none"], "none: no such folder"),
+        (["report", "{folder}"], "does not hold a campaign"),
+        (["replay", "{run}", "6"], "has no case 6; allowed: 0 to 5"),
+        (["replay", "{run}", "x"], "Invalid value for 'CASE'"),
+        (["replay", "{folder}", "0"], "does not hold a campaign"),
+        (["replay", "{run}", "0", "--out", "{file}/x"], "cannot be written"),
+    ],
+)
+def test_bad_input(finished: Path, tmp_path: Path, marsyard: Command, arguments: list[str], said: str) -> None:
+    file = write_campaign(tmp_path)
+    ended = marsyard(*(part.format(file=file, run=finished, folder=tmp_path) for part in arguments))
+    # The usage errors of the command line's own library are set in a box: what is said may be broken into lines.
+    text = re.sub(r"[\s│]+", " ", ended.err)
+    assert ended.status == 2
+    assert re.sub(r"\s+", " ", said) in text
+    assert "Traceback" not in ended.err
+    assert ended.out == ""
+    assert not (tmp_path / "runs").exists()
+
+
+def test_negative_case_numbers_are_refused(finished: Path, marsyard: Command) -> None:
+    assert marsyard("replay", finished, "--", "-1").status == 2
+
+
+def test_a_defect_of_ours_is_no_verdict(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("campaigns.loading.catalogue", lambda: 1 / 0)
+    ended = marsyard("list")
+    assert ended.status == 2
+    assert "ZeroDivisionError" in ended.err
+
+
+def test_without_out_a_run_goes_to_runs(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = write_campaign(tmp_path, dispersions="", requirement="")
+    for _ in range(2):
+        assert marsyard("run", path, "-n", 1, "--set", "retain.showcase=none", "--jobs", 1).status == 0
+    folders = sorted(entry.name for entry in (tmp_path / "runs").iterdir())
+    assert len(folders) == 2
+    assert all(re.fullmatch(r"fake-\d{8}T\d{6}Z(-2)?", name) for name in folders)
+
+
+def test_list_and_show(tmp_path: Path, marsyard: Command) -> None:
+    listed = marsyard("list")
+    assert (listed.status, listed.err) == (0, "")
+    assert "dimes-smoke" in listed.out
+    shown = marsyard("show", write_campaign(tmp_path), "--set", "terrain=2")
+    assert (shown.status, shown.err) == (0, "")
+    for text in ("uniform(low=-30.0, high=30.0)", "test", "lowest_altitude_m", "velocity", "12 cases, seed 5"):
+        assert text in shown.out
+
+
+def test_names_in_brackets_are_not_markup(tmp_path: Path, marsyard: Command) -> None:
+    head = HEAD.replace("a campaign without a world", "[red]bold[/red] [oops")
+    shown = marsyard("show", write_campaign(tmp_path, head=head))
+    assert "[red]bold[/red] [oops" in shown.out
+
+
+def test_version_and_doctor(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert re.fullmatch(r"marsyard \d+\.\d+\.\d+\n", marsyard("--version").out)
+    monkeypatch.setattr("marsyard.doctor.run", lambda console: console.print("looked") or 1)
+    ended = marsyard("doctor")
+    assert (ended.status, ended.out) == (1, "looked\n")
+
+
+def test_help_answers_at_once() -> None:
+    began = time.perf_counter()
+    ended = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "marsyard", "--help"], capture_output=True, text=True
+    )
+    elapsed = time.perf_counter() - began
+    assert ended.returncode == 0
+    assert "Exit status: 0 every requirement met" in re.sub(r"[\s│]+", " ", ended.stdout)
+    # The time is stated loosely for a busy machine; what makes it short is that none of these is imported.
+    assert elapsed < 3.0
+    for heavy in ("numpy", "pandas", "scipy", "joblib", "pydantic", "matplotlib"):
+        assert f" {heavy}\n" not in ended.stderr
+
+
+def test_a_terminal_gets_a_bar(tmp_path: Path) -> None:
+    path = write_campaign(tmp_path, dispersions="", requirement="")
+    command = [
+        sys.executable,
+        "-m",
+        "marsyard",
+        "run",
+        str(path),
+        "-n",
+        "2",
+        "--jobs",
+        "1",
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    environment = {**os.environ, "FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "100"}
+    ended = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert ended.returncode == 0, ended.stderr
+    assert "2/2" in ended.stderr
+    assert "left" in ended.stderr
+    assert "━" in ended.stderr
