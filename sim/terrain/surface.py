@@ -20,6 +20,8 @@ from sim.terrain.kernels import evaluate_field, reduce_level
 
 #: Channels of the stored samples.
 HEIGHT, ALBEDO = 0, 1
+#: One coordinate or many, metres.
+Coordinate = Float[np.ndarray, "*batch"] | float
 #: Samples along each side of the coarsest level kept.
 SMALLEST_LEVEL = 16
 
@@ -60,27 +62,19 @@ class Surface:
         """The distance after which the terrain repeats, metres."""
         return float(self.levels[0].shape[0] * self.spacing_m)
 
-    def height(
-        self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"], level: int = 0
-    ) -> Float[np.ndarray, "*batch"]:
+    def height(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch"]:
         """Height above the datum, metres, at world positions x, y (metres)."""
         return self._evaluate(x, y, level)[..., 0]
 
-    def gradient(
-        self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"], level: int = 0
-    ) -> Float[np.ndarray, "*batch 2"]:
+    def gradient(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch 2"]:
         """Slope (dz/dx, dz/dy) at world positions x, y (metres)."""
         return self._evaluate(x, y, level)[..., 1:3]
 
-    def albedo(
-        self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"], level: int = 0
-    ) -> Float[np.ndarray, "*batch"]:
+    def albedo(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch"]:
         """Albedo at world positions x, y (metres)."""
         return self._evaluate(x, y, level)[..., 3]
 
-    def _evaluate(
-        self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"], level: int
-    ) -> Float[np.ndarray, "*batch 4"]:
+    def _evaluate(self, x: Coordinate, y: Coordinate, level: int) -> Float[np.ndarray, "*batch 4"]:
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         values = evaluate_field(
             self.levels[level], self.spacing_m * 2.0**level, np.ascontiguousarray(x.ravel()), y.ravel().copy()
