@@ -27,9 +27,14 @@ def probe(backend: str) -> dict[str, Any]:
     """Renders two tilted planes with the backend and compares the depth of every pixel with their equations."""
     os.environ["PYOPENGL_PLATFORM"] = backend
     import numpy as np
-    import pyrender
     import trimesh
-    from OpenGL import GL
+
+    try:
+        import pyrender
+        from OpenGL import GL
+    except (AttributeError, ImportError) as error:
+        # PyOpenGL notices a missing library only when it looks for a function in it
+        raise SystemExit(f"its libraries do not load ({error})") from None
 
     x, y = (axis.ravel() for axis in np.meshgrid([-400.0, 400.0], [-400.0, 400.0]))
     # pyrender counts pixels from the image's corner, so a pixel's centre lies at +0.5; its y axis points up
