@@ -22,17 +22,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Self, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from sim.camera.vectors import Gradient, Vector, blocks, checked_size, frozen_vector, unit
+from sim.camera.vectors import Gradient, Real, Vector, blocks, checked_size, frozen_vector, unit
 
 #: Labels round A and O to six digits or fewer.
 UNIT_TOLERANCE = 1e-4
+
+
+M = TypeVar("M", bound="CameraModel")  # beartype does not know typing.Self
 
 
 class CameraModel(ABC):
@@ -172,7 +175,7 @@ class CameraModel(ABC):
 
     # ----- motion and changes of the image -----
 
-    def moved(self, new_from_old: RigidTransform) -> Self:
+    def moved(self: M, new_from_old: RigidTransform) -> M:
         """The camera after a rigid motion: ``moved(T).project(T.apply(points))`` equals ``project(points)``.
 
         With the camera in the body frame, ``moved(world_from_body)`` is the camera in the world.
@@ -188,7 +191,7 @@ class CameraModel(ABC):
         turned = {name: matrix[:3, :3] @ getattr(self, name) for name in ("a", "h", "v", "o") if hasattr(self, name)}
         return self._with(c=matrix[:3, :3] @ self.c + matrix[:3, 3], **turned)
 
-    def binned(self, columns: int, rows: int) -> Self:
+    def binned(self: M, columns: int, rows: int) -> M:
         """The camera of an image in which blocks of `columns` x `rows` pixels are summed or averaged into one.
 
         Column u becomes (u - (columns - 1) / 2) / columns, and rows likewise.
@@ -207,7 +210,7 @@ class CameraModel(ABC):
             (self.size[0] // columns, self.size[1] // rows),
         )
 
-    def scaled(self, factor: float) -> Self:
+    def scaled(self: M, factor: Real) -> M:
         """The camera of the image resized by `factor`: u becomes (u + 0.5) * factor - 0.5.
 
         The new size is the old one times `factor`, rounded to the nearest integer; the scale is `factor` all the same.
@@ -223,7 +226,7 @@ class CameraModel(ABC):
         size = (round(self.size[0] * factor), round(self.size[1] * factor))
         return self._with_image_map((factor, factor), (shift, shift), size)
 
-    def cropped(self, column: int, row: int, size: tuple[int, int]) -> Self:
+    def cropped(self: M, column: int, row: int, size: tuple[int, int]) -> M:
         """The camera of a part of the image, given its upper left pixel (column, row) and its size (columns, rows).
 
         Raises
@@ -250,12 +253,12 @@ class CameraModel(ABC):
             If part of the frame's edge is blind, or 90 degrees or more from A without `inside`.
         """
 
-    def _with_image_map(self, scale: tuple[float, float], shift: tuple[float, float], size: tuple[int, int]) -> Self:
+    def _with_image_map(self: M, scale: tuple[float, float], shift: tuple[float, float], size: tuple[int, int]) -> M:
         """The camera whose pixels are scale * pixel + shift."""
         return self._with(h=scale[0] * self.h + shift[0] * self.a, v=scale[1] * self.v + shift[1] * self.a, size=size)
 
-    def _with(self, **changes: Any) -> Self:
-        return cast(Self, replace(cast(Any, self), **changes))
+    def _with(self: M, **changes: Any) -> M:
+        return cast(M, replace(cast(Any, self), **changes))
 
     # ----- derived quantities -----
 
@@ -367,9 +370,6 @@ class CameraModel(ABC):
         m = self._direction_from_pixel
         x, y, z = (m[i, 0] * u + m[i, 1] * v + m[i, 2] for i in range(3))
         return x, y, z
-
-
-M = TypeVar("M", bound=CameraModel)
 
 
 def _rebuilt(model: type[M], values: Mapping[str, Any]) -> M:

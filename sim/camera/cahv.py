@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self, final
+from typing import final
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sim.camera.base import CameraModel
-from sim.camera.vectors import Gradient, Vector, dot
+from sim.camera.vectors import Gradient, Real, Triple, Vector, dot
 
 _ORIGIN = (0.0, 0.0, 0.0)
 
@@ -51,14 +51,14 @@ class Cahv(CameraModel):
     @classmethod
     def from_axes(
         cls,
-        focal_lengths: tuple[float, float],
+        focal_lengths: tuple[Real, Real],
         size: tuple[int, int],
         *,
-        axis: ArrayLike,
-        right: ArrayLike,
-        centre: ArrayLike = _ORIGIN,
-        image_centre: tuple[float, float] | None = None,
-    ) -> Self:
+        axis: Triple,
+        right: Triple,
+        centre: Triple = _ORIGIN,
+        image_centre: tuple[Real, Real] | None = None,
+    ) -> Cahv:
         """A camera with square axes from its focal lengths (hs, vs) in pixels.
 
         Parameters
@@ -101,15 +101,15 @@ class Cahv(CameraModel):
     @classmethod
     def from_focal_length(
         cls,
-        focal_m: float,
-        pixel_pitch_m: float | tuple[float, float],
+        focal_m: Real,
+        pixel_pitch_m: Real | tuple[Real, Real],
         size: tuple[int, int],
         *,
-        axis: ArrayLike,
-        right: ArrayLike,
-        centre: ArrayLike = _ORIGIN,
-        image_centre: tuple[float, float] | None = None,
-    ) -> Self:
+        axis: Triple,
+        right: Triple,
+        centre: Triple = _ORIGIN,
+        image_centre: tuple[Real, Real] | None = None,
+    ) -> Cahv:
         """A camera from its focal length and the pitch of its pixels (one, or along columns and rows), both in metres.
 
         The other parameters and the errors are those of `from_axes`.
@@ -126,14 +126,14 @@ class Cahv(CameraModel):
     @classmethod
     def from_field_of_view(
         cls,
-        horizontal_rad: float,
+        horizontal_rad: Real,
         size: tuple[int, int],
         *,
-        axis: ArrayLike,
-        right: ArrayLike,
-        vertical_rad: float | None = None,
-        centre: ArrayLike = _ORIGIN,
-    ) -> Self:
+        axis: Triple,
+        right: Triple,
+        vertical_rad: Real | None = None,
+        centre: Triple = _ORIGIN,
+    ) -> Cahv:
         """A camera from its full field of view, radians, measured between the frame's outer edges.
 
         Pixels are square unless `vertical_rad` is given. The other parameters are those of `from_axes`.

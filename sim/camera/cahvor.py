@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self, final
+from typing import final
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sim.camera.base import UNIT_TOLERANCE, CameraModel
 from sim.camera.cahv import Cahv
 from sim.camera.linearisation import linearised
 from sim.camera.radial import RadialPolynomial
-from sim.camera.vectors import Gradient, Vector, dot
+from sim.camera.vectors import Gradient, Triple, Vector, dot
 
 
 class RadialModel(CameraModel):
@@ -118,7 +118,7 @@ class Cahvor(RadialModel):
     size: tuple[int, int]
 
     @classmethod
-    def from_cahv(cls, cahv: Cahv, r: ArrayLike, o: ArrayLike | None = None) -> Self:
+    def from_cahv(cls, cahv: Cahv, r: Triple, o: Triple | None = None) -> Cahvor:
         """A linear camera with distortion `r` (rho0, rho1, rho2) added about the unit vector `o` (A if not given)."""
         axis = cahv.a if o is None else np.asarray(o, dtype=np.float64)
         return cls(cahv.c, cahv.a, cahv.h, cahv.v, axis, np.asarray(r, dtype=np.float64), cahv.size)
@@ -126,13 +126,11 @@ class Cahvor(RadialModel):
     def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
         omega, tau = self._omega_tau(x, y, z)
         mu = self._mu(tau)
-        gain = 1 + mu
-        pull = mu * omega
-        onto = self._axis_image
-        depth = gain * dot(self.a, x, y, z) - onto[2] * pull
-        u = (gain * dot(self.h, x, y, z) - onto[0] * pull) / depth
-        v = (gain * dot(self.v, x, y, z) - onto[1] * pull) / depth
-        return u, v, (omega > 0) & (tau < self._polynomial.tau_limit) & (depth > 0)
+        columns, rows, depth = (
+            (straight := dot(vector, x, y, z)) + mu * (straight - onto * omega)
+            for vector, onto in zip((self.h, self.v, self.a), self._axis_image, strict=True)
+        )
+        return columns / depth, rows / depth, (omega > 0) & (tau < self._polynomial.tau_limit) & (depth > 0)
 
     def _image_gradient(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
         omega, tau = self._omega_tau(x, y, z)

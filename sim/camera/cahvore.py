@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self, final
+from typing import final
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sim.camera.cahv import Cahv
 from sim.camera.cahvor import RadialModel
-from sim.camera.vectors import Gradient, Vector, dot
+from sim.camera.vectors import Gradient, Real, Triple, Vector, dot
 
 _NEWTON_STEPS = 30
+#: A linearity nearer to 0 than this is 0, as in cmod.
+_LINEAR = 1e-15
 
 
 @final
@@ -56,7 +58,7 @@ class Cahvore(RadialModel):
     o: Float[np.ndarray, "3"]
     r: Float[np.ndarray, "3"]
     e: Float[np.ndarray, "3"]
-    linearity: float = field(kw_only=True)
+    linearity: Real = field(kw_only=True)
     size: tuple[int, int] = field(kw_only=True)
 
     def __post_init__(self) -> None:
@@ -67,8 +69,8 @@ class Cahvore(RadialModel):
 
     @classmethod
     def from_cahv(
-        cls, cahv: Cahv, r: ArrayLike, e: ArrayLike = (0.0, 0.0, 0.0), *, linearity: float, o: ArrayLike | None = None
-    ) -> Self:
+        cls, cahv: Cahv, r: Triple, e: Triple = (0.0, 0.0, 0.0), *, linearity: Real, o: Triple | None = None
+    ) -> Cahvore:
         """A linear camera's image plane behind a wide-angle lens, about the unit vector `o` (A if not given)."""
         axis = cahv.a if o is None else np.asarray(o, dtype=np.float64)
         radial, pupil = np.asarray(r, dtype=np.float64), np.asarray(e, dtype=np.float64)
@@ -84,20 +86,20 @@ class Cahvore(RadialModel):
 
     def _chi(self, theta: Vector) -> Vector:
         scale = self.linearity
-        if scale > 0:
+        if scale > _LINEAR:
             return np.tan(scale * theta) / scale
-        return np.sin(scale * theta) / scale if scale < 0 else theta
+        return np.sin(scale * theta) / scale if scale < -_LINEAR else theta
 
     def _chi_slope(self, theta: Vector) -> Vector:
         cosine = np.cos(self.linearity * theta)
-        return 1 / (cosine * cosine) if self.linearity > 0 else cosine
+        return 1 / (cosine * cosine) if self.linearity > _LINEAR else cosine
 
     def _theta(self, chi: Vector) -> Vector:
         """The inverse of `_chi`; at the end of its range, or beyond it, the angle at the end."""
         scale = self.linearity
-        if scale > 0:
+        if scale > _LINEAR:
             return np.arctan(scale * chi) / scale
-        return np.arcsin(np.maximum(scale * chi, -1)) / scale if scale < 0 else chi
+        return np.arcsin(np.maximum(scale * chi, -1)) / scale if scale < -_LINEAR else chi
 
     def _pupil(self, theta: Vector) -> tuple[Vector, Vector]:
         """e0 + e1 theta^2 + e2 theta^4 and its derivative."""

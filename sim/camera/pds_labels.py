@@ -8,11 +8,10 @@ returned in that frame as they are. The picture's size is that of the label's IM
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import pvl
 
 from sim.camera.assembly import MODELS, Source, assembled, linearity_of_type
 from sim.camera.base import CameraModel
@@ -70,9 +69,16 @@ def _label(source: Source) -> Any:
     if end is None:
         raise source.error("END", f"missing in the first {_MOST_BYTES} bytes", "a label closed by a line END")
     try:
-        return pvl.loads(head[: end.end()].decode("latin-1"))
+        return _parsed(head[: end.end()].decode("latin-1"))
     except Exception as fault:  # pvl raises many kinds, of its own and of Python's
         raise source.error("label", f"cannot be parsed ({fault})", "a PDS3 label") from fault
+
+
+def _parsed(text: str) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ImportWarning)  # pvl misses an optional package
+        import pvl
+    return pvl.loads(text)
 
 
 def _size(label: Any, source: Source) -> tuple[int, int]:

@@ -21,6 +21,7 @@ Vector = NDArray[np.float64]
 
 _NEWTON_STEPS = 12
 _BISECTIONS = 70
+_UNLIMITED_TAU = 1e30
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,11 @@ class RadialPolynomial:
 
     @cached_property
     def tau_limit(self) -> float:
-        """chi^2 where f stops growing; infinite if it never does."""
+        """chi^2 where f stops growing; infinite if it never does, or only at right angles to rounding."""
+        limit = self._first_maximum()
+        return limit if limit < _UNLIMITED_TAU else np.inf
+
+    def _first_maximum(self) -> float:
         if self.k5 == 0:
             return -self.k1 / (3 * self.k3) if self.k3 < 0 else np.inf
         discriminant = 9 * self.k3**2 - 20 * self.k5 * self.k1
@@ -69,7 +74,7 @@ class RadialPolynomial:
             excess = ratio * (self.k1 + s * (self.k3 + s * self.k5)) - 1
             step = excess / (self.k1 + s * (3 * self.k3 + s * (5 * self.k5)))
             ratio -= step
-            if not np.any(np.abs(step) > 1e-9):  # the error is of the step's square
+            if not np.any(np.abs(step) > 1e-9 * ratio):  # the error is of the step's square
                 break
         upper = np.sqrt(self.tau_limit / tau)
         stuck = ~((np.abs(step) <= 1e-9 * ratio) & (ratio > 0) & (ratio <= upper))

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Num
 from numpy.typing import ArrayLike, NDArray
 
 Vector = NDArray[np.float64]
+#: What is measured and may be written as an integer (the run-time checks take no integer for a float).
+Real = float | int
+#: Three components, as an array or written out.
+Triple = Num[np.ndarray, "3"] | tuple[Real, Real, Real]
 Gradient = tuple[Vector, Vector, Vector]
 
 #: Points handled at once: few enough for the processor's cache, enough to hide NumPy's cost per call.

@@ -1,0 +1,365 @@
+"""Projection and rays: closure, the reference's scalar formulas, Jacobians, and what cannot be seen."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+
+# ----- plausible cameras -----
+
+
+@st.composite
+def cahv_cameras(draw: st.DrawFn) -> Cahv:
+    attitude = Rotation.from_rotvec(draw(arrays(float, 3, elements=st.floats(-3, 3)))).as_matrix()
+    size = draw(st.tuples(st.integers(2, 2048), st.integers(2, 2048)))
+    return Cahv.from_field_of_view(
+        draw(st.floats(0.05, 1.8)),
+        size,
+        vertical_rad=draw(st.floats(0.05, 1.8)),
+        axis=attitude[:, 0],
+        right=attitude[:, 1],
+        centre=draw(arrays(float, 3, elements=st.floats(-5000, 5000))),
+    )
+
+
+def tilted(axis: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+    moved = axis + tilt
+    return moved / np.linalg.norm(moved)
+
+
+tilts = arrays(float, 3, elements=st.floats(-0.03, 0.03))
+radials = st.tuples(st.floats(-0.05, 0.05), st.floats(-0.08, 0.2), st.floats(-0.02, 0.05)).map(np.array)
+
+
+@st.composite
+def cahvor_cameras(draw: st.DrawFn) -> Cahvor:
+    cahv = draw(cahv_cameras())
+    return Cahvor.from_cahv(cahv, r=draw(radials), o=tilted(cahv.a, draw(tilts)))
+
+
+@st.composite
+def cahvore_cameras(draw: st.DrawFn) -> Cahvore:
+    cahv = draw(cahv_cameras())
+    return Cahvore.from_cahv(
+        cahv,
+        r=draw(radials),
+        e=draw(arrays(float, 3, elements=st.floats(-0.003, 0.003))),
+        linearity=draw(st.sampled_from([-1.0, -0.5, 0.0, 0.37, 1.0]) | st.floats(-1, 1)),
+        o=tilted(cahv.a, draw(tilts)),
+    )
+
+
+cameras = st.one_of(cahv_cameras(), cahvor_cameras(), cahvore_cameras())
+fractions = arrays(float, (4, 2), elements=st.floats(0, 1))
+
+
+def pixels_of(camera: CameraModel, parts: np.ndarray) -> np.ndarray:
+    return parts * np.array(camera.size) - 0.5
+
+
+# ----- closure -----
+
+
+@pytest.mark.parametrize("distance", [0.5, 10.0, 1e4])
+def test_real_cameras_close_over_the_whole_frame(camera: CameraModel, distance: float) -> None:
+    pixels = camera.pixel_grid()
+    origins, directions = camera.rays(pixels)
+    again, visible = camera.project(origins + distance * directions)
+    assert visible.all()
+    # The issue asks 1e-8 px of CAHVOR and 1e-3 px of CAHVORE. Newton ends at rounding: pixels near 1000 and points near
+    # 1e4 m leave about 1e3 * 2e-16 * 1e4 / 10 ~ 2e-12 px; measured 2e-12.
+    assert np.max(np.abs(again - pixels)) < 1e-10
+
+
+@given(cameras, fractions, st.floats(0.5, 1e5))
+def test_plausible_cameras_close(camera: CameraModel, parts: np.ndarray, distance: float) -> None:
+    pixels = pixels_of(camera, parts)
+    origins, directions = camera.rays(pixels)
+    reached = np.isfinite(directions).all(axis=-1)
+    again, visible = camera.project(origins + distance * directions)
+    assert np.array_equal(visible, reached)
+    # C is up to 5000 m off: a point 0.5 m away is rounded by 1e-12 m, which 4e4 px/rad (2048 px in 0.05 rad) makes
+    # 1e-7 px. Near the end of the polynomial's range the inverse loses digits, but the pixel does not.
+    assert np.max(np.abs(again - pixels)[reached], initial=0) < 1e-6
+
+
+@given(cameras, fractions)
+def test_directions_are_unit_vectors(camera: CameraModel, parts: np.ndarray) -> None:
+    directions = camera.rays(pixels_of(camera, parts))[1]
+    seen = directions[np.isfinite(directions).all(axis=-1)]
+    assert np.allclose(np.linalg.norm(seen, axis=-1), 1, rtol=0, atol=1e-15 * 4)
+
+
+def test_rays_of_cahvore_start_on_the_optical_axis(hazcam: Cahvore) -> None:
+    origins, _ = hazcam.rays(hazcam.pixel_grid()[::64, ::64])
+    shift = origins - hazcam.c
+    along = shift @ hazcam.o
+    # O's length is 1 to 1e-6 only, as labelled, and the largest shift is about 10 mm.
+    assert np.allclose(shift, along[..., np.newaxis] * hazcam.o, atol=2e-8)
+    assert along.max() > 1e-3
+
+
+# ----- the reference: JPL's cmod, scalar and literal -----
+
+
+def cmod_cahvor(camera: Cahvor, point: np.ndarray) -> tuple[float, float]:
+    """cmod_cahvor_3d_to_2d: Gennery's omega, lambda, tau and mu."""
+    difference = point - camera.c
+    omega = difference @ camera.o
+    lambda_ = difference - omega * camera.o
+    tau = (lambda_ @ lambda_) / (omega * omega)
+    mu = camera.r[0] + camera.r[1] * tau + camera.r[2] * tau * tau
+    moved = difference + mu * lambda_
+    alpha, beta, gamma = moved @ camera.a, moved @ camera.h, moved @ camera.v
+    return beta / alpha, gamma / alpha
+
+
+def cmod_cahvore(camera: Cahvore, point: np.ndarray) -> tuple[float, float]:
+    """cmod_cahvore_3d_to_2d_general, its Newton on theta and all, but for the exit at 1e-8 which leaves 1e-16."""
+    difference = point - camera.c
+    zeta = float(difference @ camera.o)
+    lambda3 = difference - zeta * camera.o
+    lambda_ = math.sqrt(lambda3 @ lambda3)
+    e0, e1, e2 = camera.e.tolist()
+    theta = math.atan2(lambda_, zeta)
+    step = 1.0
+    for _ in range(100):
+        cosine, sine = math.cos(theta), math.sin(theta)
+        series = e0 + e1 * theta**2 + e2 * theta**4
+        upsilon = (
+            zeta * cosine
+            + lambda_ * sine
+            - (1 - cosine) * series
+            - (theta - sine) * (2 * e1 * theta + 4 * e2 * theta**3)
+        )
+        if abs(step) < 1e-8:
+            break
+        step = (zeta * sine - lambda_ * cosine - (theta - sine) * series) / upsilon
+        theta -= step
+    if theta < 1e-8:
+        moved = difference
+    else:
+        linear = camera.linearity * theta
+        if camera.linearity < -1e-15:
+            chi = math.sin(linear) / camera.linearity
+        elif camera.linearity > 1e-15:
+            chi = math.tan(linear) / camera.linearity
+        else:
+            chi = theta
+        mu = camera.r[0] + camera.r[1] * chi**2 + camera.r[2] * chi**4
+        moved = lambda_ / chi * camera.o + (1 + mu) * lambda3
+    alpha, beta, gamma = moved @ camera.a, moved @ camera.h, moved @ camera.v
+    return beta / alpha, gamma / alpha
+
+
+@given(st.one_of(cahvor_cameras(), cahvore_cameras()), fractions, st.floats(1, 1e4))
+def test_projection_is_cmods(camera: Cahvor | Cahvore, parts: np.ndarray, distance: float) -> None:
+    origins, directions = camera.rays(pixels_of(camera, parts))
+    points = (origins + distance * directions)[np.isfinite(directions).all(axis=-1)]
+    reference = cmod_cahvor if isinstance(camera, Cahvor) else cmod_cahvore
+    expected = np.array([reference(camera, point) for point in points]).reshape(-1, 2)
+    # Rounding of points 5000 m off, as above.
+    assert np.max(np.abs(camera.project(points)[0] - expected), initial=0) < 1e-6
+
+
+def test_projection_of_real_cameras_is_cmods(navcam: Cahvor, hazcam: Cahvore) -> None:
+    for camera, reference in ((navcam, cmod_cahvor), (hazcam, cmod_cahvore)):
+        origins, directions = camera.rays(camera.pixel_grid()[::93, ::93].reshape(-1, 2))
+        points = origins + 5 * directions
+        expected = np.array([reference(camera, point) for point in points])
+        # cmod uses O as labelled, off unit length by up to 1e-6, which leaves 2e-6 of omega in lambda; with f = 1223 px
+        # and mu up to 0.03 that is 1e-4 px.
+        assert np.max(np.abs(camera.project(points)[0] - expected)) < 2e-4
+
+
+def test_navcam_ray_from_the_papers_equations(pinhole: Cahv) -> None:
+    """The middle of CAHV's image plane looks along A, and a column to the right of it to the right by 1 / hs."""
+    hc, vc = pinhole.image_centre
+    hs, _ = pinhole.focal_lengths
+    straight, beside = pinhole.rays(np.array([[hc, vc], [hc + 1, vc]]))[1]
+    assert np.allclose(straight, pinhole.a, atol=1e-6)  # A is labelled to six digits
+    assert math.isclose(math.atan(1 / hs), math.acos(straight @ beside), rel_tol=1e-5)
+
+
+# ----- limits -----
+
+
+def test_points_behind_are_not_visible(camera: CameraModel) -> None:
+    behind = camera.c - 5 * camera.a + np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    pixels, visible = camera.project(behind)
+    assert not visible.any()
+    assert np.isnan(pixels).all()
+    assert np.isnan(camera.projection_jacobian(behind)).all()
+    assert not camera.in_frame(pixels).any()
+
+
+def test_the_centre_of_projection_and_nan_are_not_visible(camera: CameraModel) -> None:
+    points = np.array([camera.c, [np.nan, 0, 0], [np.inf, 0, 0]])
+    assert not camera.project(points)[1].any()
+
+
+def folding() -> Cahvor:
+    """Its polynomial chi - 0.2 chi^3 grows up to chi^2 = 1 / 0.6, where it reaches (2 / 3) sqrt(1 / 0.6)."""
+    cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
+    return Cahvor.from_cahv(cahv, r=(0.0, -0.2, 0.0))
+
+
+def test_distortion_does_not_fold_back() -> None:
+    camera = folding()
+    limit = math.sqrt(1 / 0.6)
+    radii = np.array([0.0, 0.5 * limit, 0.999 * limit, 1.001 * limit, 2 * limit])
+    points = np.stack([radii, 0 * radii, 1 + 0 * radii], axis=-1)
+    pixels, visible = camera.project(points)
+    assert visible.tolist() == [True, True, True, False, False]
+    assert (np.diff(pixels[:3, 0]) > 0).all()
+
+
+def test_pixels_beyond_the_distortions_range_have_no_ray() -> None:
+    camera = folding()
+    hc, vc = camera.image_centre
+    reach = 100 * 2 / 3 * math.sqrt(1 / 0.6)
+    directions = camera.rays(np.array([[hc + 0.9999 * reach, vc], [hc + 1.0001 * reach, vc]]))[1]
+    assert np.isfinite(directions[0]).all()
+    assert np.isnan(directions[1]).all()
+
+
+@pytest.mark.parametrize(
+    "r", [(0.0, -0.2, 0.0), (0.0, 0.3, -0.05), (0.0, -0.3, 0.06), (-0.5, 0.0, 0.0), (0.1, 2.0, 3.0)]
+)
+def test_inverse_reaches_every_angle_up_to_the_limit(r: tuple[float, float, float]) -> None:
+    """Also where the polynomial has an inflection and plain Newton would leave its range."""
+    cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
+    camera = Cahvor.from_cahv(cahv, r=r)
+    chi = np.concatenate([np.geomspace(1e-9, 1e-3, 30), np.linspace(0.002, 8, 2000)])
+    points = np.stack([0.6 * chi, -0.8 * chi, np.ones_like(chi)], axis=-1)
+    pixels, visible = camera.project(points)
+    directions = camera.rays(pixels[visible])[1]
+    again = camera.project(directions)[0]
+    assert visible[:60].all()
+    scale = np.maximum(np.abs(pixels[visible]), 1e4)  # the strongest polynomial reaches 1e7 px
+    assert np.max(np.abs(again - pixels[visible]) / scale) < 1e-14
+    slope = 1 + r[0] + 3 * r[1] * chi**2 + 5 * r[2] * chi**4
+    first_fall = np.argmax(slope <= 0) if (slope <= 0).any() else len(chi)
+    assert visible[:first_fall].all()
+    assert not visible[first_fall:].any()
+
+
+def test_a_fisheye_sees_beyond_ninety_degrees(hazcam: Cahvore) -> None:
+    """The hazcam's diagonal is about 180 degrees wide (Maki et al. 2003), so its corners look slightly behind."""
+    corners = hazcam.corner_rays()[1]
+    assert np.degrees(hazcam.half_angle()) == pytest.approx(90, abs=5)
+    assert (corners @ hazcam.o).min() < 0.02
+    equidistant = Cahvore.from_cahv(
+        Cahv.from_axes((100.0, 100.0), (401, 401), axis=(0, 0, 1), right=(1, 0, 0)), r=(0, 0, 0), linearity=0
+    )
+    angle = np.radians([0.0, 45.0, 100.0])
+    pixels, visible = equidistant.project(np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=-1))
+    assert visible.all()
+    assert np.allclose(pixels[:, 0], 200 + 100 * angle)
+
+
+def test_cahvore_of_linearity_one_without_pupil_is_cahvor(navcam: Cahvor) -> None:
+    same = Cahvore(
+        navcam.c, navcam.a, navcam.h, navcam.v, navcam.o, navcam.r, np.zeros(3), linearity=1, size=navcam.size
+    )
+    points = navcam.c + 7 * navcam.rays(navcam.pixel_grid()[::50, ::50])[1]
+    assert np.allclose(same.project(points)[0], navcam.project(points)[0], rtol=0, atol=1e-9)
+    assert np.allclose(same.projection_jacobian(points), navcam.projection_jacobian(points), rtol=0, atol=1e-9)
+
+
+# ----- the Jacobian -----
+
+
+def numerical_jacobian(camera: CameraModel, points: np.ndarray, step: float) -> np.ndarray:
+    columns = []
+    for axis in np.eye(3):
+        ahead, behind = (camera.project(points + sign * step * axis)[0] for sign in (1, -1))
+        farther, before = (camera.project(points + sign * 2 * step * axis)[0] for sign in (1, -1))
+        columns.append((8 * (ahead - behind) - (farther - before)) / (12 * step))
+    return np.stack(columns, axis=-1)
+
+
+def test_jacobian_of_real_cameras(camera: CameraModel) -> None:
+    origins, directions = camera.rays(camera.pixel_grid()[::60, ::60])
+    points = origins + 3 * directions
+    analytic = camera.projection_jacobian(points)
+    # Fourth-order differences at 1 mm of 3 m: truncation (3e-4)^4, rounding 1e-12 px / 1e-3 m = 1e-9 px/m of 400 px/m.
+    assert analytic.shape == (*points.shape[:-1], 2, 3)
+    assert np.max(np.abs(analytic - numerical_jacobian(camera, points, 1e-3))) < 1e-7
+
+
+def test_jacobian_on_the_optical_axis(navcam: Cahvor, hazcam: Cahvore) -> None:
+    for camera in (navcam, hazcam):
+        axis = camera.o / np.linalg.norm(camera.o)
+        points = camera.c + 3 * axis + np.array([[0.0, 0.0, 0.0], [1e-12, 0, 0], [1e-7, 0, 1e-7]])
+        difference = camera.projection_jacobian(points) - numerical_jacobian(camera, points, 1e-3)
+        assert np.max(np.abs(difference)) < 1e-7
+
+
+@settings(max_examples=50)
+@given(cameras, arrays(float, (4, 2), elements=st.floats(0.1, 0.9)), st.floats(5, 50))
+def test_jacobian_of_plausible_cameras(camera: CameraModel, parts: np.ndarray, distance: float) -> None:
+    origins, directions = camera.rays(pixels_of(camera, parts))
+    points = origins + distance * directions
+    analytic = camera.projection_jacobian(points)
+    numerical = numerical_jacobian(camera, points, 1e-4 * distance)
+    known = np.isfinite(numerical)  # differences may leave the distortion's range
+    size = np.linalg.norm(np.where(np.isfinite(analytic), analytic, 0), axis=(-2, -1), keepdims=True)
+    # Rounding of points 5000 m off: 1e-12 m / (1e-4 * 5 m) = 2e-9 of the slope; the rest is truncation near a limit.
+    assert np.all((np.abs(analytic - numerical) <= 2e-5 * size + 1e-7)[known])
+
+
+# ----- shapes -----
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3), (0,), (4, 0)])
+def test_leading_dimensions_are_kept(camera: CameraModel, shape: tuple[int, ...]) -> None:
+    points = np.broadcast_to(camera.c + 3 * camera.a, (*shape, 3))
+    pixels, visible = camera.project(points)
+    assert pixels.shape == (*shape, 2)
+    assert visible.shape == shape
+    assert isinstance(visible, np.ndarray)
+    assert camera.in_frame(pixels).shape == shape
+    origins, directions = camera.rays(pixels)
+    assert origins.shape == directions.shape == (*shape, 3)
+    assert camera.projection_jacobian(points).shape == (*shape, 2, 3)
+
+
+def test_a_point_alone_gives_what_it_gives_among_many(camera: CameraModel) -> None:
+    """Bit for bit, so that results do not depend on how work is divided."""
+    points = camera.c + 3 * camera.rays(camera.pixel_grid()[::4, ::4].reshape(-1, 2))[1]
+    together = camera.project(points)[0]
+    assert len(points) > 3 * 16384  # several blocks
+    for index in (0, 1, 7, 16383, 16384, 40000, len(points) - 1):
+        assert np.array_equal(camera.project(points[index])[0], together[index])
+
+
+def test_arguments_are_not_changed(camera: CameraModel) -> None:
+    points = camera.c + np.array([[3.0, 0.1, 0.2], [-3.0, 0.1, 0.2]])
+    pixels = np.array([[3.0, 4.0], [500.0, 600.0]])
+    points_before, pixels_before = points.copy(), pixels.copy()
+    camera.project(points)
+    camera.projection_jacobian(points)
+    camera.rays(pixels)
+    assert np.array_equal(points, points_before)
+    assert np.array_equal(pixels, pixels_before)
+
+
+def test_single_precision_points_are_taken(navcam: Cahvor) -> None:
+    points = (navcam.c + 3 * navcam.a)[np.newaxis].astype(np.float32)
+    pixels = navcam.project(points)[0]
+    assert pixels.dtype == np.float64
+    assert np.allclose(pixels, navcam.project(points.astype(float))[0], rtol=0, atol=1e-9)
+
+
+def test_frame_reaches_half_a_pixel_beyond_the_centres(navcam: Cahvor) -> None:
+    edge = np.array([[-0.5, 0.0], [-0.51, 0.0], [1023.49, 1023.49], [1023.5, 0.0], [0.0, 1023.5], [np.nan, 0.0]])
+    assert navcam.in_frame(edge).tolist() == [True, False, True, False, False, False]
