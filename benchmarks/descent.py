@@ -22,7 +22,7 @@ from scenarios.descent import (
     camera_optics,
     placed_descent,
 )
-from sim.environment import processor_features
+from sim.processor import processor_features
 from sim.frames import direction
 from sim.render import Photometry, Scene, Sun, process_renderer
 from sim.render.backend import default_backend

@@ -17,7 +17,7 @@ from algorithms.interface import VelocityEstimate
 from scenarios.interface import CaseResult, Scalar
 from sim.camera import Cahv, Cahvor
 from sim.dynamics import DescentParameters, ParachuteDescent, State
-from sim.environment import processor_features
+from sim.processor import processor_features
 from sim.frames import direction
 from sim.measurements import AltitudeMeasurement, DescentMeasurements, DetectorImage
 from sim.render import Photometry, Scene, Sun, process_renderer
