@@ -25,7 +25,7 @@ SCHEMA = 1
 RECORD_FILE = "campaign.json"
 
 #: What a campaign writes into its folder; a folder with any of it is never written to again.
-OWN_FILES = (RECORD_FILE, "cases.parquet", "cases.sqlite", "report.html", "cases")
+OWN_FILES = (RECORD_FILE, "cases.parquet", "cases.sqlite", "report.html", "report.json", "cases")
 
 
 def utc_now() -> str:

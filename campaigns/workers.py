@@ -26,7 +26,8 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 
 Result = TypeVar("Result")
 
-#: Set before a worker loads any library: one thread each, and an order of sets that does not change from run to run.
+#: Set before a worker loads any library: one thread each, an order of sets that does not change from run to run, and
+#: assertions kept.
 WORKER_ENVIRONMENT: Mapping[str, str] = {
     **dict.fromkeys(
         (
@@ -42,6 +43,8 @@ WORKER_ENVIRONMENT: Mapping[str, str] = {
         "1",
     ),
     "PYTHONHASHSEED": "0",
+    # pyrender makes calls of GL inside assertions, which `python -O` leaves out.
+    "PYTHONOPTIMIZE": "",
 }
 
 #: Of Linux's `prctl`: the signal that a process gets when its parent dies.

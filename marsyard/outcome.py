@@ -23,7 +23,6 @@ def conclude(directory: Path, console: Console) -> int:
         Where the folder holds no campaign with rows, or the report cannot be written.
     """
     from reports.campaign import write_report
-
     from reports.tables import verdict_table
     from reports.verdicts import exit_code, judge_campaign, overall
 

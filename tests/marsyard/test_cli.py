@@ -53,7 +53,7 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small campaign, run by the real command."""
     folder = tmp_path_factory.mktemp("campaign")
-    path = write_campaign(folder, "silent_cases = [2]", requirement=REQUIREMENT)
+    path = write_campaign(folder, "silent_cases = [2]", requirement=REQUIREMENT.replace("0.99", "0.9"))
     command = [str(Path(sys.executable).with_name("marsyard")), "run", str(path), "--jobs", "2", "-n", "6"]
     ended = subprocess.run([*command, "--out", str(folder / "run")], capture_output=True, text=True, timeout=120)
     assert ended.returncode == 3, ended.stderr
@@ -114,7 +114,8 @@ def _crash(case: int) -> str:
         ("", REQUIREMENT.replace("0.99", "0.3"), 0, "PASS"),
         ("error_scale = 1e3", REQUIREMENT, 1, "FAIL"),
         ("", REQUIREMENT, 3, "INSUFFICIENT"),
-        (_crash(1), REQUIREMENT, 1, "INSUFFICIENT"),
+        # One failure of three leaves open whether nine of ten would succeed, but a crash is a crash.
+        (_crash(1), REQUIREMENT.replace("0.99", "0.9"), 1, "INSUFFICIENT"),
     ],
 )
 def test_exit_status(
