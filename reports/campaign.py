@@ -76,7 +76,8 @@ def page_context(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) ->
         "rerun": sections.rerun_command(run),
         "replay": sections.replay_command(run, "CASE"),
     }
-    return {**context, **_error_sections(run, metric, bound)}
+    pictured = [str(case.case) for case in context["shown"]]
+    return {**context, **_error_sections(run, metric, bound, pictured)}
 
 
 def summary(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) -> dict[str, Any]:
@@ -110,7 +111,7 @@ def summary(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) -> dict
     return plain
 
 
-def _error_sections(run: StoredRun, metric: str | None, bound: float | None) -> dict[str, Any]:
+def _error_sections(run: StoredRun, metric: str | None, bound: float | None, pictured: Sequence[str]) -> dict[str, Any]:
     """What is said of the page's metric; empty where no column is one."""
     if metric is None:
         none = sections.CaseTable((), ())
@@ -120,8 +121,8 @@ def _error_sections(run: StoredRun, metric: str | None, bound: float | None) -> 
         "error_plates": gallery.error_plates(run.frame, metric, bound),
         "driver_plates": gallery.driver_plates(run.frame, metric, bound),
         "statistics": sections.statistics_grid(run.frame, metric),
-        "worst": sections.worst_cases(run, metric),
-        "silent": sections.silent_cases(run, metric),
+        "worst": sections.worst_cases(run, metric, pictured),
+        "silent": sections.silent_cases(run, metric, pictured),
     }
 
 

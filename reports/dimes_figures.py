@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
 
 from reports.svg import INK, in_page_style
 
@@ -24,6 +24,8 @@ TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
 _DEFAULT_SIDE = 15.0
 _PAIRS = (0, 1)
 _MOST_TRACKS = 2
+#: Numbers that a template may have; more than two a pair are not drawn, but their numbers are.
+_TEMPLATES = range(100)
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Track:
     patch, window
         The rectified template and search window, None where not kept.
     place
-        Row and column of the template's upper left corner in the window, None where not kept.
+        Row and column of the matched template's middle in the window, None where not kept.
     """
 
     pair: int
@@ -68,14 +70,7 @@ def tracks(products: Mapping[str, Any]) -> list[Track]:
     if table.size == 0 or table.shape[1] != len(names):
         return []
     rows = [dict(zip(names, (float(value) for value in row), strict=True)) for row in table]
-    counts = dict.fromkeys(_PAIRS, 0)
-    found = []
-    for row in rows:
-        pair = int(np.nan_to_num(row.get("pair", -1.0), nan=-1.0))
-        if pair in counts:
-            found.append(_track(products, pair, counts[pair], row))
-            counts[pair] += 1
-    return found
+    return [_track(products, row) for row in rows if row.get("pair") in _PAIRS and row.get("template") in _TEMPLATES]
 
 
 @in_page_style
@@ -118,6 +113,7 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
         axes = figure.add_subplot(lower[side])
         _show(axes, picture)
         _mark(axes, ours, stem, colour)
+        _outline(axes, products, pair, side)
         axes.set_title(f"Picture {pair + side + 1}: {'templates' if side == 0 else 'tracked'}", fontsize=9)
 
 
@@ -137,8 +133,8 @@ def _draw_window(axes: Axes, track: Track | None) -> None:
     _show(axes, track.window)
     _frame(axes, WINDOW, True)
     if track.place is not None and track.patch is not None:
-        height, width = track.patch.shape
-        _square(axes, (track.place[1] - 0.5, track.place[0] - 0.5), (width, height), MATCH, track.valid)
+        height, width = (float(side) for side in track.patch.shape)
+        _square(axes, (track.place[1] - width / 2, track.place[0] - height / 2), (width, height), MATCH, track.valid)
     axes.set_title("Window", fontsize=9)
 
 
@@ -166,6 +162,18 @@ def _mark(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
         )
 
 
+def _outline(axes: Axes, products: Mapping[str, Any], pair: int, side: int) -> None:
+    """Where the other picture of the pair overlaps the first, and the middle of the zero-phase spot in each."""
+    polygon, spot = _plane(products, f"overlap_{pair}"), _plane(products, f"zero_phase_{pair}")
+    if side == 0 and polygon is not None and polygon.shape[1] == 2:
+        axes.add_patch(Polygon(polygon, fill=False, edgecolor="#f2e35a", linewidth=0.9, linestyle=":"))
+    if spot is not None and spot.shape == (2, 2) and np.isfinite(spot[side]).all():
+        u, v = (float(value) for value in spot[side])
+        rows, columns = axes.get_images()[0].get_size()
+        if 0 <= u < columns and 0 <= v < rows:
+            axes.plot([u], [v], marker="x", color="#f2e35a", markersize=7)
+
+
 def _square(axes: Axes, corner: tuple[float, float], size: tuple[float, float], colour: str, valid: bool) -> None:
     line = "-" if valid else (0, (2, 1.5))
     axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=1.8, linestyle=line))
@@ -189,7 +197,8 @@ def _show(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
         spine.set_visible(False)
 
 
-def _track(products: Mapping[str, Any], pair: int, template: int, row: Mapping[str, float]) -> Track:
+def _track(products: Mapping[str, Any], row: Mapping[str, float]) -> Track:
+    pair, template = int(row["pair"]), int(row["template"])
     key = f"{pair}_{template}"
     place = _numbers(products.get(f"match_{key}"))
     return Track(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,7 +58,7 @@ class CaseRow:
     """A single case: its number, its values as texts, how to run it again, and what it said when it crashed."""
 
     case: str
-    kept: bool
+    pictured: bool
     values: Sequence[str]
     command: str
     message: str = ""
@@ -121,20 +121,20 @@ def outcome_grid(frame: pd.DataFrame) -> Grid:
     return Grid(["Outcome", "Cases", "Share"], rows)
 
 
-def worst_cases(run: StoredRun, metric: str) -> CaseTable:
-    """The cases with the largest errors, largest first."""
+def worst_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
+    """The cases with the largest errors, largest first; `pictured` are those that the page has pictures of."""
     magnitude = np.abs(numbers(run.frame, metric))
     known = np.flatnonzero(np.isfinite(magnitude))
     order = known[np.argsort(-magnitude[known], kind="stable")][:_MOST_CASES]
     columns = [metric, *axis_columns(metric, [str(name) for name in run.frame.columns])]
-    return _case_table(run, order, columns, metric, known.size - order.size)
+    return _case_table(run, order.tolist(), columns, metric, known.size - order.size, pictured)
 
 
-def silent_cases(run: StoredRun, metric: str) -> CaseTable:
+def silent_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
     """Cases that ran to their end without an error to score: no answer was given."""
     silent = ~np.isfinite(numbers(run.frame, metric)) & members(run.frame, "completed")
     order = np.flatnonzero(silent)
-    return _case_table(run, order[:_MOST_CASES], [], metric, max(0, order.size - _MOST_CASES))
+    return _case_table(run, order[:_MOST_CASES].tolist(), [], metric, max(0, order.size - _MOST_CASES), pictured)
 
 
 def crashed_rows(run: StoredRun) -> CaseTable:
@@ -144,13 +144,13 @@ def crashed_rows(run: StoredRun) -> CaseTable:
     rows = [
         CaseRow(
             case=_case(run.frame, index),
-            kept=False,
+            pictured=False,
             values=[_text(run.frame, "outcome", index)],
             command=replay_command(run, _case(run.frame, index)),
             message=_text(run.frame, "error", index),
             trace=_text(run.frame, "traceback", index),
         )
-        for index in order[:_MOST_CASES]
+        for index in order[:_MOST_CASES].tolist()
     ]
     return CaseTable(head, rows, max(0, order.size - _MOST_CASES))
 
@@ -214,13 +214,18 @@ def rerun_command(run: StoredRun) -> str:
 
 
 def _case_table(
-    run: StoredRun, order: np.ndarray[Any, np.dtype[np.intp]], columns: Sequence[str], metric: str, left_out: int
+    run: StoredRun,
+    order: Sequence[int],
+    columns: Sequence[str],
+    metric: str,
+    left_out: int,
+    pictured: Collection[str],
 ) -> CaseTable:
     shown = [name for name in [*columns, "terrain", *driver_columns(run.frame, metric, most=3)] if name in run.frame]
     rows = [
         CaseRow(
             case=_case(run.frame, index),
-            kept=_case(run.frame, index) in {str(case) for case in run.showcases},
+            pictured=_case(run.frame, index) in pictured,
             values=[_text(run.frame, "outcome", index), *(_text(run.frame, name, index) for name in shown)],
             command=replay_command(run, _case(run.frame, index)),
         )

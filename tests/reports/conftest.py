@@ -85,7 +85,7 @@ def synthetic_products(seed: int = 1) -> dict[str, Any]:
         ground = 1500 + 500 * np.sin(u / 70 + number) * np.cos(v / 23) + rng.normal(0, 120, u.shape)
         products[f"image_{number}"] = np.clip(ground, 0, 4095).astype(np.uint16)
     columns = ["pair", "template", "template_u", "template_v", "match_u", "match_v", "contrast", "peak", "peak_width"]
-    columns += ["second_peak_ratio", "valid", "velocity_east", "velocity_north"]
+    columns += ["second_peak_ratio", "valid", "velocity_east_m_s", "velocity_north_m_s"]
     rows = []
     for pair in (0, 1):
         for k in (0, 1):
@@ -94,7 +94,7 @@ def synthetic_products(seed: int = 1) -> dict[str, Any]:
             rows.append([pair, k, u0, v0, u0 + 12, v0 - 9, 5e4, 0.93, 2.1, 0.45, valid, 14.2, -8.8])
             products[f"window_{pair}_{k}"] = rng.normal(1500, 300, (61, 61)).astype(np.float32)
             products[f"template_{pair}_{k}"] = rng.normal(1500, 300, (17, 17)).astype(np.float32)
-            products[f"match_{pair}_{k}"] = np.array([25.4, 31.2])
+            products[f"match_{pair}_{k}"] = np.array([33.4, 39.2])
     products |= {"tracks": np.array(rows), "tracks_columns": columns}
     return products | {
         "velocity_estimated_m_s": np.array([14.1, -8.9]),
@@ -162,3 +162,21 @@ def make_run(tmp_path: Path) -> MakeRun:
         return write_run(tmp_path / name, frame, *args, **kwargs)
 
     return make
+
+
+@pytest.fixture
+def make_rows() -> Callable[..., pd.DataFrame]:
+    """Makes up rows; see `synthetic_frame`."""
+    return synthetic_frame
+
+
+@pytest.fixture
+def dimes_products() -> dict[str, Any]:
+    """Products of a made-up DIMES case; see `synthetic_products`."""
+    return synthetic_products()
+
+
+@pytest.fixture
+def velocity() -> dict[str, Any]:
+    """The requirement on velocity, on valid answers."""
+    return dict(VELOCITY)

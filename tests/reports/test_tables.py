@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pandas as pd
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from reports.columns import axis_columns, category_column, driver_columns, label, magnitude_label, primary_metric
+from reports.tables import error_table, outcome_counts, outcome_table, verdict_table
+from reports.verdicts import judge_campaign
+from reports.wording import interval, number, percent, stated
+
+Rows = Callable[..., pd.DataFrame]
+
+
+def _printed(table: Table, width: int) -> str:
+    console = Console(width=width, file=io.StringIO(), force_terminal=False, legacy_windows=False)
+    console.print(table)
+    text: str = console.file.getvalue()  # type: ignore[attr-defined]
+    return text
+
+
+@pytest.mark.parametrize("width", [80, 140])
+def test_verdict_table_holds_everything_at_any_width(make_rows: Rows, velocity: dict[str, Any], width: int) -> None:
+    verdicts = judge_campaign(make_rows(24), [velocity, {**velocity, "id": "DIMES-AVAIL", "population": "all"}])
+    text = _printed(verdict_table(verdicts), width)
+    assert max(len(line) for line in text.splitlines()) <= width
+    for said in ("DIMES-VEL", "DIMES-AVAIL", "INSUFFICIENT", "4 terrains", "Clopper-Pearson"):
+        assert said in " ".join(text.split())
+    # The column of numbers must not be cut.
+    assert "…" not in text
+
+
+def test_verdict_table_without_requirements() -> None:
+    assert "none asked" in _printed(verdict_table([]), 80)
+
+
+def test_texts_are_not_read_as_markup(make_rows: Rows, velocity: dict[str, Any]) -> None:
+    verdicts = judge_campaign(make_rows(5), [{**velocity, "id": "[red]R[/red]", "metric": "[/]"}])
+    text = _printed(verdict_table(verdicts), 140)
+    assert "[red]R[/red]" in text
+    frame = make_rows(2).assign(outcome="[bold]x[/]")
+    assert "[bold]x[/]" in _printed(outcome_table(frame), 80)
+
+
+def test_outcomes_in_order(make_rows: Rows) -> None:
+    frame = make_rows(200, crashed=2)
+    counts = outcome_counts(frame)
+    assert counts[0][0] == "VALID"
+    assert counts[-1] == ("CRASHED", 2)
+    assert sum(cases for _, cases in counts) == 200
+    assert outcome_counts(frame.drop(columns="outcome")) == []
+
+
+def test_error_table(make_rows: Rows) -> None:
+    text = _printed(error_table(make_rows(24), "velocity_error_m_s"), 140)
+    for said in ("velocity error (m/s)", "velocity error x (m/s)", "median", "95 % quantile"):
+        assert said in text
+
+
+def test_columns_in_words() -> None:
+    assert label("attitude_rate_max_deg_s") == "attitude rate max (deg/s)"
+    assert label("terrain") == "terrain"
+    assert magnitude_label("velocity_error_m_s") == "|velocity error| (m/s)"
+
+
+def test_parts_of_an_error(make_rows: Rows) -> None:
+    columns = list(make_rows(1).columns)
+    assert axis_columns("velocity_error_m_s", columns) == ["velocity_error_x_m_s", "velocity_error_y_m_s"]
+    assert axis_columns("score", columns) == []
+
+
+def test_drivers_leave_out_bookkeeping_and_the_error_itself(make_rows: Rows) -> None:
+    drivers = driver_columns(make_rows(50), "velocity_error_m_s", most=20)
+    assert drivers[:3] == ["off_nadir_max_deg", "attitude_rate_max_deg_s", "altitude_1_m"]
+    assert not {"case", "wall_time_s", "velocity_error_x_m_s", "terrain", "answered"} & set(drivers)
+
+
+def test_category(make_rows: Rows) -> None:
+    frame = make_rows(100)
+    assert category_column(frame) == "terrain"
+    assert category_column(frame.assign(site=["Gusev", "Meridiani"] * 50)) == "site"
+    assert category_column(make_rows(100, terrains=50)) is None
+
+
+def test_primary_metric(make_rows: Rows, velocity: dict[str, Any]) -> None:
+    frame = make_rows(3)
+    assert primary_metric(frame, [{**velocity, "metric": "off_nadir_max_deg"}]) == "off_nadir_max_deg"
+    assert primary_metric(frame, [{**velocity, "metric": "nonesuch"}]) == "velocity_error_m_s"
+    assert primary_metric(frame[["case", "outcome"]], []) is None
+
+
+@pytest.mark.parametrize(
+    ("fraction", "text"),
+    [(1.0, "100 %"), (0.0, "0 %"), (0.5, "50.00 %"), (0.99999, "99.999 %"), (1e-9, "0.0000001 %"), (math.nan, "–")],
+)
+def test_rates_are_never_rounded_to_certainty(fraction: float, text: str) -> None:
+    assert percent(fraction) == text
+
+
+def test_numbers() -> None:
+    assert [number(value) for value in (0.0, -1.5, 12.345, 123.45)] == ["0.000", "−1.500", "12.35", "123.5"]  # noqa: RUF100
+    assert (number(math.nan), number(math.inf), stated(0.9973)) == ("–", "∞", "99.73 %")
+    assert (interval(1.0, math.inf), interval(-math.inf, math.inf)) == ("≥ 1.000", "–")
