@@ -98,7 +98,12 @@ def summary(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) -> dict
         "sentence": whole.sentence,
         "exit_code": exit_code(verdicts, bool(whole.crashed)),
         "verdicts": [
-            {**asdict(verdict), "note": verdict.note, "clustered_status": verdict.clustered_status}
+            {
+                **asdict(verdict),
+                "note": verdict.note,
+                "clustered_status": verdict.clustered_status,
+                "further_terrains": verdict.further_terrains,
+            }
             for verdict in verdicts
         ],
         "outcomes": dict(outcome_counts(run.frame)),

@@ -90,10 +90,7 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
         _draw_points(axes, x, y, kind)
     if bound is not None:
         axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
-        if bound <= reach:
-            text = f"requirement {bound:g} {split_unit(metric)[1]}"
-            place = (0.0, 1.02 * bound)
-            axes.annotate(text, place, ha="center", va="bottom", color=INK, fontsize=9, backgroundcolor="none")
+        axes.plot([], [], "--", color=REQUIREMENT, label=f"requirement {bound:g} {split_unit(metric)[1]}")
     _cross(axes)
     axes.set(xlim=(-reach * 1.04, reach * 1.04), ylim=(-reach * 1.04, reach * 1.04), aspect="equal")
     axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Int
 
-from reports.clusters import ClusteredEvidence, clustered_evidence
+from reports.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
 from reports.statistics import further_cases_needed, proportion_lower, proportion_upper
 from reports.wording import count, percent, stated
 
@@ -104,6 +104,15 @@ class Verdict:
         return _status(self.clustered.lower, self.clustered.upper, self.probability)
 
     @property
+    def further_terrains(self) -> int | None:
+        """Terrains still needed where whole terrains are counted and no more fail; None where none is to be said."""
+        shared = self.clustered
+        counted = shared is not None and shared.method is ClusterMethod.TERRAIN_COUNT
+        if shared is None or not counted or self.clustered_status is not Status.INSUFFICIENT:
+            return None
+        return further_cases_needed(shared.terrains, shared.failed_terrains, self.probability, self.confidence)
+
+    @property
     def note(self) -> str:
         """What a reader must know before trusting the verdict; empty where there is nothing to say."""
         if self.reason:
@@ -115,8 +124,12 @@ class Verdict:
             f"{count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} and so are not independent, as the "
             f"verdict takes them to be. Allowing for that ({shared.method}, effective n {shared.effective_n:.4g}), the "
             f"success rate is at least {percent(shared.lower)} at {stated(self.confidence)} confidence: "
-            f"{self.clustered_status}."
+            f"{self.clustered_status}.{self._more_terrains()}"
         )
+
+    def _more_terrains(self) -> str:
+        further = self.further_terrains
+        return "" if further is None else f" {count(further, 'further terrain')} would do if no case fails on them."
 
 
 @dataclass(frozen=True)

@@ -146,6 +146,7 @@ def test_shared_terrains_are_owned_up_to(velocity: dict[str, Any]) -> None:
     # Issue 2 asks for the verdict as for independent cases; what eight terrains can show stands beside it.
     assert verdict.status is Status.PASS
     assert (verdict.terrains, verdict.clustered_status) == (8, Status.INSUFFICIENT)
+    assert verdict.further_terrains == 222  # of the 230 that 99 % at 90 % confidence takes
     assert "8 terrains" in verdict.note
     assert "not independent" in verdict.note
 
