@@ -1,0 +1,151 @@
+"""Compiled kernels of the rocks: placement without overlap, and assembly of their triangles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+
+@njit(cache=True)
+def place_discs(
+    radii: Array, taken: Array, period: float, cell_m: float, most_tries: int, rng: np.random.Generator
+) -> Array:
+    """Positions of discs on a periodic square, uniform where they do not overlap one another; rows (x, y).
+
+    Discs are placed in the order given, the largest first, each at the first of its random places that is free. `taken`
+    has rows (x, y, radius) of discs that are there already. A disc that finds no place in `most_tries` gets NaN.
+    """
+    side = max(int(period / cell_m), 1)
+    cell = period / side
+    entries = 0
+    for n in range(radii.size):
+        across = min(int(2.0 * radii[n] / cell) + 2, side)
+        entries += across * across
+    for n in range(taken.shape[0]):
+        across = min(int(2.0 * taken[n, 2] / cell) + 2, side)
+        entries += across * across
+    first = np.full(side * side, -1, dtype=np.int32)
+    following = np.empty(entries, dtype=np.int32)
+    member = np.empty(entries, dtype=np.int32)
+    discs = np.empty((taken.shape[0] + radii.size, 3), dtype=np.float64)
+    placed = np.full((radii.size, 2), np.nan, dtype=np.float64)
+    used = 0
+    count = 0
+    for n in range(taken.shape[0] + radii.size):
+        given = n < taken.shape[0]
+        radius = taken[n, 2] if given else radii[n - taken.shape[0]]
+        x = 0.0
+        y = 0.0
+        free = given
+        if given:
+            x = taken[n, 0] % period
+            y = taken[n, 1] % period
+        tries = 0
+        while not free and tries < most_tries:
+            tries += 1
+            x = rng.random() * period
+            y = rng.random() * period
+            free = True
+            span = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
+            width = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
+            for di in range(span):
+                i = (int((y - radius) / cell + side) + di) % side
+                for dj in range(width):
+                    j = (int((x - radius) / cell + side) + dj) % side
+                    entry = first[i * side + j]
+                    while entry >= 0:
+                        other = member[entry]
+                        dx = abs(discs[other, 0] - x)
+                        dy = abs(discs[other, 1] - y)
+                        dx = min(dx, period - dx)
+                        dy = min(dy, period - dy)
+                        apart = discs[other, 2] + radius
+                        if dx * dx + dy * dy < apart * apart:
+                            free = False
+                            break
+                        entry = following[entry]
+                    if not free:
+                        break
+                if not free:
+                    break
+        if not free:
+            continue
+        if not given:
+            placed[n - taken.shape[0], 0] = x
+            placed[n - taken.shape[0], 1] = y
+        discs[count, 0] = x
+        discs[count, 1] = y
+        discs[count, 2] = radius
+        span = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
+        width = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
+        for di in range(span):
+            i = (int((y - radius) / cell + side) + di) % side
+            for dj in range(width):
+                j = (int((x - radius) / cell + side) + dj) % side
+                member[used] = count
+                following[used] = first[i * side + j]
+                first[i * side + j] = used
+                used += 1
+        count += 1
+    return placed
+
+
+@njit(cache=True)
+def assemble(
+    shape: Ints,
+    position: Array,
+    scale: Array,
+    yaw: Array,
+    up: Array,
+    unit_vertices: Array,
+    unit_normals: Array,
+    vertices: Array,
+    normals: Array,
+) -> None:
+    """Vertices and normals of rocks in world axes, one rock after the other.
+
+    Each rock's unit shape is stretched by `scale`, turned by `yaw` about its own vertical, stood along `up` (the
+    shortest rotation from the vertical) and moved to `position`. Outputs have shape (rocks * vertices of a shape, 3).
+    """
+    each = unit_vertices.shape[1]
+    for n in range(shape.size):
+        kind = shape[n]
+        c = math.cos(yaw[n])
+        s = math.sin(yaw[n])
+        ux = up[n, 0]
+        uy = up[n, 1]
+        uz = up[n, 2]
+        # the rotation that takes z to up, about the axis z x up
+        f = 1.0 / (1.0 + uz)
+        r00 = 1.0 - ux * ux * f
+        r01 = -ux * uy * f
+        r11 = 1.0 - uy * uy * f
+        sx = scale[n, 0]
+        sy = scale[n, 1]
+        sz = scale[n, 2]
+        for v in range(each):
+            a = unit_vertices[kind, v, 0] * sx
+            b = unit_vertices[kind, v, 1] * sy
+            z = unit_vertices[kind, v, 2] * sz
+            x = c * a - s * b
+            y = s * a + c * b
+            row = n * each + v
+            vertices[row, 0] = position[n, 0] + r00 * x + r01 * y + ux * z
+            vertices[row, 1] = position[n, 1] + r01 * x + r11 * y + uy * z
+            vertices[row, 2] = position[n, 2] - ux * x - uy * y + uz * z
+            a = unit_normals[kind, v, 0] / sx
+            b = unit_normals[kind, v, 1] / sy
+            z = unit_normals[kind, v, 2] / sz
+            length = 1.0 / math.sqrt(a * a + b * b + z * z)
+            x = (c * a - s * b) * length
+            y = (s * a + c * b) * length
+            z *= length
+            normals[row, 0] = r00 * x + r01 * y + ux * z
+            normals[row, 1] = r01 * x + r11 * y + uy * z
+            normals[row, 2] = -ux * x - uy * y + uz * z

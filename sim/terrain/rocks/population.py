@@ -1,0 +1,115 @@
+"""How many rocks of which size lie on the ground, and where."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+#: Rocks beyond this number on one terrain are a mistake of the configuration.
+MOST_ROCKS = 2_000_000
+
+Positive = Annotated[float, Field(gt=0.0)]
+
+
+class PlacedRock(BaseModel):
+    """A rock put at a stated place: a rover's target, a landing hazard."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: Annotated[str, Field(min_length=1, description="what scenarios call it; unique on its terrain")]
+    east_m: Annotated[float, Field(description="x of its centre, m, on the periodic terrain")]
+    north_m: Annotated[float, Field(description="y of its centre, m, on the periodic terrain")]
+    diameter_m: Annotated[float, Field(gt=0.0, le=50.0, description="mean of longest and shortest diameter, m")]
+    height_m: Annotated[
+        Positive | None, Field(description="height above the ground, m; by default half the diameter")
+    ] = None
+    shape: Annotated[int | None, Field(ge=0, description="number of its shape; drawn where not given")] = None
+    yaw_deg: Annotated[float | None, Field(description="turn about its vertical, deg; drawn where not given")] = None
+
+
+class RockParameters(BaseModel):
+    """Rocks of a terrain: the size-frequency distribution of Golombek & Rapp (1997), and rocks at stated places.
+
+    The share of the ground covered by rocks of at least diameter D is ``F_k(D) = k exp(-q D)``,
+    ``q = 1.79 + 0.152 / k`` (D in metres), fitted to the Viking landing sites and used for all Mars landers since.
+    The number of rocks per area and diameter follows: ``n(D) = -dF/dD / (pi D**2 / 4)``.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    abundance: Annotated[float, Field(ge=0.0, le=0.4, description="k, share of the ground covered by all rocks")] = 0.05
+    smallest_m: Annotated[Positive, Field(description="diameter of the smallest rocks that are made, m")] = 0.05
+    largest_m: Annotated[Positive, Field(description="diameter of the largest, m")] = 3.0
+    height_ratio: Annotated[
+        float, Field(gt=0.0, le=1.0, description="mean height above the ground over diameter (Golombek & Rapp 1997)")
+    ] = 0.5
+    height_spread: Annotated[
+        float, Field(ge=0.0, lt=1.0, description="half-width of its uniform spread, as a share of the mean")
+    ] = 0.3
+    placed: Annotated[tuple[PlacedRock, ...], Field(description="rocks at stated places")] = ()
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> RockParameters:
+        if self.largest_m <= self.smallest_m:
+            raise ValueError(f"largest_m is {self.largest_m:g}; it must be larger than smallest_m, {self.smallest_m:g}")
+        names = [rock.name for rock in self.placed]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"more than one placed rock is called {', '.join(twice)}; names must be unique")
+        return self
+
+
+def decay_per_m(abundance: float) -> float:
+    """q(k) of Golombek & Rapp (1997), 1/m."""
+    return 1.79 + 0.152 / abundance
+
+
+def covered_share(abundance: float, diameter_m: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+    """F_k(D): share of the ground under rocks of at least this diameter."""
+    share: Float64[np.ndarray, "*n"] = abundance * np.exp(-decay_per_m(abundance) * diameter_m)
+    return share
+
+
+def rocks_per_m2(abundance: float, smallest_m: float, largest_m: float) -> float:
+    """Expected number of rocks per square metre between two diameters."""
+    return float(_cumulative(abundance, smallest_m, largest_m)[1][-1])
+
+
+def _cumulative(
+    abundance: float, smallest_m: float, largest_m: float
+) -> tuple[Float64[np.ndarray, "grid"], Float64[np.ndarray, "grid"]]:
+    """Diameters and the number per square metre from the smallest up to them, by Simpson's rule in the logarithm."""
+    if abundance == 0.0:
+        return np.array([smallest_m, largest_m]), np.zeros(2)
+    diameter = np.geomspace(smallest_m, largest_m, 2001)
+    step = np.log(largest_m / smallest_m) / 2000
+    q = decay_per_m(abundance)
+
+    def per_log(d: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        density: Float64[np.ndarray, "n"] = abundance * q * np.exp(-q * d) / (np.pi * d / 4.0)
+        return density
+
+    middle = np.sqrt(diameter[1:] * diameter[:-1])
+    pieces = step / 6.0 * (per_log(diameter[:-1]) + 4.0 * per_log(middle) + per_log(diameter[1:]))
+    return diameter, np.concatenate([[0.0], np.cumsum(pieces)])
+
+
+def draw_diameters(parameters: RockParameters, area_m2: float, rng: np.random.Generator) -> Float64[np.ndarray, "n"]:
+    """Diameters of the rocks on an area, metres, the largest first; their number is Poisson.
+
+    Raises ValueError where there would be more than `MOST_ROCKS`.
+    """
+    diameter, number = _cumulative(parameters.abundance, parameters.smallest_m, parameters.largest_m)
+    expected = number[-1] * area_m2
+    if expected > MOST_ROCKS:
+        raise ValueError(
+            f"{expected:.3g} rocks of at least {parameters.smallest_m:g} m on {area_m2:.3g} m2; at most "
+            f"{MOST_ROCKS:g} can be made: choose a larger rocks.smallest_m"
+        )
+    share = rng.random(int(rng.poisson(expected)))
+    drawn = np.exp(np.interp(share * number[-1], number, np.log(diameter)))
+    largest_first: Float64[np.ndarray, "n"] = np.sort(drawn)[::-1]
+    return largest_first

@@ -1,0 +1,167 @@
+"""Irregular rock shapes, made once from seeds: blocks cut by planes, angular to rounded, at several resolutions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+import trimesh
+from jaxtyping import Float64, Int32
+
+#: Number of different shapes. Even ones of the lower half are angular, those at the end well rounded.
+SHAPES = 16
+#: Subdivisions of the icosahedron at each level of detail: 80, 320, 1280 and 5120 triangles.
+SUBDIVISIONS = (1, 2, 3, 4)
+COARSE, MEDIUM, FINE, FINEST = range(4)
+#: Height above the ground over diameter of the unit shapes. Each rock is stretched to its own.
+UNIT_HEIGHT = 0.5
+#: Bumps in bands of wavenumber (radians per radius): number of waves and RMS height over the radius.
+_BUMP_WAVENUMBERS, _BUMP_WAVES, _BUMP_RMS = (3.0, 6.5, 13.0), (10, 16, 24), (0.05, 0.018, 0.007)
+
+
+@dataclass(frozen=True)
+class ShapeSet:
+    """All shapes at one level of detail. They share their triangles, for each is a displaced icosphere.
+
+    A unit shape stands on the ground plane z = 0, part of it below; seen from above, the mean of its longest and its
+    shortest diameter is 1, and it is `UNIT_HEIGHT` high.
+
+    Attributes
+    ----------
+    vertices, normals
+        Shape (shapes, vertices, 3). Normals are those of the smooth shape, not of the triangles.
+    faces
+        Vertex numbers of each triangle, counter-clockwise seen from outside.
+    reach
+        Largest horizontal distance of each shape's surface from its origin.
+    """
+
+    vertices: Float64[np.ndarray, "shapes vertices 3"]
+    normals: Float64[np.ndarray, "shapes vertices 3"]
+    faces: Int32[np.ndarray, "faces 3"]
+    reach: Float64[np.ndarray, "shapes"]
+
+    def mesh(self, shape: int) -> trimesh.Trimesh:
+        """One unit shape as a mesh."""
+        return trimesh.Trimesh(self.vertices[shape], self.faces, process=False, validate=False)
+
+
+@cache
+def rock_shapes(detail: int) -> ShapeSet:
+    """The shapes at a level of detail, 0 (`COARSE`) to 3 (`FINEST`); finer levels keep the coarser ones' vertices."""
+    sphere = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS[detail])
+    directions = np.array(sphere.vertices, dtype=np.float64)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    blocks = _blocks()
+    vertices = np.stack([block.surface(directions) for block in blocks])
+    normals = np.stack([block.normals(directions) for block in blocks])
+    for array in (vertices, normals):
+        array.setflags(write=False)
+    reach = np.array([block.reach() for block in blocks])
+    return ShapeSet(vertices, normals, np.ascontiguousarray(sphere.faces, dtype=np.int32), reach)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """A star-shaped body: an ellipsoid cut by planes whose edges are rounded, with a bumpy surface.
+
+    In its own axes the distance of the surface from the centre along direction d is
+    ``(|d|**-p + sum((n_i . d / c_i)**p))**(-1/p) (1 + bumps(d))``: for large p the smallest of all cuts.
+    """
+
+    cut_normals: Float64[np.ndarray, "cuts 3"]
+    cut_distances: Float64[np.ndarray, "cuts"]
+    sharpness: float
+    waves: Float64[np.ndarray, "waves 3"]
+    wave_phases: Float64[np.ndarray, "waves"]
+    wave_heights: Float64[np.ndarray, "waves"]
+    axes: Float64[np.ndarray, "3"]
+    buried_share: float
+
+    @classmethod
+    def drawn(cls, number: int) -> _Block:
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(0x70C6, spawn_key=(number,))))
+        roundness = number / (SHAPES - 1)
+        cuts = int(rng.integers(7, 14))
+        normals = rng.standard_normal((cuts, 3))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        waves = rng.standard_normal((sum(_BUMP_WAVES), 3))
+        waves *= (np.repeat(_BUMP_WAVENUMBERS, _BUMP_WAVES) / np.linalg.norm(waves, axis=1))[:, None]
+        bumps = np.repeat(np.array(_BUMP_RMS) * np.sqrt(2.0 / np.array(_BUMP_WAVES)), _BUMP_WAVES)
+        return cls(
+            cut_normals=normals,
+            cut_distances=rng.uniform(0.5, 0.9, cuts),
+            sharpness=float(40.0 * (1.0 - roundness) + 5.0 * roundness),
+            waves=waves,
+            wave_phases=rng.uniform(0.0, 2.0 * np.pi, sum(_BUMP_WAVES)),
+            wave_heights=bumps,
+            axes=np.array([1.0, rng.uniform(0.65, 0.95), rng.uniform(0.6, 0.85)]),
+            buried_share=float(rng.uniform(0.15, 0.4)),
+        )
+
+    def surface(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """Points of the unit shape along directions of the block's own axes."""
+        shift, stretch = self.frame
+        points: Float64[np.ndarray, "n 3"] = (self._raw(directions) - shift) * stretch
+        return points
+
+    def normals(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """Outward unit normals there, by differences of the implicit surface ``|x| - r(x / |x|)``."""
+        points = self._raw(directions)
+        own = points / self.axes
+        step = 1e-4
+        gradient = np.empty_like(own)
+        for axis in range(3):
+            offset = step * np.eye(3)[axis]
+            gradient[:, axis] = (self._beyond(own + offset) - self._beyond(own - offset)) / (2.0 * step)
+        gradient /= self.axes * self.frame[1]
+        unit: Float64[np.ndarray, "n 3"] = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+        return unit
+
+    def reach(self) -> float:
+        """Largest horizontal distance from the origin, over the finest mesh."""
+        return float(np.hypot(*self.surface(_finest_directions())[:, :2].T).max())
+
+    def _beyond(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+        length = np.linalg.norm(points, axis=1)
+        beyond: Float64[np.ndarray, "n"] = length - self._radius(points / length[:, None])
+        return beyond
+
+    def _radius(self, d: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+        # sums over few terms, written out so that no BLAS with its own order of summation takes part
+        towards = np.maximum(np.sum(d[:, None, :] * self.cut_normals, axis=-1), 0.0) / self.cut_distances
+        radius = (1.0 + np.sum(towards**self.sharpness, axis=1)) ** (-1.0 / self.sharpness)
+        phase = np.sum(d[:, None, :] * self.waves, axis=-1) + self.wave_phases
+        bumpy: Float64[np.ndarray, "n"] = radius * (1.0 + np.sum(self.wave_heights * np.cos(phase), axis=1))
+        return bumpy
+
+    def _raw(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        raw: Float64[np.ndarray, "n 3"] = directions * self._radius(directions)[:, None] * self.axes
+        return raw
+
+    @cached_property
+    def frame(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """Origin on the ground plane and scale that make the block a unit shape."""
+        points = self._raw(_finest_directions())
+        lowest, highest = points[:, 2].min(), points[:, 2].max()
+        ground = lowest + self.buried_share * (highest - lowest)
+        seen = points[points[:, 2] >= ground, :2]
+        azimuth = np.linspace(0.0, np.pi, 180, endpoint=False)
+        along = seen[:, :1] * np.cos(azimuth) + seen[:, 1:] * np.sin(azimuth)
+        diameters = np.ptp(along, axis=0)
+        middle = 0.5 * (seen.max(axis=0) + seen.min(axis=0))
+        across = 2.0 / (diameters.max() + diameters.min())
+        return np.array([*middle, ground]), np.array([across, across, UNIT_HEIGHT / (highest - ground)])
+
+
+@cache
+def _blocks() -> tuple[_Block, ...]:
+    return tuple(_Block.drawn(number) for number in range(SHAPES))
+
+
+@cache
+def _finest_directions() -> Float64[np.ndarray, "n 3"]:
+    vertices = np.array(trimesh.creation.icosphere(subdivisions=SUBDIVISIONS[FINEST]).vertices, dtype=np.float64)
+    directions: Float64[np.ndarray, "n 3"] = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+    return directions
