@@ -1,0 +1,35 @@
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _folder(sources: Path, cache: Path, **environment: str) -> str:
+    kept = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-c", "import os, sim; print(os.environ['NUMBA_CACHE_DIR'])"],
+        cwd=sources,
+        env=kept | {"MARSYARD_CACHE": str(cache), "PYTHONPATH": str(sources)} | environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    return done.stdout.strip()
+
+
+def test_a_changed_kernel_is_compiled_anew_with_all_that_call_it(tmp_path: Path) -> None:
+    sources = tmp_path / "sources"
+    shutil.copytree(ROOT / "sim", sources / "sim", ignore=shutil.ignore_patterns("__pycache__"))
+    before = _folder(sources, tmp_path / "cache")
+    assert _folder(sources, tmp_path / "cache") == before
+    kernels = sources / "sim" / "terrain" / "kernels.py"
+    kernels.write_text(kernels.read_text() + "\n# changed\n")
+    assert _folder(sources, tmp_path / "cache") != before
+
+
+def test_the_users_own_choice_stands(tmp_path: Path) -> None:
+    assert _folder(ROOT, tmp_path, NUMBA_CACHE_DIR="/somewhere") == "/somewhere"
