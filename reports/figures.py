@@ -90,7 +90,8 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
         _draw_points(axes, x, y, kind)
     if bound is not None:
         axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
-        axes.plot([], [], "--", color=REQUIREMENT, label=f"requirement {bound:g} {split_unit(metric)[1]}")
+        if bound <= reach * math.sqrt(2.0):  # else the circle lies outside of all four corners
+            axes.plot([], [], "--", color=REQUIREMENT, label=f"requirement {bound:g} {split_unit(metric)[1]}")
     _cross(axes)
     axes.set(xlim=(-reach * 1.04, reach * 1.04), ylim=(-reach * 1.04, reach * 1.04), aspect="equal")
     axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))
