@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
@@ -70,10 +71,9 @@ def bin_factors(shape: tuple[int, int], binned_size: tuple[int, int]) -> tuple[i
 def bin_mean(
     image: Float[np.ndarray, "rows columns"], columns: int, rows: int
 ) -> Float[np.ndarray, "binned_rows binned_columns"]:
-    """Averages over blocks of `columns` x `rows` pixels."""
-    height, width = image.shape
-    blocks = image.reshape(height // rows, rows, width // columns, columns)
-    return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float32))
+    """Averages over blocks of `columns` x `rows` pixels, which divide the image."""
+    size = (image.shape[1] // columns, image.shape[0] // rows)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def view(image: DetectorImage, world_from_body: Rotation, altitude_m: float, binned_size: tuple[int, int]) -> View:
@@ -86,7 +86,7 @@ def view(image: DetectorImage, world_from_body: Rotation, altitude_m: float, bin
     placed = rigid(world_from_body, np.array([-lever[0], -lever[1], altitude_m]))
     return View(
         signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(image.calibration.offset_dn),
-        flat_field=bin_mean(np.asarray(image.calibration.flat_field, dtype=np.float32), columns, rows),
+        flat_field=bin_mean(image.calibration.flat_field, columns, rows),
         camera=image.camera.binned(columns, rows).moved(placed),
         centre=np.array([0.0, 0.0, altitude_m + lever[2]]),
         time_s=image.time_s,

@@ -15,6 +15,9 @@ from algorithms.dimes.tracking import track_pair
 from algorithms.interface import VelocityEstimate, VelocityOutcome
 from sim.measurements import DescentMeasurements
 
+#: Heights outside of which nothing is tried: lower than the airbags are large, higher than the atmosphere.
+HEIGHTS_M = (1.0, 1e6)
+
 
 @final
 class DimesEstimator:
@@ -61,8 +64,10 @@ def _measurable(measurements: DescentMeasurements) -> bool:
 
 
 def _ordered_above_ground(triple: tuple[View, View, View]) -> bool:
-    """Whether the pictures were taken one after the other, all from above the ground."""
-    return all(view.centre[2] > 0.0 for view in triple) and triple[0].time_s < triple[1].time_s < triple[2].time_s
+    """Whether the pictures were taken one after the other, from heights at which there is ground to be measured."""
+    lowest, highest = HEIGHTS_M
+    in_range = all(lowest <= view.centre[2] <= highest for view in triple)
+    return in_range and triple[0].time_s < triple[1].time_s < triple[2].time_s
 
 
 def conclude(

@@ -147,6 +147,6 @@ def template_candidates(
         outside = outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
         return np.asarray(outside.all(axis=1))
 
-    clear = dark(first, geometry.template_half_m, 5) & dark(second, geometry.template_half_m, 5)
-    preferred = dark(second, geometry.window_half_m, 9)
+    clear = dark(first, geometry.template_half_m, 4) & dark(second, geometry.template_half_m, 4)
+    preferred = dark(second, geometry.window_half_m, 7)
     return Candidates(pixels[clear], ground[clear], preferred[clear])

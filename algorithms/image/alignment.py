@@ -14,6 +14,10 @@ from scipy import ndimage
 from scipy.interpolate import BSpline
 
 ORDER: Final = 5
+#: A step below this, pixels, ends the iteration; the one that would follow is smaller by a factor of ten or more.
+TOLERANCE = 1e-3
+#: Pixels around the start that the spline is computed from; what is beyond shifts the result by less than 1e-4 px.
+SURROUND = 12
 _TAPS = np.arange(ORDER + 1)
 _BASIS = BSpline.basis_element(np.arange(ORDER + 2) - (ORDER + 1) / 2.0, extrapolate=False)
 _SLOPE = _BASIS.derivative()
@@ -65,20 +69,24 @@ def refine_shift(
     when it leaves the circle of `reach` pixels about the start, when the patch comes within three pixels of the
     window's border, or when the normal equations are singular.
     """
-    coefficients = spline_coefficients(window)
-    room = np.array(window.shape) - np.array(template.shape) - 4.0
+    near = np.maximum(np.floor(corner).astype(int) - SURROUND, 0)
+    far = np.floor(corner).astype(int) + np.array(template.shape) + SURROUND
+    region = window[near[0] : far[0], near[1] : far[1]]
+    coefficients = spline_coefficients(region)
+    room = np.array(region.shape) - np.array(template.shape) - 4.0
     a = template - template.mean()
-    place = np.array(corner, dtype=np.float64)
+    start = corner - near
+    place = start
     for _ in range(iterations):
-        if np.hypot(*(place - corner)) > reach or np.any(place < 3.0) or np.any(place > room):
+        if np.hypot(*(place - start)) > reach or np.any(place < 3.0) or np.any(place > room):
             return None
         step = _step(a, *shifted_patch(coefficients, place, (template.shape[0], template.shape[1])))
         if step is None:
             return None
         place = place + step
-        if np.hypot(*step) < 1e-4:
+        if np.hypot(*step) < TOLERANCE:
             break
-    return place if np.hypot(*(place - corner)) <= reach else None
+    return place + near if np.hypot(*(place - start)) <= reach else None
 
 
 def _step(

@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cache
 
+import cv2
 import numpy as np
-from scipy import fft, ndimage
+from scipy import fft
 from scipy.spatial.transform import Rotation
 
 from sim.camera import Cahv, Cahvor
-from sim.frames import direction, rigid
+from sim.frames import direction
 from sim.measurements import (
     AltitudeMeasurement,
     AttitudeMeasurement,
@@ -43,15 +44,19 @@ class Texture:
     values: np.ndarray
     step_m: float
 
-    def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        rows, columns = -north / self.step_m, east / self.step_m
+    def __call__(self, east: np.ndarray, north: np.ndarray, origin: np.ndarray) -> np.ndarray:
+        """Brightness `east` and `north` of `origin`; float32 offsets keep 1e-4 of a texel, remap itself 1/32."""
         size = np.array(self.values.shape, dtype=np.float64)
-        rows, columns = np.mod(rows, size[0]).astype(np.float32), np.mod(columns, size[1]).astype(np.float32)
-        return ndimage.map_coordinates(self.values, [rows, columns], order=1, mode="grid-wrap")
+        row, column = np.mod(np.array([-origin[1], origin[0]]) / self.step_m, size)
+        rows = np.float32(row) - east.dtype.type(1.0 / self.step_m) * north
+        columns = np.float32(column) + east.dtype.type(1.0 / self.step_m) * east
+        return cv2.remap(self.values, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
 
 
 @cache
-def terrain(seed: int = 1, contrast: float = 0.15, slope: float = 1.2, size: int = 2048, step_m: float = 1.5) -> Texture:
+def terrain(
+    seed: int = 1, contrast: float = 0.15, slope: float = 1.2, size: int = 2048, step_m: float = 1.5
+) -> Texture:
     """Random texture of mean 1 and RMS `contrast`, amplitudes falling as frequency to the power `slope`."""
     rng = np.random.default_rng(seed)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(size), fft.rfftfreq(size), indexing="ij"))
@@ -70,19 +75,24 @@ def waves(wavelength_m: float, contrast: float = 0.2, size: int = 2048, step_m: 
 
 @cache
 def body_rays() -> np.ndarray:
-    """Directions of all physical pixels' rays in the body frame, shape (1024, 1024, 3)."""
-    return CAMERA.rays(CAMERA.pixel_grid())[1]
+    """Directions of all physical pixels' rays in the body frame, shape (3, 1024, 1024)."""
+    return np.ascontiguousarray(np.moveaxis(CAMERA.rays(CAMERA.pixel_grid())[1], -1, 0), dtype=np.float32)
 
 
 @cache
 def fall_off() -> np.ndarray:
     """Relative response of the physical pixels: cosine to the fourth, shape (1024, 1024)."""
-    return np.clip(body_rays() @ CAMERA.a, 0.0, 1.0) ** 4
+    return np.clip(np.tensordot(CAMERA.a, body_rays(), 1), 0.0, 1.0) ** 4
+
+
+@cache
+def delivered_fall_off() -> np.ndarray:
+    return fall_off().reshape(-1, ROWS_SUMMED, 1024).mean(axis=1)
 
 
 def calibration(transfer_row_s: float = 5e-6, clear_row_s: float = 2e-6) -> DetectorCalibration:
     return DetectorCalibration(
-        flat_field=fall_off().reshape(-1, ROWS_SUMMED, 1024).mean(axis=1),
+        flat_field=delivered_fall_off(),
         exposure_s=0.004,
         transfer_row_s=transfer_row_s,
         clear_row_s=clear_row_s,
@@ -92,13 +102,12 @@ def calibration(transfer_row_s: float = 5e-6, clear_row_s: float = 2e-6) -> Dete
     )
 
 
-def scene(texture: Texture, world_from_body: Rotation, position: np.ndarray, sky: float = 0.0) -> np.ndarray:
-    """Radiance of every physical pixel, shape (1024, 1024)."""
-    rays = body_rays().reshape(-1, 3) @ world_from_body.as_matrix().T
-    down = -rays[:, 2] > 0.05
-    slant = position[2] / np.where(down, -rays[:, 2], 1.0)
-    ground = position[:2] + slant[:, None] * rays[:, :2]
-    return np.where(down, texture(ground[:, 0], ground[:, 1]), sky).reshape(1024, 1024)
+def scene(texture: Texture, world_from_body: Rotation, position: np.ndarray) -> np.ndarray:
+    """Radiance of every physical pixel, shape (1024, 1024); the sky is black."""
+    rays = np.tensordot(world_from_body.as_matrix().astype(np.float32), body_rays(), 1)
+    down = rays[2] < -0.05
+    slant = np.where(down, np.float32(-position[2]) / np.where(down, rays[2], np.float32(-1.0)), np.float32(0.0))
+    return np.where(down, texture(slant * rays[0], slant * rays[1], position), np.float32(0.0))
 
 
 def delivered(
@@ -106,7 +115,7 @@ def delivered(
 ) -> np.ndarray:
     """Counts of a still scene; `level` counts for radiance 1 on the axis. Noise is that of 11,000 electrons at 1600."""
     rate = radiance * fall_off()
-    before = np.cumsum(rate, axis=0) - rate
+    before = np.cumsum(rate, axis=0) - rate  # in float64, as the fall-off is
     after = rate.sum(axis=0) - before - rate
     charge = rate + (known.transfer_row_s * before + known.clear_row_s * after) / known.exposure_s
     counts = level * charge.reshape(-1, known.rows_summed, charge.shape[1]).mean(axis=1)
@@ -137,7 +146,7 @@ def tilted(tilt_deg: float, azimuth_deg: float, roll_deg: float) -> Rotation:
 
 
 def flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: float = 30.0) -> Flight:
-    """Random rolls, leans that wander by a few degrees about a random one, wind in any direction with a change of it."""
+    """Random rolls, leans that wander by a few degrees about a random one, any wind with a change of it."""
     wind = max_wind * np.sqrt(rng.uniform()) * np.array([*_unit(rng), 0.0])
     change = np.array([*rng.normal(0.0, 1.0, 2), 0.0])
     first = np.array([*rng.uniform(0.0, 3000.0, 2), rng.uniform(1900.0, 2100.0)])

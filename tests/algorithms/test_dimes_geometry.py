@@ -1,0 +1,263 @@
+"""Geometry of DIMES: ground and pixels, overlap and room, zero-phase spot, rectification."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic_descent import CAMERA, INTERVAL_S, ROWS_SUMMED, Texture, calibration, delivered, scene, tilted
+
+from algorithms.dimes.binning import View, view
+from algorithms.dimes.ground import (
+    ground_from_pixels,
+    inside_frame,
+    pixel_angle_rad,
+    pixels_from_ground,
+    square,
+    square_outline,
+)
+from algorithms.dimes.options import DimesOptions
+from algorithms.dimes.overlap import (
+    Candidates,
+    border_pixels,
+    grid_pixels,
+    overlap_polygon,
+    search_geometry,
+    template_candidates,
+    zero_phase_pixel,
+)
+from algorithms.dimes.rectification import ground_lattice, rectified_patch
+from algorithms.dimes.selection import at_pixels, best_candidates, contrast_map, select_templates
+from sim.frames import direction
+from sim.measurements import DetectorImage
+
+OPTIONS = DimesOptions()
+LIMIT = OPTIONS.max_off_nadir_rad
+NIGHT = direction(0.0, -1.0)  # the sun below the horizon: no zero-phase spot on the ground
+
+
+def blank(attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None) -> View:
+    picture = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
+    return view(
+        DetectorImage(picture, time_s, CAMERA.binned(1, ROWS_SUMMED), calibration()), attitude, altitude_m, (256, 256)
+    )
+
+
+def pair(first: Rotation, second: Rotation, altitudes: tuple[float, float] = (2000.0, 1719.0)) -> tuple[View, View]:
+    return blank(first, altitudes[0]), blank(second, altitudes[1], INTERVAL_S)
+
+
+def candidates(first: View, second: View, sun: np.ndarray = NIGHT) -> Candidates:
+    return template_candidates(first, second, search_geometry(first, second, OPTIONS), sun, OPTIONS)
+
+
+def test_ground_and_pixels_invert_each_other() -> None:
+    seen = blank(tilted(20.0, 70.0, 200.0), 1850.0)
+    pixels = grid_pixels(seen.size, 16)
+    ground, near = ground_from_pixels(seen, pixels, LIMIT)
+    back, visible = pixels_from_ground(seen, ground)
+    assert near.sum() > 200
+    assert np.all(visible[near])
+    np.testing.assert_allclose(back[near], pixels[near], atol=1e-6)
+
+
+def test_rays_beyond_the_limit_end_at_the_limit_in_their_own_azimuth() -> None:
+    seen = blank(tilted(80.0, 0.0, 0.0), 1500.0)  # leans so that half of the picture is sky
+    pixels = border_pixels(seen.size)
+    ground, near = ground_from_pixels(seen, pixels, LIMIT)
+    _, directions = seen.camera.rays(pixels)
+    assert np.any(directions[:, 2] > 0.0)
+    assert not near.all()
+    off_nadir = np.hypot(*ground.T) / seen.centre[2]
+    np.testing.assert_allclose(off_nadir[~near], np.tan(LIMIT))
+    along = np.sum(ground * directions[:, :2], axis=1)
+    np.testing.assert_allclose(along, np.hypot(*ground.T) * np.hypot(*directions[:, :2].T))
+
+
+def test_camera_stands_above_the_origin_whatever_its_place_in_the_body() -> None:
+    from scipy.spatial.transform import RigidTransform
+
+    attitude = tilted(30.0, 45.0, 10.0)
+    lever = np.array([0.5, -1.0, -2.0])
+    image = DetectorImage(
+        np.zeros((256, 1024), dtype=np.uint16),
+        0.0,
+        CAMERA.binned(1, ROWS_SUMMED).moved(RigidTransform.from_translation(lever)),
+        calibration(),
+    )
+    seen = view(image, attitude, 1400.0, (256, 256))
+    np.testing.assert_allclose(seen.camera.c, seen.centre, atol=1e-9)
+    np.testing.assert_allclose(seen.centre, [0.0, 0.0, 1400.0 + attitude.apply(lever)[2]], atol=1e-9)
+
+
+def test_pixel_angle_and_search_geometry() -> None:
+    first, second = pair(Rotation.identity(), Rotation.identity())
+    # 4 x 12 um / 14.67 mm = 3.272 mrad; distortion changes it by less than 0.1 % near the middle.
+    assert pixel_angle_rad(second) == pytest.approx(4 * 12e-6 / 0.01467, rel=2e-3)
+    geometry = search_geometry(first, second, OPTIONS)
+    assert geometry.gsd_m == pytest.approx(1719.0 * 3.272e-3, rel=2e-3)
+    # 30 m/s in 3.75 s: 112.5 m (the paper's "at least 110 m") are 20.003 px: 21, and the margin.
+    assert geometry.search_px == 21 + OPTIONS.search_margin_px
+    assert geometry.window_px == OPTIONS.template_px + 2 * geometry.search_px
+
+
+def test_squares() -> None:
+    assert square(3.0, 4).shape == (16, 2)
+    outline = square_outline(3.0, 4)
+    assert outline.shape == (12, 2)
+    assert np.all(np.abs(outline).max(axis=1) == 3.0)
+
+
+def test_overlap_of_nadir_pictures_is_the_smaller_one_within() -> None:
+    first, second = pair(Rotation.identity(), Rotation.identity())
+    polygon = overlap_polygon(first, second, OPTIONS)
+    # Without distortion the second picture's border lies at 1719 / 2000 of the distance from the principal point.
+    middle = np.array([(515.0 - 1.5) / 4, (508.5 - 1.5) / 4])
+    expected = middle + (border_pixels(second.size) - middle) * 0.8595
+    np.testing.assert_allclose(polygon, expected, atol=1.2)
+
+
+def test_candidates_lie_within_the_overlap_polygon() -> None:
+    first, second = pair(tilted(15.0, 10.0, 0.0), tilted(12.0, 120.0, 77.0))
+    polygon = overlap_polygon(first, second, OPTIONS).astype(np.float32)
+    places = candidates(first, second).pixels
+    assert len(places) > 20
+    inside = [cv2.pointPolygonTest(polygon, (float(u), float(v)), True) for u, v in places]
+    assert min(inside) > 0.5 * OPTIONS.template_px * 0.7  # the window's half, seen in the first picture, at the least
+
+
+def test_every_candidate_has_room_for_template_and_window() -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(6):
+        first, second = pair(
+            tilted(*rng.uniform([0.0, 0.0, 0.0], [25.0, 360.0, 360.0])),
+            tilted(*rng.uniform([0.0, 0.0, 0.0], [25.0, 360.0, 360.0])),
+        )
+        geometry = search_geometry(first, second, OPTIONS)
+        for ground in candidates(first, second).ground:
+            assert inside_frame(first, ground + square_outline(geometry.template_half_m, 15), 0.0, LIMIT).all()
+            assert inside_frame(second, ground + square_outline(geometry.window_half_m, 15), 0.0, LIMIT).all()
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (tilted(0.0, 0.0, 0.0), tilted(120.0, 0.0, 0.0)),  # the second looks at the sky
+        (tilted(180.0, 0.0, 0.0), tilted(0.0, 0.0, 0.0)),  # the first does
+        (tilted(35.0, 0.0, 0.0), tilted(35.0, 180.0, 0.0)),  # they look away from each other
+    ],
+)
+def test_no_overlap_no_candidates(first: Rotation, second: Rotation) -> None:
+    assert len(candidates(*pair(first, second)).pixels) == 0
+
+
+def test_zero_phase_spot_is_where_the_shadow_falls() -> None:
+    # Sun in the east 60 deg high: the shadow falls to the west, at altitude / tan 60 from the nadir.
+    sun = direction(np.radians(90.0), np.radians(60.0))
+    seen = blank(tilted(10.0, 200.0, 30.0), 2000.0)
+    shadow = np.array([[-2000.0 / np.tan(np.radians(60.0)), 0.0]])
+    # A direction and a ground point on it project alike but for the rounding of 1e7 m.
+    np.testing.assert_allclose(zero_phase_pixel(seen, sun), pixels_from_ground(seen, shadow)[0][0], atol=1e-3)
+    assert np.all(np.isnan(zero_phase_pixel(seen, -sun)))
+
+
+def test_no_template_and_if_possible_no_window_shows_the_spot() -> None:
+    radius = OPTIONS.zero_phase_radius_rad
+    for azimuth in np.radians([0.0, 100.0, 230.0]):
+        sun = direction(azimuth, np.radians(80.0))
+        first, second = pair(tilted(5.0, 30.0, 0.0), tilted(8.0, 60.0, 140.0))
+        geometry = search_geometry(first, second, OPTIONS)
+        places = candidates(first, second, sun)
+        free = candidates(first, second)
+        assert 0 < len(places.pixels) < len(free.pixels)
+        assert 0 < places.preferred.sum() < len(places.pixels)
+        for seen in (first, second):
+            for ground, preferred in zip(places.ground, places.preferred, strict=True):
+                half = geometry.window_half_m if preferred and seen is second else geometry.template_half_m
+                points = np.column_stack([ground + square(half, 25), np.zeros(625)]) - seen.centre
+                cosines = points @ -sun / np.linalg.norm(points, axis=1)
+                # Between the points of the lattice that is tested the spot may reach in by a fraction of a degree.
+                assert np.degrees(np.arccos(cosines.max())) > np.degrees(radius) - 0.6
+        chosen, _ = select_templates(first, places, OPTIONS)
+        assert all(places.preferred[k] for k in chosen)
+
+
+def test_grid_is_coarse_and_centred() -> None:
+    pixels = grid_pixels((256, 256), 8)
+    assert pixels.shape == (32 * 32, 2)
+    assert pixels.min() == 3.0
+    assert pixels.max() == 251.0
+
+
+def test_best_candidates_are_taken_in_order_and_apart() -> None:
+    pixels = np.array([[10.0, 10.0], [20.0, 12.0], [60.0, 10.0], [10.0, 90.0]])
+    contrasts = np.array([0.9, 0.8, 0.1, 0.5])
+    everywhere = np.ones(4, dtype=bool)
+    assert best_candidates(contrasts, pixels, everywhere, 2, 31.0) == [0, 3]
+    assert best_candidates(contrasts, pixels, everywhere, 4, 31.0) == [0, 3, 2]
+    assert best_candidates(contrasts, pixels, everywhere, 2, 5.0) == [0, 1]
+    assert best_candidates(contrasts, pixels, np.array([False, True, False, False]), 2, 31.0) == [1, 3]
+    assert best_candidates(np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=bool), 2, 31.0) == []
+
+
+def test_selection_finds_the_only_textured_place() -> None:
+    counts = np.full((256, 1024), 1000, dtype=np.uint16)
+    rng = np.random.default_rng(6)
+    counts[140:170, 4 * 60 : 4 * 90] = np.repeat(rng.integers(700, 1300, (30, 30), dtype=np.uint16), 4, axis=1)
+    seen = blank(Rotation.identity(), 2000.0, 0.0, counts)
+    pixels = grid_pixels(seen.size, OPTIONS.grid_step_px)
+    places = Candidates(pixels, pixels, np.ones(len(pixels), dtype=bool))
+    chosen, contrasts = select_templates(seen, places, OPTIONS)
+    np.testing.assert_allclose(pixels[chosen[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
+    assert contrasts[0] > 0.02
+    assert contrasts[1] < 0.001
+    assert at_pixels(contrast_map(seen, OPTIONS.template_px), pixels)[chosen[0]] == contrasts[0]
+
+
+def chart() -> Texture:
+    """A smooth picture of which every point can be told analytically: waves of 60 to 200 m, and a ramp of none."""
+    size, step = 2048, 1.5
+    north = -np.arange(size)[:, None] * 2.0 * np.pi / size
+    east = np.arange(size)[None, :] * 2.0 * np.pi / size
+    values = 1.0 + 0.2 * np.sin(30 * east + 0.4) * np.cos(17 * north) + 0.2 * np.cos(41 * north - 12 * east)
+    return Texture(values.astype(np.float32), step)
+
+
+def chart_at(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
+    east, north = (2.0 * np.pi * x / (2048 * 1.5) for x in (east_m, north_m))
+    return 1.0 + 0.2 * np.sin(30 * east + 0.4) * np.cos(17 * north) + 0.2 * np.cos(41 * north - 12 * east)
+
+
+def test_ground_lattice_is_north_up() -> None:
+    lattice = ground_lattice(np.array([100.0, 200.0]), 3, 10.0)
+    np.testing.assert_allclose(lattice[0, 0], [90.0, 210.0])
+    np.testing.assert_allclose(lattice[2, 1], [100.0, 190.0])
+
+
+@pytest.mark.parametrize("attitude", [tilted(0.0, 0.0, 0.0), tilted(18.0, 200.0, 140.0), tilted(25.0, 80.0, 300.0)])
+def test_rectified_patch_shows_the_ground_that_it_names(attitude: Rotation) -> None:
+    position = np.array([700.0, -300.0, 1700.0])
+    counts = delivered(scene(chart(), attitude, position), calibration(), level=1600.0)
+    seen = blank(attitude, 1700.0, 0.0, counts)
+    centre, near = ground_from_pixels(seen, np.array([[150.0, 90.0]]), LIMIT)
+    assert near[0]
+    patch = rectified_patch(seen, centre[0], 61, 5.5)
+    lattice = ground_lattice(centre[0], 61, 5.5) + position[:2]
+    expected = chart_at(lattice[..., 0], lattice[..., 1])
+    shift = _shift(patch / 1600.0, expected, chart_at, lattice)
+    # 0.01 px of a binned pixel: 0.06 m, or 0.015 m/s over 3.75 s.
+    assert np.abs(shift).max() < 0.06
+    np.testing.assert_allclose(patch / 1600.0, expected, atol=0.02)
+
+
+def _shift(patch: np.ndarray, expected: np.ndarray, truth: object, lattice: np.ndarray) -> np.ndarray:
+    """Mean displacement (east, north) of the patch against the truth, metres, by one least-squares step."""
+    assert callable(truth)
+    slopes = [
+        (truth(lattice[..., 0] + dx, lattice[..., 1] + dy) - truth(lattice[..., 0] - dx, lattice[..., 1] - dy)) / 0.2
+        for dx, dy in ((0.1, 0.0), (0.0, 0.1))
+    ]
+    design = np.column_stack([slopes[0].ravel(), slopes[1].ravel(), np.ones(patch.size)])
+    solution, *_ = np.linalg.lstsq(design, (patch - expected).ravel())
+    return solution[:2]

@@ -1,0 +1,185 @@
+"""Operators on plain arrays, against brute force and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy import ndimage
+
+from algorithms.image.alignment import refine_shift, shifted_patch, spline_coefficients
+from algorithms.image.correlation import box_sums, pseudo_normalized_correlation
+from algorithms.image.interest import harris_interest, local_mean
+from algorithms.image.peak import Peak, biquadratic_offset, highest_peak, peak_width, second_peak
+
+
+def brute_force(template: np.ndarray, window: np.ndarray) -> np.ndarray:
+    n, m = template.shape
+    a = template - template.mean()
+    result = np.zeros((window.shape[0] - n + 1, window.shape[1] - m + 1))
+    for i, j in np.ndindex(*result.shape):
+        b = window[i : i + n, j : j + m]
+        b = b - b.mean()
+        result[i, j] = 2.0 * np.sum(a * b) / (np.sum(a * a) + np.sum(b * b))
+    return result
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "rows", "columns"), [(5, 5, 12, 12), (7, 9, 30, 21), (31, 31, 71, 71), (5, 5, 5, 5)]
+)
+def test_correlation_equals_its_definition(n: int, m: int, rows: int, columns: int) -> None:
+    rng = np.random.default_rng(n * rows)
+    template, window = 1000.0 + rng.normal(size=(n, m)), 1500.0 + 3.0 * rng.normal(size=(rows, columns))
+    # Rounding: values of 1e3 with deviations of 1 leave about 1e-16 * 1e6 of the squares.
+    np.testing.assert_allclose(
+        pseudo_normalized_correlation(template, window), brute_force(template, window), atol=1e-10
+    )
+
+
+def test_correlation_is_one_where_the_template_was_cut_out_whatever_is_added() -> None:
+    window = np.random.default_rng(2).normal(size=(40, 50))
+    surface = pseudo_normalized_correlation(window[7:22, 13:28] + 500.0, window)
+    assert surface.shape == (26, 36)
+    peak = highest_peak(surface)
+    assert (peak.row, peak.column) == (7, 13)
+    assert peak.value == pytest.approx(1.0, abs=1e-12)
+
+
+def test_correlation_falls_when_contrasts_differ() -> None:
+    # 2 g / (1 + g^2) for a gain g: it is only pseudo-normalised.
+    patch = np.random.default_rng(3).normal(size=(9, 9))
+    assert pseudo_normalized_correlation(patch, 3.0 * patch)[0, 0] == pytest.approx(0.6, abs=1e-12)
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-3, 4095.0])
+def test_correlation_of_flat_patches_is_zero(value: float) -> None:
+    assert np.all(pseudo_normalized_correlation(np.full((7, 7), value), np.full((20, 20), value)) == 0.0)
+
+
+@given(arrays(np.float64, (11, 13), elements=st.floats(-1e6, 1e6)), st.integers(1, 5), st.integers(1, 5))
+def test_correlation_is_bounded_and_finite(window: np.ndarray, n: int, m: int) -> None:
+    surface = pseudo_normalized_correlation(window[:n, :m], window)
+    assert surface.shape == (12 - n, 14 - m)
+    assert np.all(np.abs(surface) <= 1.0)
+
+
+def test_box_sums() -> None:
+    image = np.arange(30.0).reshape(5, 6)
+    expected = [[image[i : i + 2, j : j + 3].sum() for j in range(4)] for i in range(4)]
+    np.testing.assert_allclose(box_sums(image, 2, 3), expected)
+
+
+def blobs(seed: int, shift: tuple[float, float] = (0.0, 0.0), size: int = 55, width: float = 1.2) -> np.ndarray:
+    """An analytic picture: a sum of Gaussians, moved by `shift` (row, column)."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:size, :size].astype(float)
+    image = np.zeros((size, size))
+    for y, x, height in zip(*rng.uniform(-5.0, size + 5.0, (2, 500)), rng.normal(size=500), strict=True):
+        image += height * np.exp(-((rows - y - shift[0]) ** 2 + (columns - x - shift[1]) ** 2) / (2.0 * width**2))
+    return image
+
+
+def subpixel_errors(align: bool) -> np.ndarray:
+    """Errors (row, column) of measured shifts over a table of fractions of a pixel."""
+    fractions = np.linspace(-0.5, 0.5, 6)
+    errors = []
+    for k, (fy, fx) in enumerate((a, b) for a in fractions[::2] for b in fractions):
+        template = blobs(k % 2)[12:43, 12:43]
+        window = blobs(k % 2, (fy, fx))
+        surface = pseudo_normalized_correlation(template, window)
+        peak = highest_peak(surface)
+        found: np.ndarray | None = np.array([peak.row, peak.column]) + biquadratic_offset(surface, peak)
+        if align:
+            found = refine_shift(template, window, found)
+        assert found is not None
+        errors.append(found - 12.0 - np.array([fy, fx]))
+    return np.array(errors)
+
+
+def test_subpixel_bias() -> None:
+    # The biquadratic leans towards whole pixels by up to 0.09 px on sharp texture (design notes); alignment on quintic
+    # splines must do better than 0.005 px there.
+    assert np.abs(subpixel_errors(align=False)).max() < 0.12
+    assert np.abs(subpixel_errors(align=True)).max() < 0.005
+
+
+def test_alignment_gives_up_rather_than_wander() -> None:
+    window = blobs(1)
+    template = blobs(2)[12:43, 12:43]
+    assert refine_shift(np.zeros((31, 31)), window, np.array([12.0, 12.0])) is None
+    assert refine_shift(window[12:43, 12:43], window, np.array([1.0, 12.0])) is None  # too near the border
+    edge = np.tile(np.linspace(0.0, 1.0, 55), (55, 1))
+    assert refine_shift(edge[12:43, 12:43], edge, np.array([12.0, 12.0])) is None  # slides along itself
+    found = refine_shift(template, window, np.array([12.0, 12.0]))
+    assert found is None or np.hypot(*(found - 12.0)) <= 1.5
+
+
+def test_shifted_patch_equals_scipys_spline() -> None:
+    image = blobs(4)
+    corner = np.array([20.3, 17.8])
+    patch, by_row, by_column = shifted_patch(spline_coefficients(image), corner, (9, 11))
+    places = np.mgrid[:9, :11] + corner[:, None, None]
+    np.testing.assert_allclose(patch, ndimage.map_coordinates(image, places, order=5, mode="mirror"), atol=1e-12)
+    step = 1e-4
+    ahead = shifted_patch(spline_coefficients(image), corner + np.array([step, 0.0]), (9, 11))[0]
+    right = shifted_patch(spline_coefficients(image), corner + np.array([0.0, step]), (9, 11))[0]
+    np.testing.assert_allclose(by_row, (ahead - patch) / step, atol=1e-3)
+    np.testing.assert_allclose(by_column, (right - patch) / step, atol=1e-3)
+
+
+def test_biquadratic_is_exact_on_a_quadric() -> None:
+    rows, columns = np.mgrid[:9, :9].astype(float)
+    surface = 1.0 - 0.02 * (rows - 4.3) ** 2 - 0.05 * (columns - 3.8) ** 2 + 0.01 * (rows - 4.3) * (columns - 3.8)
+    np.testing.assert_allclose(biquadratic_offset(surface, highest_peak(surface)), [0.3, -0.2], atol=1e-12)
+
+
+def test_biquadratic_stays_put_without_a_maximum() -> None:
+    rows, columns = np.mgrid[:9, :9].astype(float)
+    saddle = (rows - 4.0) ** 2 - (columns - 4.0) ** 2
+    assert np.all(biquadratic_offset(saddle, Peak(4, 4, 0.0, False)) == 0.0)
+    ramp = highest_peak(rows)
+    assert ramp.on_border
+    assert np.all(biquadratic_offset(rows, ramp) == 0.0)
+
+
+def gaussian(rows: float, columns: float, widths: tuple[float, float] = (1.5, 1.5)) -> np.ndarray:
+    y, x = np.mgrid[:41, :41]
+    return np.exp(-((y - rows) ** 2) / (2 * widths[0] ** 2) - (x - columns) ** 2 / (2 * widths[1] ** 2))
+
+
+def test_peak_width_is_that_of_the_longest_direction() -> None:
+    # A Gaussian of width s is above 3/4 within s sqrt(2 ln 4/3) = 0.759 s: full width 1.517 s. Pixels are whole.
+    for s in (2.0, 4.0, 6.0):
+        surface = gaussian(20.0, 20.0, (2.0, s))
+        assert peak_width(surface, highest_peak(surface)) == pytest.approx(1.517 * max(s, 2.0), abs=1.0)
+    spike = np.zeros((9, 9))
+    spike[4, 4] = 1.0
+    assert peak_width(spike, highest_peak(spike)) == pytest.approx(4.0 / np.sqrt(12.0))
+    assert peak_width(np.zeros((9, 9)), Peak(0, 0, 0.0, True)) > 9.0
+
+
+def test_second_peak_is_a_maximum_of_its_own() -> None:
+    one = gaussian(20.0, 20.0, (4.0, 4.0))
+    assert second_peak(one, highest_peak(one), 3.0) == 0.0  # its flanks are no second peak
+    two = np.maximum(one, 0.7 * gaussian(31.0, 9.0))
+    assert second_peak(two, highest_peak(two), 3.0) == pytest.approx(0.7)
+    near = np.maximum(gaussian(20.0, 20.0), 0.9 * gaussian(20.0, 23.0))
+    assert second_peak(near, highest_peak(near), 3.0) == 0.0
+    assert second_peak(near, highest_peak(near), 2.0) == pytest.approx(0.9)
+
+
+def test_interest_asks_for_structure_in_both_directions() -> None:
+    u, v = np.meshgrid(np.arange(64.0), np.arange(64.0))
+    one_way, both_ways = 10.0 * np.sin(0.3 * u), 10.0 * (np.sin(0.3 * u) + np.sin(0.3 * v))
+    assert harris_interest(one_way, 21)[32, 32] < 0.05 * harris_interest(both_ways, 21)[32, 32]
+    # RMS gradient per axis is 10 * 0.3 / sqrt(2) = 2.12; Sobel's difference over two pixels damps by sin(0.3) / 0.3,
+    # and 21 pixels are one period of 20.9.
+    assert harris_interest(both_ways, 21)[32, 32] == pytest.approx(2.12 * np.sin(0.3) / 0.3, rel=0.02)
+    assert np.all(harris_interest(np.full((64, 64), 7.0), 21) == 0.0)
+
+
+def test_local_mean() -> None:
+    image = np.arange(100.0).reshape(10, 10)
+    assert local_mean(image, 3)[4, 4] == pytest.approx(44.0)
