@@ -156,6 +156,7 @@ class DescentScenario:
         row = {
             **_score(estimate, true_velocity),
             **_conditions(p, exposures, measurements, altimeter, sun),
+            **{f"descent_{name}": value for name, value in descent.parameters.model_dump().items()},
             **_provenance(p, exposures),
         }
         return CaseResult(

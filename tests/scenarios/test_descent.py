@@ -121,6 +121,8 @@ def test_conditions_are_read_from_the_simulated_objects(nominal) -> None:
     assert row["sun_azimuth_deg"] == pytest.approx(270.0)
     assert row["sun_elevation_deg"] == pytest.approx(40.0)
     assert len(row["image_hash"]) == 64
+    assert row["descent_wind_east_m_s"] == 14.0
+    assert row["descent_heading_deg"] == 70.0
 
 
 def test_no_room_for_a_template_is_an_outcome_without_velocity() -> None:
