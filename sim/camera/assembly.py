@@ -12,6 +12,7 @@ from sim.camera.base import CameraModel
 from sim.camera.cahv import Cahv
 from sim.camera.cahvor import Cahvor
 from sim.camera.cahvore import Cahvore
+from sim.camera.vectors import Real
 
 
 class CameraFileError(ValueError):
@@ -51,7 +52,7 @@ class Source:
 MODELS = ("CAHV", "CAHVOR", "CAHVORE")
 
 
-def linearity_of_type(kind: float | None, parameter: float | None, field: str, source: Source) -> float:
+def linearity_of_type(kind: Real | None, parameter: float | None, field: str, source: Source) -> float:
     """CAHVORE's linearity from its type (1 perspective, 2 fish-eye, 3 general) and, for type 3, its parameter."""
     if kind == 1:
         return 1.0

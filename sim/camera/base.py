@@ -222,9 +222,10 @@ class CameraModel(ABC):
         """
         if not (np.isfinite(factor) and factor > 0):
             raise ValueError(f"an image is scaled by a positive, finite factor, not {factor}")
-        shift = 0.5 * factor - 0.5
+        scale = float(factor)
+        shift = 0.5 * scale - 0.5
         size = (round(self.size[0] * factor), round(self.size[1] * factor))
-        return self._with_image_map((factor, factor), (shift, shift), size)
+        return self._with_image_map((scale, scale), (shift, shift), size)
 
     def cropped(self: M, column: int, row: int, size: tuple[int, int]) -> M:
         """The camera of a part of the image, given its upper left pixel (column, row) and its size (columns, rows).

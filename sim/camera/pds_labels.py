@@ -20,6 +20,11 @@ _GROUP = "GEOMETRIC_CAMERA_MODEL"
 _FIRST_BYTES = 1 << 16
 _MOST_BYTES = 1 << 23
 _END = re.compile(rb"^END\s*$", re.MULTILINE)
+_BLOCKS = re.compile(
+    r"^[ \t]*(GROUP|OBJECT)[ \t]*=[ \t]*(GEOMETRIC_CAMERA_MODEL|IMAGE|INSTRUMENT_STATE_PARMS)[ \t]*\r?$"
+    r".*?^[ \t]*END_\1\b[^\n]*$",
+    re.MULTILINE | re.DOTALL,
+)
 _METRES = ("METER", "METERS", "METRE", "METRES", "M", "N/A")
 
 
@@ -45,7 +50,7 @@ def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
     label = _label(source)
     groups = label.getall(_GROUP) if _GROUP in label else []
     if not groups:
-        raise source.error(_GROUP, "missing", "a label with at least one such group")
+        raise source.error(_GROUP, "missing or not closed", "a label with at least one such group")
     size = _size(label, source)
     if not subframe_folded_in:
         _refuse_subframes(label, source)
@@ -75,10 +80,22 @@ def _label(source: Source) -> Any:
 
 
 def _parsed(text: str) -> Any:
+    """The blocks that are needed, parsed strictly.
+
+    pvl's strict parser refuses what real labels hold elsewhere (values that begin with a digit and have no quotes), and
+    its lenient one never returns from some damaged labels; the blocks are regular.
+    """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ImportWarning)  # pvl misses an optional package
-        import pvl
-    return pvl.loads(text)
+        # What pvl says of itself: an optional package is missing, and a class that it uses itself is deprecated.
+        warnings.simplefilter("ignore", ImportWarning)
+        warnings.simplefilter("ignore", PendingDeprecationWarning)
+        from pvl.decoder import PDSLabelDecoder
+        from pvl.grammar import PDSGrammar
+        from pvl.parser import ODLParser
+
+        grammar = PDSGrammar()
+        parser = ODLParser(grammar=grammar, decoder=PDSLabelDecoder(grammar=grammar))
+        return parser.parse("\n".join(block[0] for block in _BLOCKS.finditer(text)) + "\nEND\n")
 
 
 def _size(label: Any, source: Source) -> tuple[int, int]:

@@ -1,0 +1,340 @@
+"""Motion, changes of the image, linear stand-ins, construction and what makes a camera a value."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+import pickle
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+
+
+@st.composite
+def transforms(draw: st.DrawFn) -> RigidTransform:
+    rotation = Rotation.from_rotvec(draw(arrays(float, 3, elements=st.floats(-3, 3))))
+    return RigidTransform.from_components(draw(arrays(float, 3, elements=st.floats(-2000, 2000))), rotation)
+
+
+def points_before(camera: CameraModel) -> np.ndarray:
+    """Points all over the frame, 4 m off."""
+    origins, directions = camera.rays(camera.pixel_grid()[::100, ::100])
+    return origins + 4 * directions
+
+
+def vectors(camera: CameraModel) -> np.ndarray:
+    return np.stack([getattr(camera, name) for name in "cahv"])
+
+
+# ----- rigid motion: a group acts -----
+
+
+def test_moved_camera_sees_moved_points_as_before(camera: CameraModel) -> None:
+    motion = RigidTransform.from_components([100.0, -20.0, 5.0], Rotation.from_rotvec([0.4, -1.2, 2.0]))
+    points = points_before(camera)
+    moved_points = motion.apply(points.reshape(-1, 3)).reshape(points.shape)
+    # Points 100 m off are rounded to 1e-14 m, of 4 m and 1200 px/rad: 4e-12 px.
+    assert np.allclose(camera.moved(motion).project(moved_points)[0], camera.project(points)[0], rtol=0, atol=1e-10)
+
+
+@given(transforms(), transforms())
+def test_motions_compose(first: RigidTransform, second: RigidTransform) -> None:
+    camera = Cahv.from_field_of_view(0.8, (64, 48), axis=(0, 0, -1), right=(1, 0, 0), centre=(1, 2, 3))
+    # Coordinates reach 4000 m, so that 1e-11 is a few roundings.
+    assert np.allclose(
+        vectors(camera.moved(first).moved(second)), vectors(camera.moved(second * first)), rtol=0, atol=1e-11
+    )
+    assert np.allclose(vectors(camera.moved(first).moved(first.inv())), vectors(camera), rtol=0, atol=1e-11)
+
+
+def test_motion_turns_the_lens_too(hazcam: Cahvore) -> None:
+    turn = Rotation.from_rotvec([0.3, 0.2, 0.1])
+    moved = hazcam.moved(RigidTransform.from_rotation(turn))
+    assert np.allclose(moved.o, turn.apply(np.array(hazcam.o)), atol=1e-15)
+    assert np.array_equal(moved.r, hazcam.r)
+    assert np.array_equal(moved.e, hazcam.e)
+    assert moved.linearity == hazcam.linearity
+    assert moved.size == hazcam.size
+
+
+def test_several_motions_at_once_are_refused(navcam: Cahvor) -> None:
+    with pytest.raises(ValueError, match="single transform"):
+        navcam.moved(RigidTransform.identity(2))
+
+
+# ----- changes of the image -----
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(1, 1), (2, 2), (4, 1), (1, 4), (32, 64)])
+def test_binning_puts_blocks_at_their_middle(camera: CameraModel, columns: int, rows: int) -> None:
+    binned = camera.binned(columns, rows)
+    assert binned.size == (1024 // columns, 1024 // rows)
+    points = points_before(camera)
+    factors = np.array([columns, rows])
+    expected = (camera.project(points)[0] - (factors - 1) / 2) / factors
+    assert np.allclose(binned.project(points)[0], expected, rtol=0, atol=1e-10)
+
+
+def test_binning_agrees_with_averaged_rays(navcam: Cahvor) -> None:
+    """The middle of four pixels looks between their directions (exactly, but for the curvature over half a pixel)."""
+    grid = navcam.pixel_grid()[500:502, 300:302].reshape(-1, 2)
+    between = navcam.rays(grid)[1].mean(axis=0)
+    direction = navcam.binned(2, 2).rays(np.array([150.0, 250.0]))[1]
+    assert np.allclose(between / np.linalg.norm(between), direction, atol=1e-9)
+
+
+def test_scaling_keeps_the_frames_edges(camera: CameraModel) -> None:
+    points = points_before(camera)
+    for factor in (0.5, 0.25, 2, 1.7):
+        scaled = camera.scaled(factor)
+        expected = (camera.project(points)[0] + 0.5) * factor - 0.5
+        assert np.allclose(scaled.project(points)[0], expected, rtol=0, atol=1e-9)
+        assert scaled.size == (round(1024 * factor), round(1024 * factor))
+    assert np.allclose(vectors(camera.scaled(0.25)), vectors(camera.binned(4, 4)), rtol=0, atol=1e-12)
+
+
+def test_cropping_moves_the_origin(camera: CameraModel) -> None:
+    cropped = camera.cropped(100, 37, (512, 256))
+    points = points_before(camera)
+    assert cropped.size == (512, 256)
+    assert np.allclose(cropped.project(points)[0], camera.project(points)[0] - [100, 37], rtol=0, atol=1e-10)
+
+
+@given(st.integers(0, 20), st.integers(0, 30), st.sampled_from([1, 2, 4]), st.sampled_from([1, 2, 4]))
+def test_crop_then_bin_is_bin_then_crop(column: int, row: int, columns: int, rows: int) -> None:
+    camera = Cahv.from_field_of_view(1.0, (256, 256), axis=(0, 0, -1), right=(1, 0, 0))
+    one = camera.cropped(column * columns, row * rows, (32 * columns, 16 * rows)).binned(columns, rows)
+    other = camera.binned(columns, rows).cropped(column, row, (32, 16))
+    assert one.size == other.size
+    assert np.allclose(vectors(one), vectors(other), rtol=0, atol=1e-12)
+
+
+def test_changes_keep_the_lens(hazcam: Cahvore) -> None:
+    changed = hazcam.cropped(1, 2, (512, 256)).binned(2, 2).scaled(3)
+    for name in "caore":
+        assert np.array_equal(getattr(changed, name), getattr(hazcam, name))
+    assert changed.linearity == hazcam.linearity
+
+
+def test_impossible_changes_are_refused(navcam: Cahvor) -> None:
+    for columns, rows in ((3, 1), (1, 7), (0, 1), (-2, 1), (2048, 1)):
+        with pytest.raises(ValueError, match="cannot bin"):
+            navcam.binned(columns, rows)
+    for factor in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match="positive, finite"):
+            navcam.scaled(factor)
+    with pytest.raises(ValueError, match="size"):
+        navcam.scaled(1e-6)
+    for column, row, size in ((-1, 0, (4, 4)), (0, 1020, (4, 5)), (1024, 0, (1, 1))):
+        with pytest.raises(ValueError, match="leaves the frame"):
+            navcam.cropped(column, row, size)
+    with pytest.raises(ValueError, match="size"):
+        navcam.cropped(0, 0, (0, 4))
+
+
+# ----- linear stand-ins -----
+
+
+def test_linear_camera_is_its_own_stand_in(pinhole: Cahv) -> None:
+    assert pinhole.linearized() is pinhole
+    assert pinhole.linearized(inside=True) is pinhole
+
+
+def test_linear_stand_in_bounds_the_view(navcam: Cahvor) -> None:
+    linear = navcam.linearized()
+    assert isinstance(linear, Cahv)
+    assert linear.size == navcam.size
+    assert linear.right_handed
+    assert linear.theta == pytest.approx(-math.pi / 2, abs=1e-12)
+    pixels, visible = linear.project(navcam.c + navcam.rays(navcam.border(200))[1])
+    assert visible.all()
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    # The border is sampled at 256 places a side; between them it bulges by less than 1e-3 px.
+    assert np.allclose(low, -0.5, atol=1e-3)
+    assert np.allclose(high, 1023.5, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["navcam", "hazcam"])
+def test_linear_stand_in_inside_is_filled(name: str, request: pytest.FixtureRequest) -> None:
+    camera: CameraModel = request.getfixturevalue(name)
+    linear = camera.linearized(inside=True)
+    pixels, visible = camera.project(camera.c + 1e6 * linear.rays(linear.border(200))[1])
+    assert visible.all()
+    inside = np.clip(pixels, -0.501, 1023.501) == pixels
+    assert inside.all()
+    # It touches each side.
+    assert np.allclose(pixels.min(axis=0), -0.5, atol=0.05)
+    assert np.allclose(pixels.max(axis=0), 1023.5, atol=0.05)
+
+
+def test_no_linear_camera_covers_half_a_sphere(hazcam: Cahvore) -> None:
+    with pytest.raises(ValueError, match="less than 90"):
+        hazcam.linearized()
+    assert hazcam.cropped(256, 256, (512, 512)).linearized().right_handed
+
+
+def test_a_blind_edge_has_no_stand_in() -> None:
+    cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
+    with pytest.raises(ValueError, match="sees nothing"):
+        Cahvor.from_cahv(cahv, r=(0, -0.2, 0)).linearized()
+
+
+def test_mirrored_camera_keeps_its_handedness(navcam: Cahvor) -> None:
+    mirrored = dataclasses.replace(navcam, h=1023 * navcam.a - navcam.h)
+    assert not mirrored.right_handed
+    assert not mirrored.linearized().right_handed
+    points = points_before(navcam)
+    expected = navcam.project(points)[0]
+    expected[..., 0] = 1023 - expected[..., 0]
+    assert np.allclose(mirrored.project(points)[0], expected, rtol=0, atol=1e-9)
+    pixels = navcam.pixel_grid()[::100, ::100]
+    assert np.allclose(mirrored.project(mirrored.c + mirrored.rays(pixels)[1])[0], pixels, rtol=0, atol=1e-10)
+
+
+# ----- construction -----
+
+
+def test_camera_from_focal_length_and_pitch() -> None:
+    """MER's navcam: 14.67 mm, 12 um pixels, 45 degrees across 1024 (Maki et al. 2003)."""
+    camera = Cahv.from_focal_length(14.67e-3, 12e-6, (1024, 1024), axis=(1, 0, 0), right=(0, -1, 0), centre=(0, 0, 1.5))
+    assert camera.focal_lengths == pytest.approx((1222.5, 1222.5))
+    assert camera.image_centre == pytest.approx((511.5, 511.5))
+    left, upper = camera.corner_rays()[1][[0, 1]], camera.rays(np.array([511.5, -0.5]))[1]
+    assert math.degrees(math.acos(left[0] @ left[1])) == pytest.approx(45, abs=3)
+    assert upper[2] > 0  # rows grow downwards
+    pixel = camera.project(np.array([10.0, -1.0, 1.5]))[0]
+    assert pixel == pytest.approx([511.5 + 122.25, 511.5])
+
+
+def test_pitch_may_differ_along_columns_and_rows() -> None:
+    camera = Cahv.from_focal_length(
+        0.01, (1e-5, 4e-5), (100, 25), axis=(0, 0, -2), right=(3, 0, 1), image_centre=(40, 10)
+    )
+    assert camera.focal_lengths == pytest.approx((1000, 250))
+    assert camera.image_centre == pytest.approx((40, 10))
+    assert np.allclose(camera.right, (1, 0, 0))
+    assert np.allclose(camera.down, (0, -1, 0))
+
+
+def test_field_of_view_is_between_the_outer_edges() -> None:
+    camera = Cahv.from_field_of_view(math.radians(60), (100, 50), axis=(0, 0, 1), right=(1, 0, 0))
+    left, right = camera.rays(np.array([[-0.5, 24.5], [99.5, 24.5]]))[1]
+    assert math.degrees(math.acos(left @ right)) == pytest.approx(60)
+    assert camera.focal_lengths[0] == pytest.approx(camera.focal_lengths[1])
+    both = Cahv.from_field_of_view(1.0, (100, 50), vertical_rad=0.8, axis=(0, 0, 1), right=(1, 0, 0))
+    upper, lower = both.rays(np.array([[49.5, -0.5], [49.5, 49.5]]))[1]
+    assert math.acos(upper @ lower) == pytest.approx(0.8)
+    assert both.half_angle() == pytest.approx(math.atan(math.hypot(math.tan(0.5), math.tan(0.4))))
+    assert np.allclose(both.boresight(), (0, 0, 1))
+
+
+def test_impossible_constructions_are_refused() -> None:
+    with pytest.raises(ValueError, match="parallel"):
+        Cahv.from_axes((1, 1), (4, 4), axis=(0, 0, 1), right=(0, 0, 2))
+    with pytest.raises(ValueError, match="axis must be a finite vector"):
+        Cahv.from_axes((1, 1), (4, 4), axis=(0, 0, 0), right=(0, 0, 2))
+    for focal in ((0, 1), (1, -1), (math.nan, 1), (math.inf, 1)):
+        with pytest.raises(ValueError, match="focal lengths"):
+            Cahv.from_axes(focal, (4, 4), axis=(0, 0, 1), right=(1, 0, 0))
+    with pytest.raises(ValueError, match="pixel pitch"):
+        Cahv.from_focal_length(0.01, 0, (4, 4), axis=(0, 0, 1), right=(1, 0, 0))
+    for angle in (0, math.pi, -1):
+        with pytest.raises(ValueError, match="field of view"):
+            Cahv.from_field_of_view(angle, (4, 4), axis=(0, 0, 1), right=(1, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"a": np.array([1.0, 1.0, 0.0])}, "a must be a unit vector"),
+        ({"a": np.array([1.0, 0.001, 0.05])}, "a must be a unit vector"),
+        ({"c": np.array([np.nan, 0.0, 0.0])}, "c must be finite"),
+        ({"h": np.array([np.inf, 0.0, 0.0])}, "h must be finite"),
+        ({"h": np.zeros(3)}, "linearly independent"),
+        ({"v": np.array([0.93995, -0.338133, 0.0464979])}, "linearly independent"),
+        ({"size": (0, 4)}, "size must be"),
+        ({"size": (4, -4)}, "size must be"),
+        ({"o": np.array([1.0, 1.0, 0.0])}, "o must be a unit vector"),
+        ({"o": np.array([-0.946551, 0.315595, -0.0666419])}, "same side"),
+        ({"r": np.array([0.0, np.nan, 0.0])}, "r must be finite"),
+        ({"r": np.array([-1.0, 0.0, 0.0])}, "r must begin with a number above -1"),
+    ],
+)
+def test_impossible_fields_are_refused(navcam: Cahvor, change: dict[str, object], fault: str) -> None:
+    with pytest.raises(ValueError, match=fault):
+        dataclasses.replace(navcam, **change)
+
+
+@pytest.mark.parametrize("linearity", [1.01, -1.01, math.nan, math.inf])
+def test_impossible_linearity_is_refused(hazcam: Cahvore, linearity: float) -> None:
+    with pytest.raises(ValueError, match="linearity must lie between -1 and 1"):
+        dataclasses.replace(hazcam, linearity=linearity)
+
+
+# ----- a camera is a value -----
+
+
+def test_cameras_are_immutable(camera: CameraModel) -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        camera.c = np.zeros(3)
+    with pytest.raises(ValueError, match="read-only"):
+        camera.c[0] = 1.0
+
+
+def test_cameras_do_not_share_the_callers_arrays(navcam: Cahvor) -> None:
+    centre = np.array([1.0, 2.0, 3.0])
+    camera = dataclasses.replace(navcam, c=centre)
+    centre[:] = 0
+    assert camera.c.tolist() == [1, 2, 3]
+
+
+def through_pickle(camera: CameraModel) -> CameraModel:
+    """As a worker process gets it."""
+    return pickle.loads(pickle.dumps(camera))  # noqa: S301
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, through_pickle])
+def test_copies_are_equal_and_immutable(camera: CameraModel, duplicate: Callable[[CameraModel], CameraModel]) -> None:
+    camera.rays(np.zeros(2))  # fills what is cached
+    twin = duplicate(camera)
+    assert twin == camera
+    assert hash(twin) == hash(camera)
+    assert not twin.c.flags.writeable
+    assert twin in {camera}
+
+
+def test_different_cameras_differ(navcam: Cahvor, pinhole: Cahv) -> None:
+    assert navcam != pinhole
+    assert navcam != dataclasses.replace(navcam, size=(1024, 1023))
+    assert navcam != dataclasses.replace(navcam, r=np.zeros(3))
+    assert navcam != "navcam"
+    assert dataclasses.replace(navcam, c=np.array([0.0, 0, 0])) == dataclasses.replace(navcam, c=np.array([-0.0, 0, 0]))
+
+
+def test_derived_quantities_of_the_navcam(navcam: Cahvor) -> None:
+    """Against the formulas of cmod_cahv_internal, which take A for a unit vector (it is labelled to six digits)."""
+    hs, vs = navcam.focal_lengths
+    hc, vc = navcam.image_centre
+    assert hs == pytest.approx(np.linalg.norm(np.cross(navcam.a, navcam.h)), rel=2e-6)
+    assert vs == pytest.approx(np.linalg.norm(np.cross(navcam.a, navcam.v)), rel=2e-6)
+    assert hc == pytest.approx(navcam.a @ navcam.h, rel=3e-6)
+    assert vc == pytest.approx(navcam.a @ navcam.v, rel=3e-6)
+    across, along = np.cross(navcam.a, navcam.v), np.cross(navcam.a, navcam.h)
+    assert navcam.theta == pytest.approx(math.atan2(np.cross(navcam.v, navcam.h) @ navcam.a, across @ along), abs=1e-8)
+    assert navcam.right_handed
+    assert np.allclose(hs * navcam.right + hc * navcam.a, navcam.h, atol=1e-2)
+    assert math.degrees(2 * navcam.half_angle()) == pytest.approx(61.4, abs=0.1)  # 45 x 45 degrees, across the corners
+
+
+def test_corner_rays_go_round_clockwise(camera: CameraModel) -> None:
+    origins, directions = camera.corner_rays()
+    pixels = camera.project(origins + directions)[0]
+    assert np.allclose(pixels, [[-0.5, -0.5], [1023.5, -0.5], [1023.5, 1023.5], [-0.5, 1023.5]], rtol=0, atol=1e-9)

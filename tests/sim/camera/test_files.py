@@ -1,0 +1,309 @@
+"""Camera files: Opportunity's labels as they are, round trips, and every fault named."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from sim.camera import (
+    Cahv,
+    Cahvor,
+    Cahvore,
+    CameraFileError,
+    CameraModel,
+    read_cahvor,
+    read_camera,
+    read_cameras,
+    read_pds3,
+    write_cahvor,
+)
+
+SHARED = Path(__file__).parents[3].parent / "shared" / "data" / "mer_opportunity"
+
+LABEL = """PDS_VERSION_ID                    = PDS3
+RECORD_TYPE                       = FIXED_LENGTH
+^IMAGE                            = 3
+
+OBJECT                            = IMAGE
+  LINES                           = 1024
+  LINE_SAMPLES                    = 1020
+  FIRST_LINE                      = 1
+  FIRST_LINE_SAMPLE               = 1
+END_OBJECT                        = IMAGE
+
+GROUP                             = GEOMETRIC_CAMERA_MODEL
+  MODEL_TYPE                      = CAHVORE
+  MODEL_COMPONENT_ID              = (C,A,H,V,O,R,E,T,P)
+  MODEL_COMPONENT_UNIT            = (METER,"N/A",PIXEL,PIXEL,"N/A","N/A",
+                                     METER,"N/A","N/A")
+  MODEL_COMPONENT_1               = (0.609331,-0.041064,-0.233849)
+  MODEL_COMPONENT_2               = (0.703447,-0.005161,0.710729)
+  MODEL_COMPONENT_3               = (351.362,452.204,353.494)
+  MODEL_COMPONENT_4               = (35.8065,-1.75143,682.705)
+  MODEL_COMPONENT_5               = (0.704402,-0.006062,0.709775)
+  MODEL_COMPONENT_6               = (3e-06,-0.012015,-0.007525)
+  MODEL_COMPONENT_7               = (0.001442,0.001522,0.000483)
+  MODEL_COMPONENT_8               = 3.0
+  MODEL_COMPONENT_9               = 0.37
+END_GROUP                         = GEOMETRIC_CAMERA_MODEL
+
+GROUP                             = INSTRUMENT_STATE_PARMS
+  PIXEL_AVERAGING_HEIGHT          = 1
+  PIXEL_AVERAGING_WIDTH           = 1
+END_GROUP                         = INSTRUMENT_STATE_PARMS
+END
+"""
+
+# As cmod writes it: comment, covariances and derived lines included.
+TEXT = """# navcam, left
+#
+
+Model = CAHVOR = perspective, distortion
+
+Dimensions = 1024 1024
+
+C =      0.442604     -0.061164     -1.251060
+A =      0.939950     -0.338133      0.046498
+H =    884.720000    981.763000     24.147200
+V =    418.579000   -152.039000   1245.750000
+O =      0.946551     -0.315595      0.066642
+R =      0.000960     -0.002183      0.018547
+
+S =
+  0.0000000e+00  1.0000000e-09 -1.0000000e-09
+  0.0000000e+00  1.0000000e-09 -1.0000000e-09
+
+Hs    =   1223.282116
+Hc    =    500.747897
+Vs    =   1223.694971
+Vc    =    502.776496
+Theta =     -1.571213 (-90.023899 deg)
+
+S internal =
+  0.0000000e+00  1.0000000e-09
+"""
+
+
+def written(folder: Path, text: str, name: str = "camera.cahvor") -> Path:
+    path = folder / name
+    path.write_bytes(text.encode("latin-1"))
+    return path
+
+
+# ----- PDS3 labels -----
+
+
+def test_opportunitys_labels_read_as_they_are(labelled: dict[str, CameraModel]) -> None:
+    if not SHARED.is_dir():
+        pytest.skip(f"needs Opportunity's frames in {SHARED}, which are not there")
+    for name, expected in labelled.items():
+        assert read_camera(SHARED / name) == expected
+        assert read_cameras(str(SHARED / name)) == (expected,)
+
+
+def test_label_of_cahvore(tmp_path: Path, hazcam: Cahvore) -> None:
+    expected = dataclasses.replace(hazcam, size=(1020, 1024))
+    assert read_camera(written(tmp_path, LABEL)) == expected
+    assert read_camera(written(tmp_path, LABEL.replace("\n", "\r\n"))) == expected
+    assert read_camera(written(tmp_path, LABEL + "\0\xff END of nothing" * 1000)) == expected
+
+
+@pytest.mark.parametrize(("kind", "linearity"), [("1.0", 1.0), ("2", 0.0), ("3.0", 0.37)])
+def test_cahvores_types(tmp_path: Path, kind: str, linearity: float) -> None:
+    text = LABEL.replace("MODEL_COMPONENT_8               = 3.0", f"MODEL_COMPONENT_8 = {kind}")
+    camera = read_camera(written(tmp_path, text))
+    assert isinstance(camera, Cahvore)
+    assert camera.linearity == linearity
+
+
+def test_components_are_found_by_their_letters(tmp_path: Path, hazcam: Cahvore) -> None:
+    text = (
+        LABEL.replace("(C,A,H,V,O,R,E,T,P)", "(C,A,V,H,O,R,E,T,P)")
+        .replace("_3 ", "_X ")
+        .replace("_4 ", "_3 ")
+        .replace("_X ", "_4 ")
+    )
+    assert read_camera(written(tmp_path, text)) == dataclasses.replace(hazcam, size=(1020, 1024))
+
+
+def test_several_models_in_a_label(tmp_path: Path) -> None:
+    start, end = LABEL.index("GROUP "), LABEL.index("GROUP                             = INSTRUMENT")
+    path = written(tmp_path, LABEL[:end] + LABEL[start:])
+    cameras = read_cameras(path)
+    assert len(cameras) == 2
+    assert cameras[0] == cameras[1]
+    with pytest.raises(CameraFileError, match="2 of them"):
+        read_camera(path)
+
+
+def test_subframes_are_refused_unless_folded_in(tmp_path: Path) -> None:
+    for field in ("  FIRST_LINE     ", "  FIRST_LINE_SAMPLE ", "  PIXEL_AVERAGING_HEIGHT", "  PIXEL_AVERAGING_WIDTH"):
+        lines = [line[:-1] + "2" if line.startswith(field) else line for line in LABEL.splitlines()]
+        path = written(tmp_path, "\n".join(lines) + "\n")
+        with pytest.raises(CameraFileError, match=f"{field.strip()}: 2.*subframe_folded_in"):
+            read_camera(path)
+        assert read_pds3(path, subframe_folded_in=True)[0].size == (1020, 1024)
+
+
+LABEL_FAULTS = [
+    ("= GEOMETRIC_CAMERA_MODEL", "= OTHER_MODEL", "GEOMETRIC_CAMERA_MODEL: missing"),
+    ("= CAHVORE\n", "= CAHVORES\n", "MODEL_TYPE: 'CAHVORES'; allowed: CAHV, CAHVOR, CAHVORE"),
+    ("  MODEL_TYPE                      = CAHVORE\n", "", "MODEL_TYPE: missing"),
+    ("(C,A,H,V,O,R,E,T,P)", "(C,A,H,V,O,R,Q,T,P)", "MODEL_COMPONENT_ID: has no E"),
+    ("(C,A,H,V,O,R,E,T,P)", "(C,A,H,V,O,R,E,R,P)", "repeats a letter"),
+    ("(C,A,H,V,O,R,E,T,P)", "CAHVORE", "a list of letters"),
+    ("(C,A,H,V,O,R,E,T,P)", "(C,A,H,V,O,R,E)", "type is missing"),
+    ("(351.362,452.204,353.494)", "(351.362,452.204)", r"MODEL_COMPONENT_3 \(H\): .*three finite numbers"),
+    ("(351.362,452.204,353.494)", '(351.362,"N/A",353.494)', r"MODEL_COMPONENT_3 \(H\)"),
+    ("(0.703447,-0.005161,0.710729)", "(0.703447,-0.005161,0.810729)", "A: a must be a unit vector"),
+    ("(0.703447,-0.005161,0.710729)", "(NaN,-0.005161,0.710729)", "A"),
+    ("  MODEL_COMPONENT_6", "  MODEL_COMPONENT_66", r"MODEL_COMPONENT_6 \(R\): missing"),
+    ("MODEL_COMPONENT_8               = 3.0", "MODEL_COMPONENT_8 = 4.0", "type is 4.0; allowed: type 1, 2 or 3"),
+    ("MODEL_COMPONENT_8               = 3.0", 'MODEL_COMPONENT_8 = "N/A"', r"MODEL_COMPONENT_8 \(T\)"),
+    ("MODEL_COMPONENT_9               = 0.37", "MODEL_COMPONENT_9 = 3.7", "LINEARITY: .*between -1 and 1"),
+    ("  MODEL_COMPONENT_9               = 0.37\n", "", r"MODEL_COMPONENT_9 \(P\): missing"),
+    ("(METER,", "(MM,", "MODEL_COMPONENT_UNIT: 'MM' for C; allowed: METER"),
+    ("LINES                           = 1024", 'LINES = "N/A"', "IMAGE.LINES: 'N/A'; allowed: a positive integer"),
+    ("  LINE_SAMPLES                    = 1020\n", "", "IMAGE.LINE_SAMPLES: missing"),
+    ("LINE_SAMPLES                    = 1020", "LINE_SAMPLES = -4", "IMAGE.LINE_SAMPLES: -4"),
+    ("= IMAGE\n", "= PICTURE\n", "IMAGE: missing"),
+    ("\nEND\n", "\n", "END: missing"),
+    (
+        "END_GROUP                         = GEOMETRIC_CAMERA_MODEL\n",
+        "",
+        "GEOMETRIC_CAMERA_MODEL: missing or not closed",
+    ),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "fault"), LABEL_FAULTS, ids=[f"{new!r}" for _, new, _ in LABEL_FAULTS])
+def test_label_faults_are_named(tmp_path: Path, old: str, new: str, fault: str) -> None:
+    assert old in LABEL
+    path = written(tmp_path, LABEL.replace(old, new), "faulty.IMG")
+    with pytest.raises(CameraFileError, match=fault) as raised:
+        read_camera(path)
+    assert "faulty.IMG" in str(raised.value)
+    assert "allowed" in str(raised.value)
+
+
+# ----- JPL text files -----
+
+
+def test_cmods_text_file(tmp_path: Path, navcam: Cahvor) -> None:
+    camera = read_cahvor(written(tmp_path, TEXT))
+    assert isinstance(camera, Cahvor)
+    assert camera.size == (1024, 1024)
+    for name in "cahvor":  # %13f: six decimals
+        assert np.allclose(getattr(camera, name), getattr(navcam, name), rtol=0, atol=5.1e-7)
+
+
+@pytest.mark.parametrize("ending", ["\n", "\r\n"])
+def test_text_may_be_spaced_and_ended_otherwise(tmp_path: Path, ending: str) -> None:
+    text = TEXT.replace("C =", "  C  =").replace("Dimensions = 1024 1024", "Dimensions=1024\t1024 # columns, rows")
+    assert read_camera(written(tmp_path, text.replace("\n", ending))) == read_cahvor(written(tmp_path, TEXT, "plain"))
+
+
+@pytest.mark.parametrize(
+    ("model", "linearity"),
+    [
+        ("CAHVORE1 = perspective, distortion, pupil", 1.0),
+        ("CAHVORE2 = fish-eye", 0.0),
+        ("CAHVORE3,0.37 = general", 0.37),
+        ("CAHVORE3, -0.5", -0.5),
+    ],
+)
+def test_text_of_cahvore(tmp_path: Path, model: str, linearity: float) -> None:
+    text = TEXT.replace("CAHVOR = perspective, distortion", model).replace("\nS =", "E = 0.001 0.002 0.003\n\nS =")
+    camera = read_camera(written(tmp_path, text))
+    assert isinstance(camera, Cahvore)
+    assert camera.linearity == linearity
+    assert camera.e.tolist() == [0.001, 0.002, 0.003]
+
+
+def test_text_of_cahv(tmp_path: Path) -> None:
+    text = TEXT.replace("CAHVOR = perspective, distortion", "CAHV = perspective, linear")
+    assert isinstance(read_camera(written(tmp_path, text)), Cahv)
+
+
+def test_written_cameras_read_back_equal(tmp_path: Path, camera: CameraModel) -> None:
+    path = tmp_path / "camera.txt"
+    write_cahvor(camera, path, comment="the left one\nModel = NONE")
+    assert read_cahvor(path) == camera
+    assert read_camera(path) == camera
+    assert path.read_text().startswith("# the left one\n# Model = NONE\n")
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    arrays(float, 3, elements=st.floats(-1e12, 1e12)),
+    arrays(float, 3, elements=st.floats(-0.9, 1e3)),
+    st.floats(-1, 1),
+    st.tuples(st.integers(1, 10**6), st.integers(1, 10**6)),
+)
+def test_round_trip_is_exact(
+    tmp_path: Path, hazcam: Cahvore, c: np.ndarray, r: np.ndarray, linearity: float, size: tuple[int, int]
+) -> None:
+    camera = dataclasses.replace(hazcam, c=c, r=r, linearity=linearity, size=size)
+    write_cahvor(camera, tmp_path / "camera.cahvore")
+    assert read_camera(tmp_path / "camera.cahvore") == camera
+
+
+TEXT_FAULTS = [
+    ("Model = CAHVOR = perspective, distortion\n", "", "Model: missing"),
+    ("Model = CAHVOR =", "Model = CAHVOX =", "Model: 'CAHVOX.*allowed: CAHV, CAHVOR, CAHVORE1"),
+    ("Model = CAHVOR =", "Model = CAHVORE =", "type is missing; allowed: type 1, 2 or 3"),
+    ("Model = CAHVOR =", "Model = CAHVORE4 =", "type is 4"),
+    ("Model = CAHVOR =", "Model = CAHVORE3 =", "Model: CAHVORE of type 3 has no parameter"),
+    ("Model = CAHVOR =", "Model = CAHVORE3,wide =", "Model: 'wide' in line 4 is not a number"),
+    ("Model = CAHVOR =", "Model = CAHVORE1 =", "E: missing; allowed: a line 'E = ...'"),
+    ("Dimensions = 1024 1024\n", "", "Dimensions: missing"),
+    ("Dimensions = 1024 1024", "Dimensions = 1024", "Dimensions: '1024' in line 6; allowed: two positive integers"),
+    ("Dimensions = 1024 1024", "Dimensions = 1024 0", "Dimensions"),
+    ("Dimensions = 1024 1024", "Dimensions = 1024.5 3", "Dimensions"),
+    ("884.720000    981.763000     24.147200", "884.720000    981.763000", "H: 2 words in line 10; allowed: three"),
+    ("884.720000    981.763000", "884.72O000    981.763000", "H: '884.72O000' in line 10 is not a number"),
+    ("884.720000    981.763000", "nan    981.763000", "H: h must be finite"),
+    ("     0.939950", "     0.039950", "A: a must be a unit vector"),
+    ("O =      0.946551", "O =     -0.946551", "O: "),
+    ("R =      0.000960", "R =     -1.000960", "R: r must begin with a number above -1"),
+    ("R =  ", "A =  ", "A: given twice, in lines 9 and 13"),
+    ("V =  ", "W =  ", "V: missing"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "fault"), TEXT_FAULTS, ids=[f"{new!r}" for _, new, _ in TEXT_FAULTS])
+def test_text_faults_are_named(tmp_path: Path, old: str, new: str, fault: str) -> None:
+    assert old in TEXT
+    path = written(tmp_path, TEXT.replace(old, new, 1), "faulty.cahvor")
+    with pytest.raises(CameraFileError, match=fault) as raised:
+        read_camera(path)
+    assert "faulty.cahvor" in str(raised.value)
+    assert "allowed" in str(raised.value)
+
+
+def test_files_that_are_not_there_or_no_cameras(tmp_path: Path) -> None:
+    with pytest.raises(CameraFileError, match=r"absent.cahvor: file: cannot be read \(No such file"):
+        read_camera(tmp_path / "absent.cahvor")
+    with pytest.raises(CameraFileError, match="cannot be read"):
+        read_camera(tmp_path)
+    with pytest.raises(CameraFileError, match="Model: missing"):
+        read_camera(written(tmp_path, ""))
+    with pytest.raises(CameraFileError, match="PDS_VERSION_ID: missing"):
+        read_pds3(written(tmp_path, TEXT))
+
+
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from([TEXT, LABEL]), st.integers(0, 1700), st.binary(min_size=0, max_size=12), st.integers(0, 30))
+def test_damaged_files_never_crash_the_reader(tmp_path: Path, text: str, at: int, junk: bytes, removed: int) -> None:
+    whole = text.encode("latin-1")
+    path = tmp_path / "damaged"
+    path.write_bytes(whole[:at] + junk + whole[at + removed :])
+    with contextlib.suppress(CameraFileError):
+        assert len(read_cameras(path)) == 1
