@@ -46,12 +46,12 @@ CHECKED_PACKAGES = ["sim.camera", "sim.dynamics", "sim.frames", "sim.measurement
 
 
 class _KernelsAreLeftAlone(MetaPathFinder):
-    """Finds modules named `kernels` as usual, past the checking hook: numba cannot compile a wrapped function."""
+    """Finds `kernels` (modules, packages) past the checking hook: numba cannot compile a wrapped function."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if fullname.rpartition(".")[2] == "kernels":
+        if "kernels" in fullname.split("."):
             return PathFinder.find_spec(fullname, path, target)
         return None
 
