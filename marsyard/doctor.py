@@ -6,6 +6,8 @@ probe is imported before it is known to be ours: this is what people run when im
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import importlib.metadata
 import importlib.util
 import json
@@ -312,13 +314,14 @@ def _check_backend(backend: str, probe: Probe) -> Check:
 
 def check_numba_cache() -> Check:
     """Whether compiled kernels can be kept; where not, every process compiles them anew."""
-    configured = os.environ.get("NUMBA_CACHE_DIR")
-    candidates = [Path(configured)] if configured else [ROOT / "sim" / "__pycache__", Path.home() / ".cache" / "numba"]
-    for place in candidates:
-        if _writable(place):
-            return Check("numba cache", f"{place} is writable")
-    mend = "export NUMBA_CACHE_DIR=FOLDER, one that you may write to"
-    return Check("numba cache", f"cannot write to {' nor '.join(map(str, candidates))}", Verdict.WARN, mend)
+    with contextlib.suppress(ImportError):
+        importlib.import_module("sim")  # which tells numba where, unless the user has
+    place = Path(os.environ.get("NUMBA_CACHE_DIR", Path.home() / ".cache" / "numba"))
+    if _writable(place):
+        return Check("numba cache", f"{place} is writable")
+    return Check(
+        "numba cache", f"cannot write to {place}", Verdict.WARN, "export NUMBA_CACHE_DIR=FOLDER, one you may write to"
+    )
 
 
 def check_disk() -> Iterator[Check]:
