@@ -19,6 +19,8 @@ from sim.camera.base import CameraModel
 _GROUP = "GEOMETRIC_CAMERA_MODEL"
 _FIRST_BYTES = 1 << 16
 _MOST_BYTES = 1 << 23
+_START = re.compile(rb"^\s*PDS_VERSION_ID\s*=", re.MULTILINE)
+_START_WITHIN = 4096
 _END = re.compile(rb"^END\s*$", re.MULTILINE)
 _BLOCKS = re.compile(
     r"^[ \t]*(GROUP|OBJECT)[ \t]*=[ \t]*(GEOMETRIC_CAMERA_MODEL|IMAGE|INSTRUMENT_STATE_PARMS)[ \t]*\r?$"
@@ -59,7 +61,7 @@ def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
 
 def is_pds3(head: bytes) -> bool:
     """Whether a file that begins so is a PDS3 label or product."""
-    return re.match(rb"\s*(CCSD\w*\s+|NJPL\w*\s+)?(/\*.*?\*/\s*)*PDS_VERSION_ID\s*=", head, re.DOTALL) is not None
+    return _START.search(head[:_START_WITHIN]) is not None
 
 
 def _label(source: Source) -> Any:

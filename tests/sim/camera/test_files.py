@@ -112,6 +112,9 @@ def test_label_of_cahvore(tmp_path: Path, hazcam: Cahvore) -> None:
     expected = dataclasses.replace(hazcam, size=(1020, 1024))
     assert read_camera(written(tmp_path, LABEL)) == expected
     assert read_camera(written(tmp_path, LABEL.replace("\n", "\r\n"))) == expected
+    assert (
+        read_camera(written(tmp_path, "CCSD3ZF0000100000001NJPL3IF0PDS200000001\n/* a label */\n" + LABEL)) == expected
+    )
     assert read_camera(written(tmp_path, LABEL + "\0\xff END of nothing" * 1000)) == expected
 
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
@@ -304,7 +304,6 @@ def test_jacobian_on_the_optical_axis(navcam: Cahvor, hazcam: Cahvore) -> None:
         assert np.max(np.abs(difference)) < 1e-7
 
 
-@settings(max_examples=50)
 @given(cameras, arrays(float, (4, 2), elements=st.floats(0.1, 0.9)), st.floats(5, 50))
 def test_jacobian_of_plausible_cameras(camera: CameraModel, parts: np.ndarray, distance: float) -> None:
     origins, directions = camera.rays(pixels_of(camera, parts))
