@@ -1,8 +1,8 @@
 """The OpenGL context: the only module that knows which library draws.
 
-OpenGL is asked for one thing, the depth of every pixel of a pinhole view. pyrender does it, off-screen, through OSMesa
-or EGL. The platform has to be chosen before pyrender or PyOpenGL is first imported in a process, and a process has one
-renderer: contexts survive neither fork nor threads.
+OpenGL is asked for one thing: what each pixel of a pinhole view sees, as depth and number of the triangle. pyrender
+draws that off-screen, through OSMesa or EGL. The platform has to be chosen before pyrender or PyOpenGL is first
+imported in a process, and contexts belong to the process that made them: they survive neither fork nor threads.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64, Int32
 
 if TYPE_CHECKING:
     import trimesh
@@ -61,8 +61,15 @@ class PinholeView:
 _VIEW_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
+def _colours(count: int) -> Float32[np.ndarray, "count 4"]:
+    """Colours that spell the numbers 1 to count in 24 bits, least significant first."""
+    number = np.arange(1, count + 1, dtype=np.uint32)
+    spelled = np.stack([number & 255, (number >> 8) & 255, (number >> 16) & 255, np.full(count, 255)], axis=-1)
+    return spelled.astype(np.float32) / np.float32(255.0)
+
+
 class DepthRenderer:
-    """Draws the depth of a triangle mesh, one sample at the centre of each pixel.
+    """Draws depth and triangle numbers of a scene, one sample at the centre of each pixel.
 
     Parameters
     ----------
@@ -88,25 +95,51 @@ class DepthRenderer:
                 f"no OpenGL context through {backend} ({error}); run 'marsyard doctor' to see what is missing"
             ) from error
         _draw_single_sampled(self._offscreen._renderer)
-        self._flags = pyrender.RenderFlags.DEPTH_ONLY
         self._pyrender = pyrender
         self._scene: Any = None
+        self._flags = 0
 
-    def load(self, mesh: trimesh.Trimesh) -> None:
-        """Makes this mesh (world coordinates) the one that is drawn; the one before is released."""
-        if self._scene is not None:
-            self._scene.clear()
-        # pyrender frees what no scene holds when it next draws
-        primitive = self._pyrender.Primitive(
-            positions=mesh.vertices.view(np.ndarray).astype(np.float32),
-            indices=mesh.faces.view(np.ndarray).astype(np.uint32),
-            mode=self._pyrender.GLTF.TRIANGLES,
+    def load(self, ground: trimesh.Trimesh, triangles: Float64[np.ndarray, "triangles 3 3"] | None = None) -> None:
+        """Makes this ground, and these triangles on it, what is drawn; what was before is released.
+
+        Parameters
+        ----------
+        ground
+            Mesh in world coordinates.
+        triangles
+            Corners in world coordinates of triangles that are told apart in the picture; None or none for ground alone.
+        """
+        self._clear()
+        pyrender = self._pyrender
+        things = None if triangles is None or len(triangles) == 0 else triangles
+        self._flags = (
+            pyrender.RenderFlags.DEPTH_ONLY if things is None else pyrender.RenderFlags.FLAT | pyrender.RenderFlags.RGBA
         )
-        self._scene = self._pyrender.Scene()
-        self._scene.add(self._pyrender.Mesh([primitive]))
+        black = pyrender.MetallicRoughnessMaterial(baseColorFactor=(0.0, 0.0, 0.0, 1.0))
+        primitives = [
+            pyrender.Primitive(
+                positions=ground.vertices.view(np.ndarray).astype(np.float32),
+                indices=ground.faces.view(np.ndarray).astype(np.uint32),
+                mode=pyrender.GLTF.TRIANGLES,
+                material=black,
+            )
+        ]
+        if things is not None:
+            primitives.append(
+                pyrender.Primitive(
+                    positions=things.reshape(-1, 3).astype(np.float32),
+                    color_0=np.repeat(_colours(len(things)), 3, axis=0),
+                    mode=pyrender.GLTF.TRIANGLES,
+                )
+            )
+        self._scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
+        self._scene.add(pyrender.Mesh(primitives))
 
-    def draw(self, view: PinholeView) -> Float32[np.ndarray, "side side"]:
-        """Depth along the view's axis, metres; 0 where there is no ground. Row 0 is the top of the view."""
+    def draw(self, view: PinholeView) -> tuple[Float32[np.ndarray, "side side"], Int32[np.ndarray, "side side"]]:
+        """Depth along the view's axis, metres, and the number of the triangle seen plus one (0 for the ground).
+
+        The depth is 0 where there is nothing. Row 0 is the top of the view.
+        """
         if self._scene is None:
             raise RenderingError("no mesh has been loaded")
         # pyrender counts pixels from the corner of the first, whose centre is at 0.5: the middle is at side / 2
@@ -116,10 +149,25 @@ class DepthRenderer:
         )
         node = self._scene.add(camera, pose=view.world_from_view @ _VIEW_FROM_GL)
         try:
-            depth: Float32[np.ndarray, "side side"] = self._offscreen.render(self._scene, flags=self._flags)
+            drawn = self._offscreen.render(self._scene, flags=self._flags)
         finally:
             self._scene.remove_node(node)
-        return np.ascontiguousarray(depth)
+        if isinstance(drawn, tuple):
+            colours, depth = drawn
+            numbers = np.ascontiguousarray(colours).view("<u4")[..., 0] & np.uint32(0xFFFFFF)
+            return np.ascontiguousarray(depth), numbers.astype(np.int32)
+        return np.ascontiguousarray(drawn), np.zeros(drawn.shape, dtype=np.int32)
+
+    def _clear(self) -> None:
+        """Releases what is loaded, on the card too, now rather than when pyrender next draws."""
+        if self._scene is None:
+            return
+        self._offscreen._platform.make_current()
+        for mesh in self._scene.meshes:
+            for primitive in mesh.primitives:
+                primitive.delete()
+        self._scene.clear()
+        self._scene = None
 
     def description(self) -> str:
         """Renderer and version strings of OpenGL."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt32
 from scipy.optimize import brentq
 
 from sim.terrain import Surface
@@ -28,30 +28,42 @@ def graded_offsets(reach_m: float, finest_m: float, count: int) -> Float[np.ndar
     return offsets
 
 
-def ground_mesh(
-    surface: Surface, centre: Float[np.ndarray, "2"], offsets: Float[np.ndarray, "count"]
-) -> trimesh.Trimesh:
-    """The ground as triangles over the grid ``centre + offsets`` by ``centre + offsets``, in world coordinates.
+def ground_mesh(surface: Surface, x: Float[np.ndarray, "columns"], y: Float[np.ndarray, "rows"]) -> trimesh.Trimesh:
+    """The ground as triangles over the grid of these lines, in world coordinates.
 
-    Each vertex takes its height from the level of the surface whose samples are about as far apart as the grid's, so
-    that the mesh does not alias the terrain.
+    Each vertex takes its height from the level of the surface whose samples are about as far apart as the grid's lines
+    there, so that the mesh does not alias the terrain.
     """
-    gaps = np.gradient(offsets)
-    level_of_line = np.clip(np.floor(np.log2(gaps / surface.spacing_m)), 0, len(surface.levels) - 1).astype(int)
-    level = np.maximum(level_of_line[:, None], level_of_line[None, :])
-    x, y = np.meshgrid(centre[0] + offsets, centre[1] + offsets)
-    z = np.empty_like(x)
+    level = np.maximum(_levels_of_lines(surface, y)[:, None], _levels_of_lines(surface, x)[None, :])
+    across, along = np.meshgrid(x, y)
+    z = np.empty_like(across)
     for one in np.unique(level):
         chosen = level == one
-        z[chosen] = surface.height(x[chosen], y[chosen], int(one))
-    vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    return trimesh.Trimesh(vertices, grid_faces(offsets.size), process=False, validate=False)
+        z[chosen] = surface.height(across[chosen], along[chosen], int(one))
+    vertices = np.stack([across, along, z], axis=-1).reshape(-1, 3)
+    return trimesh.Trimesh(vertices, grid_faces(y.size, x.size), process=False, validate=False)
 
 
-def grid_faces(count: int) -> np.ndarray:
-    """Triangles of a grid of count x count vertices stored row by row, counter-clockwise seen from above."""
-    corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)[None, :]).ravel()
-    right, above = corner + 1, corner + count
+def _levels_of_lines(surface: Surface, lines: Float[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:
+    level: Int[np.ndarray, "count"] = np.clip(
+        np.floor(np.log2(np.gradient(lines) / surface.spacing_m)), 0, len(surface.levels) - 1
+    ).astype(int)
+    return level
+
+
+def grid_faces(rows: int, columns: int) -> UInt32[np.ndarray, "faces 3"]:
+    """Triangles of a grid of vertices stored row by row, counter-clockwise seen from above."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)[None, :]).ravel()
+    right, above = corner + 1, corner + columns
     lower = np.column_stack([corner, right, above + 1])
     upper = np.column_stack([corner, above + 1, above])
     return np.concatenate([lower, upper]).astype(np.uint32)
+
+
+def lines_in_view(lines: Float[np.ndarray, "count"], low: float, high: float) -> Float[np.ndarray, "kept"]:
+    """The lines between two bounds and one more to either side."""
+    first = max(int(np.searchsorted(lines, low)) - 2, 0)
+    last = min(int(np.searchsorted(lines, high)) + 2, lines.size)
+    if last - first < 3:
+        first, last = max(min(first, lines.size - 3), 0), min(max(last, 3), lines.size)
+    return lines[first:last]

@@ -1,18 +1,31 @@
-"""How bright the ground looks: parameters of the reflectance law and the light."""
+"""How bright the ground looks: the reflectance law, the light, and texture finer than the terrain's samples."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
+
+#: Angular radius of the sun seen from Mars at 1.52 AU, radians (0.35 deg across).
+SUN_RADIUS_AT_MARS_RAD = 0.00305
 
 
 @dataclass(frozen=True)
 class Sun:
-    """Direct sunlight from one direction (unit vector towards the sun, world axes)."""
+    """Direct sunlight.
+
+    Attributes
+    ----------
+    direction
+        Unit vector towards the sun, world axes.
+    angular_radius_rad
+        Half the angle that the sun's disc takes.
+    """
 
     direction: Float[np.ndarray, "3"]
+    angular_radius_rad: float = SUN_RADIUS_AT_MARS_RAD
 
     def __post_init__(self) -> None:
         if abs(float(np.linalg.norm(self.direction)) - 1.0) > 1e-9:
@@ -21,15 +34,15 @@ class Sun:
 
 @dataclass(frozen=True)
 class Photometry:
-    """A Lunar-Lambert surface with an opposition surge, under direct sun and an even sky.
+    """A Lunar-Lambert surface with an opposition surge, under direct sun, an even sky and light from the ground around.
 
     Radiance factor (I/F) of ground of albedo A under incidence i, emission e, phase angle g::
 
-        I/F = A S(g) [2 L cos i / (cos i + cos e) + (1 - L) cos i] + A D (1 + n_z) / 2
-        S(g) = (1 + B0 / (1 + tan(g / 2) / h)) / (1 + B0 / (1 + tan(g0 / 2) / h))
+        I/F = A K S(g) [2 L cos i / (cos i + cos e) + (1 - L) cos i] + A D (1 + n_z) / 2 + A B (1 - n_z) / 2
+        S(g) = 1 + B0 / (1 + tan(g / 2) / h)
 
-    The Lunar-Lambert law is that of McEwen (1991); the surge has the form of Hapke's shadow-hiding term (1986),
-    normalised to 1 at phase g0 = 45 deg.
+    The Lunar-Lambert law is that of McEwen (1991); the surge has the form of Hapke's shadow-hiding term (1986). K makes
+    A the spherical albedo of the law: the share that a surface returns of light from all sides. The law is reciprocal.
 
     Attributes
     ----------
@@ -41,6 +54,9 @@ class Photometry:
         D, diffuse irradiance from the sky over the direct sun's on a plane facing it.
     sky_radiance
         Radiance factor of the sky, where a pixel sees no ground.
+    surrounding_albedo
+        Albedo of the ground that scatters light onto slopes and into shadows: B is this times the light that falls on
+        a level ground.
     """
 
     lunar_share: float = 0.55
@@ -48,3 +64,66 @@ class Photometry:
     surge_width: float = 0.06
     sky_share: float = 0.15
     sky_radiance: float = 0.1
+    surrounding_albedo: float = 0.2
+
+    def normalisation(self) -> float:
+        """K of the law."""
+        return 1.0 / _spherical_albedo(self.lunar_share, self.surge_amplitude, self.surge_width)
+
+    def law(self, sun: Sun, caster_diameter_m: float) -> Float64[np.ndarray, "9"]:
+        """The numbers that the kernel takes, in its order."""
+        bounced = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_share)
+        return np.array(
+            [
+                self.lunar_share,
+                self.surge_amplitude,
+                self.surge_width,
+                self.normalisation(),
+                self.sky_share,
+                self.sky_radiance,
+                bounced,
+                caster_diameter_m,
+                sun.angular_radius_rad,
+            ]
+        )
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Albedo finer than the terrain's samples: octaves of noise in three dimensions, evaluated per pixel.
+
+    Attributes
+    ----------
+    coarsest_m
+        Size of the coarsest octave's cells, metres; each further octave is half as large.
+    amplitudes
+        Amplitude of each octave in the natural logarithm of albedo, coarsest first.
+    """
+
+    coarsest_m: float = 1.0
+    amplitudes: tuple[float, ...] = ()
+
+    def arrays(self) -> tuple[float, Float64[np.ndarray, "octaves"]]:
+        """What the kernel takes."""
+        return float(self.coarsest_m), np.asarray(self.amplitudes, dtype=np.float64)
+
+
+@cache
+def _spherical_albedo(lunar_share: float, surge_amplitude: float, surge_width: float) -> float:
+    """Spherical albedo of the law with A = K = 1, by Gauss-Legendre quadrature over incidence, emission and azimuth.
+
+    ``2 int_0^1 [(1 / pi) int I/F cos e dOmega_e / cos i] cos i d(cos i)``. The surge's peak is narrow: its azimuths are
+    taken closest around opposition by the substitution phi = pi s^3.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(96)
+    mu, mu_weights = 0.5 * (nodes + 1.0), 0.5 * weights
+    s, s_weights = mu, mu_weights
+    phi, phi_weights = np.pi * s**3, 3.0 * np.pi * s**2 * s_weights
+    cos_i, cos_e, azimuth = mu[:, None, None], mu[None, :, None], phi[None, None, :]
+    cos_g = cos_i * cos_e + np.sqrt((1.0 - cos_i**2) * (1.0 - cos_e**2)) * np.cos(azimuth)
+    tan_half = np.sqrt(np.clip(1.0 - cos_g, 0.0, None) / (1.0 + cos_g))
+    surge = 1.0 + surge_amplitude / (1.0 + tan_half / surge_width)
+    radiance = surge * (2.0 * lunar_share * cos_i / (cos_i + cos_e) + (1.0 - lunar_share) * cos_i)
+    # both halves of the azimuth
+    flux = 2.0 * np.einsum("ijk,j,k->i", radiance * cos_e, mu_weights, phi_weights) / np.pi
+    return float(2.0 * np.sum(flux * mu_weights))

@@ -1,127 +1,117 @@
 """Radiance and truth of a scene through an exact camera model.
 
-OpenGL draws the depth of the ground in a pinhole view that contains the camera's field. Every pixel's own ray, from the
-exact camera model, takes its first guess of distance from that picture, is brought onto the terrain's surface by
-Newton's method, and is shaded there. Distortion is therefore exact and not a resampling of a pinhole picture.
+OpenGL draws what is seen in pinhole views that contain the camera's field: the depth of the ground and the numbers of
+the triangles before it. Every pixel's own ray, from the exact camera model, takes its first guess from these pictures,
+is brought onto the terrain's surface by Newton's method or onto its triangle by intersection, and is shaded there.
+Distortion is therefore exact and not a resampling of a pinhole picture.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, cached_property
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int32
 from scipy.spatial.transform import RigidTransform
 
-from sim.camera import CameraModel
 from sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
-from sim.render.kernels import shade
-from sim.render.mesh import graded_offsets, ground_mesh
-from sim.render.photometry import Photometry, Sun
+from sim.render.kernels.ground import height_range, sweep_shadow
+from sim.render.kernels.objects import ObjectArrays
+from sim.render.kernels.shading import shade
+from sim.render.mesh import graded_offsets, ground_mesh, lines_in_view
+from sim.render.objects import Objects
+from sim.render.photometry import Photometry, Sun, Texture
+from sim.render.rays import VIEW_SIDE_PX, PixelRays
 from sim.terrain import Surface
 
-#: Samples along each side of the depth picture: a 1024 x 1024 camera of 45 deg is drawn at about its own resolution.
-DEPTH_SIDE_PX = 1088
-#: Samples left free around the camera's field in the depth picture.
-DEPTH_MARGIN_PX = 2.0
-#: Widest angle from the optical axis that one pinhole view can hold.
-WIDEST_HALF_ANGLE_RAD = np.radians(75.0)
+NO_TEXTURE = Texture()
+#: Most posts along a side of the grid on which the ground's shadow is swept.
+SHADOW_SIDE = 2048
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Ground and light.
+    """Ground, things on it, and light.
 
     Attributes
     ----------
     surface
         The terrain.
     centre_m
-        World x, y around which the mesh is dense.
+        World x, y around which the mesh is dense: below a camera near the ground, or the place of a descent.
     sun, photometry
         The light, and how the ground scatters it.
+    objects
+        What stands on the ground.
+    ground_texture, object_texture
+        Albedo finer than the terrain's samples.
+    caster_diameter_m
+        Diameter of what casts a shadow from the camera's place: the lander seen against the sun. 0 for none.
+    ground_shadows
+        Whether the ground hides the sun from itself.
     mesh_finest_m, mesh_reach_m, mesh_lines
         Spacing of the mesh at the centre, how far it reaches to each side, and the number of its lines.
+    mesh_in_view
+        Whether only the part of the mesh that a picture shows is drawn. It is made anew for every picture then, which
+        pays for narrow views of wide scenes; without it one mesh serves all pictures of the scene.
     """
 
     surface: Surface
     centre_m: tuple[float, float]
     sun: Sun
     photometry: Photometry
+    objects: Objects = field(default_factory=Objects.none)
+    ground_texture: Texture = NO_TEXTURE
+    object_texture: Texture = NO_TEXTURE
+    caster_diameter_m: float = 0.0
+    ground_shadows: bool = True
     mesh_finest_m: float = 12.0
     mesh_reach_m: float = 20000.0
     mesh_lines: int = 513
+    mesh_in_view: bool = False
+
+    @cached_property
+    def mesh_offsets(self) -> Float64[np.ndarray, "lines"]:
+        """Offsets of the mesh's lines from the centre."""
+        return graded_offsets(self.mesh_reach_m, self.mesh_finest_m, self.mesh_lines)
+
+    @cached_property
+    def height_range_m(self) -> tuple[float, float]:
+        """Bounds of the ground's height."""
+        low, high = height_range(self.surface.levels[0])
+        return float(low), float(high)
+
+    @cached_property
+    def object_arrays(self) -> ObjectArrays:
+        """The objects as the kernels take them."""
+        return self.objects.arrays()
+
+    @cached_property
+    def shadow(self) -> tuple[Float32[np.ndarray, "rows columns"], float]:
+        """Height of the ground's shadow on a periodic grid, and the grid's spacing."""
+        if not self.ground_shadows or self.sun.direction[2] <= 0.0:
+            return np.full((1, 1), -np.inf, dtype=np.float32), 1.0
+        return _ground_shadow(self.surface, self.sun, self.height_range_m)
 
 
-@dataclass(frozen=True)
-class PixelRays:
-    """Every pixel's ray in body axes, and the pinhole view that contains them all.
-
-    Attributes
-    ----------
-    centre
-        Centre of projection in the body frame, metres; for CAHVORE the mean of the moving entrance pupil.
-    origins, directions
-        Rays relative to `centre`, shape (rows * columns, 3), float32; directions are unit vectors.
-    size
-        Columns and rows.
-    pixel_angle_rad
-        Mean angle between neighbouring pixels' rays.
-    view_from_body
-        Rotation matrix from body axes to those of the pinhole view.
-    focal_px
-        Focal length of the pinhole view.
-    """
-
-    centre: Float64[np.ndarray, "3"]
-    origins: Float32[np.ndarray, "pixels 3"]
-    directions: Float32[np.ndarray, "pixels 3"]
-    size: tuple[int, int]
-    pixel_angle_rad: float
-    view_from_body: Float64[np.ndarray, "3 3"]
-    focal_px: float
-
-    @classmethod
-    def of(cls, camera: CameraModel) -> PixelRays:
-        """The rays of this camera, given in the body frame. Raises RenderingError for too wide a field."""
-        columns, rows = camera.size
-        u, v = np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64))
-        origins, directions = camera.rays(np.stack([u, v], axis=-1))
-        origins = np.broadcast_to(origins, directions.shape)
-        if not np.isfinite(directions).all():
-            raise RenderingError("the camera model has pixels without a ray")
-        centre = origins.reshape(-1, 3).mean(axis=0)
-        view_from_body = _view_axes(directions)
-        in_view = directions.reshape(-1, 3) @ view_from_body.T
-        widest = float(np.arccos(in_view[:, 2].min()))
-        if widest > WIDEST_HALF_ANGLE_RAD:
-            raise RenderingError(
-                f"the camera sees {np.degrees(widest):.0f} deg from its axis; "
-                f"at most {np.degrees(WIDEST_HALF_ANGLE_RAD):.0f} deg can be drawn"
-            )
-        extent = np.abs(in_view[:, :2] / in_view[:, 2:]).max()
-        neighbours = np.linalg.norm(np.diff(directions, axis=1), axis=-1).mean()
-        return cls(
-            centre=centre,
-            origins=(origins - centre).reshape(-1, 3).astype(np.float32),
-            directions=directions.reshape(-1, 3).astype(np.float32),
-            size=(columns, rows),
-            pixel_angle_rad=float(neighbours),
-            view_from_body=view_from_body,
-            focal_px=float((DEPTH_SIDE_PX / 2.0 - DEPTH_MARGIN_PX) / extent),
-        )
-
-
-def _view_axes(directions: Float64[np.ndarray, "rows columns 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Rows: right, down and forward of the pinhole view in body axes."""
-    corners = directions[[0, 0, -1, -1], [0, -1, 0, -1]]
-    forward = corners.mean(axis=0)
-    forward /= np.linalg.norm(forward)
-    right = corners[1] + corners[3] - corners[0] - corners[2]
-    right -= forward * (right @ forward)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
+def _ground_shadow(
+    surface: Surface, sun: Sun, height_range_m: tuple[float, float]
+) -> tuple[Float32[np.ndarray, "rows columns"], float]:
+    """Sweeps the shadow along whichever axis the sun's azimuth is nearer to."""
+    level = int(np.argmax([one.shape[0] <= SHADOW_SIDE for one in surface.levels]))
+    spacing = surface.spacing_m * 2.0**level
+    height = np.ascontiguousarray(surface.levels[level][..., 0])
+    east, north, up = sun.direction
+    along_y = abs(north) >= abs(east)
+    main, side = (north, east) if along_y else (east, north)
+    if main == 0.0:
+        return np.full((1, 1), -np.inf, dtype=np.float32), 1.0
+    drop = spacing * up / abs(main)
+    reach = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, height.shape[0]))
+    rows_towards_sun = height if along_y else np.ascontiguousarray(height.T)
+    swept = sweep_shadow(rows_towards_sun, float(np.sign(main)), drop, side / abs(main), reach)
+    return (swept if along_y else np.ascontiguousarray(swept.T)), spacing
 
 
 @dataclass(frozen=True)
@@ -133,7 +123,11 @@ class Frame:
     radiance
         Radiance factor (I/F), shape (rows, columns).
     range_m
-        Distance from each pixel's ray origin to the ground along the ray, infinite where it meets none.
+        Distance from each pixel's ray origin to what it sees along the ray, infinite for the sky.
+    body
+        Number of the object seen (row of `Scene.objects`), `GROUND` (-1) or `SKY` (-2).
+    normal
+        Unit normal of the surface seen, world axes; zero for the sky.
     world_from_body
         Pose of the body at the exposure.
     rays
@@ -142,11 +136,13 @@ class Frame:
 
     radiance: Float32[np.ndarray, "rows columns"]
     range_m: Float64[np.ndarray, "rows columns"]
+    body: Int32[np.ndarray, "rows columns"]
+    normal: Float32[np.ndarray, "rows columns 3"]
     world_from_body: RigidTransform
     rays: PixelRays
 
     def points_world(self) -> Float64[np.ndarray, "rows columns 3"]:
-        """World point seen by each pixel, metres; NaN where it sees no ground."""
+        """World point seen by each pixel, metres; NaN where it sees the sky."""
         along = np.where(np.isfinite(self.range_m), self.range_m, np.nan).reshape(-1, 1)
         points_body = self.rays.centre + self.rays.origins + along * self.rays.directions.astype(np.float64)
         points: Float64[np.ndarray, "pixels 3"] = self.world_from_body.apply(points_body)
@@ -163,12 +159,13 @@ class Renderer:
     """
 
     def __init__(self, backend: Backend) -> None:
-        self._depth = DepthRenderer(DEPTH_SIDE_PX, backend)
-        self._loaded: Scene | None = None
+        self._backend = backend
+        self._views: dict[int, DepthRenderer] = {}
+        self._loaded: dict[int, Scene] = {}
 
     def description(self) -> str:
         """Renderer and version strings of OpenGL."""
-        return self._depth.description()
+        return self._view_renderer(VIEW_SIDE_PX).description()
 
     def render(self, scene: Scene, rays: PixelRays, world_from_body: RigidTransform) -> Frame:
         """The picture of the scene from this pose.
@@ -176,7 +173,7 @@ class Renderer:
         Parameters
         ----------
         scene
-            Ground and light; its mesh stays loaded until another scene is asked for.
+            Ground, objects and light; its mesh stays loaded until another scene is asked for.
         rays
             The camera in the body frame, `PixelRays.of(camera)`.
         world_from_body
@@ -187,70 +184,127 @@ class Renderer:
         RenderingError
             The camera is at or below the ground.
         """
-        if self._loaded is not scene:
-            self._load(scene)
         position = world_from_body.apply(rays.centre)
-        ground_from_camera = position[2] - float(scene.surface.height(position[0], position[1]))
-        if ground_from_camera <= 0.0:
-            raise RenderingError(f"the camera is {-ground_from_camera:.2f} m below the ground at {position}")
+        clearance = position[2] - float(scene.surface.height(position[0], position[1]))
+        if clearance <= 0.0:
+            raise RenderingError(f"the camera is {-clearance:.2f} m below the ground at {position}")
         rotation = world_from_body.rotation.as_matrix()
-        depth = self._depth.draw(self._view(scene, rays, rotation, position, ground_from_camera))
+        self._load(scene, rays, rotation, position)
+        depth, numbers = self._draw(scene, rays, rotation, position, clearance)
         columns, rows = rays.size
         radiance = np.empty(rows * columns, dtype=np.float32)
         distance = np.empty(rows * columns, dtype=np.float64)
+        body = np.empty(rows * columns, dtype=np.int32)
+        normal = np.empty((rows * columns, 3), dtype=np.float32)
         shade(
             scene.surface.levels,
             scene.surface.spacing_m,
             depth,
+            numbers,
             rays.focal_px,
             rays.view_from_body,
+            rays.view_of_pixel,
             rotation,
             position,
             rays.origins,
             rays.directions,
             rays.pixel_angle_rad,
             np.asarray(scene.sun.direction, dtype=np.float64),
-            _law(scene.photometry),
+            scene.photometry.law(scene.sun, scene.caster_diameter_m),
+            *scene.shadow,
+            scene.ground_texture.arrays(),
+            scene.object_texture.arrays(),
+            scene.object_arrays,
             radiance,
             distance,
+            body,
+            normal,
         )
-        return Frame(radiance.reshape(rows, columns), distance.reshape(rows, columns), world_from_body, rays)
+        return Frame(
+            radiance.reshape(rows, columns),
+            distance.reshape(rows, columns),
+            body.reshape(rows, columns),
+            normal.reshape(rows, columns, 3),
+            world_from_body,
+            rays,
+        )
 
     def close(self) -> None:
-        """Releases the OpenGL context."""
-        self._depth.close()
+        """Releases the OpenGL contexts."""
+        for view in self._views.values():
+            view.close()
+        self._views.clear()
+        self._loaded.clear()
 
-    def _load(self, scene: Scene) -> None:
-        offsets = graded_offsets(scene.mesh_reach_m, scene.mesh_finest_m, scene.mesh_lines)
-        self._depth.load(ground_mesh(scene.surface, np.asarray(scene.centre_m), offsets))
-        self._loaded = scene
+    def _view_renderer(self, side_px: int) -> DepthRenderer:
+        if side_px not in self._views:
+            self._views[side_px] = DepthRenderer(side_px, self._backend)
+        return self._views[side_px]
 
-    def _view(
+    def _load(
+        self,
+        scene: Scene,
+        rays: PixelRays,
+        rotation: Float64[np.ndarray, "3 3"],
+        position: Float64[np.ndarray, "3"],
+    ) -> None:
+        """Loads the mesh that this picture needs, if it is not there."""
+        side = rays.view_side_px
+        if self._loaded.get(side) is scene and not scene.mesh_in_view:
+            return
+        x, y = (centre + scene.mesh_offsets for centre in scene.centre_m)
+        if scene.mesh_in_view:
+            (west, east), (south, north) = _seen(scene, rays, rotation, position)
+            x, y = lines_in_view(x, west, east), lines_in_view(y, south, north)
+        self._view_renderer(side).load(ground_mesh(scene.surface, x, y), scene.objects.triangles)
+        self._loaded[side] = scene
+
+    def _draw(
         self,
         scene: Scene,
         rays: PixelRays,
         rotation: Float64[np.ndarray, "3 3"],
         position: Float64[np.ndarray, "3"],
         clearance_m: float,
-    ) -> PinholeView:
-        pose = np.eye(4)
-        pose[:3, :3] = rotation @ rays.view_from_body.T
-        pose[:3, 3] = position
-        # A fifth of the height above the ground below leaves room for any relief in view at descent altitudes.
-        return PinholeView(pose, rays.focal_px, near_m=0.2 * clearance_m, far_m=2.0 * scene.mesh_reach_m + clearance_m)
+    ) -> tuple[Float32[np.ndarray, "views side side"], Int32[np.ndarray, "views side side"]]:
+        """Depth and triangle numbers of the camera's pinhole views."""
+        renderer = self._view_renderer(rays.view_side_px)
+        drawn = []
+        for view_from_body, focal in zip(rays.view_from_body, rays.focal_px, strict=True):
+            pose = np.eye(4)
+            pose[:3, :3] = rotation @ view_from_body.T
+            pose[:3, 3] = position
+            # A twentieth of the height above the ground leaves room for relief and things before the camera; depth is
+            # only the first guess, so that its coarseness far away does no harm.
+            far = 2.0 * scene.mesh_reach_m + clearance_m
+            drawn.append(renderer.draw(PinholeView(pose, float(focal), near_m=0.05 * clearance_m, far_m=far)))
+        return np.stack([depth for depth, _ in drawn]), np.stack([numbers for _, numbers in drawn])
 
 
-def _law(photometry: Photometry) -> tuple[float, float, float, float, float, float]:
-    """The numbers of the photometric law in the order of the kernel, with the surge at the phase of normalisation."""
-    surge_norm = 1.0 + photometry.surge_amplitude / (1.0 + np.tan(np.radians(22.5)) / photometry.surge_width)
-    return (
-        photometry.lunar_share,
-        photometry.surge_amplitude,
-        photometry.surge_width,
-        float(surge_norm),
-        photometry.sky_share,
-        photometry.sky_radiance,
-    )
+#: Rays along each side of a picture from which the ground that it shows is found.
+_PROBES = 9
+
+
+def _seen(
+    scene: Scene, rays: PixelRays, rotation: Float64[np.ndarray, "3 3"], position: Float64[np.ndarray, "3"]
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Bounds in x and y of the ground that a picture can show.
+
+    The ground lies between two planes; a ray that meets the lower one has seen nothing beyond. A ray that never does
+    sees as far as the mesh reaches.
+    """
+    columns, rows = rays.size
+    probes = np.ix_(np.linspace(0, rows - 1, _PROBES).astype(int), np.linspace(0, columns - 1, _PROBES).astype(int))
+    directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ rotation.T
+    low, high = scene.height_range_m
+    farthest = 2.0 * scene.mesh_reach_m
+    falls = np.minimum(directions[:, 2], -1e-9)
+    ends = [np.clip((level - position[2]) / falls, 0.0, farthest) for level in (low, max(high, position[2]))]
+    places = np.concatenate([position[:2] + end[:, None] * directions[:, :2] for end in ends])
+    # between the probes the border bulges by at most a part of what they span
+    margin = 0.02 * (places.max(axis=0) - places.min(axis=0)) + 2.0 * scene.mesh_finest_m
+    lowest, highest = places.min(axis=0) - margin, places.max(axis=0) + margin
+    return (float(lowest[0]), float(highest[0])), (float(lowest[1]), float(highest[1]))
 
 
 @cache

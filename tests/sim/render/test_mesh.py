@@ -24,7 +24,7 @@ def test_refuses_more_lines_than_fit() -> None:
 
 def test_mesh_is_closed_faces_up_and_follows_the_ground(rough) -> None:
     offsets = graded_offsets(2000.0, 6.0, 65)
-    mesh = ground_mesh(rough, np.array([120.0, -40.0]), offsets)
+    mesh = ground_mesh(rough, 120.0 + offsets, -40.0 + offsets)
     assert len(mesh.faces) == 2 * 64 * 64
     assert (mesh.face_normals[:, 2] > 0.0).all()
     # no cracks: the only open edges are the square's border

@@ -1,0 +1,290 @@
+"""Compiled kernel of the picture: what each pixel's ray meets, and how bright that is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sim.render.kernels.ground import Array32, ground_lit, meet_ground
+from sim.render.kernels.objects import ObjectArrays, hit_triangle, objects_hide_sun
+from sim.render.kernels.texture import texture
+from sim.terrain.kernels import Array, Level, sample
+
+Ints = NDArray[np.int32]
+#: Body number of pixels that see the ground, and of pixels that see the sky.
+GROUND, SKY = -1, -2
+#: Slack of a triangle's edge, as a share: so that no ray slips between two triangles.
+SLACK = 1e-9
+
+
+@njit(cache=True, inline="always")
+def _ground_depth(depth: Array32, ids: Ints, face: int, u: float, v: float) -> float:
+    """Depth of the ground between the samples of a depth picture; 0 where no sample around shows ground.
+
+    Where all four samples show one stretch of ground its inverse depth, linear over a plane's picture, is interpolated;
+    across an edge the nearest sample of the ground is taken.
+    """
+    side = depth.shape[1]
+    i = min(max(math.floor(v), 0), side - 2)
+    j = min(max(math.floor(u), 0), side - 2)
+    fu = u - j
+    fv = v - i
+    a = depth[face, i, j]
+    b = depth[face, i, j + 1]
+    c = depth[face, i + 1, j]
+    d = depth[face, i + 1, j + 1]
+    smallest = min(min(a, b), min(c, d))
+    largest = max(max(a, b), max(c, d))
+    whole = ids[face, i, j] == 0 and ids[face, i, j + 1] == 0 and ids[face, i + 1, j] == 0
+    if whole and ids[face, i + 1, j + 1] == 0 and smallest > 0.0 and largest < 1.1 * smallest:
+        above = (1.0 - fu) / a + fu / b
+        below = (1.0 - fu) / c + fu / d
+        return float(1.0 / ((1.0 - fv) * above + fv * below))
+    nearest = 0.0
+    least = math.inf
+    for di in range(2):
+        for dj in range(2):
+            value = depth[face, i + di, j + dj]
+            far = abs(fv - di) + abs(fu - dj)
+            if value > 0.0 and ids[face, i + di, j + dj] == 0 and far < least:
+                least = far
+                nearest = value
+    return nearest
+
+
+@njit(cache=True)
+def _meet_object(
+    ids: Ints,
+    face: int,
+    u: float,
+    v: float,
+    triangles: Array,
+    x: float,
+    y: float,
+    z: float,
+    dx: float,
+    dy: float,
+    dz: float,
+) -> tuple[float, int, float, float]:
+    """The nearest triangle that a ray meets among those that the four samples around it show.
+
+    Where all four show triangles and the ray meets none of them (it slips to a sliver between), the plane of the
+    nearest sample's triangle is taken.
+    """
+    side = ids.shape[1]
+    i = min(max(math.floor(v), 0), side - 2)
+    j = min(max(math.floor(u), 0), side - 2)
+    best = math.inf
+    best_triangle = -1
+    best_second = 0.0
+    best_third = 0.0
+    shown = 0
+    last = 0
+    for k in range(4):
+        one = ids[face, i + k // 2, j + k % 2]
+        if one <= 0:
+            continue
+        shown += 1
+        if one == last:
+            continue
+        last = one
+        t, second, third = hit_triangle(triangles, one - 1, x, y, z, dx, dy, dz)
+        if 0.0 < t < best and second >= -SLACK and third >= -SLACK and second + third <= 1.0 + SLACK:
+            best = t
+            best_triangle = one - 1
+            best_second = second
+            best_third = third
+    if shown == 4 and best_triangle < 0:
+        one = ids[face, i + (1 if v - i > 0.5 else 0), j + (1 if u - j > 0.5 else 0)]
+        t, second, third = hit_triangle(triangles, one - 1, x, y, z, dx, dy, dz)
+        if 0.0 < t < math.inf:
+            second = min(max(second, 0.0), 1.0)
+            return t, one - 1, second, min(max(third, 0.0), 1.0 - second)
+    return best, best_triangle, best_second, best_third
+
+
+@njit(cache=True, inline="always")
+def _disc_overlap(first: float, second: float, apart: float) -> float:
+    """Share of the second disc that the first covers; radii and distance of their centres."""
+    if apart >= first + second:
+        return 0.0
+    if apart <= abs(first - second):
+        return min((first / second) ** 2, 1.0)
+    alpha = math.acos((apart * apart + first * first - second * second) / (2.0 * apart * first))
+    beta = math.acos((apart * apart + second * second - first * first) / (2.0 * apart * second))
+    area = first * first * (alpha - 0.5 * math.sin(2.0 * alpha)) + second * second * (beta - 0.5 * math.sin(2.0 * beta))
+    return area / (math.pi * second * second)
+
+
+@njit(cache=True, inline="always")
+def _brightness(law: Array, cos_i: float, cos_e: float, cos_g: float) -> float:
+    """Radiance factor of ground of unit albedo under the sun alone: Lunar-Lambert with an opposition surge."""
+    tan_half = math.sqrt(max(1.0 - cos_g, 0.0) / max(1.0 + cos_g, 1e-9))
+    surge = 1.0 + law[1] / (1.0 + tan_half / law[2])
+    brightness: float = law[3] * surge * (2.0 * law[0] * cos_i / (cos_i + cos_e) + (1.0 - law[0]) * cos_i)
+    return brightness
+
+
+@njit(cache=True)
+def shade(
+    levels: tuple[Level, ...],
+    spacing: float,
+    depth: Array32,
+    ids: Ints,
+    focal: Array,
+    view_from_body: Array,
+    face_of_pixel: NDArray[np.uint8],
+    world_from_body: Array,
+    position: Array,
+    origins: Array32,
+    directions: Array32,
+    pixel_angle: float,
+    sun: Array,
+    law: Array,
+    shadow: Array32,
+    shadow_spacing: float,
+    ground_texture: tuple[float, Array],
+    object_texture: tuple[float, Array],
+    things: ObjectArrays,
+    radiance: Array32,
+    distance: Array,
+    body: Ints,
+    normal: Array32,
+) -> None:
+    """Radiance factor and truth of every pixel.
+
+    Parameters
+    ----------
+    levels, spacing
+        The surface's pyramid and the spacing of its level 0.
+    depth, ids, focal, view_from_body
+        Pinhole views from `position`: depth along the axis, number of the triangle plus one (0 for ground), focal
+        lengths in samples, and rotations from body axes to the views' (x right, y down, z forward).
+    face_of_pixel
+        The view that holds each pixel.
+    world_from_body, position
+        Rotation matrix of the body, and world position of the centre of projection.
+    origins, directions
+        Each pixel's ray in body axes relative to `position`, shape (n, 3), float32; directions are unit.
+    pixel_angle
+        Angle between neighbouring pixels' rays, radians.
+    sun
+        Unit vector to the sun, world axes.
+    law
+        Lunar share, surge amplitude, surge width, normalisation, sky share, sky radiance, light from the surrounding
+        ground, diameter of what casts a shadow from the body's place, angular radius of the sun.
+    shadow, shadow_spacing
+        Height of the ground's shadow on a periodic grid; one side is 1 where there is none.
+    ground_texture, object_texture
+        Coarsest cell and amplitudes of octaves.
+    things
+        Triangles that stand on the ground.
+    radiance, distance, body, normal
+        Outputs: radiance factor; distance along the ray, infinite for the sky; number of the thing seen (GROUND, SKY);
+        unit normal in world axes.
+    """
+    triangles, normals, body_of_triangle, _first, _spheres, albedos = things[:6]
+    sky_share, sky_radiance, bounced = law[4], law[5], law[6]
+    caster, sun_radius = law[7], law[8]
+    middle = depth.shape[1] / 2.0 - 0.5
+    inverse_spacing = 1.0 / spacing
+    top_level = len(levels) - 1
+    shadowed = shadow.shape[0] > 1
+    w = world_from_body
+    for n in range(directions.shape[0]):
+        bx = directions[n, 0]
+        by = directions[n, 1]
+        bz = directions[n, 2]
+        ox = origins[n, 0]
+        oy = origins[n, 1]
+        oz = origins[n, 2]
+        face = face_of_pixel[n]
+        p = view_from_body[face]
+        px = p[0, 0] * bx + p[0, 1] * by + p[0, 2] * bz
+        py = p[1, 0] * bx + p[1, 1] * by + p[1, 2] * bz
+        pz = p[2, 0] * bx + p[2, 1] * by + p[2, 2] * bz
+        u = focal[face] * px / pz + middle
+        v = focal[face] * py / pz + middle
+        dx = w[0, 0] * bx + w[0, 1] * by + w[0, 2] * bz
+        dy = w[1, 0] * bx + w[1, 1] * by + w[1, 2] * bz
+        dz = w[2, 0] * bx + w[2, 1] * by + w[2, 2] * bz
+        x0 = position[0] + w[0, 0] * ox + w[0, 1] * oy + w[0, 2] * oz
+        y0 = position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz
+        z0 = position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz
+        t = math.inf
+        guess = _ground_depth(depth, ids, face, u, v)
+        if guess > 0.0:
+            t = meet_ground(levels[0], inverse_spacing, x0, y0, z0, dx, dy, dz, guess / pz)
+        triangle = -1
+        second = 0.0
+        third = 0.0
+        if triangles.shape[0] > 0:
+            t_thing, triangle, second, third = _meet_object(ids, face, u, v, triangles, x0, y0, z0, dx, dy, dz)
+            if triangle >= 0 and t_thing < t:
+                t = t_thing
+            else:
+                triangle = -1
+        distance[n] = t
+        if t == math.inf:
+            radiance[n] = sky_radiance
+            body[n] = SKY
+            normal[n] = 0.0
+            continue
+        x = x0 + t * dx
+        y = y0 + t * dy
+        z = z0 + t * dz
+        if triangle >= 0:
+            rest = 1.0 - second - third
+            nx = rest * normals[triangle, 0, 0] + second * normals[triangle, 1, 0] + third * normals[triangle, 2, 0]
+            ny = rest * normals[triangle, 0, 1] + second * normals[triangle, 1, 1] + third * normals[triangle, 2, 1]
+            nz = rest * normals[triangle, 0, 2] + second * normals[triangle, 1, 2] + third * normals[triangle, 2, 2]
+            length = math.sqrt(nx * nx + ny * ny + nz * nz)
+            nx /= length
+            ny /= length
+            nz /= length
+            body[n] = body_of_triangle[triangle]
+            albedo = albedos[body[n]]
+            cos_e = max(-(dx * nx + dy * ny + dz * nz), 1e-3)
+            footprint = t * pixel_angle / math.sqrt(max(cos_e, 0.05))
+            change = texture(x, y, z, footprint, object_texture[0], object_texture[1])
+        else:
+            # the level whose samples are as far apart as the pixel's footprint, blended between the two nearest
+            footprint = t * pixel_angle / math.sqrt(max(-dz, 0.05))
+            fractional = math.log2(max(footprint / spacing, 1.0))
+            lower = min(int(fractional), top_level)
+            blend = min(fractional - lower, 1.0)
+            scale = inverse_spacing / (1 << lower)
+            _height, slope_x, slope_y, albedo = sample(levels[lower], scale, x, y)
+            if blend > 0.0 and lower < top_level:
+                _height, slope_x2, slope_y2, albedo2 = sample(levels[lower + 1], 0.5 * scale, x, y)
+                slope_x += blend * (slope_x2 - slope_x)
+                slope_y += blend * (slope_y2 - slope_y)
+                albedo += blend * (albedo2 - albedo)
+            nz = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+            nx = -slope_x * nz
+            ny = -slope_y * nz
+            cos_e = max(-(dx * nx + dy * ny + dz * nz), 1e-3)
+            body[n] = GROUND
+            change = texture(x, y, z, footprint, ground_texture[0], ground_texture[1])
+        if change != 0.0:
+            albedo *= math.exp(change)
+        normal[n, 0] = nx
+        normal[n, 1] = ny
+        normal[n, 2] = nz
+        value = sky_share * 0.5 * (1.0 + nz) + bounced * 0.5 * (1.0 - nz)
+        cos_i = sun[0] * nx + sun[1] * ny + sun[2] * nz
+        if cos_i > 0.0:
+            lit = 1.0
+            if shadowed:
+                lit = ground_lit(shadow, 1.0 / shadow_spacing, 0.25 * shadow_spacing, x, y, z)
+            if lit > 0.0 and objects_hide_sun(things, x, y, z, sun, 1e-3):
+                lit = 0.0
+            cos_g = min(max(-(dx * sun[0] + dy * sun[1] + dz * sun[2]), -1.0), 1.0)
+            if caster > 0.0 and cos_g > 0.9:
+                lit *= 1.0 - _disc_overlap(0.5 * caster / t, sun_radius, math.acos(cos_g))
+            if lit > 0.0:
+                value += lit * _brightness(law, cos_i, cos_e, cos_g)
+        radiance[n] = albedo * value
