@@ -17,12 +17,11 @@ from algorithms.interface import VelocityEstimate
 from scenarios.interface import CaseResult, Scalar
 from sim.camera import Cahv, Cahvor
 from sim.dynamics import DescentParameters, ParachuteDescent, State
-from sim.processor import processor_features
 from sim.frames import direction
 from sim.measurements import AltitudeMeasurement, DescentMeasurements, DetectorImage
-from sim.render import Photometry, Scene, Sun, process_renderer
+from sim.processor import processor_features
+from sim.render import Photometry, PixelRays, Scene, Sun, process_renderer
 from sim.render.backend import Backend, default_backend
-from sim.render.renderer import PixelRays
 from sim.sensor import (
     Altimeter,
     AltimeterParameters,
