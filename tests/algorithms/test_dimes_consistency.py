@@ -81,8 +81,8 @@ def track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
     """Velocity errors of four tracks per case within specification, m/s, shape (cases, pair, template, 2).
 
     Altitude errors of 1 % (3 sigma), attitude errors of 0.03 deg (0.5 ms at 60 deg/s) and match errors of 0.1 m/s, all
-    new in each picture but common to the tracks in it; features anywhere within 39 deg of the nadir. A feature at r from
-    the nadir of a picture with relative altitude error e and tilt error (a, b) is misplaced by at most
+    new in each picture but common to the tracks in it; features anywhere within 39 deg of the nadir. A feature at r
+    from the nadir of a picture with relative altitude error e and tilt error (a, b) is misplaced by at most
     e r + H (1 + r^2 / H^2) (a, b).
     """
     heights = np.array([2000.0, 1719.0, 1438.0])
