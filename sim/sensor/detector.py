@@ -2,45 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt16
-from pydantic import BaseModel, ConfigDict, Field
 
-from sim.camera import CameraModel
 from sim.measurements import DetectorCalibration
+from sim.sensor.companding import compand, expand
+from sim.sensor.defects import add_bursts, dead_pixels, hot_currents
+from sim.sensor.motion import ImageMotion, moving_exposure
+from sim.sensor.optics import dust_transmission, natural_fall_off, spread
+from sim.sensor.parameters import DetectorParameters
 
-NonNegative = Annotated[float, Field(ge=0.0)]
-
-
-class DetectorParameters(BaseModel):
-    """A frame-transfer CCD without shutter. The defaults are those of the MER descent camera where they are known.
-
-    Full well, gain and read noise: Maki et al. 2003. Responsivity is a calibration: it gives the paper's
-    signal-to-noise ratio of 102 (11,000 electrons in a delivered, row-summed pixel) on the darkest terrain, of albedo
-    0.1 at a radiance factor of 0.07. How fast the detector is cleared is assumed.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="exposure time, s")] = 0.004
-    responsivity_e_s: Annotated[
-        float, Field(gt=0.0, description="electrons per second in a pixel on axis at radiance factor 1")
-    ] = 9.8e6
-    rows_summed: Annotated[int, Field(ge=1, le=16, description="rows summed on the chip")] = 4
-    transfer_row_s: Annotated[NonNegative, Field(description="time under each row during the transfer, s")] = 5.0e-6
-    clear_row_s: Annotated[NonNegative, Field(description="time under each row during the clearing, s")] = 1.0e-6
-    full_well_e: Annotated[float, Field(gt=0.0, description="full well, electrons")] = 170000.0
-    gain_e_dn: Annotated[float, Field(gt=0.0, description="electrons per count")] = 41.5
-    read_noise_e: Annotated[NonNegative, Field(description="read noise, electrons")] = 25.0
-    offset_dn: Annotated[NonNegative, Field(description="counts without light")] = 20.0
-    bits: Annotated[int, Field(ge=8, le=16, description="bits of a count")] = 12
-    response_spread: Annotated[float, Field(ge=0.0, le=0.1, description="RMS of the pixels' relative response")] = 0.01
-    calibration_error: Annotated[
-        float, Field(ge=0.0, le=0.1, description="RMS error of the calibrated relative response")
-    ] = 0.002
+__all__ = ["Detector", "DetectorParameters", "dark_seconds", "natural_fall_off"]
 
 
 @dataclass(frozen=True)
@@ -52,20 +26,25 @@ class Detector:
     parameters
         The detector's parameters.
     response
-        Relative response of each physical pixel with the lens's fall-off, shape (rows, columns).
+        Relative response of each physical pixel with the lens's fall-off, its dust and dead pixels, shape (rows,
+        columns).
     calibration
-        What the ground knows of it.
+        What the ground knows of it: neither dust nor dead pixels, nor dark current.
+    hot_e_s
+        Dark current of each physical pixel at 0 deg C beyond the common one, electrons per second; None without hot
+        pixels.
     """
 
     parameters: DetectorParameters
     response: Float32[np.ndarray, "rows columns"]
     calibration: DetectorCalibration
+    hot_e_s: Float32[np.ndarray, "rows columns"] | None = None
 
     @classmethod
     def drawn(
         cls, fall_off: Float32[np.ndarray, "rows columns"], parameters: DetectorParameters, rng: np.random.Generator
     ) -> Detector:
-        """A detector of as many physical pixels behind a lens of this fall-off, its pixels' response drawn."""
+        """A detector of as many physical pixels behind a lens of this fall-off, its pixels and dust drawn."""
         rows, columns = fall_off.shape
         if rows % parameters.rows_summed:
             raise ValueError(f"{rows} rows cannot be summed by {parameters.rows_summed}")
@@ -81,47 +60,94 @@ class Detector:
             clear_row_s=parameters.clear_row_s,
             rows_summed=parameters.rows_summed,
             offset_dn=parameters.offset_dn,
-            full_scale_dn=2**parameters.bits - 1,
+            full_scale_dn=parameters.full_scale_dn,
         )
-        return cls(parameters, response.astype(np.float32), calibration)
+        defects, optics = parameters.defects, parameters.optics
+        hot = None if defects.hot_share == 0.0 else hot_currents(fall_off.shape, defects, rng)
+        if defects.dead_share > 0.0:
+            response = np.where(dead_pixels(fall_off.shape, defects, rng), np.float32(0.0), response)
+        if optics.dust_discs > 0:
+            response = response * dust_transmission(fall_off.shape, optics, rng)
+        return cls(parameters, response.astype(np.float32), calibration, hot)
+
+    def with_exposure(self, exposure_s: float) -> Detector:
+        """The same detector set to another exposure time, which its calibration states."""
+        parameters = DetectorParameters.model_validate(self.parameters.model_dump() | {"exposure_s": exposure_s})
+        return replace(self, parameters=parameters, calibration=replace(self.calibration, exposure_s=exposure_s))
 
     def expose(
-        self, radiance: Float32[np.ndarray, "rows columns"], rng: np.random.Generator
+        self,
+        radiance: Float32[np.ndarray, "rows columns"],
+        rng: np.random.Generator,
+        motion: ImageMotion | None = None,
     ) -> UInt16[np.ndarray, "delivered_rows columns"]:
-        """Counts of one exposure to a still scene of this radiance factor."""
+        """Counts of one exposure.
+
+        Parameters
+        ----------
+        radiance
+            Radiance factor of the scene at mid exposure.
+        rng
+            Stream of the noise.
+        motion
+            How the picture moves; None for a still one.
+        """
         p = self.parameters
-        mean = _sum_rows(self.charge(radiance), p.rows_summed)
-        electrons = rng.poisson(mean).astype(np.float32)
+        mean = _sum_rows(self.charge(radiance, motion), p.rows_summed) + self.dark_charge()
+        # deconvolved edges of the point spread may dip below 0
+        electrons = rng.poisson(np.maximum(mean, 0.0)).astype(np.float32)
         electrons += np.float32(p.read_noise_e) * rng.standard_normal(electrons.shape, dtype=np.float32)
         np.minimum(electrons, np.float32(p.full_well_e), out=electrons)
-        counts = np.rint(electrons / np.float32(p.gain_e_dn) + np.float32(p.offset_dn))
-        delivered: UInt16[np.ndarray, "delivered_rows columns"] = np.clip(counts, 0, 2**p.bits - 1).astype(np.uint16)
-        return delivered
+        counts = add_bursts(electrons / np.float32(p.gain_e_dn) + np.float32(p.offset_dn), p.bursts, rng)
+        delivered: UInt16[np.ndarray, "delivered_rows columns"] = np.clip(np.rint(counts), 0, p.full_scale_dn).astype(
+            np.uint16
+        )
+        return expand(compand(delivered, p.full_scale_dn), p.full_scale_dn) if p.companded else delivered
 
-    def charge(self, radiance: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
-        """Mean charge in electrons of each physical pixel at the end of the transfer.
+    def charge(
+        self, radiance: Float32[np.ndarray, "rows columns"], motion: ImageMotion | None = None
+    ) -> Float32[np.ndarray, "rows columns"]:
+        """Mean charge by light in electrons of each physical pixel at the end of the transfer.
 
         Besides its exposure, a packet collects light from the rows it passes under: before the exposure, while the
         detector is cleared, the rows after its own; after it, on the way to the storage area, the rows before its own.
+        Each row is seen as it is when the packet passes it.
         """
         p = self.parameters
-        rate = radiance * self.response * np.float32(p.responsivity_e_s)
-        passed = np.cumsum(rate, axis=0)
-        total = passed[-1:]
+        scene = spread(radiance, p.optics)
+        duration = p.exposure_s + len(radiance) * (p.transfer_row_s + p.clear_row_s)
+        if motion is not None and not motion.is_still(duration):
+            seconds = moving_exposure(scene, self.response, motion, p.exposure_s, p.transfer_row_s, p.clear_row_s)
+            seconds *= np.float32(p.responsivity_e_s)
+            return seconds
+        rate = scene * self.response * np.float32(p.responsivity_e_s)
         charge: Float32[np.ndarray, "rows columns"] = np.float32(p.exposure_s) * rate
-        charge += np.float32(p.transfer_row_s) * (passed - rate)
-        charge += np.float32(p.clear_row_s) * (total - passed)
+        if p.transfer_row_s > 0.0 or p.clear_row_s > 0.0:
+            passed = np.cumsum(rate, axis=0)
+            charge += np.float32(p.transfer_row_s) * (passed - rate)
+            charge += np.float32(p.clear_row_s) * (passed[-1:] - passed)
+        return charge
+
+    def dark_charge(self) -> Float32[np.ndarray, "delivered_rows _"]:
+        """Mean dark charge in electrons of each delivered pixel, one column where all columns are alike."""
+        p = self.parameters
+        rows = len(self.response)
+        current = np.full((rows // p.rows_summed, 1), p.rows_summed * p.dark_e_s, dtype=np.float32)
+        if self.hot_e_s is not None:
+            current = current + _sum_rows(self.hot_e_s, p.rows_summed)
+        seconds = dark_seconds(p, rows)[:, None].astype(np.float32)
+        charge: Float32[np.ndarray, "delivered_rows _"] = np.float32(p.dark_growth) * current * seconds
         return charge
 
 
-def natural_fall_off(camera: CameraModel) -> Float32[np.ndarray, "rows columns"]:
-    """Brightness of each pixel behind an unvignetted lens: the fourth power of the cosine of its field angle."""
-    columns, rows = camera.size
-    u, v = np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64))
-    _origins, directions = camera.rays(np.stack([u, v], axis=-1))
-    cosine: Float64[np.ndarray, "rows columns"] = directions @ camera.a
-    fall_off: Float32[np.ndarray, "rows columns"] = (np.clip(cosine, 0.0, 1.0) ** 4).astype(np.float32)
-    return fall_off
+def dark_seconds(parameters: DetectorParameters, rows: int) -> Float64[np.ndarray, "delivered_rows"]:
+    """How long the charge of each delivered row gathers dark current: exposure, transfer and the wait for its readout.
+
+    Row 0 is read out first.
+    """
+    waits = parameters.readout_row_s * np.arange(rows // parameters.rows_summed, dtype=np.float64)
+    seconds: Float64[np.ndarray, "delivered_rows"] = waits + parameters.exposure_s + rows * parameters.transfer_row_s
+    return seconds
 
 
 def _sum_rows(picture: Float[np.ndarray, "rows columns"], count: int) -> Float[np.ndarray, "summed columns"]:

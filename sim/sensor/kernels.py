@@ -1,0 +1,307 @@
+"""Compiled kernels of exposure over time: motion blur, and the smear of a moving scene during charge transfer.
+
+Both take the scene as it stands at mid exposure, with `pad` rows and columns repeated beyond each border, and its image
+velocity (rows and columns per second) on a coarse grid. What stands at x at time t stood at x - velocity * t at mid
+exposure. Velocity is constant within tiles of `TILE` x `TILE` pixels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+#: Side of the tiles within which image velocity is constant, pixels.
+TILE = 32
+#: Steps per pixel of path of the integral over the exposure.
+STEPS_PER_PX = 8
+#: Weights below this are not worth adding.
+LEAST_TAP = 1e-6
+
+
+@njit(cache=True)
+def velocity_at(field: Array, step: float, row: float, column: float) -> tuple[float, float]:
+    """Rows and columns per second at a pixel, bilinear between the nodes of the grid, held beyond them."""
+    y = min(max(row / step, 0.0), field.shape[0] - 1.0)
+    x = min(max(column / step, 0.0), field.shape[1] - 1.0)
+    i = min(int(y), field.shape[0] - 2)
+    j = min(int(x), field.shape[1] - 2)
+    fy = y - i
+    fx = x - j
+    a = (1.0 - fy) * (1.0 - fx)
+    b = (1.0 - fy) * fx
+    c = fy * (1.0 - fx)
+    d = fy * fx
+    return (
+        a * field[i, j, 0] + b * field[i, j + 1, 0] + c * field[i + 1, j, 0] + d * field[i + 1, j + 1, 0],
+        a * field[i, j, 1] + b * field[i, j + 1, 1] + c * field[i + 1, j, 1] + d * field[i + 1, j + 1, 1],
+    )
+
+
+@njit(cache=True)
+def _cubic(f: float, weights: Array) -> None:
+    """Weights of samples -1, 0, 1, 2 at 0 <= f < 1: cubic convolution (Keys 1981, a = -1/2)."""
+    weights[0] = ((-0.5 * f + 1.0) * f - 0.5) * f
+    weights[1] = (1.5 * f - 2.5) * f * f + 1.0
+    weights[2] = ((-1.5 * f + 2.0) * f + 0.5) * f
+    weights[3] = (0.5 * f - 0.5) * f * f
+
+
+@njit(cache=True)
+def path_kernel(row_path: float, column_path: float, reach: int, kernel: Array) -> None:
+    """Mean over a straight path, centred on the pixel, as a convolution of whole pixels.
+
+    Parameters
+    ----------
+    row_path, column_path
+        Length of the path in rows and columns.
+    reach
+        Half size of the kernel.
+    kernel
+        Output, shape (2 reach + 1, at least 2 reach + 1); its sum is 1.
+    """
+    kernel[:] = 0.0
+    count = max(1, math.ceil(STEPS_PER_PX * math.sqrt(row_path * row_path + column_path * column_path)))
+    down = np.empty(4)
+    right = np.empty(4)
+    for n in range(count):
+        share = (n + 0.5) / count - 0.5
+        y = share * row_path
+        x = share * column_path
+        i = math.floor(y)
+        j = math.floor(x)
+        _cubic(y - i, down)
+        _cubic(x - j, right)
+        for p in range(4):
+            for q in range(4):
+                kernel[reach + i + p - 1, reach + j + q - 1] += down[p] * right[q] / count
+
+
+@njit(cache=True)
+def _tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
+    """First row and column of each run of four neighbouring taps that matter, and how many there are."""
+    count = 0
+    for p in range(kernel.shape[0]):
+        q = 0
+        while q < kernel.shape[1] - 3:
+            if abs(kernel[p, q]) > LEAST_TAP:
+                groups[count, 0] = p
+                groups[count, 1] = q
+                count += 1
+                q += 4
+            else:
+                q += 1
+    return count
+
+
+@njit(cache=True)
+def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float, out: Array32) -> None:
+    """Mean of the moving scene over an exposure centred on the time of `padded`, for each pixel.
+
+    Parameters
+    ----------
+    padded, pad
+        The scene, and its border, with three columns more on the right.
+    field, step
+        Image velocity at grid nodes (rows and columns per second), shape (n, m, 2), and their distance in pixels.
+    exposure_s
+        Exposure time.
+    out
+        Output, the shape of the scene without its border.
+    """
+    rows, columns = out.shape
+    # three columns more, always 0: taps are added four at a time
+    kernel = np.zeros((2 * pad + 1, 2 * pad + 4))
+    line = np.empty(TILE, dtype=np.float32)
+    groups = np.empty(((2 * pad + 1) * (2 * pad + 4), 2), dtype=np.int64)
+    for top in range(0, rows, TILE):
+        bottom = min(top + TILE, rows)
+        for left in range(0, columns, TILE):
+            width = min(TILE, columns - left)
+            by_row, by_column = velocity_at(field, step, 0.5 * (top + bottom - 1), left + 0.5 * (width - 1))
+            path_kernel(by_row * exposure_s, by_column * exposure_s, pad, kernel)
+            count = _tap_groups(kernel, groups)
+            for r in range(top, bottom):
+                line[:] = 0.0
+                for n in range(count):
+                    p, q = groups[n]
+                    a = np.float32(kernel[p, q])
+                    b = np.float32(kernel[p, q + 1])
+                    c = np.float32(kernel[p, q + 2])
+                    d = np.float32(kernel[p, q + 3])
+                    source = padded[r + p, left + q : left + q + width + 3]
+                    for k in range(width):
+                        line[k] += a * source[k] + b * source[k + 1] + c * source[k + 2] + d * source[k + 3]
+                for k in range(width):
+                    out[r, left + k] = line[k]
+
+
+@njit(cache=True)
+def _split(position: float, size: int) -> tuple[int, np.float32]:
+    """Whole and fractional part of a position, held so that the next sample exists."""
+    i = math.floor(position)
+    if i < 0:
+        return 0, np.float32(0.0)
+    if i > size - 2:
+        return size - 2, np.float32(1.0)
+    return i, np.float32(position - i)
+
+
+@njit(cache=True)
+def _add_moved(source: Array32, y: float, x: float, factor: np.float32, line: Array32, width: int) -> None:
+    """Adds factor times the source at row y and columns x, x + 1, ... to a line, bilinear between samples."""
+    i, fy = _split(y, source.shape[0])
+    j, fx = _split(x, source.shape[1] - width)
+    one = np.float32(1.0)
+    a = factor * (one - fy) * (one - fx)
+    b = factor * (one - fy) * fx
+    c = factor * fy * (one - fx)
+    d = factor * fy * fx
+    upper = source[i, j : j + width + 1]
+    lower = source[i + 1, j : j + width + 1]
+    for k in range(width):
+        line[k] += a * upper[k] + b * upper[k + 1] + c * lower[k] + d * lower[k + 1]
+
+
+@njit(cache=True)
+def sums_before(scene: Array32) -> Array32:
+    """Sums over the rows before each row, shape (rows + 1, columns)."""
+    rows, columns = scene.shape
+    sums = np.empty((rows + 1, columns), dtype=np.float32)
+    sums[0] = 0.0
+    for r in range(rows):
+        for c in range(columns):
+            sums[r + 1, c] = sums[r, c] + scene[r, c]
+    return sums
+
+
+@njit(cache=True)
+def block_means(picture: Array32, edges: NDArray[np.int64]) -> Array32:
+    """Means over blocks of rows, shape (blocks, columns)."""
+    means = np.zeros((len(edges) - 1, picture.shape[1]), dtype=np.float32)
+    for block in range(len(edges) - 1):
+        share = np.float32(1.0 / (edges[block + 1] - edges[block]))
+        for r in range(edges[block], edges[block + 1]):
+            for c in range(picture.shape[1]):
+                means[block, c] += share * picture[r, c]
+    return means
+
+
+@njit(cache=True)
+def passed_blocks(
+    prefix: Array32,
+    pad: int,
+    response: Array32,
+    edges: NDArray[np.int64],
+    field: Array,
+    step: float,
+    start_s: float,
+    row_s: float,
+    out: Array32,
+) -> None:
+    """What a packet gathers on its way out from the upper edge of each block of rows, in units of radiance x rows.
+
+    A packet that starts at the upper edge of block R passes the middle of block K < R when the picture has moved on
+    for (R - K - 1/2) blocks. Each block of the scene is seen at that one time.
+
+    Parameters
+    ----------
+    prefix, pad
+        Sums over the padded scene's rows before each row, shape (padded rows + 1, padded columns), and the border.
+    response
+        Mean response of each block, shape (blocks, columns).
+    edges
+        First row of each block, and the number of rows, shape (blocks + 1,).
+    field, step
+        Image velocity, as for `blur`.
+    start_s, row_s
+        Time at which the transfer starts, from mid exposure, and time per row.
+    out
+        Output, shape (blocks + 1, columns): the sum at each edge.
+    """
+    blocks, columns = response.shape
+    line = np.empty(TILE, dtype=np.float32)
+    out[:] = 0.0
+    for start in range(1, blocks + 1):
+        for block in range(start):
+            middle = 0.5 * (edges[block] + edges[block + 1])
+            time = start_s + (edges[start] - middle) * row_s
+            for left in range(0, columns, TILE):
+                width = min(TILE, columns - left)
+                by_row, by_column = velocity_at(field, step, middle - 0.5, left + 0.5 * (width - 1))
+                y = pad - by_row * time
+                x = pad + left - by_column * time
+                line[:] = 0.0
+                _add_moved(prefix, edges[block + 1] + y, x, np.float32(1.0), line, width)
+                _add_moved(prefix, edges[block] + y, x, np.float32(-1.0), line, width)
+                for c in range(width):
+                    out[start, left + c] += response[block, left + c] * line[c]
+
+
+@njit(cache=True)
+def add_passed(
+    padded: Array32,
+    pad: int,
+    response: Array32,
+    passed: Array32,
+    edges: NDArray[np.int64],
+    field: Array,
+    step: float,
+    start_s: float,
+    row_s: float,
+    charge: Array32,
+) -> None:
+    """Adds what every row's packet gathers on its way out to `charge`, in units of radiance x seconds.
+
+    Between the edges of a block the sums over earlier blocks change linearly, as their times do; the block's own rows
+    are added one by one, seen half a block's time after the start.
+
+    Parameters
+    ----------
+    padded, pad, response
+        The scene with its border, and the response of every pixel.
+    passed, edges
+        The sums from `passed_blocks`, and the blocks.
+    field, step, start_s, row_s
+        As for `passed_blocks`.
+    charge
+        Changed in place, shape (rows, columns).
+    """
+    columns = response.shape[1]
+    seconds = np.float32(row_s)
+    moved = np.empty((np.max(np.diff(edges)), TILE), dtype=np.float32)
+    own = np.empty(TILE, dtype=np.float32)
+    change = np.empty(TILE, dtype=np.float32)
+    for left in range(0, columns, TILE):
+        width = min(TILE, columns - left)
+        for block in range(len(edges) - 1):
+            first, last = edges[block], edges[block + 1]
+            time = start_s + 0.5 * (last - first) * row_s
+            by_row, by_column = velocity_at(field, step, 0.5 * (first + last - 1), left + 0.5 * (width - 1))
+            y = pad - by_row * time
+            x = pad + left - by_column * time
+            moved[:] = 0.0
+            own[:] = 0.0
+            before = passed[block, left : left + width]
+            after = passed[block + 1, left : left + width]
+            for k in range(width):
+                change[k] = after[k] - before[k]
+            for r in range(first, last):
+                line = moved[r - first]
+                _add_moved(padded, r + y, x, np.float32(1.0), line, width)
+                weights = response[r, left : left + width]
+                for k in range(width):
+                    line[k] *= weights[k]
+                    change[k] -= line[k]
+            for r in range(first, last):
+                share = np.float32((r - first) / (last - first))
+                line = moved[r - first]
+                out = charge[r, left : left + width]
+                for k in range(width):
+                    out[k] += seconds * (before[k] + share * change[k] + own[k])
+                    own[k] += line[k]

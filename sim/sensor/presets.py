@@ -1,0 +1,245 @@
+"""Cameras by name: geometry and detector of the papers' cameras.
+
+Frames
+------
+A descent camera is given in the body frame: at its origin, looking along -z, columns along +x. All others are given in
+a frame with x forward, y to the left and z up, whose origin lies between the two cameras of a pair: the mast's, or the
+rover's. ``camera.moved(body_from_mast)`` puts them onto a vehicle.
+
+Sources: the field-test paper III.B; the target tracking paper section 3 (research rover); the landing paper section 5;
+Maki et al. 2003, "Mars Exploration Rover Engineering Cameras" (MER); what is assumed is called so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BeforeValidator
+from scipy.spatial.transform import Rotation
+
+from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from sim.sensor.optics import OpticsParameters
+from sim.sensor.parameters import DetectorParameters
+from sim.sensor.radiometry import DARK_E_S, NG3_FIELD, NG4_FLIGHT, LightPath
+
+#: Distance of Mars from the sun at the MER landings (the paper's "1.5 AU": 44 % of Earth's sunlight), AU.
+MARS_AU = 1.5
+#: Distortion of Opportunity's left navcam (its PDS label), R of CAHVOR.
+NAVCAM_RADIAL = (0.00096, -0.002183, 0.018547)
+#: What an exposure is set for where it is not known: a radiance factor of 0.3 fills 60 % of the full well.
+BRIGHT_RADIANCE_FACTOR, BRIGHT_SHARE = 0.3, 0.6
+
+
+@dataclass(frozen=True)
+class CameraDesign:
+    """Geometry of a camera or of a stereo pair.
+
+    Attributes
+    ----------
+    focal_length_mm, pixel_pitch_um, size
+        Focal length, distance of the pixels, and (columns, rows).
+    radial
+        R of CAHVOR or CAHVORE.
+    linearity
+        CAHVORE's linearity; None for CAHVOR.
+    baseline_m
+        Distance of the two cameras of a pair; None for a single camera.
+    toe_in_deg
+        By how much each camera of a pair is turned towards the other.
+    down
+        Whether it looks down along -z, rather than forward along +x.
+    """
+
+    focal_length_mm: float
+    pixel_pitch_um: float
+    size: tuple[int, int]
+    radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    linearity: float | None = None
+    baseline_m: float | None = None
+    toe_in_deg: float = 0.0
+    down: bool = False
+
+    def cameras(self) -> tuple[CameraModel, ...]:
+        """The camera, or the left and the right one of the pair."""
+        if self.baseline_m is None:
+            return (self._camera(0.0, 0.0),)
+        half, toe = 0.5 * self.baseline_m, np.radians(self.toe_in_deg)
+        return (self._camera(half, -toe), self._camera(-half, toe))
+
+    def _camera(self, left_m: float, azimuth_rad: float) -> CameraModel:
+        turn = Rotation.from_rotvec([0.0, 0.0, azimuth_rad])
+        pinhole = Cahv.from_focal_length(
+            focal_m=self.focal_length_mm * 1e-3,
+            pixel_pitch_m=self.pixel_pitch_um * 1e-6,
+            size=self.size,
+            centre=np.array([0.0, left_m, 0.0]),
+            axis=np.array([0.0, 0.0, -1.0]) if self.down else turn.apply([1.0, 0.0, 0.0]),
+            right=np.array([1.0, 0.0, 0.0]) if self.down else turn.apply([0.0, -1.0, 0.0]),
+        )
+        radial = np.array(self.radial)
+        if self.linearity is None:
+            return Cahvor.from_cahv(pinhole, r=radial)
+        return Cahvore.from_cahv(pinhole, r=radial, linearity=self.linearity)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A camera of the papers.
+
+    Attributes
+    ----------
+    design, light, detector
+        Geometry, light path and detector.
+    """
+
+    design: CameraDesign
+    light: LightPath
+    detector: DetectorParameters
+
+    def cameras(self) -> tuple[CameraModel, ...]:
+        """The camera, or the left and the right one of a pair."""
+        return self.design.cameras()
+
+
+def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float) -> Preset:
+    """A camera with the MER detector, of which the descent camera's parameters are the defaults."""
+    settings = {
+        "responsivity_e_s": light.responsivity_e_s(sun_au),
+        "dark_e_s": DARK_E_S,
+        "optics": OpticsParameters(diffraction_px=_diffraction_px(light)),
+    }
+    return Preset(design, light, DetectorParameters.model_validate(settings | changes))
+
+
+def _diffraction_px(light: LightPath) -> float:
+    return 1e-3 * light.mean_wavelength_nm() * light.f_number / light.pixel_pitch_um
+
+
+def _bright_exposure_s(full_well_e: float, responsivity_e_s: float) -> float:
+    return BRIGHT_SHARE * full_well_e / (BRIGHT_RADIANCE_FACTOR * responsivity_e_s)
+
+
+_DESCENT = CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, down=True)
+_FLIGHT_EXPOSURE_S = 0.004
+#: Passbands (Maki et al. 2003), nm.
+_DESCENT_BAND, _ROVER_BAND = (400.0, 1100.0), (600.0, 800.0)
+
+
+def _mer_descent_flown() -> Preset:
+    light = LightPath(12.0, 12.0, _DESCENT_BAND, NG4_FLIGHT)
+    return _mer(_DESCENT, light, MARS_AU, exposure_s=_FLIGHT_EXPOSURE_S, temperature_c=-34.0)
+
+
+def _mer_descent_field() -> Preset:
+    """Under Earth's sun; exposed for as many electrons from the same ground as in flight."""
+    light = LightPath(12.0, 12.0, _DESCENT_BAND, NG3_FIELD)
+    flown = _mer_descent_flown().detector.responsivity_e_s
+    exposure = _FLIGHT_EXPOSURE_S * flown / light.responsivity_e_s(1.0)
+    return _mer(_DESCENT, light, 1.0, exposure_s=exposure, temperature_c=0.0)
+
+
+def _mer_rover_camera(design: CameraDesign, f_number: float) -> Preset:
+    """Rows are not summed; the temperature is assumed."""
+    light = LightPath(f_number, design.pixel_pitch_um, _ROVER_BAND)
+    exposure = _bright_exposure_s(170000.0, light.responsivity_e_s(MARS_AU))
+    return _mer(design, light, MARS_AU, exposure_s=exposure, temperature_c=-40.0, rows_summed=1)
+
+
+def _mer_navcam() -> Preset:
+    return _mer_rover_camera(CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, baseline_m=0.20), 12.0)
+
+
+def _mer_hazcam() -> Preset:
+    """An equidistant fisheye without distortion, its pupil at rest: both assumed."""
+    return _mer_rover_camera(CameraDesign(5.58, 12.0, (1024, 1024), linearity=0.0, baseline_m=0.10), 15.0)
+
+
+def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
+    """A camera with an interline CCD, which has no smear, on Earth at +20 deg C.
+
+    Assumed: lens of f/4, passband to 700 nm, full well, read noise, dark current in proportion to the pixel's area.
+    """
+    light = LightPath(4.0, design.pixel_pitch_um, (400.0, 700.0))
+    responsivity = light.responsivity_e_s(1.0)
+    detector = DetectorParameters(
+        exposure_s=_bright_exposure_s(full_well_e, responsivity),
+        responsivity_e_s=responsivity,
+        rows_summed=1,
+        transfer_row_s=0.0,
+        clear_row_s=0.0,
+        readout_row_s=1.0 / 15.0 / design.size[1],
+        full_well_e=full_well_e,
+        gain_e_dn=full_well_e / 2**bits,
+        read_noise_e=15.0,
+        offset_dn=4.0 * 2 ** (bits - 8),
+        bits=bits,
+        temperature_c=20.0,
+        dark_e_s=DARK_E_S * (design.pixel_pitch_um / 12.0) ** 2,
+        optics=OpticsParameters(diffraction_px=_diffraction_px(light)),
+    )
+    return Preset(design, light, detector)
+
+
+def _research_navcam() -> Preset:
+    return _interline(CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10)
+
+
+def _research_pancam() -> Preset:
+    """The toe-in is assumed, that of MER's pancams: parallel cameras would see a point at 2 m 516 px apart."""
+    return _interline(CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10)
+
+
+def _xc55() -> Preset:
+    """The lens is assumed: 6 mm, 43 deg. It looks down."""
+    return _interline(CameraDesign(6.0, 7.4, (640, 480), down=True), 20000.0, 8)
+
+
+PRESETS: Mapping[str, Callable[[], Preset]] = MappingProxyType(
+    {
+        "mer-descent-flown": _mer_descent_flown,
+        "mer-descent-field": _mer_descent_field,
+        "mer-navcam": _mer_navcam,
+        "mer-hazcam": _mer_hazcam,
+        "research-navcam": _research_navcam,
+        "research-pancam": _research_pancam,
+        "xc-55": _xc55,
+    }
+)
+
+
+def preset(name: str) -> Preset:
+    """The camera of this name.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"there is no camera preset {name!r}; allowed: {', '.join(PRESETS)}")
+    return PRESETS[name]()
+
+
+def _over(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested settings with some of them changed."""
+    merged = dict(base)
+    for key, value in changes.items():
+        below = merged.get(key)
+        merged[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, Mapping) else value
+    return merged
+
+
+def _chosen(settings: object) -> object:
+    if not isinstance(settings, Mapping) or "preset" not in settings:
+        return settings
+    changes = {key: value for key, value in settings.items() if key != "preset"}
+    return _over(preset(str(settings["preset"])).detector.model_dump(), changes)
+
+
+#: Detector parameters that a campaign may also state by a preset's name, with what differs from it:
+#: ``[parameters.detector]`` with ``preset = "mer-descent-field"`` and, say, ``temperature_c = 23.0``.
+DetectorChoice = Annotated[DetectorParameters, BeforeValidator(_chosen)]

@@ -1,0 +1,174 @@
+"""Exposure over time against brute force: sums of many sharp pictures, each at its own time."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial.transform import Rotation
+
+from sim.camera import Cahv, Cahvor
+from sim.frames import rigid
+from sim.render import Photometry, Scene, Sun, process_renderer
+from sim.render.backend import default_backend
+from sim.render.renderer import PixelRays
+from sim.sensor import ImageMotion, natural_fall_off
+from sim.sensor.kernels import path_kernel
+from sim.sensor.motion import moving_exposure
+from sim.terrain import TerrainParameters, synthesise
+
+Picture = NDArray[np.float64]
+EXPOSURE_S = 4e-3
+
+
+def _brute_force(
+    seen: Callable[[float], Picture], shape: tuple[int, int], transfer_row_s: float, clear_row_s: float, rows: int
+) -> Picture:
+    """Radiance x seconds that packets gather, from pictures at any time; `rows` steps of the transfer at once."""
+    total = sum((seen(((n + 0.5) / 24 - 0.5) * EXPOSURE_S) for n in range(24)), np.zeros(shape)) * EXPOSURE_S / 24
+    for first in range(1, shape[0], rows):
+        lags = range(first, min(first + rows, shape[0]))
+        middle = np.mean(lags) - 0.5
+        after = seen(0.5 * EXPOSURE_S + middle * transfer_row_s) * transfer_row_s
+        before = seen(-0.5 * EXPOSURE_S - middle * clear_row_s) * clear_row_s
+        for lag in lags:
+            total[lag:] += after[:-lag]
+            total[:-lag] += before[lag:]
+    return total
+
+
+def test_the_picture_of_a_turning_camera_is_that_of_many_renderings() -> None:
+    """60 deg/s and 80 m/s over rough ground; a coarse copy of the descent camera with as long a transfer."""
+    size = 80
+    transfer_row_s, clear_row_s = 5e-6 * 1024 / size, 1e-6 * 1024 / size
+    parameters = TerrainParameters(samples=512, rms_slope_deg=6.0, outer_scale_m=400.0, albedo_contrast=0.2)
+    surface = synthesise(parameters, np.random.default_rng(11))
+    pinhole = Cahv.from_focal_length(
+        14.67e-3, 12e-6, (size, size), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
+    )
+    camera = Cahvor.from_cahv(pinhole, r=np.array([0.00096, -0.002183, 0.018547]))
+    rays = PixelRays.of(camera)
+    renderer = process_renderer(default_backend())
+    scene = Scene(surface, (0.0, 0.0), Sun(np.array([0.6, 0.3, np.sqrt(0.55)])), Photometry())
+    attitude = Rotation.from_euler("xyz", [20.0, -10.0, 30.0], degrees=True)
+    velocity, rate = np.array([20.0, -15.0, -75.0]), np.radians([45.0, -40.0, 5.0])
+    place = np.array([50.0, 80.0, 1400.0])
+    response = natural_fall_off(camera)
+
+    def seen(time_s: float) -> Picture:
+        turned = Rotation.from_rotvec(rate * time_s) * attitude
+        return renderer.render(scene, rays, rigid(turned, place + velocity * time_s)).radiance * response
+
+    frame = renderer.render(scene, rays, rigid(attitude, place))
+    motion = ImageMotion.seen(camera, frame.range_m, frame.world_from_body, velocity, rate)
+    assert motion.greatest_px_s == pytest.approx(np.radians(60.0) * 14.67e-3 / 12e-6, rel=0.1)
+    found = moving_exposure(frame.radiance, response, motion, EXPOSURE_S, transfer_row_s, clear_row_s)
+    expected = _brute_force(seen, (size, size), transfer_row_s, clear_row_s, rows=6)
+    # beyond the border nothing was rendered: as far as the picture moves, it is not compared
+    inside = np.s_[13:-13, 13:-13]
+    error = (found - expected)[inside] / expected.mean()
+    assert np.sqrt((error**2).mean()) < 0.004
+    still = (frame.radiance * response * EXPOSURE_S)[inside]
+    assert np.abs(still / still.mean() - expected[inside] / expected[inside].mean()).std() > 0.02
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 1400.0), (1400.0, 0.0), (-1000.0, 800.0), (6.0, -4.0)])
+def test_smear_and_blur_of_a_drifting_picture(velocity: tuple[float, float]) -> None:
+    rng = np.random.default_rng(0)
+    scene = (1.0 + 0.5 * gaussian_filter(rng.standard_normal((128, 96)), 1.5)).astype(np.float32)
+    response = np.linspace(1.0, 0.8, 128)[:, None] * (1.0 + 0.01 * rng.standard_normal((128, 96)))
+    response = response.astype(np.float32)
+    rows, columns = np.indices(scene.shape).astype(np.float64)
+
+    def seen(time_s: float) -> Picture:
+        where = [rows - velocity[0] * time_s, columns - velocity[1] * time_s]
+        return map_coordinates(scene.astype(np.float64), where, order=3, mode="nearest") * response
+
+    found = moving_exposure(scene, response, ImageMotion.uniform(*velocity), EXPOSURE_S, 4e-5, 8e-6)
+    expected = _brute_force(seen, scene.shape, 4e-5, 8e-6, rows=1)
+    assert np.sqrt(((found - expected) ** 2).mean()) < 0.0015 * expected.mean()
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 1500.0), (1100.0, -900.0), (37.0, 12.0)])
+def test_a_moving_dot_stays_where_it_is_at_mid_exposure(velocity: tuple[float, float]) -> None:
+    rows, columns = np.indices((64, 64))
+    dot = np.exp(-0.5 * ((rows - 31.3) ** 2 + (columns - 30.6) ** 2) / 1.5**2).astype(np.float32)
+    picture = moving_exposure(dot, np.ones_like(dot), ImageMotion.uniform(*velocity), EXPOSURE_S, 0.0, 0.0)
+    total = picture.sum(dtype=np.float64)
+    assert total == pytest.approx(dot.sum(dtype=np.float64) * EXPOSURE_S, rel=1e-4)
+    assert (picture * rows).sum() / total == pytest.approx(31.3, abs=0.005)
+    assert (picture * columns).sum() / total == pytest.approx(30.6, abs=0.005)
+    # its length along the motion is that of the path: variance L^2 / 12
+    along = ((rows - 31.3) * velocity[0] + (columns - 30.6) * velocity[1]) / np.hypot(*velocity)
+    path = np.hypot(*velocity) * EXPOSURE_S
+    assert (picture * along**2).sum() / total == pytest.approx(1.5**2 + path**2 / 12.0, rel=0.02)
+
+
+def test_the_trail_of_a_moving_dot_leans() -> None:
+    """While it is shifted out, a packet d rows below the dot passes it d row times after the exposure."""
+    rows, columns = np.indices((96, 96))
+    dot = np.exp(-0.5 * ((rows - 20.0) ** 2 + (columns - 40.0) ** 2) / 1.5**2).astype(np.float32)
+    picture = moving_exposure(dot, np.ones_like(dot), ImageMotion.uniform(0.0, 1000.0), EXPOSURE_S, 5e-5, 0.0)
+    for row in (40, 60, 90):
+        centre = (picture[row] * columns[row]).sum() / picture[row].sum()
+        assert centre == pytest.approx(40.0 + 1000.0 * (0.5 * EXPOSURE_S + (row - 20 - 0.5) * 5e-5), abs=0.05)
+    # before the exposure the packets above passed it, the higher the earlier
+    cleared = moving_exposure(dot, np.ones_like(dot), ImageMotion.uniform(0.0, 1000.0), EXPOSURE_S, 0.0, 5e-5)
+    centre = (cleared[5] * columns[5]).sum() / cleared[5].sum()
+    assert centre == pytest.approx(40.0 - 1000.0 * (0.5 * EXPOSURE_S + 14.5 * 5e-5), abs=0.05)
+
+
+def test_slow_motion_joins_the_still_picture() -> None:
+    rng = np.random.default_rng(3)
+    scene, response = (1.0 + 0.1 * rng.standard_normal((2, 96, 64))).astype(np.float32)
+    found = moving_exposure(scene, response, ImageMotion.uniform(1e-6, 1e-6), EXPOSURE_S, 5e-6, 1e-6)
+    rate = scene * response
+    passed = np.cumsum(rate, axis=0)
+    still = EXPOSURE_S * rate + 5e-6 * (passed - rate) + 1e-6 * (passed[-1:] - passed)
+    # responses are averaged over 32 rows where they weigh the passing scene
+    np.testing.assert_allclose(found, still, rtol=1e-3)
+
+
+def test_image_velocity_by_finite_differences() -> None:
+    pinhole = Cahv.from_focal_length(
+        14.67e-3, 24e-6, (512, 512), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
+    )
+    camera = Cahvor.from_cahv(pinhole, r=np.array([0.00096, -0.002183, 0.018547]))
+    rng = np.random.default_rng(4)
+    distance = 1000.0 + 100.0 * rng.random((512, 512))
+    pose = rigid(Rotation.from_euler("xyz", [0.2, 0.1, 1.0]), np.array([3.0, 5.0, 900.0]))
+    velocity, rate = np.array([10.0, -20.0, -60.0]), np.array([0.3, -0.4, 0.2])
+    motion = ImageMotion.seen(camera, distance, pose, velocity, rate)
+    pixels = 32.0 * np.stack(np.meshgrid(np.arange(16), np.arange(16)), axis=-1).astype(np.float64)
+    origins, directions = camera.rays(pixels)
+    world = pose.apply((origins + distance[::32, ::32, None] * directions).reshape(-1, 3))
+    step = 1e-5
+    ends = []
+    for time_s in (-step, step):
+        later = rigid(Rotation.from_rotvec(rate * time_s) * pose.rotation, pose.translation + velocity * time_s)
+        ends.append(camera.project(later.inv().apply(world))[0].reshape(16, 16, 2))
+    expected = (ends[1] - ends[0]) / (2 * step)
+    np.testing.assert_allclose(motion.velocity_px_s[:16, :16, ::-1], expected, atol=1e-3)
+
+
+def test_what_has_no_range_moves_with_the_rotation_alone() -> None:
+    camera = Cahv.from_focal_length(
+        6e-3, 12e-6, (128, 96), axis=np.array([1.0, 0.0, 0.0]), right=np.array([0.0, -1.0, 0.0])
+    )
+    pose = rigid(Rotation.identity(), np.zeros(3))
+    sky = np.full((96, 128), np.inf)
+    assert ImageMotion.seen(camera, sky, pose, np.array([50.0, 20.0, 0.0]), np.zeros(3)).greatest_px_s < 1e-3
+    turning = ImageMotion.seen(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
+    # a turn to the left moves the picture to the right by 500 px/rad
+    assert turning.velocity_px_s[1, 2, 1] == pytest.approx(50.0, rel=0.01)
+
+
+def test_path_kernel_is_a_mean_about_the_pixel() -> None:
+    kernel = np.empty((15, 15))
+    offsets = np.arange(-7, 8)
+    for path in ((0.0, 0.0), (3.3, -7.1), (0.0, 9.0)):
+        path_kernel(*path, 7, kernel)
+        assert kernel.sum() == pytest.approx(1.0)
+        assert (kernel.sum(axis=1) * offsets).sum() == pytest.approx(0.0, abs=1e-12)
+        assert (kernel.sum(axis=0) * offsets).sum() == pytest.approx(0.0, abs=1e-12)

@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+from pydantic import BaseModel, ValidationError
+
+from sim.camera import Cahvore
+from sim.sensor import PRESETS, Detector, DetectorChoice, DetectorParameters, natural_fall_off, preset
+
+
+class _Campaign(BaseModel):
+    detector: DetectorChoice = DetectorParameters()
+
+
+def _fields_deg(name: str) -> tuple[float, float]:
+    """Angles between the middles of opposite edges."""
+    camera = preset(name).cameras()[0]
+    columns, rows = camera.size
+    u, v = (columns - 1) / 2, (rows - 1) / 2
+    _origins, d = camera.rays(np.array([[-0.5, v], [columns - 0.5, v], [u, -0.5], [u, rows - 0.5]]))
+    across, down = np.degrees(np.arccos([d[0] @ d[1], d[2] @ d[3]]))
+    return float(across), float(down)
+
+
+@pytest.mark.parametrize(
+    ("name", "across", "down", "tolerance"),
+    [
+        ("mer-descent-flown", 45.0, 45.0, 1.0),
+        ("mer-descent-field", 45.0, 45.0, 1.0),
+        ("mer-navcam", 45.0, 45.0, 1.0),
+        # 1024 pixels of 12 um behind 5.58 mm are 126 deg for an equidistant lens
+        ("mer-hazcam", 124.0, 124.0, 3.0),
+        # the tracking paper's fields are those of 4.8 mm x 3.6 mm, ours of 4.65 um pixels
+        ("research-navcam", 49.0, 37.0, 6.0),
+        ("research-pancam", 17.0, 13.0, 0.5),
+    ],
+)
+def test_fields_of_view(name: str, across: float, down: float, tolerance: float) -> None:
+    assert _fields_deg(name) == pytest.approx((across, down), abs=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("name", "baseline_m"),
+    [("mer-navcam", 0.20), ("mer-hazcam", 0.10), ("research-navcam", 0.20), ("research-pancam", 0.30)],
+)
+def test_pairs(name: str, baseline_m: float) -> None:
+    left, right = preset(name).cameras()
+    np.testing.assert_allclose(left.c - right.c, [0.0, baseline_m, 0.0], atol=1e-12)
+    for camera in (left, right):
+        assert camera.right_handed
+        # up is up and forward is forward
+        assert camera.a[0] > 0.99
+        np.testing.assert_allclose(camera.down, [0.0, 0.0, -1.0], atol=1e-12)
+    # what is ahead lies further right for the left camera
+    ahead = np.array([2.0, 0.0, 0.0])
+    assert left.project(ahead)[0][0] > right.project(ahead)[0][0]
+
+
+def test_pancam_toes_in() -> None:
+    """2 deg between the cameras are 120 px of the 516 px of disparity at 2 m."""
+    left, right = preset("research-pancam").cameras()
+    ahead = np.array([2.0, 0.0, 0.0])
+    disparity = left.project(ahead)[0][0] - right.project(ahead)[0][0]
+    assert disparity == pytest.approx(516.1 - 120.1, abs=1.0)
+
+
+def test_hazcam_is_a_fisheye() -> None:
+    assert all(isinstance(camera, Cahvore) for camera in preset("mer-hazcam").cameras())
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_picture_of_each(name: str) -> None:
+    """Ground of radiance factor 0.3 fills about 60 % of the full well on axis; the descent camera is set for less."""
+    camera = preset(name)
+    fall_off = natural_fall_off(camera.cameras()[0])[::8, ::8]
+    p = camera.detector.model_copy(update={"rows_summed": 1, "transfer_row_s": 0.0, "clear_row_s": 0.0})
+    detector = Detector.drawn(np.ascontiguousarray(fall_off), p, np.random.default_rng(0))
+    counts = detector.expose(0.3 * np.ones_like(fall_off), np.random.default_rng(1))
+    rows, columns = counts.shape
+    level = np.median(counts[rows // 2 - 5 : rows // 2 + 5, columns // 2 - 5 : columns // 2 + 5]) / p.full_scale_dn
+    assert level == pytest.approx(0.6, abs=0.05) if "descent" not in name else 0.05 < level < 0.1
+
+
+def test_unknown_name() -> None:
+    with pytest.raises(ValueError, match=r"no camera preset 'mer-pancam'; allowed: mer-descent-flown, "):
+        preset("mer-pancam")
+
+
+def test_a_campaign_names_a_preset_and_changes_it() -> None:
+    chosen = _Campaign.model_validate(
+        {"detector": {"preset": "mer-descent-field", "temperature_c": 23.0, "optics": {"dust_discs": 3}}}
+    ).detector
+    expected = preset("mer-descent-field").detector
+    assert chosen.responsivity_e_s == expected.responsivity_e_s
+    assert chosen.temperature_c == 23.0
+    assert chosen.optics == expected.optics.model_copy(update={"dust_discs": 3})
+    assert _Campaign.model_validate({"detector": {"rows_summed": 2}}).detector.rows_summed == 2
+    with pytest.raises(ValidationError, match="no camera preset"):
+        _Campaign.model_validate({"detector": {"preset": "kodak"}})

@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+
+from sim.sensor import DetectorParameters, preset
+from sim.sensor.radiometry import (
+    DARK_E_S,
+    DARKEST_RADIANCE_FACTOR,
+    NG3_FIELD,
+    NG4_FLIGHT,
+    LightPath,
+    dark_share,
+    signal_to_noise,
+    solar_photons,
+)
+
+FLOWN, FIELD = preset("mer-descent-flown"), preset("mer-descent-field")
+
+
+def test_sunlight_is_the_solar_constant() -> None:
+    wavelength_nm = np.linspace(150.0, 20000.0, 100000)
+    energy = 6.62607015e-34 * 2.99792458e8 / (wavelength_nm * 1e-9)
+    # 1361 W/m2, of which 0.2 % lie outside
+    assert np.trapezoid(solar_photons(wavelength_nm) * energy, wavelength_nm) == pytest.approx(1361.0, rel=0.003)
+
+
+def test_neutral_density_filters() -> None:
+    """Section III.B.2: optical density 0.67 and 22 %, 0.97 and 11 %."""
+    assert NG4_FLIGHT.optical_density == pytest.approx(0.67)
+    assert NG3_FIELD.optical_density == pytest.approx(0.97)
+    assert FLOWN.light.filter_transmission() == pytest.approx(0.22, abs=0.005)
+    assert FIELD.light.filter_transmission() == pytest.approx(0.11, abs=0.005)
+    # thicker glass is darker: Beer's law with the reflection left alone
+    assert 10 ** -(2 * 1.44 * NG4_FLIGHT.density_per_mm) == pytest.approx(0.2332**2, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("temperature_c", "ratio", "share"), [(-34.0, 102.0, None), (0.0, 100.0, 0.02), (23.0, 87.0, 0.15)]
+)
+def test_paper_signal_to_noise_and_shares_of_dark_current(
+    temperature_c: float, ratio: float, share: float | None
+) -> None:
+    """Section III.B.3, one set of constants: the ratio within 2, shares within a factor of 1.2."""
+    for camera in (FLOWN, FIELD):
+        p = camera.detector.model_copy(update={"temperature_c": temperature_c})
+        assert signal_to_noise(p, DARKEST_RADIANCE_FACTOR).mean() == pytest.approx(ratio, abs=2.0)
+        found = dark_share(p, DARKEST_RADIANCE_FACTOR)
+        if share is None:
+            assert found < 0.001
+        else:
+            assert share / 1.2 < found < share * 1.2
+
+
+def test_field_test_gathers_as_many_electrons_as_flight() -> None:
+    flown, field = FLOWN.detector, FIELD.detector
+    electrons = flown.responsivity_e_s * flown.exposure_s
+    assert field.responsivity_e_s * field.exposure_s == pytest.approx(electrons)
+    # 44 % of the sunlight through 22 % of glass is a little less than all of it through 11 %
+    assert flown.responsivity_e_s / field.responsivity_e_s == pytest.approx(0.44 * 0.22 / 0.11, rel=0.03)
+    assert 0.003 < field.exposure_s < flown.exposure_s < 0.005
+
+
+def test_default_detector_is_the_flown_descent_camera() -> None:
+    p = DetectorParameters()
+    flown = FLOWN.detector.model_dump()
+    assert p.responsivity_e_s == pytest.approx(flown.pop("responsivity_e_s"), rel=2e-3)
+    assert p.optics.diffraction_px == pytest.approx(flown.pop("optics")["diffraction_px"], abs=0.01)
+    assert p.model_dump(include=set(flown)) == flown
+    assert p.dark_e_s == DARK_E_S
+
+
+def test_responsivity_follows_the_lens_the_pixel_and_the_sun() -> None:
+    light = LightPath(12.0, 12.0, (400.0, 1100.0))
+    rate = light.responsivity_e_s(1.0)
+    assert light.responsivity_e_s(2.0) == pytest.approx(rate / 4.0)
+    assert LightPath(6.0, 12.0, (400.0, 1100.0)).responsivity_e_s(1.0) == pytest.approx(4.0 * rate)
+    assert LightPath(12.0, 6.0, (400.0, 1100.0)).responsivity_e_s(1.0) == pytest.approx(rate / 4.0)
+    assert LightPath(12.0, 12.0, (600.0, 800.0)).responsivity_e_s(1.0) < rate
