@@ -26,11 +26,13 @@ from sim.sensor import (
     Altimeter,
     AltimeterParameters,
     Detector,
+    DetectorChoice,
     DetectorParameters,
+    ImageMotion,
     Navigation,
     NavigationParameters,
+    natural_fall_off,
 )
-from sim.sensor.detector import natural_fall_off
 from sim.streams import Streams
 from sim.terrain import Surface, TerrainBank, TerrainParameters
 
@@ -101,7 +103,7 @@ class DescentScenarioParameters(BaseModel):
     sun: SunParameters = SunParameters()
     descent: DescentParameters = DescentParameters()
     camera: CameraParameters = CameraParameters()
-    detector: DetectorParameters = DetectorParameters()
+    detector: DetectorChoice = DetectorParameters()
     altimeter: AltimeterParameters = AltimeterParameters()
     navigation: NavigationParameters = NavigationParameters()
     render: RenderParameters = Field(default_factory=RenderParameters)
@@ -213,7 +215,15 @@ def _expose(
     for number in range(PICTURES):
         state = descent.state(number * p.descent.interval_s)
         frame = renderer.render(scene, optics.rays, state.world_from_body * mounting)
-        exposures.append(Exposure(state, detector.expose(frame.radiance, noise)))
+        # the camera sits at the body's origin: its mounting turns it, but moves it nowhere
+        motion = ImageMotion.seen(
+            optics.camera,
+            frame.range_m,
+            frame.world_from_body,
+            state.velocity_m_s,
+            state.attitude.apply(state.body_rate_rad_s),
+        )
+        exposures.append(Exposure(state, detector.expose(frame.radiance, noise, motion)))
     return exposures
 
 
