@@ -22,8 +22,8 @@ from scenarios.descent import (
     camera_optics,
     placed_descent,
 )
-from sim.processor import processor_features
 from sim.frames import direction
+from sim.processor import processor_features
 from sim.render import Photometry, Scene, Sun, process_renderer
 from sim.render.backend import default_backend
 from sim.sensor import Detector, DetectorParameters
