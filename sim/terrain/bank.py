@@ -11,17 +11,19 @@ from pathlib import Path
 import numpy as np
 
 from sim.cache import cache_directory
-from sim.terrain import kernels, surface, synthesis
+from sim.terrain.parameters import TerrainParameters
+from sim.terrain.rocks.field import RockField
+from sim.terrain.substreams import substream
 from sim.terrain.surface import SMALLEST_LEVEL, Surface
-from sim.terrain.synthesis import TerrainParameters, synthesise
+from sim.terrain.synthesis import synthesise
 
 
 @cache
 def _code_version() -> str:
     """Hash of the code that makes a terrain: a change of it makes cached terrains unknown, never wrong."""
     digest = hashlib.sha256(np.__version__.encode())
-    for module in (kernels, surface, synthesis):
-        digest.update(Path(str(module.__file__)).read_bytes())
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
@@ -43,13 +45,21 @@ class TerrainBank:
             self._build(number, path)
         return self._read(path)
 
+    def rocks(self, number: int) -> RockField | None:
+        """The rocks of terrain `number`, built anew each time; None where the parameters ask for none."""
+        if self.parameters.rocks is None:
+            return None
+        return RockField.on(self.terrain(number), self.parameters.rocks, substream(self._rng(number), "rocks"))
+
+    def _rng(self, number: int) -> np.random.Generator:
+        return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))
+
     def _path(self, number: int) -> Path:
-        identity = f"{self.parameters.model_dump_json()} {self.seed} {number} {_code_version()}"
+        identity = f"{self.parameters.model_dump_json(exclude={'rocks'})} {self.seed} {number} {_code_version()}"
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
 
     def _build(self, number: int, path: Path) -> None:
-        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))
-        built = synthesise(self.parameters, rng)
+        built = synthesise(self.parameters, self._rng(number))
         # Written aside and moved into place, so that neither an interruption nor a second builder leaves half a file.
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
             try:

@@ -1,4 +1,4 @@
-"""Compiled kernels of the terrain: cubic B-spline evaluation, pyramid reduction, crater stamping."""
+"""Compiled kernels of the terrain: cubic B-spline evaluation, pyramid reduction."""
 
 from __future__ import annotations
 
@@ -102,41 +102,3 @@ def reduce_level(fine: Level) -> Level:
                 for c in range(2):
                     coarse[i, j, c] += weights[k] * narrow[source, j, c]
     return coarse
-
-
-@njit(cache=True)
-def stamp_craters(
-    height: NDArray[np.floating], spacing: float, craters: Array, rim_fraction: float, ejecta_reach: float
-) -> None:
-    """Adds bowls, rims and ejecta to a periodic height map, in place and in order.
-
-    `craters` has rows (x, y, radius, depth, softness), metres and a share. The bowl is a paraboloid, the ejecta blanket
-    falls off with the cube of the distance (McGetchin et al. 1973) and is brought to zero at `ejecta_reach` radii.
-    Where they meet at the rim the lower of the two is taken, rounded over a height of `softness * depth`: a fresh rim
-    is sharp, a degraded one round.
-    """
-    side = height.shape[0]
-    mask = side - 1
-    for n in range(craters.shape[0]):
-        x, y, radius, depth, softness = craters[n]
-        rim = rim_fraction * depth
-        rounding = softness * depth
-        reach = ejecta_reach * radius
-        first_i = math.ceil((y - reach) / spacing)
-        last_i = math.floor((y + reach) / spacing)
-        first_j = math.ceil((x - reach) / spacing)
-        last_j = math.floor((x + reach) / spacing)
-        for i in range(first_i, last_i + 1):
-            dy = i * spacing - y
-            for j in range(first_j, last_j + 1):
-                dx = j * spacing - x
-                r = math.sqrt(dx * dx + dy * dy) / radius
-                if r >= ejecta_reach:
-                    continue
-                bowl = (rim + depth) * r * r - depth
-                outside = max(r, 0.5)
-                fade = min((ejecta_reach - r) / (ejecta_reach - 1.0), 1.0)
-                blanket = rim / (outside * outside * outside) * fade
-                overlap = max(rounding - abs(bowl - blanket), 0.0)
-                change = min(bowl, blanket) - overlap * overlap / (4.0 * max(rounding, 1e-9))
-                height[i & mask, j & mask] += change

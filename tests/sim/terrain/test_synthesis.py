@@ -3,8 +3,9 @@ import pytest
 from pydantic import ValidationError
 
 from sim.terrain import TerrainParameters, synthesise
-from sim.terrain.kernels import stamp_craters
-from sim.terrain.synthesis import Spectrum, draw_craters
+from sim.terrain.landforms.craters import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
+from sim.terrain.landforms.kernels import stamp_craters
+from sim.terrain.spectrum import Spectrum
 
 
 def test_same_stream_same_bytes() -> None:
@@ -64,17 +65,35 @@ def test_crater_sizes_follow_the_power_law() -> None:
     assert diameters.max() <= parameters.crater_diameter_max_m
 
 
-def test_a_crater_has_its_depth_rim_and_place_across_the_border() -> None:
-    height = np.zeros((256, 256))
-    radius, depth = 20.0, 8.0
-    # sharp rim; centred on the corner, so that it is cut by the periodic border
-    stamp_craters(height, 1.0, np.array([[0.0, 0.0, radius, depth, 0.0]]), 0.25, 3.0)
+def test_crater_depths_run_from_degraded_to_fresh() -> None:
+    craters = draw_craters(TerrainParameters(craters_per_km2=100.0), np.random.default_rng(3))
+    from_rim_to_floor = (craters[:, 3] + craters[:, 4]) / (2.0 * craters[:, 2])
+    assert from_rim_to_floor.min() == pytest.approx(DEGRADED_DEPTH, rel=0.02)
+    assert from_rim_to_floor.max() == pytest.approx(FRESH_DEPTH, rel=0.02)
+
+
+def test_a_fresh_crater_has_its_depth_rim_and_place_across_the_border() -> None:
+    height, tone = np.zeros((256, 256), dtype=np.float32), np.zeros((256, 256), dtype=np.float32)
+    radius, depth, rim = 20.0, 6.4, 1.6
+    # sharp rim, round outline; centred on the corner, so that it is cut by the periodic border
+    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, *np.zeros(6), 0.3]
+    stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
     centred = np.roll(height, (128, 128), axis=(0, 1))
     assert centred[128, 128] == pytest.approx(-depth)
     assert np.unravel_index(centred.argmin(), centred.shape) == (128, 128)
-    assert centred[128, 128 + 20] == pytest.approx(0.25 * depth)
-    np.testing.assert_allclose(centred[1:, 1:], centred[1:, 1:][::-1, ::-1], atol=1e-12)
+    assert centred[128, 128 + 20] == pytest.approx(rim)
+    assert centred[128 - 20, 128] == pytest.approx(rim)
     assert np.count_nonzero(centred[:, :60]) == 0
+    assert np.roll(tone, 128, axis=1)[0, 128] == pytest.approx(0.1)
+
+
+def test_a_filled_crater_has_a_flat_floor_at_its_depth() -> None:
+    height, tone = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
+    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, *np.zeros(6), 0.0]
+    stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
+    assert height[64, 64] == pytest.approx(-3.0, abs=0.05)
+    assert np.ptp(height[64, 56:73]) < 0.15
+    assert not tone.any()
 
 
 def test_refuses_crater_sizes_in_the_wrong_order() -> None:

@@ -1,0 +1,268 @@
+"""Compiled kernels of the landforms. Grids are periodic squares whose side is a power of two; all work in place."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sim.terrain.kernels import Array, Level, sample
+
+Grid = NDArray[np.float32]
+
+
+@njit(cache=True)
+def add_refined(fine: Grid, coarse: Grid) -> None:
+    """Adds to control values the control values of the same cubic B-spline on a grid half as coarse, exactly."""
+    side = coarse.shape[0]
+    row = np.empty(side, dtype=np.float32)
+    eighth = np.float32(0.125)
+    six = np.float32(0.75)
+    half = np.float32(0.5)
+    for i in range(2 * side):
+        k = i // 2
+        here = coarse[k]
+        after = coarse[(k + 1) % side]
+        if i % 2 == 0:
+            before = coarse[k - 1]
+            for j in range(side):
+                row[j] = eighth * (before[j] + after[j]) + six * here[j]
+        else:
+            for j in range(side):
+                row[j] = half * (here[j] + after[j])
+        out = fine[i]
+        for j in range(side - 1):
+            out[2 * j] += eighth * (row[j - 1] + row[j + 1]) + six * row[j]
+            out[2 * j + 1] += half * (row[j] + row[j + 1])
+        out[2 * side - 2] += eighth * (row[side - 2] + row[0]) + six * row[side - 1]
+        out[2 * side - 1] += half * (row[side - 1] + row[0])
+
+
+@njit(cache=True)
+def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reach: float) -> None:
+    """Adds bowls, rims and ejecta to height and to the logarithm of albedo, in order.
+
+    `craters` has rows (x, y, radius, depth below the surroundings, rim height, rounding of the rim in metres, share of
+    the depth that is filled, tone of the ejecta, then three pairs of cosine and sine terms of the outline for two,
+    three and five lobes, and the phase of the rays).
+    """
+    mask = height.shape[0] - 1
+    for n in range(craters.shape[0]):
+        x, y, radius, depth, rim, rounding, fill, bright = craters[n, :8]
+        c2, s2, c3, s3, c5, s5, phase = craters[n, 8:]
+        extent = reach * radius * 1.1
+        # the bowl before it was filled
+        bottom = depth / (1.0 - fill)
+        soft_floor = 0.25 * fill * bottom + 1e-9
+        for i in range(math.ceil((y - extent) / spacing), math.floor((y + extent) / spacing) + 1):
+            dy = i * spacing - y
+            for j in range(math.ceil((x - extent) / spacing), math.floor((x + extent) / spacing) + 1):
+                dx = j * spacing - x
+                d = math.sqrt(dx * dx + dy * dy)
+                if d >= extent:
+                    continue
+                c = dx / max(d, 1e-9)
+                s = dy / max(d, 1e-9)
+                # cosines and sines of twice, three and five times the azimuth
+                cc = c * c - s * s
+                ss = 2.0 * c * s
+                ccc = cc * c - ss * s
+                sss = ss * c + cc * s
+                c5t = ccc * cc - sss * ss
+                s5t = sss * cc + ccc * ss
+                r = d / (radius * (1.0 + c2 * cc + s2 * ss + c3 * ccc + s3 * sss + c5 * c5t + s5 * s5t))
+                if r >= reach:
+                    continue
+                bowl = (rim + bottom) * r**2.2 - bottom
+                if fill > 0.0:
+                    # the higher of bowl and floor, rounded where they meet
+                    meeting = max(soft_floor - abs(bowl + depth), 0.0)
+                    bowl = max(bowl, -depth) + meeting * meeting / (4.0 * soft_floor)
+                outside = max(r, 0.6)
+                fade = min((reach - r) / (reach - 1.0), 1.0)
+                blanket = rim / (outside * outside * outside) * fade
+                rays = 0.0
+                if r > 1.0:
+                    azimuth = math.atan2(s, c)
+                    rays = math.cos(7.0 * azimuth + phase) + math.cos(12.0 * azimuth + 2.3 * phase)
+                    blanket *= 1.0 + 0.25 * rays * min(2.0 * (r - 1.0), 1.0)
+                overlap = max(rounding - abs(bowl - blanket), 0.0)
+                change = min(bowl, blanket) - overlap * overlap / (4.0 * max(rounding, 1e-9))
+                row = i & mask
+                column = j & mask
+                height[row, column] += change
+                if bright != 0.0:
+                    light = fade * fade * (1.0 + 0.5 * rays) if r > 1.0 else 1.0
+                    tone[row, column] += bright * max(light, 0.0)
+
+
+@njit(cache=True)
+def add_dunes(
+    height: Grid,
+    tone: Grid,
+    spacing: float,
+    modulation: Level,
+    modulation_spacing: float,
+    wave_x: float,
+    wave_y: float,
+    crest: float,
+    steepest: float,
+    contrast: float,
+) -> None:
+    """Adds transverse dunes: a gentle stoss up to the crest, then a slip face of the slope `steepest`.
+
+    The phase is that of a plane wave (wave_x, wave_y), radians per metre, times a smooth complex modulation of unit
+    mean square. Where the modulation vanishes crests end and fork, and the dunes have no height.
+    """
+    side = height.shape[0]
+    inverse = 1.0 / modulation_spacing
+    wave = math.sqrt(wave_x * wave_x + wave_y * wave_y)
+    for i in range(side):
+        y = i * spacing
+        for j in range(side):
+            x = j * spacing
+            real, _a, _b, imaginary = sample(modulation, inverse, x, y)
+            strength = math.sqrt(real * real + imaginary * imaginary)
+            high = crest * min(strength, 1.6)
+            turns = (wave_x * x + wave_y * y + math.atan2(imaginary, real)) / (2.0 * math.pi)
+            u = turns - math.floor(turns)
+            slip = min(max(high * wave / (2.0 * math.pi * steepest), 0.01), 0.5)
+            if u < 1.0 - slip:
+                v = u / (1.0 - slip)
+                shape = 0.25 * v + 0.75 * v * v * (3.0 - 2.0 * v)
+            else:
+                shape = (1.0 - u) / slip
+            height[i, j] += high * shape
+            tone[i, j] += contrast * (shape - 0.5) * min(strength, 1.0)
+
+
+@njit(cache=True)
+def stamp_lobes(height: Grid, tone: Grid, spacing: float, lobes: Array, warp_x: Grid, warp_y: Grid) -> None:
+    """Stacks lava lobes: each a plateau with a steep, crenulated margin and a slightly sunken middle.
+
+    `lobes` has rows (x, y, half length, half width, thickness, cosine and sine of its direction, tone). The warps are
+    displacements in half widths that make the outlines irregular. Every lobe covers the tone of those below.
+    """
+    mask = height.shape[0] - 1
+    for n in range(lobes.shape[0]):
+        x, y, along, across, thick, c, s, colour = lobes[n]
+        reach_x = 1.3 * (along * abs(c) + across * abs(s)) + 0.5 * across
+        reach_y = 1.3 * (along * abs(s) + across * abs(c)) + 0.5 * across
+        for i in range(math.ceil((y - reach_y) / spacing), math.floor((y + reach_y) / spacing) + 1):
+            row = i & mask
+            for j in range(math.ceil((x - reach_x) / spacing), math.floor((x + reach_x) / spacing) + 1):
+                column = j & mask
+                dx = j * spacing - x + warp_x[row, column] * across
+                dy = i * spacing - y + warp_y[row, column] * across
+                p = (c * dx + s * dy) / along
+                q = (c * dy - s * dx) / across
+                far = p * p + q * q
+                if far >= 1.0:
+                    continue
+                edge = 1.0 - (far * far) * (far * far)
+                height[row, column] += thick * edge * (0.65 + 0.35 * far)
+                tone[row, column] += (colour - tone[row, column]) * edge
+
+
+@njit(cache=True)
+def add_cracks(
+    height: Grid, tone: Grid, spacing: float, points: Array, cell: float, width: float, depth: float, contrast: float
+) -> None:
+    """Adds polygonal cracks: the borders between the Voronoi cells of one point in each square of a periodic grid.
+
+    `points` has shape (count, count, 2): the place of each point within its square, from 0 to 1.
+    """
+    count = points.shape[0]
+    for i in range(height.shape[0]):
+        y = i * spacing / cell
+        row = int(y)
+        for j in range(height.shape[0]):
+            x = j * spacing / cell
+            column = int(x)
+            nearest = 1e9
+            nx = 0.0
+            ny = 0.0
+            second = 1e9
+            sx = 0.0
+            sy = 0.0
+            for di in range(-1, 2):
+                for dj in range(-1, 2):
+                    point = points[(row + di) % count, (column + dj) % count]
+                    dx = column + dj + point[0] - x
+                    dy = row + di + point[1] - y
+                    far = dx * dx + dy * dy
+                    if far < nearest:
+                        second = nearest
+                        sx = nx
+                        sy = ny
+                        nearest = far
+                        nx = dx
+                        ny = dy
+                    elif far < second:
+                        second = far
+                        sx = dx
+                        sy = dy
+            apart = math.sqrt((sx - nx) ** 2 + (sy - ny) ** 2)
+            border = 0.5 * (second - nearest) / max(apart, 1e-6) * cell
+            if border < width:
+                share = 1.0 - border / width
+                height[i, j] -= depth * share
+                tone[i, j] += contrast * share
+
+
+@njit(cache=True)
+def cut_channels(cut: Grid, spacing: float, discs: Array, sharpness: float) -> None:
+    """Deepest cut of channels given as rows of discs (x, y, half width, depth): ``depth (1 - (d / w)**sharpness)``."""
+    mask = cut.shape[0] - 1
+    for n in range(discs.shape[0]):
+        x, y, half, depth = discs[n]
+        for i in range(math.ceil((y - half) / spacing), math.floor((y + half) / spacing) + 1):
+            dy = i * spacing - y
+            for j in range(math.ceil((x - half) / spacing), math.floor((x + half) / spacing) + 1):
+                dx = j * spacing - x
+                far = math.sqrt(dx * dx + dy * dy) / half
+                if far < 1.0:
+                    deep = depth * (1.0 - far**sharpness)
+                    if deep > cut[i & mask, j & mask]:
+                        cut[i & mask, j & mask] = deep
+
+
+@njit(cache=True)
+def raise_cones(
+    height: Grid, cover: Grid, spacing: float, apexes: Array, slope: float, concavity: float, rounding: float
+) -> None:
+    """Adds the union of cones with rows (x, y, radius) that flatten towards their toes; `cover` is 1 on them.
+
+    A cone is ``slope R / concavity (1 - r / R)**concavity`` high: `slope` steep at its apex, which is rounded.
+    """
+    side = height.shape[0]
+    period = side * spacing
+    for i in range(side):
+        for j in range(side):
+            total = 0.0
+            for n in range(apexes.shape[0]):
+                dx = abs(j * spacing - apexes[n, 0])
+                dy = abs(i * spacing - apexes[n, 1])
+                dx = min(dx, period - dx)
+                dy = min(dy, period - dy)
+                far = math.sqrt(dx * dx + dy * dy + rounding * rounding) - rounding
+                rest = 1.0 - far / apexes[n, 2]
+                if rest > 0.0:
+                    z = slope * apexes[n, 2] / concavity * rest**concavity
+                    # the highest, rounded where two meet
+                    total += z**8
+            if total > 0.0:
+                z = total**0.125
+                height[i, j] += z
+                cover[i, j] = min(z / (0.02 * slope * apexes[0, 2]), 1.0)
+
+
+@njit(cache=True)
+def pack(height: Grid, albedo: Grid, scale: float, samples: Level) -> None:
+    """Interleaves height and albedo; the albedo is scaled and kept below 1."""
+    for i in range(height.shape[0]):
+        for j in range(height.shape[0]):
+            samples[i, j, 0] = height[i, j]
+            samples[i, j, 1] = min(scale * albedo[i, j], 1.0)

@@ -1,0 +1,58 @@
+"""What a terrain depends on, besides its seed."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
+from sim.terrain.rocks.population import RockParameters
+
+Positive = Annotated[float, Field(gt=0.0)]
+
+
+class TerrainParameters(BaseModel):
+    """A synthetic terrain: fractal ground and craters, and landforms where asked for. Lengths in metres."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side, a power of two")] = 4096
+    spacing_m: Annotated[float, Field(gt=0.0, le=100.0, description="distance between samples, m")] = 1.5
+    hurst: Annotated[float, Field(gt=0.0, lt=1.0, description="Hurst exponent of the fractal ground's heights")] = 0.8
+    rms_slope_deg: Annotated[
+        float,
+        Field(ge=0.0, le=30.0, description="RMS slope of the fractal ground along a line over the slope baseline, deg"),
+    ] = 2.0
+    slope_baseline_m: Annotated[Positive, Field(description="baseline of the RMS slope, m")] = 30.0
+    outer_scale_m: Annotated[Positive, Field(description="wavelength above which relief stops growing, m")] = 3000.0
+    craters_per_km2: Annotated[
+        float, Field(ge=0.0, le=2.0e6, description="craters per square kilometre above the smallest diameter")
+    ] = 60.0
+    crater_exponent: Annotated[Positive, Field(description="exponent of the cumulative size-frequency power law")] = 2.0
+    crater_diameter_min_m: Annotated[Positive, Field(description="smallest crater diameter, m")] = 12.0
+    crater_diameter_max_m: Annotated[Positive, Field(description="largest crater diameter, m")] = 600.0
+    crater_ejecta_contrast: Annotated[
+        float, Field(ge=0.0, le=1.0, description="log albedo of the freshest craters' ejecta, brighter or darker")
+    ] = 0.12
+    albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="mean albedo")] = 0.2
+    albedo_contrast: Annotated[
+        float, Field(ge=0.0, le=1.0, description="RMS of the logarithm of the fractal albedo over all scales")
+    ] = 0.12
+    albedo_hurst: Annotated[
+        float,
+        Field(ge=-0.5, lt=1.0, description="Hurst exponent of the albedo; 0: equal contrast in each octave"),
+    ] = 0.0
+    playa: Annotated[Playa | None, Field(description="desiccation polygons")] = None
+    fans: Annotated[Fans | None, Field(description="alluvial fans around a playa")] = None
+    lava: Annotated[Lava | None, Field(description="pahoehoe flows and a'a")] = None
+    dunes: Annotated[Dunes | None, Field(description="transverse dunes")] = None
+    ripples: Annotated[Dunes | None, Field(description="ripples: dunes of a smaller size")] = None
+    swell: Annotated[Swell | None, Field(description="broad relief")] = None
+    ramp: Annotated[Ramp | None, Field(description="an even slope")] = None
+    gullies: Annotated[Gullies | None, Field(description="steep-walled gullies")] = None
+    rocks: Annotated[RockParameters | None, Field(description="rocks on the ground")] = None
+
+
+#: The landforms in the order in which they are laid upon the fractal ground.
+LANDFORMS = ("fans", "playa", "lava", "swell", "ramp", "gullies", "dunes", "ripples")

@@ -1,0 +1,73 @@
+"""Random fields with a stated spectrum on a periodic grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from jaxtyping import Float32, Float64
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """A power-law spectrum on a periodic grid, from which random fields of unit expected variance are drawn.
+
+    Attributes
+    ----------
+    amplitude
+        Amplitude of each mode of the half spectrum, shape (samples, samples // 2 + 1).
+    spacing_m
+        Distance between the grid's samples.
+    column_power
+        Sum of the squared amplitudes along y for each wavenumber along x, counting the conjugate modes.
+    """
+
+    amplitude: Float32[np.ndarray, "samples half"]
+    spacing_m: float
+    column_power: Float64[np.ndarray, "half"]
+
+    @classmethod
+    def power_law(cls, samples: int, spacing_m: float, hurst: float, outer_scale_m: float) -> Spectrum:
+        """Power spectral density ``(k**2 + k0**2)**-(hurst + 1)`` with k0 the wavenumber of the outer scale.
+
+        Above k0 the field is self-affine with the Hurst exponent; below it is white.
+        """
+        along_y = (2.0 * np.pi * scipy.fft.fftfreq(samples, spacing_m)).astype(np.float32)
+        along_x = (2.0 * np.pi * scipy.fft.rfftfreq(samples, spacing_m)).astype(np.float32)
+        squared = along_y[:, None] ** 2 + along_x[None, :] ** 2 + np.float32((2.0 * np.pi / outer_scale_m) ** 2)
+        amplitude = np.exp(np.float32(-(hurst + 1.0) / 2.0) * np.log(squared))
+        amplitude[0, 0] = 0.0
+        power = np.einsum("ij,ij->j", amplitude, amplitude, dtype=np.float64)
+        # A mode of the half spectrum stands for itself and its conjugate, except in the first and the last column.
+        power[1:-1] *= 2.0
+        return cls(amplitude, spacing_m, power)
+
+    def field(self, rng: np.random.Generator, scale: float) -> Float32[np.ndarray, "samples samples"]:
+        """A Gaussian field whose expected variance is ``scale**2``.
+
+        White noise in the frequency domain is shaped and transformed; the variance is normalised by its expectation, so
+        that terrains differ as draws do. One thread, so that the bytes do not depend on how many there are.
+        """
+        samples, half = self.amplitude.shape
+        noise = rng.standard_normal((samples, half, 2), dtype=np.float32).view(np.complex64)[..., 0]
+        noise *= self.amplitude
+        # irfft2 keeps only the real part of what these two columns give: half the power of their modes
+        noise[:, 0] *= np.float32(np.sqrt(2.0))
+        noise[:, -1] *= np.float32(np.sqrt(2.0))
+        field: Float32[np.ndarray, "samples samples"] = scipy.fft.irfft2(
+            noise, s=(samples, samples), workers=1, overwrite_x=True
+        )
+        # complex noise has variance 2; irfft2 divides by samples**2
+        field *= np.float32(scale * samples**2 / np.sqrt(2.0 * self.column_power.sum()))
+        return field
+
+    def line_slope_rms(self, baseline_m: float) -> float:
+        """Expected RMS slope over a baseline along a line of a unit-variance field.
+
+        ``E[(z(x + L) - z(x))**2] = 2 sum P (1 - cos k L) / sum P``.
+        """
+        k = 2.0 * np.pi * scipy.fft.rfftfreq(self.amplitude.shape[0], self.spacing_m)
+        # 1 - cos without cancellation
+        square = np.sum(self.column_power * 4.0 * np.sin(0.5 * k * baseline_m) ** 2) / self.column_power.sum()
+        return float(np.sqrt(square) / baseline_m)
