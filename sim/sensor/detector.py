@@ -75,6 +75,36 @@ class Detector:
         parameters = DetectorParameters.model_validate(self.parameters.model_dump() | {"exposure_s": exposure_s})
         return replace(self, parameters=parameters, calibration=replace(self.calibration, exposure_s=exposure_s))
 
+    def window(self, column: int, row: int, size: tuple[int, int]) -> Detector:
+        """The part of the detector that a subframe reads, given its upper left pixel and its size (columns, rows).
+
+        Its pixels are those of the whole detector, noise apart. What moves through the rows outside while it is
+        cleared and shifted out is not seen; exact for a detector without smear.
+
+        Raises
+        ------
+        ValueError
+            If the part is empty, leaves the detector or cuts through rows that are summed.
+        """
+        rows, columns = self.response.shape
+        count = self.parameters.rows_summed
+        if row % count or size[1] % count:
+            raise ValueError(f"a subframe of {size[1]} rows from row {row} cuts through {count} summed rows")
+        if min(row, column) < 0 or min(size) < 1 or column + size[0] > columns or row + size[1] > rows:
+            raise ValueError(
+                f"a subframe of {size[0]} x {size[1]} pixels at ({column}, {row}) leaves the detector of "
+                f"{columns} x {rows}"
+            )
+        part = np.s_[row : row + size[1], column : column + size[0]]
+        known = self.calibration.flat_field[row // count : (row + size[1]) // count, part[1]]
+        hot = None if self.hot_e_s is None else self.hot_e_s[part]
+        return replace(
+            self,
+            response=np.ascontiguousarray(self.response[part]),
+            calibration=replace(self.calibration, flat_field=known),
+            hot_e_s=hot,
+        )
+
     def expose(
         self,
         radiance: Float32[np.ndarray, "rows columns"],
@@ -94,7 +124,7 @@ class Detector:
         """
         p = self.parameters
         mean = _sum_rows(self.charge(radiance, motion), p.rows_summed) + self.dark_charge()
-        # deconvolved edges of the point spread may dip below 0
+        # the point spread's kernel has weights below 0: beside a bright edge the mean may dip under it
         electrons = rng.poisson(np.maximum(mean, 0.0)).astype(np.float32)
         electrons += np.float32(p.read_noise_e) * rng.standard_normal(electrons.shape, dtype=np.float32)
         np.minimum(electrons, np.float32(p.full_well_e), out=electrons)

@@ -36,13 +36,11 @@ class ImageMotion:
     Attributes
     ----------
     velocity_px_s
-        Rows and columns per second at the nodes of a grid, shape (n, m, 2), at least two nodes each way.
-    step_px
-        Distance of the nodes; the first lies on pixel (0, 0).
+        Rows and columns per second at the nodes of a grid, shape (n, m, 2), at least two nodes each way. The first
+        node lies on pixel (0, 0), the others every `GRID_STEP_PX` pixels; beyond the last the velocity stays the same.
     """
 
     velocity_px_s: Float64[np.ndarray, "n m 2"]
-    step_px: float = GRID_STEP_PX
 
     @classmethod
     def uniform(cls, rows_s: float, columns_s: float) -> ImageMotion:
@@ -129,7 +127,7 @@ def moving_exposure(
     padded = np.pad(scene, pad, mode="edge")
     inner = np.pad(scene, ((near, near), (near, near + 3)), mode="edge")
     charge = np.empty_like(scene)
-    blur(inner, near, motion.velocity_px_s, motion.step_px, exposure_s, charge)
+    blur(inner, near, motion.velocity_px_s, GRID_STEP_PX, exposure_s, charge)
     charge *= np.float32(exposure_s)
     charge *= response
     start = 0.5 * exposure_s
@@ -153,13 +151,11 @@ def _add_clearing(
     rows = len(response)
     nodes = _nodes(rows)
     # velocities of the turned picture at its own nodes: row velocity turns twice, column velocity once
-    upright = np.clip((rows - 1 - nodes) / motion.step_px, 0.0, len(motion.velocity_px_s) - 1.0)
+    upright = np.clip((rows - 1 - nodes) / GRID_STEP_PX, 0.0, len(motion.velocity_px_s) - 1.0)
     below = np.minimum(upright.astype(np.int64), len(motion.velocity_px_s) - 2)
     share = (upright - below)[:, None, None]
     turned = (1.0 - share) * motion.velocity_px_s[below] + share * motion.velocity_px_s[below + 1]
-    if motion.step_px != GRID_STEP_PX:
-        raise ValueError(f"image velocity must be given every {GRID_STEP_PX} px, not every {motion.step_px} px")
-    backwards = ImageMotion(np.ascontiguousarray(turned * np.array([1.0, -1.0])), motion.step_px)
+    backwards = ImageMotion(np.ascontiguousarray(turned * np.array([1.0, -1.0])))
     gathered = np.zeros_like(charge)
     _add_smear(
         np.ascontiguousarray(padded[::-1]),
@@ -187,6 +183,6 @@ def _add_smear(
     block_rows = int(np.clip(BLOCK_PX / max(motion.greatest_px_s * row_s, 1e-12), *BLOCK_ROWS))
     edges = np.append(np.arange(0, rows, block_rows), rows).astype(np.int64)
     passed = np.empty((len(edges), columns), dtype=np.float32)
-    field, step = motion.velocity_px_s, motion.step_px
+    field, step = motion.velocity_px_s, GRID_STEP_PX
     passed_blocks(sums_before(padded), pad, block_means(response, edges), edges, field, step, start_s, row_s, passed)
     add_passed(padded, pad, response, passed, edges, field, step, start_s, row_s, charge)

@@ -105,7 +105,7 @@ class Preset:
         return self.design.cameras()
 
 
-def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float) -> Preset:
+def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float | int) -> Preset:
     """A camera with the MER detector, of which the descent camera's parameters are the defaults."""
     settings = {
         "responsivity_e_s": light.responsivity_e_s(sun_au),

@@ -181,3 +181,18 @@ def test_exposure_can_be_set_and_is_stated() -> None:
     assert detector.parameters.exposure_s == detector.calibration.exposure_s == 0.002
     with pytest.raises(ValueError, match="exposure_s"):
         _detector().with_exposure(-1.0)
+
+
+def test_a_subframe_has_the_pixels_of_the_whole() -> None:
+    parameters = DetectorParameters(
+        transfer_row_s=0.0, clear_row_s=0.0, optics=SHARP, defects=DefectParameters(hot_share=0.02)
+    )
+    whole = Detector.drawn(EVEN, parameters, np.random.default_rng(6))
+    part = whole.window(8, 16, (24, 32))
+    scene = np.random.default_rng(2).random(EVEN.shape, dtype=np.float32)
+    np.testing.assert_array_equal(part.charge(scene[16:48, 8:32]), whole.charge(scene)[16:48, 8:32])
+    np.testing.assert_array_equal(part.calibration.flat_field, whole.calibration.flat_field[4:12, 8:32])
+    assert part.expose(scene[16:48, 8:32], np.random.default_rng(0)).shape == (8, 24)
+    for wrong in ((0, 2, (8, 8)), (0, 0, (8, 6)), (44, 0, (8, 8)), (0, -4, (8, 8)), (0, 0, (0, 8))):
+        with pytest.raises(ValueError, match="a subframe of"):
+            whole.window(*wrong)
