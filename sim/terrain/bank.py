@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.cache import cache_directory
+from sim.terrain.embedding import RealExtent, embed
 from sim.terrain.parameters import TerrainParameters
 from sim.terrain.rocks.field import RockField
 from sim.terrain.substreams import substream
@@ -54,9 +55,23 @@ class TerrainBank:
     def _rng(self, number: int) -> np.random.Generator:
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))
 
+    def real_extent(self) -> RealExtent | None:
+        """Where the real part of the bank's terrains lies; None where they are wholly synthetic."""
+        p = self.parameters
+        return None if p.source is None else embed(p.source, p.samples, p.spacing_m).extent
+
     def _path(self, number: int) -> Path:
-        identity = f"{self.parameters.model_dump_json(exclude={'rocks'})} {self.seed} {number} {_code_version()}"
+        parameters = self.parameters.model_dump_json(exclude={"rocks"})
+        identity = f"{parameters} {self.seed} {number} {_code_version()} {self._files()}"
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
+
+    def _files(self) -> str:
+        """Hash of the files of real terrain, which may change under the same name."""
+        source = self.parameters.source
+        if source is None:
+            return ""
+        paths = [path for path in (source.dtm, source.ortho) if path is not None and path.exists()]
+        return " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
 
     def _build(self, number: int, path: Path) -> None:
         built = synthesise(self.parameters, self._rng(number))

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from sim.terrain.imported import RealTerrain
 from sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
 from sim.terrain.rocks.population import RockParameters
 
@@ -51,6 +52,12 @@ class TerrainParameters(BaseModel):
     swell: Annotated[Swell | None, Field(description="broad relief")] = None
     ramp: Annotated[Ramp | None, Field(description="an even slope")] = None
     gullies: Annotated[Gullies | None, Field(description="steep-walled gullies")] = None
+    source: Annotated[
+        RealTerrain | None,
+        Field(
+            description="real terrain in the middle; all else then is its surround, and its detail below the posting"
+        ),
+    ] = None
     rocks: Annotated[RockParameters | None, Field(description="rocks on the ground")] = None
 
 

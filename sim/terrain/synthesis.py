@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
+from sim.terrain.embedding import detail_below, embed, lay_in
 from sim.terrain.landforms.craters import EJECTA_REACH_RADII, draw_craters
 from sim.terrain.landforms.ground import Ground
 from sim.terrain.landforms.kernels import pack, stamp_craters
@@ -23,6 +24,10 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     ground = Ground(
         _relief(parameters, substream(rng, "relief")), _tone(parameters, substream(rng, "albedo")), parameters.spacing_m
     )
+    real = None
+    if parameters.source is not None:
+        real = embed(parameters.source, ground.side, ground.spacing_m)
+        detail = detail_below(ground, real) if parameters.source.roughen else None
     for name in LANDFORMS:
         landform = getattr(parameters, name)
         if landform is not None:
@@ -30,6 +35,8 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     if parameters.craters_per_km2 > 0.0:
         craters = draw_craters(parameters, substream(rng, "craters"))
         stamp_craters(ground.height, ground.tone, ground.spacing_m, craters, EJECTA_REACH_RADII)
+    if real is not None:
+        lay_in(ground, real, detail)
     return _surface(ground, parameters.albedo)
 
 
