@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int32
+from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 
 if TYPE_CHECKING:
     import trimesh
@@ -61,11 +61,19 @@ class PinholeView:
 _VIEW_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def _colours(count: int) -> Float32[np.ndarray, "count 4"]:
-    """Colours that spell the numbers 1 to count in 24 bits, least significant first."""
-    number = np.arange(1, count + 1, dtype=np.uint32)
-    spelled = np.stack([number & 255, (number >> 8) & 255, (number >> 16) & 255, np.full(count, 255)], axis=-1)
+def _colours(number: Int64[np.ndarray, "count"]) -> Float32[np.ndarray, "count 4"]:
+    """Colours that spell numbers in 24 bits, least significant first."""
+    spelled = np.stack([number & 255, (number >> 8) & 255, (number >> 16) & 255, np.full_like(number, 255)], axis=-1)
     return spelled.astype(np.float32) / np.float32(255.0)
+
+
+def _numbers(colours: UInt8[np.ndarray, "rows columns channels"]) -> Int32[np.ndarray, "rows columns"]:
+    """The numbers that colours spell; OSMesa's have three channels, EGL's four."""
+    numbers = colours[..., 2].astype(np.int32)
+    for channel in (1, 0):
+        numbers <<= 8
+        numbers |= colours[..., channel]
+    return numbers
 
 
 class DepthRenderer:
@@ -99,21 +107,28 @@ class DepthRenderer:
         self._scene: Any = None
         self._flags = 0
 
-    def load(self, ground: trimesh.Trimesh, triangles: Float64[np.ndarray, "triangles 3 3"] | None = None) -> None:
+    def load(
+        self,
+        ground: trimesh.Trimesh,
+        triangles: Float64[np.ndarray, "triangles 3 3"],
+        numbers: Int64[np.ndarray, "triangles"],
+    ) -> None:
         """Makes this ground, and these triangles on it, what is drawn; what was before is released.
 
         Parameters
         ----------
         ground
             Mesh in world coordinates.
-        triangles
-            Corners in world coordinates of triangles that are told apart in the picture; None or none for ground alone.
+        triangles, numbers
+            Corners in world coordinates of triangles that stand on the ground, and the number by which each is told
+            apart in the picture, counted from zero.
         """
         self._clear()
         pyrender = self._pyrender
-        things = None if triangles is None or len(triangles) == 0 else triangles
         self._flags = (
-            pyrender.RenderFlags.DEPTH_ONLY if things is None else pyrender.RenderFlags.FLAT | pyrender.RenderFlags.RGBA
+            pyrender.RenderFlags.DEPTH_ONLY
+            if len(triangles) == 0
+            else pyrender.RenderFlags.FLAT | pyrender.RenderFlags.RGBA
         )
         black = pyrender.MetallicRoughnessMaterial(baseColorFactor=(0.0, 0.0, 0.0, 1.0))
         primitives = [
@@ -124,11 +139,11 @@ class DepthRenderer:
                 material=black,
             )
         ]
-        if things is not None:
+        if len(triangles) > 0:
             primitives.append(
                 pyrender.Primitive(
-                    positions=things.reshape(-1, 3).astype(np.float32),
-                    color_0=np.repeat(_colours(len(things)), 3, axis=0),
+                    positions=triangles.reshape(-1, 3).astype(np.float32),
+                    color_0=np.repeat(_colours(numbers + 1), 3, axis=0),
                     mode=pyrender.GLTF.TRIANGLES,
                 )
             )
@@ -154,8 +169,7 @@ class DepthRenderer:
             self._scene.remove_node(node)
         if isinstance(drawn, tuple):
             colours, depth = drawn
-            numbers = np.ascontiguousarray(colours).view("<u4")[..., 0] & np.uint32(0xFFFFFF)
-            return np.ascontiguousarray(depth), numbers.astype(np.int32)
+            return np.ascontiguousarray(depth), _numbers(colours)
         return np.ascontiguousarray(drawn), np.zeros(drawn.shape, dtype=np.int32)
 
     def _clear(self) -> None:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int32, Int64
 
-from sim.render.kernels.objects import ObjectArrays
+from sim.render.kernels.hierarchy import Hierarchy, morton_codes, node_boxes
 
 #: Triangle numbers are drawn as colours of 24 bits, of which 0 is the ground.
 MOST_TRIANGLES = 2**24 - 2
-#: Cells along a side of the grid in which shadows look for things, at the most.
-MOST_CELLS = 512
 
 
 @dataclass(frozen=True)
@@ -28,8 +27,6 @@ class Objects:
         Number of the body of each triangle: row of `albedo`.
     first_triangle
         First triangle of each body, and the number of triangles at the end.
-    spheres
-        Centre and radius of a sphere around each body.
     albedo
         Albedo of each body.
     names
@@ -40,7 +37,6 @@ class Objects:
     normals: Float64[np.ndarray, "triangles 3 3"]
     body_of_triangle: Int32[np.ndarray, "triangles"]
     first_triangle: Int64[np.ndarray, "bodies+1"]
-    spheres: Float64[np.ndarray, "bodies 4"]
     albedo: Float64[np.ndarray, "bodies"]
     names: Int64[np.ndarray, "bodies"]
 
@@ -62,13 +58,11 @@ class Objects:
         changes = np.flatnonzero(np.diff(name_of_face)) + 1
         first = np.concatenate([[0], changes, [len(faces)]]).astype(np.int64) if len(faces) else np.zeros(1, np.int64)
         counts = np.diff(first)
-        triangles = np.asarray(vertices, dtype=np.float64)[faces]
         return cls(
-            triangles=triangles,
+            triangles=np.asarray(vertices, dtype=np.float64)[faces],
             normals=np.asarray(vertex_normals, dtype=np.float64)[faces],
             body_of_triangle=np.repeat(np.arange(counts.size, dtype=np.int32), counts),
             first_triangle=first,
-            spheres=_spheres(triangles, first),
             albedo=np.full(counts.size, float(albedo)),
             names=np.asarray(name_of_face, dtype=np.int64)[first[:-1]],
         )
@@ -87,7 +81,6 @@ class Objects:
             normals=np.concatenate([part.normals for part in parts]),
             body_of_triangle=np.concatenate(numbers).astype(np.int32),
             first_triangle=np.concatenate([*first, starts[-1:]]).astype(np.int64),
-            spheres=np.concatenate([part.spheres for part in parts]),
             albedo=np.concatenate([part.albedo for part in parts]),
             names=np.concatenate([part.names for part in parts]),
         )
@@ -102,21 +95,27 @@ class Objects:
     def __len__(self) -> int:
         return len(self.albedo)
 
-    def arrays(self) -> ObjectArrays:
-        """The arrays that the kernels take, with the grid in which shadows look for bodies."""
-        grid, cells_x, start, items = _shadow_grid(self.spheres)
-        return (
-            self.triangles,
-            self.normals,
-            self.body_of_triangle,
-            self.first_triangle,
-            self.spheres,
-            self.albedo,
-            grid,
-            cells_x,
-            start,
-            items,
-        )
+    @cached_property
+    def spheres(self) -> Float64[np.ndarray, "bodies 4"]:
+        """Centre and radius of a sphere around each body."""
+        return _spheres(self.triangles, self.first_triangle)
+
+    def in_cone(
+        self, apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_angle_rad: float
+    ) -> Int64[np.ndarray, "kept"]:
+        """Numbers of the triangles of all bodies whose spheres reach into a cone."""
+        away = self.spheres[:, :3] - apex
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        beside = np.arccos(np.clip(away @ axis / distance, -1.0, 1.0))
+        widening = np.arcsin(np.clip(self.spheres[:, 3] / distance, 0.0, 1.0))
+        kept = beside <= half_angle_rad + np.where(distance <= self.spheres[:, 3], np.pi, widening)
+        return np.flatnonzero(np.repeat(kept, np.diff(self.first_triangle)))
+
+    @cached_property
+    def hierarchy(self) -> Hierarchy:
+        """The tree in which shadows look for triangles."""
+        order = np.argsort(morton_codes(self.triangles), kind="stable")
+        return self.triangles, order, node_boxes(self.triangles, order)
 
 
 def _spheres(
@@ -130,34 +129,3 @@ def _spheres(
     middle = 0.5 * (low + high)
     away = np.linalg.norm(triangles - np.repeat(middle, np.diff(first), axis=0)[:, None], axis=2).max(axis=1)
     return np.column_stack([middle, np.maximum.reduceat(away, first[:-1])])
-
-
-def _shadow_grid(
-    spheres: Float64[np.ndarray, "bodies 4"],
-) -> tuple[Float64[np.ndarray, "4"], int, Int64[np.ndarray, "cells+1"], Int32[np.ndarray, "items"]]:
-    """Bodies sorted into square cells of the plan view.
-
-    A body stands in every cell that its disc, widened by three quarters of a cell, touches: a walk in steps of one cell
-    then enters a cell of every body that it passes under.
-    """
-    if len(spheres) == 0:
-        return np.array([0.0, 0.0, 1.0, -np.inf]), 1, np.zeros(2, np.int64), np.empty(0, np.int32)
-    low = (spheres[:, :2] - spheres[:, 3:]).min(axis=0)
-    high = (spheres[:, :2] + spheres[:, 3:]).max(axis=0)
-    size = max(2.0 * float(np.median(spheres[:, 3])), float((high - low).max()) / (MOST_CELLS - 4), 1e-3)
-    low = low - size
-    cells = np.ceil((high - low) / size).astype(int) + 2
-    widened = spheres[:, 3] + 0.75 * size
-    first = np.clip(np.floor((spheres[:, :2] - widened[:, None] - low) / size).astype(int), 0, cells - 1)
-    last = np.clip(np.floor((spheres[:, :2] + widened[:, None] - low) / size).astype(int), 0, cells - 1)
-    spans = last - first + 1
-    counts = spans.prod(axis=1)
-    body = np.repeat(np.arange(len(spheres), dtype=np.int32), counts)
-    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    across = within % spans[body, 0] + first[body, 0]
-    along = within // spans[body, 0] + first[body, 1]
-    cell = along * cells[0] + across
-    order = np.argsort(cell, kind="stable")
-    start = np.searchsorted(cell[order], np.arange(cells[0] * cells[1] + 1)).astype(np.int64)
-    top = float((spheres[:, 2] + spheres[:, 3]).max())
-    return np.array([low[0], low[1], size, top]), int(cells[0]), start, body[order]

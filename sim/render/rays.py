@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -32,8 +33,8 @@ class PixelRays:
         Rays relative to `centre`, shape (rows * columns, 3), float32; directions are unit vectors.
     size
         Columns and rows.
-    pixel_angle_rad
-        Mean angle between neighbouring pixels' rays.
+    pixel_angles
+        Angle that each pixel takes: the square root of its solid angle, radians.
     view_side_px
         Samples along each side of the pinhole views.
     view_from_body
@@ -48,11 +49,23 @@ class PixelRays:
     origins: Float32[np.ndarray, "pixels 3"]
     directions: Float32[np.ndarray, "pixels 3"]
     size: tuple[int, int]
-    pixel_angle_rad: float
+    pixel_angles: Float32[np.ndarray, "pixels"]
     view_side_px: int
     view_from_body: Float64[np.ndarray, "views 3 3"]
     focal_px: Float64[np.ndarray, "views"]
     view_of_pixel: UInt8[np.ndarray, "pixels"]
+
+    @cached_property
+    def axis(self) -> Float64[np.ndarray, "3"]:
+        """Unit vector along the middle of all rays, body axes."""
+        middle: Float64[np.ndarray, "3"] = self.directions.mean(axis=0, dtype=np.float64)
+        middle /= np.linalg.norm(middle)
+        return middle
+
+    @cached_property
+    def half_angle_rad(self) -> float:
+        """Widest angle of a ray from the axis, radians."""
+        return float(np.arccos(np.clip((self.directions @ self.axis).min(), -1.0, 1.0)))
 
     @classmethod
     def of(cls, camera: CameraModel) -> PixelRays:
@@ -76,7 +89,7 @@ class PixelRays:
             origins=(origins - centre).reshape(-1, 3).astype(np.float32),
             directions=directions.reshape(-1, 3).astype(np.float32),
             size=(columns, rows),
-            pixel_angle_rad=float(np.linalg.norm(np.diff(directions, axis=1), axis=-1).mean()),
+            pixel_angles=_pixel_angles(directions),
             view_side_px=side,
             view_from_body=np.stack(axes),
             focal_px=np.array(focal),
@@ -124,3 +137,10 @@ def _focal_length(
     in_view = directions.reshape(-1, 3) @ axes.T
     extent = np.abs(in_view[:, :2] / in_view[:, 2:]).max()
     return float((side / 2.0 - MARGIN_PX) / extent)
+
+
+def _pixel_angles(directions: Float64[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "pixels"]:
+    along_row, along_column = np.gradient(directions, axis=(1, 0))
+    solid_angle = np.linalg.norm(np.cross(along_row, along_column), axis=-1)
+    angles: Float32[np.ndarray, "pixels"] = np.sqrt(solid_angle).astype(np.float32).ravel()
+    return angles

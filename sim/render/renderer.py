@@ -17,7 +17,6 @@ from scipy.spatial.transform import RigidTransform
 
 from sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
 from sim.render.kernels.ground import height_range, sweep_shadow
-from sim.render.kernels.objects import ObjectArrays
 from sim.render.kernels.shading import shade
 from sim.render.mesh import graded_offsets, ground_mesh, lines_in_view
 from sim.render.objects import Objects
@@ -28,6 +27,7 @@ from sim.terrain import Surface
 NO_TEXTURE = Texture()
 #: Most posts along a side of the grid on which the ground's shadow is swept.
 SHADOW_SIDE = 2048
+NO_SHADOW = (np.full((1, 1), -np.inf, dtype=np.float32), 1.0, 0)
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class Scene:
     mesh_finest_m, mesh_reach_m, mesh_lines
         Spacing of the mesh at the centre, how far it reaches to each side, and the number of its lines.
     mesh_in_view
-        Whether only the part of the mesh that a picture shows is drawn. It is made anew for every picture then, which
-        pays for narrow views of wide scenes; without it one mesh serves all pictures of the scene.
+        Whether only the ground and the objects that a picture shows are drawn. They are loaded anew for every picture
+        then, which pays for narrow views of wide scenes; without it one mesh serves all pictures of the scene.
     """
 
     surface: Surface
@@ -83,21 +83,16 @@ class Scene:
         return float(low), float(high)
 
     @cached_property
-    def object_arrays(self) -> ObjectArrays:
-        """The objects as the kernels take them."""
-        return self.objects.arrays()
-
-    @cached_property
-    def shadow(self) -> tuple[Float32[np.ndarray, "rows columns"], float]:
-        """Height of the ground's shadow on a periodic grid, and the grid's spacing."""
+    def shadow(self) -> tuple[Float32[np.ndarray, "rows columns"], float, int]:
+        """Height of the ground's shadow on the grid of a level of the surface, the grid's spacing, and the level."""
         if not self.ground_shadows or self.sun.direction[2] <= 0.0:
-            return np.full((1, 1), -np.inf, dtype=np.float32), 1.0
+            return NO_SHADOW
         return _ground_shadow(self.surface, self.sun, self.height_range_m)
 
 
 def _ground_shadow(
     surface: Surface, sun: Sun, height_range_m: tuple[float, float]
-) -> tuple[Float32[np.ndarray, "rows columns"], float]:
+) -> tuple[Float32[np.ndarray, "rows columns"], float, int]:
     """Sweeps the shadow along whichever axis the sun's azimuth is nearer to."""
     level = int(np.argmax([one.shape[0] <= SHADOW_SIDE for one in surface.levels]))
     spacing = surface.spacing_m * 2.0**level
@@ -106,12 +101,12 @@ def _ground_shadow(
     along_y = abs(north) >= abs(east)
     main, side = (north, east) if along_y else (east, north)
     if main == 0.0:
-        return np.full((1, 1), -np.inf, dtype=np.float32), 1.0
+        return NO_SHADOW
     drop = spacing * up / abs(main)
     reach = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, height.shape[0]))
     rows_towards_sun = height if along_y else np.ascontiguousarray(height.T)
     swept = sweep_shadow(rows_towards_sun, float(np.sign(main)), drop, side / abs(main), reach)
-    return (swept if along_y else np.ascontiguousarray(swept.T)), spacing
+    return (swept if along_y else np.ascontiguousarray(swept.T)), spacing, level
 
 
 @dataclass(frozen=True)
@@ -208,13 +203,16 @@ class Renderer:
             position,
             rays.origins,
             rays.directions,
-            rays.pixel_angle_rad,
+            rays.pixel_angles,
             np.asarray(scene.sun.direction, dtype=np.float64),
             scene.photometry.law(scene.sun, scene.caster_diameter_m),
             *scene.shadow,
             scene.ground_texture.arrays(),
             scene.object_texture.arrays(),
-            scene.object_arrays,
+            scene.objects.normals,
+            scene.objects.body_of_triangle,
+            scene.objects.albedo,
+            scene.objects.hierarchy,
             radiance,
             distance,
             body,
@@ -253,10 +251,13 @@ class Renderer:
         if self._loaded.get(side) is scene and not scene.mesh_in_view:
             return
         x, y = (centre + scene.mesh_offsets for centre in scene.centre_m)
+        numbers = np.arange(len(scene.objects.triangles))
         if scene.mesh_in_view:
             (west, east), (south, north) = _seen(scene, rays, rotation, position)
             x, y = lines_in_view(x, west, east), lines_in_view(y, south, north)
-        self._view_renderer(side).load(ground_mesh(scene.surface, x, y), scene.objects.triangles)
+            numbers = scene.objects.in_cone(position, rotation @ rays.axis, rays.half_angle_rad)
+        triangles = scene.objects.triangles[numbers]
+        self._view_renderer(side).load(ground_mesh(scene.surface, x, y), triangles, numbers)
         self._loaded[side] = scene
 
     def _draw(

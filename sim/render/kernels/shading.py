@@ -9,13 +9,18 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sim.render.kernels.ground import Array32, ground_lit, meet_ground
-from sim.render.kernels.objects import ObjectArrays, hit_triangle, objects_hide_sun
+from sim.render.kernels.hierarchy import Hierarchy, anything_hit
+from sim.render.kernels.intersection import hit_triangle
 from sim.render.kernels.texture import texture
 from sim.terrain.kernels import Array, Level, sample
 
 Ints = NDArray[np.int32]
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
+#: Sine of the flattest angle at which a pixel's footprint on the ground is still drawn out in full.
+FLATTEST = 0.01
+#: Samples of the terrain up to which a footprint is met by the terrain itself, not by a smoothed level of it.
+FINE_UNTIL = 8.0
 #: Slack of a triangle's edge, as a share: so that no ray slips between two triangles.
 SLACK = 1e-9
 
@@ -141,14 +146,18 @@ def shade(
     position: Array,
     origins: Array32,
     directions: Array32,
-    pixel_angle: float,
+    pixel_angles: Array32,
     sun: Array,
     law: Array,
     shadow: Array32,
     shadow_spacing: float,
+    shadow_level: int,
     ground_texture: tuple[float, Array],
     object_texture: tuple[float, Array],
-    things: ObjectArrays,
+    normals: Array,
+    body_of_triangle: Ints,
+    albedos: Array,
+    tree: Hierarchy,
     radiance: Array32,
     distance: Array,
     body: Ints,
@@ -169,24 +178,25 @@ def shade(
         Rotation matrix of the body, and world position of the centre of projection.
     origins, directions
         Each pixel's ray in body axes relative to `position`, shape (n, 3), float32; directions are unit.
-    pixel_angle
-        Angle between neighbouring pixels' rays, radians.
+    pixel_angles
+        Angle that each pixel takes, radians.
     sun
         Unit vector to the sun, world axes.
     law
         Lunar share, surge amplitude, surge width, normalisation, sky share, sky radiance, light from the surrounding
         ground, diameter of what casts a shadow from the body's place, angular radius of the sun.
-    shadow, shadow_spacing
-        Height of the ground's shadow on a periodic grid; one side is 1 where there is none.
+    shadow, shadow_spacing, shadow_level
+        Height of the ground's shadow on the grid of a level of the surface; one side is 1 where there is none.
     ground_texture, object_texture
         Coarsest cell and amplitudes of octaves.
-    things
-        Triangles that stand on the ground.
+    normals, body_of_triangle, albedos, tree
+        Triangles that stand on the ground: normals at their corners, the body of each, the bodies' albedos, and the
+        triangles themselves with the tree in which shadows look for them.
     radiance, distance, body, normal
         Outputs: radiance factor; distance along the ray, infinite for the sky; number of the thing seen (GROUND, SKY);
         unit normal in world axes.
     """
-    triangles, normals, body_of_triangle, _first, _spheres, albedos = things[:6]
+    triangles = tree[0]
     sky_share, sky_radiance, bounced = law[4], law[5], law[6]
     caster, sun_radius = law[7], law[8]
     middle = depth.shape[1] / 2.0 - 0.5
@@ -215,9 +225,17 @@ def shade(
         y0 = position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz
         z0 = position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz
         t = math.inf
+        smooth = 0
+        met = True
         guess = _ground_depth(depth, ids, face, u, v)
         if guess > 0.0:
-            t = meet_ground(levels[0], inverse_spacing, x0, y0, z0, dx, dy, dz, guess / pz)
+            # Far away and at a flat angle a pixel takes in many samples along its line of sight: it sees them smoothed.
+            t = guess / pz
+            stretched = t * pixel_angles[n] / max(-dz, FLATTEST)
+            first_guess = t
+            smooth = min(int(math.log2(max(stretched / (FINE_UNTIL * spacing), 1.0)) + 0.999), top_level)
+            t = meet_ground(levels[smooth], inverse_spacing / (1 << smooth), x0, y0, z0, dx, dy, dz, t)
+            met = t != first_guess and smooth == 0
         triangle = -1
         second = 0.0
         third = 0.0
@@ -248,12 +266,12 @@ def shade(
             body[n] = body_of_triangle[triangle]
             albedo = albedos[body[n]]
             cos_e = max(-(dx * nx + dy * ny + dz * nz), 1e-3)
-            footprint = t * pixel_angle / math.sqrt(max(cos_e, 0.05))
+            footprint = t * pixel_angles[n] / math.sqrt(max(cos_e, 0.05))
             change = texture(x, y, z, footprint, object_texture[0], object_texture[1])
         else:
             # the level whose samples are as far apart as the pixel's footprint, blended between the two nearest
-            footprint = t * pixel_angle / math.sqrt(max(-dz, 0.05))
-            fractional = math.log2(max(footprint / spacing, 1.0))
+            footprint = t * pixel_angles[n] / math.sqrt(max(-dz, FLATTEST))
+            fractional = max(math.log2(max(footprint / spacing, 1.0)), float(smooth))
             lower = min(int(fractional), top_level)
             blend = min(fractional - lower, 1.0)
             scale = inverse_spacing / (1 << lower)
@@ -279,9 +297,16 @@ def shade(
         if cos_i > 0.0:
             lit = 1.0
             if shadowed:
+                if triangle < 0 and not met:
+                    # the terrain itself, where the pixel saw it smoothed: its own bumps must not shade a smooth ground
+                    height, _slope_x, _slope_y, _albedo = sample(levels[shadow_level], 1.0 / shadow_spacing, x, y)
+                    z = max(z, height)
                 lit = ground_lit(shadow, 1.0 / shadow_spacing, 0.25 * shadow_spacing, x, y, z)
-            if lit > 0.0 and objects_hide_sun(things, x, y, z, sun, 1e-3):
-                lit = 0.0
+            if lit > 0.0 and triangles.shape[0] > 0:
+                # lifted off its facet by a millimetre and half a pixel, so that it does not shade itself
+                lift = 1e-3 + 0.5 * t * pixel_angles[n]
+                if anything_hit(tree, x + lift * nx, y + lift * ny, z + lift * nz, sun, 0.0):
+                    lit = 0.0
             cos_g = min(max(-(dx * sun[0] + dy * sun[1] + dz * sun[2]), -1.0), 1.0)
             if caster > 0.0 and cos_g > 0.9:
                 lit *= 1.0 - _disc_overlap(0.5 * caster / t, sun_radius, math.acos(cos_g))
