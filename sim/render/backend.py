@@ -151,9 +151,10 @@ class DepthRenderer:
         self._scene.add(pyrender.Mesh(primitives))
 
     def draw(self, view: PinholeView) -> tuple[Float32[np.ndarray, "side side"], Int32[np.ndarray, "side side"]]:
-        """Depth along the view's axis, metres, and the number of the triangle seen plus one (0 for the ground).
+        """Depth along the view's axis, metres, and the number of the triangle seen plus one, 0 for the ground.
 
-        The depth is 0 where there is nothing. Row 0 is the top of the view.
+        The depth is 0 where there is nothing. The numbers are an empty array where nothing but ground is loaded. Row 0
+        is the top of the view.
         """
         if self._scene is None:
             raise RenderingError("no mesh has been loaded")
@@ -170,7 +171,7 @@ class DepthRenderer:
         if isinstance(drawn, tuple):
             colours, depth = drawn
             return np.ascontiguousarray(depth), _numbers(colours)
-        return np.ascontiguousarray(drawn), np.zeros(drawn.shape, dtype=np.int32)
+        return np.ascontiguousarray(drawn), np.zeros((0, 0), dtype=np.int32)
 
     def _clear(self) -> None:
         """Releases what is loaded, on the card too, now rather than when pyrender next draws."""

@@ -28,6 +28,9 @@ def meet_ground(
     """Distance along a ray to the surface near a first guess, by Newton's method; the guess itself where it fails."""
     t = start
     bound = 0.05 * start
+    # A step that short leaves, by the surface's greatest curvature of about one over its spacing, less than 1e-6 of
+    # the distance.
+    short = math.sqrt(2e-6 * start / inverse_spacing)
     for _ in range(8):
         height, slope_x, slope_y, _albedo = sample(field, inverse_spacing, x0 + t * dx, y0 + t * dy)
         miss = z0 + t * dz - height
@@ -38,7 +41,7 @@ def meet_ground(
         t -= step
         if abs(t - start) > bound:
             return start
-        if abs(step) < 1e-6 * start:
+        if abs(step) < short:
             break
     return t
 

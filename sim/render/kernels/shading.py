@@ -21,12 +21,14 @@ GROUND, SKY = -1, -2
 FLATTEST = 0.01
 #: Samples of the terrain up to which a footprint is met by the terrain itself, not by a smoothed level of it.
 FINE_UNTIL = 8.0
+#: Footprint, in samples, up to which the finest level is taken: the B-spline itself holds nothing finer than this.
+SHARP_UNTIL = 1.2
 #: Slack of a triangle's edge, as a share: so that no ray slips between two triangles.
 SLACK = 1e-9
 
 
 @njit(cache=True, inline="always")
-def _ground_depth(depth: Array32, ids: Ints, face: int, u: float, v: float) -> float:
+def _ground_depth(depth: Array32, ids: Ints, things: bool, face: int, u: float, v: float) -> float:
     """Depth of the ground between the samples of a depth picture; 0 where no sample around shows ground.
 
     Where all four samples show one stretch of ground its inverse depth, linear over a plane's picture, is interpolated;
@@ -43,8 +45,11 @@ def _ground_depth(depth: Array32, ids: Ints, face: int, u: float, v: float) -> f
     d = depth[face, i + 1, j + 1]
     smallest = min(min(a, b), min(c, d))
     largest = max(max(a, b), max(c, d))
-    whole = ids[face, i, j] == 0 and ids[face, i, j + 1] == 0 and ids[face, i + 1, j] == 0
-    if whole and ids[face, i + 1, j + 1] == 0 and smallest > 0.0 and largest < 1.1 * smallest:
+    whole = smallest > 0.0 and largest < 1.1 * smallest
+    if whole and things:
+        whole = ids[face, i, j] == 0 and ids[face, i, j + 1] == 0
+        whole = whole and ids[face, i + 1, j] == 0 and ids[face, i + 1, j + 1] == 0
+    if whole:
         above = (1.0 - fu) / a + fu / b
         below = (1.0 - fu) / c + fu / d
         return float(1.0 / ((1.0 - fv) * above + fv * below))
@@ -54,7 +59,7 @@ def _ground_depth(depth: Array32, ids: Ints, face: int, u: float, v: float) -> f
         for dj in range(2):
             value = depth[face, i + di, j + dj]
             far = abs(fv - di) + abs(fu - dj)
-            if value > 0.0 and ids[face, i + di, j + dj] == 0 and far < least:
+            if value > 0.0 and far < least and (not things or ids[face, i + di, j + dj] == 0):
                 least = far
                 nearest = value
     return nearest
@@ -133,7 +138,8 @@ def _brightness(law: Array, cos_i: float, cos_e: float, cos_g: float) -> float:
     return brightness
 
 
-@njit(cache=True)
+# Fused multiplications round differently, but the same way every time on the same processor.
+@njit(cache=True, fastmath={"contract"})
 def shade(
     levels: tuple[Level, ...],
     spacing: float,
@@ -203,6 +209,8 @@ def shade(
     inverse_spacing = 1.0 / spacing
     top_level = len(levels) - 1
     shadowed = shadow.shape[0] > 1
+    finest = levels[0]
+    things = triangles.shape[0] > 0
     w = world_from_body
     for n in range(directions.shape[0]):
         bx = directions[n, 0]
@@ -227,19 +235,23 @@ def shade(
         t = math.inf
         smooth = 0
         met = True
-        guess = _ground_depth(depth, ids, face, u, v)
+        guess = _ground_depth(depth, ids, things, face, u, v)
         if guess > 0.0:
             # Far away and at a flat angle a pixel takes in many samples along its line of sight: it sees them smoothed.
             t = guess / pz
             stretched = t * pixel_angles[n] / max(-dz, FLATTEST)
             first_guess = t
-            smooth = min(int(math.log2(max(stretched / (FINE_UNTIL * spacing), 1.0)) + 0.999), top_level)
-            t = meet_ground(levels[smooth], inverse_spacing / (1 << smooth), x0, y0, z0, dx, dy, dz, t)
-            met = t != first_guess and smooth == 0
+            if stretched <= FINE_UNTIL * spacing:
+                t = meet_ground(finest, inverse_spacing, x0, y0, z0, dx, dy, dz, t)
+                met = t != first_guess
+            else:
+                smooth = min(int(math.log2(stretched / (FINE_UNTIL * spacing))) + 1, top_level)
+                t = meet_ground(levels[smooth], inverse_spacing / (1 << smooth), x0, y0, z0, dx, dy, dz, t)
+                met = False
         triangle = -1
         second = 0.0
         third = 0.0
-        if triangles.shape[0] > 0:
+        if things:
             t_thing, triangle, second, third = _meet_object(ids, face, u, v, triangles, x0, y0, z0, dx, dy, dz)
             if triangle >= 0 and t_thing < t:
                 t = t_thing
@@ -271,16 +283,19 @@ def shade(
         else:
             # the level whose samples are as far apart as the pixel's footprint, blended between the two nearest
             footprint = t * pixel_angles[n] / math.sqrt(max(-dz, FLATTEST))
-            fractional = max(math.log2(max(footprint / spacing, 1.0)), float(smooth))
-            lower = min(int(fractional), top_level)
-            blend = min(fractional - lower, 1.0)
-            scale = inverse_spacing / (1 << lower)
-            _height, slope_x, slope_y, albedo = sample(levels[lower], scale, x, y)
-            if blend > 0.0 and lower < top_level:
-                _height, slope_x2, slope_y2, albedo2 = sample(levels[lower + 1], 0.5 * scale, x, y)
-                slope_x += blend * (slope_x2 - slope_x)
-                slope_y += blend * (slope_y2 - slope_y)
-                albedo += blend * (albedo2 - albedo)
+            if smooth == 0 and footprint <= SHARP_UNTIL * spacing:
+                _height, slope_x, slope_y, albedo = sample(finest, inverse_spacing, x, y)
+            else:
+                fractional = max(math.log2(max(footprint / (SHARP_UNTIL * spacing), 1.0)), float(smooth))
+                lower = min(int(fractional), top_level)
+                blend = min(fractional - lower, 1.0)
+                scale = inverse_spacing / (1 << lower)
+                _height, slope_x, slope_y, albedo = sample(levels[lower], scale, x, y)
+                if blend > 0.0 and lower < top_level:
+                    _height, slope_x2, slope_y2, albedo2 = sample(levels[lower + 1], 0.5 * scale, x, y)
+                    slope_x += blend * (slope_x2 - slope_x)
+                    slope_y += blend * (slope_y2 - slope_y)
+                    albedo += blend * (albedo2 - albedo)
             nz = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
             nx = -slope_x * nz
             ny = -slope_y * nz
@@ -302,7 +317,7 @@ def shade(
                     height, _slope_x, _slope_y, _albedo = sample(levels[shadow_level], 1.0 / shadow_spacing, x, y)
                     z = max(z, height)
                 lit = ground_lit(shadow, 1.0 / shadow_spacing, 0.25 * shadow_spacing, x, y, z)
-            if lit > 0.0 and triangles.shape[0] > 0:
+            if lit > 0.0 and things:
                 # lifted off its facet by a millimetre and half a pixel, so that it does not shade itself
                 lift = 1e-3 + 0.5 * t * pixel_angles[n]
                 if anything_hit(tree, x + lift * nx, y + lift * ny, z + lift * nz, sun, 0.0):
