@@ -31,7 +31,7 @@ bench: setup ## Measure speed and memory
 	$(BIN)/python -m benchmarks
 
 validate: setup ## Compare with the papers' published results
-	@[ -f benchmarks/validation.py ] || { echo "validate: there is no comparison with published results yet" >&2; exit 1; }
+	@[ -e benchmarks/validation.py ] || [ -e benchmarks/validation/__main__.py ] || { echo "validate: there is no comparison with published results yet" >&2; exit 1; }
 	$(BIN)/python -m benchmarks.validation
 
 constraints: ## Renew the pinned versions in constraints.txt
