@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, ParamSpec
 import typer
 
 from campaigns.errors import CampaignError
+from marsyard.terrain_command import app as terrain
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -28,6 +29,7 @@ app = typer.Typer(
     epilog="Exit status: 0 every requirement met, or none asked; 1 a requirement failed, or a case crashed; "
     "2 the command or a file is wrong; 3 not enough cases to say.",
 )
+app.add_typer(terrain, name="terrain")
 
 
 class Exit(IntEnum):

@@ -14,6 +14,8 @@ from sim.terrain.landforms.ground import Ground, finer
 
 #: Side of the grid on which the surround is bent to meet the real terrain.
 BENDING_SIDE = 128
+#: Samples along a side of the largest terrain.
+LARGEST_SIDE = 8192
 #: Pixels beside missing ones that resampling has mixed with black.
 TORN_EDGE_PX = 3
 
@@ -127,6 +129,18 @@ def _tone(
     spline = RectBivariateSpline(posts_y, posts_x, logarithm, kx=1, ky=1)
     tone = spline(np.clip(y, posts_y[0], posts_y[-1]), np.clip(x, posts_x[0], posts_x[-1]))
     return tone.astype(np.float32), holes
+
+
+def grid_for(source: RealTerrain) -> tuple[int, float]:
+    """Samples and spacing of a terrain that holds the file's at its own posting, with a surround. TerrainFileError."""
+    raster, _ = read_rasters(source)
+    wanted = 1.5 * max(raster.values.shape)
+    samples = 64
+    while samples < wanted:
+        samples *= 2
+    if samples > LARGEST_SIDE:
+        raise TerrainFileError(f"{source.dtm} has {max(raster.values.shape)} posts along a side; at most 5461 fit")
+    return samples, raster.posting_m
 
 
 #: Heights and tones finer than a DTM's posting.

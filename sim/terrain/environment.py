@@ -48,9 +48,9 @@ class Environment(BaseModel):
         mu = max(float(np.sin(sun_elevation_rad)), LOWEST_SUN_SINE)
         k = np.sqrt(3.0 * (1.0 - albedo) * (1.0 - albedo * asymmetry))
         p = np.sqrt(3.0 * (1.0 - albedo) / (1.0 - albedo * asymmetry))
-        # unit solar flux pi F = 1 is written as F = 1 / pi; pi is put back at the end
-        alpha = 0.75 * albedo * mu * (1.0 + asymmetry * (1.0 - albedo)) / (1.0 - (k * mu) ** 2)
-        beta = 0.5 * albedo * (1.0 + 3.0 * asymmetry * (1.0 - albedo) * mu**2) / (1.0 - (k * mu) ** 2)
+        # intensity I + I1 cos(angle from the nadir) for a solar flux of pi, particular solution -alpha, -beta
+        alpha = 0.75 * albedo * mu**2 * (1.0 + asymmetry * (1.0 - albedo)) / (1.0 - (k * mu) ** 2)
+        beta = 0.75 * albedo * mu * (1.0 + 3.0 * asymmetry * (1.0 - albedo) * mu**2) / (1.0 - (k * mu) ** 2)
         # I = C1 e^-kt + C2 e^kt - alpha e^-t/mu, I1 = p (C1 e^-kt - C2 e^kt) - beta e^-t/mu; no diffuse light comes
         # down at the top (I + 2/3 I1 = 0) nor up from the ground (I - 2/3 I1 = 0)
         two_thirds = 2.0 / 3.0

@@ -108,7 +108,7 @@ def _read_geotiff(path: Path) -> Raster:
         import rasterio
     except ImportError as error:
         raise TerrainFileError(
-            f"{path}: reading GeoTIFF needs rasterio, which is not installed; run: pip install 'marsyard[geo]'"
+            f"{path}: reading GeoTIFF needs rasterio, which is not installed: pip install rasterio (extra 'geo')"
         ) from error
     with rasterio.open(path) as file:
         values = file.read(1, masked=True).astype(np.float64).filled(np.nan)

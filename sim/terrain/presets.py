@@ -51,13 +51,13 @@ PISGAH = Site(
     rock_texture=texture(0.2, 0.001, 0.06),
     descent=TerrainParameters(
         hurst=0.95,
-        rms_slope_deg=2.4,
+        rms_slope_deg=2.65,
         slope_baseline_m=90.0,
         outer_scale_m=2500.0,
         craters_per_km2=0.0,
         albedo=0.1,
         albedo_contrast=0.05,
-        lava=Lava(lobe_thickness_m=1.25),
+        lava=Lava(lobe_thickness_m=0.9, layers=2.2, aa_relief_m=0.35),
         rocks=RockParameters(abundance=0.15, smallest_m=1.5),
     ),
     ground=ROVER_GROUND.model_copy(
@@ -153,7 +153,7 @@ GUSEV = Site(
     rock_texture=texture(0.2, 0.001, 0.07),
     descent=TerrainParameters(
         hurst=0.75,
-        rms_slope_deg=1.6,
+        rms_slope_deg=1.7,
         craters_per_km2=80.0,
         albedo=0.22,
         albedo_contrast=0.09,
@@ -178,7 +178,7 @@ MERIDIANI = Site(
     rock_texture=texture(0.2, 0.001, 0.07),
     descent=TerrainParameters(
         hurst=0.8,
-        rms_slope_deg=1.7,
+        rms_slope_deg=1.8,
         craters_per_km2=25.0,
         albedo=0.14,
         albedo_contrast=0.08,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
 from sim.terrain.surface import ALBEDO, HEIGHT, Surface
 
@@ -42,48 +42,56 @@ class TerrainStatistics:
     contrast: float
 
 
-def terrain_statistics(surface: Surface) -> TerrainStatistics:
-    """All figures of a terrain. Raises ValueError where it is too small for a baseline of 90 m."""
-    base = surface.levels[0]
+#: West, south, east and north borders of a part of a terrain, metres.
+Area = tuple[float, float, float, float]
+
+
+def terrain_statistics(surface: Surface, area: Area | None = None) -> TerrainStatistics:
+    """All figures of a terrain, or of a part of it; a slope is NaN where that is too small for its baseline."""
+    base = _part(surface.levels[0], surface.spacing_m, area)
     return TerrainStatistics(
         albedo=float(base[..., ALBEDO].mean(dtype=np.float64)),
-        mean_slope_30_m_deg=mean_slope_deg(surface, 30.0),
-        mean_slope_90_m_deg=mean_slope_deg(surface, 90.0),
+        mean_slope_30_m_deg=mean_slope_deg(surface, 30.0, area),
+        mean_slope_90_m_deg=mean_slope_deg(surface, 90.0, area),
         relief_m=float(np.ptp(base[..., HEIGHT])),
-        contrast=image_contrast(surface, CONTRAST_PIXEL_M),
+        contrast=image_contrast(surface, CONTRAST_PIXEL_M, area),
     )
 
 
-def mean_slope_deg(surface: Surface, baseline_m: float) -> float:
+def mean_slope_deg(surface: Surface, baseline_m: float, area: Area | None = None) -> float:
     """Mean absolute slope along lines to the east and to the north over a baseline, degrees.
 
     The slope from a terrain model's posts a baseline apart, ``atan(|z(x + L) - z(x)| / L)``: the bidirectional slope of
     the MER landing site studies (Golombek et al. 2003; Kirk et al. 2003). The slope of a plane's steepest
-    descent is larger, on average by a factor of pi / 2 for small slopes in random directions.
+    descent is larger, on average by a factor of pi / 2 for small slopes in random directions. NaN where the terrain
+    is not twice as wide as the baseline.
     """
-    if baseline_m >= surface.period_m / 2.0:
-        raise ValueError(
-            f"the terrain repeats after {surface.period_m:g} m: too small for a baseline of {baseline_m:g}"
-        )
-    z, spacing = _posts(surface, baseline_m / 8.0)
-    lag = round(baseline_m / spacing)
-    total = 0.0
-    for axis in (0, 1):
-        rise = np.abs(np.roll(z, -lag, axis=axis) - z) / (lag * spacing)
-        total += float(np.degrees(np.arctan(rise)).mean(dtype=np.float64))
-    return total / 2.0
-
-
-def _posts(surface: Surface, finest_m: float) -> tuple[Float32[np.ndarray, "rows columns"], float]:
-    """Heights at the posts of level 0, thinned until they are about `finest_m` apart, and their distance."""
     step = 1
-    while surface.spacing_m * 2 * step <= finest_m:
+    while surface.spacing_m * 2 * step <= baseline_m / 8.0:
         step *= 2
-    return surface.levels[0][::step, ::step, HEIGHT], surface.spacing_m * step
+    spacing = surface.spacing_m * step
+    z = _part(surface.levels[0][::step, ::step, HEIGHT], spacing, area)
+    lag = round(baseline_m / spacing)
+    if lag < 1 or 2 * lag > min(z.shape):
+        return float("nan")
+    if area is None:
+        rises = [np.roll(z, -lag, axis=axis) - z for axis in (0, 1)]
+    else:
+        rises = [z[lag:] - z[:-lag], z[:, lag:] - z[:, :-lag]]
+    slopes = [np.degrees(np.arctan(np.abs(rise) / (lag * spacing))).mean(dtype=np.float64) for rise in rises]
+    return float(np.mean(slopes))
 
 
-def image_contrast(surface: Surface, pixel_m: float) -> float:
-    """RMS over mean of the brightness seen from straight above, over the whole terrain.
+def _part(values: np.ndarray, spacing_m: float, area: Area | None) -> np.ndarray:
+    """The samples within an area, rows and columns first."""
+    if area is None:
+        return values
+    west, south, east, north = (border / spacing_m for border in area)
+    return values[int(np.ceil(south)) : int(north) + 1, int(np.ceil(west)) : int(east) + 1]
+
+
+def image_contrast(surface: Surface, pixel_m: float, area: Area | None = None) -> float:
+    """RMS over mean of the brightness seen from straight above, over the whole terrain or a part of it.
 
     Each pixel takes slope and albedo of the pyramid's level whose samples are about as far apart as pixels. The
     brightness is Lunar-Lambert's under the sun 45 deg high in the west and an even sky; shadows and
@@ -91,7 +99,8 @@ def image_contrast(surface: Surface, pixel_m: float) -> float:
     """
     level = min(max(round(np.log2(pixel_m / surface.spacing_m)), 0), len(surface.levels) - 1)
     picture = nadir_picture(surface, level, np.radians(270.0), np.radians(CONTRAST_SUN_ELEVATION_DEG))
-    return float(picture.std() / picture.mean())
+    seen = _part(picture, surface.spacing_m * 2.0**level, area)
+    return float(seen.std() / seen.mean())
 
 
 def nadir_picture(

@@ -56,6 +56,7 @@ class Ramp(LandformParameters):
         bend = 0.1 * self.length_m
         climb = np.clip((0.5 * self.length_m + bend / 2.0 - np.abs(place - 0.25 * period)) / bend, 0.0, 1.0)
         fall = np.clip((0.5 * self.length_m + bend / 2.0 - np.abs(place - 0.75 * period)) / bend, 0.0, 1.0)
-        profile = np.cumsum(climb - fall) * ground.spacing_m * np.tan(np.radians(self.slope_deg))
+        rise = climb - fall
+        profile = (np.cumsum(rise) - 0.5 * rise) * ground.spacing_m * np.tan(np.radians(self.slope_deg))
         profile = (profile - profile.mean()).astype(np.float32)
         np.add(ground.height, profile[None, :] if self.uphill == "east" else profile[:, None], out=ground.height)

@@ -1,0 +1,187 @@
+"""Real terrain from files: heights at the posts, holes filled and counted, blended into a periodic surround."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
+from sim.terrain.embedding import embed, grid_for
+from sim.terrain.imported import RealTerrain, TerrainFileError, filled, read_rasters
+
+ROWS, COLUMNS = 90, 110
+
+
+def dem() -> np.ndarray:
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    return 100.0 + 3.0 * np.sin(x / 9.0) + 2.0 * np.cos(y / 7.0) + 0.05 * x
+
+
+@pytest.fixture
+def npz(tmp_path: Path) -> Path:
+    """Row 0 in the north; a hole of six posts; a picture twice as dense, brighter to the east."""
+    heights = dem().astype(np.float32)
+    heights[40:42, 50:53] = np.nan
+    picture = np.broadcast_to(np.linspace(80, 160, 2 * COLUMNS), (2 * ROWS, 2 * COLUMNS)).astype(np.uint8).copy()
+    valid = np.ones(picture.shape, dtype=bool)
+    valid[:4] = False
+    path = tmp_path / "tile.npz"
+    np.savez(path, dem=heights, dem_gsd=1.0, ortho=picture, ortho_gsd=0.5, ortho_valid=valid)
+    return path
+
+
+def around(source: RealTerrain, **changes: object) -> TerrainParameters:
+    values: dict[str, object] = {
+        "samples": 256,
+        "spacing_m": 1.0,
+        "craters_per_km2": 0.0,
+        "outer_scale_m": 100.0,
+        "source": source,
+        **changes,
+    }
+    return TerrainParameters(**values)
+
+
+def made(parameters: TerrainParameters) -> Surface:
+    return synthesise(parameters, np.random.default_rng(1))
+
+
+def test_the_surface_passes_through_the_posts(npz: Path) -> None:
+    source = RealTerrain(dtm=npz, border_m=10.0, roughen=False)
+    extent = embed(source, 256, 1.0).extent
+    assert (extent.holes, extent.ortho_holes) == (6, 8 * COLUMNS)
+    surface = made(around(source))
+    whole, _ = filled(read_rasters(source)[0].values)
+    x, y = np.meshgrid(extent.west_m + np.arange(11, COLUMNS - 11), extent.south_m + np.arange(11, ROWS - 11))
+    expected = whole[11:-11, 11:-11] - whole.mean()
+    np.testing.assert_allclose(surface.height(x, y), expected, atol=1e-4)
+    # north is up: the file's first row is the northernmost
+    np.testing.assert_allclose(whole[-1], dem()[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("spacing_m", [0.5, 1.5])
+def test_resampling_keeps_the_heights(npz: Path, spacing_m: float) -> None:
+    source = RealTerrain(dtm=npz, border_m=10.0, roughen=False)
+    surface = made(around(source, samples=512 if spacing_m < 1 else 128, spacing_m=spacing_m))
+    extent = embed(source, surface.levels[0].shape[0], spacing_m).extent
+    x, y = np.meshgrid(np.arange(15.0, 45.0), np.arange(15.0, 35.0))
+    expected = 3.0 * np.sin(x / 9.0) + 2.0 * np.cos((ROWS - 1 - y) / 7.0) + 0.05 * x + 100.0
+    ours = surface.height(extent.west_m + x, extent.south_m + y)
+    # smooth terrain with waves of 44 m and more: cubic interpolation is good to centimetres
+    np.testing.assert_allclose(ours - ours.mean(), expected - expected.mean(), atol=0.02)
+
+
+def test_the_seam_has_no_step(npz: Path) -> None:
+    source = RealTerrain(dtm=npz, border_m=15.0)
+    surface = made(around(source, rms_slope_deg=3.0))
+    x, y = np.meshgrid(np.arange(256.0), np.arange(256.0))
+    slope = np.degrees(np.arctan(np.hypot(*np.moveaxis(surface.gradient(x, y), -1, 0))))
+    # the DTM's own slopes reach 25 deg; a step of a metre between two posts would be 45 deg
+    assert slope.max() < 42.0
+
+
+def test_detail_below_the_posting_is_added_where_asked_for(npz: Path) -> None:
+    smooth, rough = (
+        made(around(RealTerrain(dtm=npz, roughen=r), samples=1024, spacing_m=0.25, rms_slope_deg=4.0))
+        for r in (False, True)
+    )
+    middle = np.s_[480:560, 480:560, 0]
+    added = rough.levels[0][middle] - smooth.levels[0][middle]
+    assert 0.003 < added.std() < 0.3
+    assert abs(added.mean()) < 0.2 * added.std(), "nothing above the posting"
+
+
+def test_brightness_comes_from_the_picture_moved_back_by_its_offset(npz: Path) -> None:
+    source = RealTerrain(dtm=npz, border_m=5.0, roughen=False)
+    surface = made(around(source, albedo=0.2, albedo_contrast=0.0))
+    extent = embed(source, 256, 1.0).extent
+    along = surface.albedo(extent.west_m + np.arange(10.0, 100.0), np.full(90, extent.south_m + 40.0))
+    assert along[-1] / along[0] == pytest.approx((80 + 80 * 99.5 / 110) / (80 + 80 * 9.5 / 110), rel=0.02)
+    moved = made(around(source.model_copy(update={"ortho_east_m": 8.0}), albedo=0.2, albedo_contrast=0.0))
+    shifted = moved.albedo(extent.west_m + np.arange(10.0, 90.0), np.full(80, extent.south_m + 40.0))
+    np.testing.assert_allclose(shifted, along[8:88], rtol=0.02)
+
+
+def test_a_file_that_changes_makes_another_terrain(npz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path / "cache"))
+    bank = TerrainBank(around(RealTerrain(dtm=npz)), seed=1)
+    extent = bank.real_extent()
+    assert extent is not None
+    assert extent.holes == 6
+    before = bank.terrain(0).levels[0].tobytes()
+    np.savez(npz, dem=dem() * 2.0, dem_gsd=1.0)
+    assert bank.terrain(0).levels[0].tobytes() != before
+
+
+def test_the_hirise_tile_works(shared_data: Path) -> None:
+    """Its ortho lies about 2 m east and 1 m south of its heights."""
+    source = RealTerrain(
+        dtm=shared_data / "gale_hirise" / "gale_1m_dem_0p5m_ortho.npz", ortho_east_m=2.0, ortho_north_m=-1.0
+    )
+    assert grid_for(source) == (1024, 1.0)
+    surface = made(around(source, samples=512))
+    extent = embed(source, 512, 1.0).extent
+    assert (extent.east_m - extent.west_m, extent.north_m - extent.south_m) == (347.0, 336.0)
+    inside = surface.levels[0][100:400, 100:400, 0]
+    assert np.ptp(inside) == pytest.approx(-4437.883 + 4472.67, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"dem": np.zeros((9, 9))}, "lacks dem_gsd"),
+        ({"dem": np.zeros(9), "dem_gsd": 1.0}, r"grid of shape \(9,\)"),
+        ({"dem": np.full((9, 9), np.nan), "dem_gsd": 1.0}, "no valid height"),
+        ({"dem": np.zeros((400, 9)), "dem_gsd": 1.0}, r"choose more terrain\.samples"),
+        ({"dem": np.zeros((9, 9)), "dem_gsd": 1.0}, "leaves nothing of it"),
+    ],
+)
+def test_says_what_is_wrong_with_a_file(tmp_path: Path, content: dict[str, object], message: str) -> None:
+    path = tmp_path / "wrong.npz"
+    np.savez(path, **content)  # type: ignore[arg-type]
+    with pytest.raises(TerrainFileError, match=message):
+        embed(RealTerrain(dtm=path), 256, 1.0)
+
+
+def test_says_that_a_file_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(TerrainFileError, match="does not exist"):
+        read_rasters(RealTerrain(dtm=tmp_path / "none.npz"))
+
+
+def test_says_what_to_install_for_geotiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "dtm.tif").write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    with pytest.raises(TerrainFileError, match="pip install rasterio"):
+        read_rasters(RealTerrain(dtm=tmp_path / "dtm.tif"))
+
+
+# affine warns about its own operators
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
+def test_reads_geotiff_in_its_own_units_with_holes(tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    heights = dem().astype(np.float32)
+    heights[3, 4] = -9999.0
+    path = tmp_path / "dtm.tif"
+    profile = {
+        "driver": "GTiff",
+        "height": ROWS,
+        "width": COLUMNS,
+        "count": 1,
+        "dtype": "float32",
+        "nodata": -9999.0,
+        "crs": "EPSG:32611",
+        "transform": rasterio.transform.from_origin(5000.0, 9000.0, 2.0, 2.0),
+    }
+    with rasterio.open(path, "w", **profile) as file:
+        file.write(heights, 1)
+    raster, ortho = read_rasters(RealTerrain(dtm=path))
+    assert ortho is None
+    assert raster.posting_m == 2.0
+    assert (raster.west_m, raster.south_m) == (5001.0, 9000.0 - 2.0 * ROWS + 1.0)
+    assert np.isnan(raster.values[ROWS - 4, 4])
+    np.testing.assert_allclose(raster.values[-1], heights[0])
+    with rasterio.open(path, "r+") as file:
+        file.crs = "EPSG:4326"
+    with pytest.raises(TerrainFileError, match="in degrees"):
+        read_rasters(RealTerrain(dtm=path))

@@ -1,0 +1,210 @@
+"""Landforms: each has the shape it promises, and none disturbs another."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from sim.terrain import TerrainParameters, synthesise
+from sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
+from sim.terrain.landforms.ground import finer, smooth_pair
+from sim.terrain.statistics import mean_slope_deg
+from sim.terrain.substreams import substream
+
+SMOOTH = TerrainParameters(samples=512, rms_slope_deg=0.0, craters_per_km2=0.0, albedo_contrast=0.0)
+
+
+def made(**changes: object) -> TerrainParameters:
+    return SMOOTH.model_copy(update=changes)
+
+
+def heights(parameters: TerrainParameters, seed: int = 1) -> np.ndarray:
+    return synthesise(parameters, np.random.default_rng(seed)).levels[0][..., 0].astype(np.float64)
+
+
+ALL = {
+    "dunes": Dunes(),
+    "ripples": Dunes(wavelength_m=20.0, height_m=0.8),
+    "lava": Lava(),
+    "fans": Fans(radius_m=250.0, apex_spacing_m=150.0, divides=1, polygons=Playa(polygon_m=30.0)),
+    "playa": Playa(),
+    "swell": Swell(relief_m=30.0),
+    "ramp": Ramp(length_m=200.0),
+    "gullies": Gullies(width_m=20.0, length_m=200.0, per_km2=20.0),
+}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_same_seed_same_bytes_and_another_seed_others(name: str) -> None:
+    parameters = made(**{name: ALL[name]})
+    first, again, other = heights(parameters), heights(parameters), heights(parameters, seed=2)
+    assert first.tobytes() == again.tobytes()
+    assert np.isfinite(first).all()
+    assert np.ptp(first) > 0.0
+    assert (name == "ramp") == np.array_equal(first, other)
+
+
+@pytest.mark.parametrize("name", ["dunes", "lava", "swell", "ramp", "gullies", "playa"])
+def test_adding_a_landform_changes_no_other(name: str) -> None:
+    """Heights add up: with all else the same, a landform contributes the same whatever else is there."""
+    rough = made(rms_slope_deg=2.0, ripples=ALL["ripples"])
+    contribution = heights(made(**{name: ALL[name]}))
+    difference = heights(rough.model_copy(update={name: ALL[name]})) - heights(rough)
+    np.testing.assert_allclose(difference, contribution, atol=1e-3)
+
+
+def test_bytes_do_not_depend_on_the_number_of_threads() -> None:
+    program = (
+        "import hashlib, numpy as np\n"
+        "from sim.terrain import TerrainParameters, synthesise\n"
+        "from sim.terrain.landforms import *\n"
+        "p = TerrainParameters(samples=256, dunes=Dunes(), lava=Lava(), swell=Swell(), playa=Playa())\n"
+        "print(hashlib.sha256(synthesise(p, np.random.default_rng(5)).levels[0].tobytes()).hexdigest())\n"
+    )
+    hashes = set()
+    for threads in ("1", "4"):
+        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+        environment = {**os.environ, **dict.fromkeys(names, threads)}
+        ended = subprocess.run(
+            [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+        )
+        hashes.add(ended.stdout.strip())
+    assert len(hashes) == 1
+
+
+def test_dunes_have_their_wavelength_height_and_slip_faces() -> None:
+    dunes = Dunes(wavelength_m=64.0, height_m=4.0, wind_from_deg=270.0, crest_length=6.0, regularity=4.0)
+    surface = synthesise(made(samples=1024, spacing_m=1.0, dunes=dunes), np.random.default_rng(3))
+    z = surface.levels[0][..., 0].astype(np.float64)
+    power = (np.abs(np.fft.rfft(z, axis=1)) ** 2).mean(axis=0)
+    assert np.argmax(power[1:]) + 1 == pytest.approx(1024 / 64, abs=1.5)
+    # downwind is east: the lee slopes are the steepest, at the angle of repose, and face east
+    x, y = np.meshgrid(np.arange(0, 1024, 0.5), np.arange(0, 1024, 16.0))
+    slope = surface.gradient(x, y)[..., 0]
+    steepest = np.degrees(np.arctan(-np.quantile(slope, 0.01)))
+    assert 30.0 <= steepest <= 34.0
+    assert np.degrees(np.arctan(slope.max())) < 20.0, "the stoss is gentle"
+    assert np.mean(slope > 0) > 0.7, "the stoss takes most of the wavelength"
+
+
+def test_dunes_end_in_defects_without_steps() -> None:
+    """Where crests fork the height is continuous: no slope much beyond that of the slip faces."""
+    dunes = Dunes(wavelength_m=60.0, height_m=3.0, crest_length=1.8, regularity=0.9)
+    surface = synthesise(made(samples=1024, spacing_m=1.0, dunes=dunes), np.random.default_rng(3))
+    x, y = np.meshgrid(np.arange(0, 1024, 1.0), np.arange(0, 1024, 1.0))
+    slope = np.degrees(np.arctan(np.hypot(*np.moveaxis(surface.gradient(x, y), -1, 0))))
+    # at forks crests crowd together, and slip faces are a little steeper there
+    assert np.quantile(slope, 0.9999) < 42.0
+    assert slope.max() < 55.0
+
+
+def test_wind_turns_the_crests() -> None:
+    crests_north = heights(made(dunes=Dunes(wavelength_m=60.0, wind_from_deg=270.0)))
+    crests_east = heights(made(dunes=Dunes(wavelength_m=60.0, wind_from_deg=180.0)))
+
+    def rough_along(z: np.ndarray, axis: int) -> float:
+        return float(np.abs(np.roll(z, -20, axis=axis) - z).mean())
+
+    assert rough_along(crests_north, 1) > 2 * rough_along(crests_north, 0)
+    assert rough_along(crests_east, 0) > 2 * rough_along(crests_east, 1)
+
+
+def test_lava_is_rough_at_metres_and_gentle_beyond() -> None:
+    surface = synthesise(made(samples=1024, lava=Lava()), np.random.default_rng(1))
+    assert mean_slope_deg(surface, 6.0) > 2.5 * mean_slope_deg(surface, 90.0)
+    assert mean_slope_deg(surface, 90.0) < 2.0
+
+
+@pytest.mark.parametrize("slope_deg", [8.0, 17.5, 25.0])
+@pytest.mark.parametrize("uphill", ["east", "north"])
+def test_a_ramp_has_its_slope_where_told(slope_deg: float, uphill: str) -> None:
+    ramp = Ramp(slope_deg=slope_deg, length_m=20.0, uphill=uphill)
+    surface = synthesise(made(spacing_m=0.2, ramp=ramp), np.random.default_rng(0))
+    period = surface.period_m
+    along = np.linspace(0.25 * period - 8.5, 0.25 * period + 8.5, 50)
+    across = np.linspace(0.0, period, 50)
+    place = (along, across) if uphill == "east" else (across, along)
+    gradient = surface.gradient(*place)
+    forward, sideways = (0, 1) if uphill == "east" else (1, 0)
+    np.testing.assert_allclose(np.degrees(np.arctan(gradient[:, forward])), slope_deg, atol=0.05)
+    np.testing.assert_allclose(gradient[:, sideways], 0.0, atol=1e-4)
+    level = surface.gradient(*((0.0, 5.0) if uphill == "east" else (5.0, 0.0)))
+    np.testing.assert_allclose(level, 0.0, atol=1e-4)
+
+
+def test_a_swell_has_its_relief() -> None:
+    assert np.ptp(heights(made(swell=Swell(relief_m=120.0)))) == pytest.approx(120.0, rel=0.01)
+
+
+def test_fans_slope_down_to_an_almost_level_playa() -> None:
+    fans = Fans(radius_m=250.0, apex_spacing_m=150.0, divides=1, slope_deg=4.0, washes_per_fan=0)
+    surface = synthesise(made(samples=512, rms_slope_deg=1.0, fans=fans), np.random.default_rng(2))
+    x = np.linspace(0.0, surface.period_m, 200)
+    on_fan = np.degrees(np.arctan(np.abs(surface.gradient(x, np.full_like(x, 110.0))[:, 1])))
+    on_playa = surface.gradient(x, np.full_like(x, 384.0))
+    assert 2.0 < np.median(on_fan) < 5.0
+    assert np.degrees(np.arctan(np.abs(on_playa))).mean() < 0.2
+    albedo_fan, albedo_playa = surface.albedo(x, np.full_like(x, 110.0)), surface.albedo(x, np.full_like(x, 384.0))
+    assert np.log(albedo_fan.mean() / albedo_playa.mean()) == pytest.approx(fans.fan_contrast, abs=0.02)
+
+
+def test_gullies_have_steep_walls() -> None:
+    gullies = Gullies(width_m=6.0, wall_slope_deg=35.0, per_km2=400.0, length_m=60.0)
+    surface = synthesise(made(spacing_m=0.25, samples=512, gullies=gullies), np.random.default_rng(1))
+    x, y = np.meshgrid(np.arange(0, 128, 0.25), np.arange(0, 128, 0.25))
+    slope = np.degrees(np.arctan(np.hypot(*np.moveaxis(surface.gradient(x, y), -1, 0))))
+    assert 25.0 < np.quantile(slope, 0.995) < 45.0
+    z = surface.levels[0][..., 0]
+    assert np.mean(z > -0.01) > 0.4, "between them the ground is untouched"
+    assert z.min() < -1.0
+
+
+def test_refinement_keeps_the_surface_exactly() -> None:
+    rng = np.random.default_rng(0)
+    coarse = rng.normal(size=(16, 16)).astype(np.float32)
+    fine = finer(coarse, 64)
+    x, y = rng.uniform(0, 16, 200), rng.uniform(0, 16, 200)
+    theirs = map_coordinates(coarse.astype(float), [y, x], order=3, mode="grid-wrap", prefilter=False)
+    ours = map_coordinates(fine.astype(float), [4 * y, 4 * x], order=3, mode="grid-wrap", prefilter=False)
+    np.testing.assert_allclose(ours, theirs, atol=2e-6)
+
+
+def test_smooth_pair_has_unit_power() -> None:
+    powers = [
+        np.mean(np.sum(smooth_pair(100.0, 4.0, 8.0, 0.3, np.random.default_rng(s)) ** 2.0, axis=2)) for s in range(30)
+    ]
+    assert np.mean(powers) == pytest.approx(1.0, abs=0.05)
+
+
+def test_landforms_on_a_coarser_grid_come_back_in_place() -> None:
+    ground = Ground(np.zeros((64, 64), np.float32), np.zeros((64, 64), np.float32), 1.0)
+    part = ground.coarser(4.0)
+    assert (part.side, part.spacing_m, part.period_m) == (16, 4.0, 64.0)
+    part.height[4, 8] = 1.0
+    ground.add(part)
+    assert np.unravel_index(ground.height.argmax(), (64, 64)) == (16, 32)
+
+
+def test_substreams_depend_on_their_name_alone() -> None:
+    rng = np.random.default_rng(7)
+    first = substream(rng, "dunes").random(3)
+    rng.random(100)
+    rng.spawn(2)
+    np.testing.assert_array_equal(substream(rng, "dunes").random(3), first)
+    assert not np.array_equal(substream(rng, "lava").random(3), first)
+    assert not np.array_equal(substream(np.random.default_rng(8), "dunes").random(3), first)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"dunes": Dunes(wavelength_m=5000.0)}, r"dunes\.wavelength_m is 5000"),
+        ({"ramp": Ramp(length_m=2000.0)}, r"ramp\.length_m is 2000"),
+    ],
+)
+def test_refuses_landforms_that_do_not_fit(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        synthesise(made(**wrong), np.random.default_rng(0))

@@ -1,0 +1,196 @@
+import numpy as np
+import pytest
+import trimesh
+from pydantic import ValidationError
+from scipy.spatial import cKDTree
+
+from sim.terrain import PlacedRock, RockField, RockParameters, Surface
+from sim.terrain.rocks.population import covered_share, draw_diameters, rocks_per_m2
+from sim.terrain.rocks.shapes import COARSE, FINE, FINEST, MEDIUM, SHAPES, UNIT_HEIGHT, rock_shapes
+
+TARGET = PlacedRock(name="target", east_m=3.0, north_m=60.0, diameter_m=1.5, shape=4, yaw_deg=30.0)
+
+
+@pytest.fixture(scope="module")
+def ground() -> Surface:
+    """A bumpy ground of 64 m, its slopes up to 20 deg."""
+    side, spacing = 256, 0.25
+    turn = 2 * np.pi * np.arange(side) / side
+    samples = np.full((side, side, 2), 0.2, dtype=np.float32)
+    samples[..., 0] = np.sin(3 * turn)[None, :] * 0.9 + np.cos(2 * turn)[:, None] * 0.8
+    return Surface.from_samples(samples, spacing)
+
+
+def make(ground: Surface, seed: int = 1, **changes: object) -> RockField:
+    parameters = RockParameters(**{"abundance": 0.2, "smallest_m": 0.1, "placed": (TARGET,), **changes})
+    return RockField.on(ground, parameters, np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def field(ground: Surface) -> RockField:
+    return make(ground)
+
+
+@pytest.mark.parametrize(("detail", "triangles"), [(COARSE, 80), (MEDIUM, 320), (FINE, 1280), (FINEST, 5120)])
+def test_shapes_are_closed_and_of_unit_size(detail: int, triangles: int) -> None:
+    shapes = rock_shapes(detail)
+    for number in range(SHAPES):
+        mesh = shapes.mesh(number)
+        assert len(mesh.faces) == triangles
+        assert mesh.is_watertight
+        assert mesh.volume > 0.0
+        assert mesh.bounds[0, 2] < -0.05, "part of it is buried"
+        assert np.hypot(*shapes.vertices[number, :, :2].T).max() <= shapes.reach[number] + 1e-12
+    np.testing.assert_allclose(np.linalg.norm(shapes.normals, axis=2), 1.0, atol=1e-12)
+
+
+def test_the_finest_shapes_have_their_height_diameter_and_normals() -> None:
+    shapes = rock_shapes(FINEST)
+    azimuth = np.radians(np.arange(0, 180, 5))
+    for number in range(SHAPES):
+        vertices = shapes.vertices[number]
+        assert vertices[:, 2].max() == pytest.approx(UNIT_HEIGHT)
+        seen = vertices[vertices[:, 2] >= 0.0, :2]
+        across = np.ptp(seen @ np.stack([np.cos(azimuth), np.sin(azimuth)]), axis=0)
+        assert (across.max() + across.min()) / 2 == pytest.approx(1.0, abs=0.005)
+        # triangles cut corners: their mean normals agree but for edges
+        agreement = np.sum(shapes.mesh(number).vertex_normals * shapes.normals[number], axis=1)
+        assert np.median(agreement) > 0.999
+
+
+def test_shapes_differ() -> None:
+    vertices = rock_shapes(MEDIUM).vertices
+    for one in range(SHAPES):
+        for other in range(one):
+            assert np.abs(vertices[one] - vertices[other]).max() > 0.05
+
+
+@pytest.mark.parametrize("abundance", [0.02, 0.1, 0.4])
+def test_sizes_follow_golombek(abundance: float) -> None:
+    """The area under rocks above each diameter is the model's, within 10 %, wherever rocks are many enough to say."""
+    parameters = RockParameters(abundance=abundance, smallest_m=0.05, largest_m=10.0)
+    area = 1.5e4 if abundance > 0.02 else 1.0e5
+    diameters = draw_diameters(parameters, area, np.random.default_rng(3))
+    for least in (0.05, 0.1, 0.2, 0.4):
+        above = diameters[diameters >= least]
+        share = np.sum(np.pi / 4 * above**2) / area
+        # one sigma of a compound Poisson sum
+        sigma = np.sqrt(np.sum((np.pi / 4 * above**2) ** 2)) / area
+        expected = float(covered_share(abundance, np.array(least)))
+        assert share == pytest.approx(expected, abs=max(0.1 * expected, 3 * sigma))
+        if least < 0.2:
+            assert 3 * sigma < 0.1 * expected, "enough rocks for the bar of 10 %"
+        number = rocks_per_m2(abundance, least, 10.0) * area
+        assert above.size == pytest.approx(number, abs=max(0.02 * number, 4 * np.sqrt(number)))
+
+
+def test_no_two_rocks_overlap(field: RockField) -> None:
+    """Every pair in reach of one another, across the border as well; rocks stay apart in plan."""
+    reach = rock_shapes(COARSE).reach[field.shape] * field.diameter_m
+    tree = cKDTree(field.position_m[:, :2], boxsize=field.period_m)
+    pairs = tree.query_pairs(2 * reach.max(), output_type="ndarray")
+    apart = np.abs(field.position_m[pairs[:, 0], :2] - field.position_m[pairs[:, 1], :2])
+    apart = np.minimum(apart, field.period_m - apart)
+    assert len(pairs) > 1000
+    assert np.all(np.hypot(*apart.T) >= reach[pairs].sum(axis=1))
+
+
+def test_the_densest_ground_can_be_filled(ground: Surface) -> None:
+    field = make(ground, abundance=0.4, smallest_m=0.06, placed=())
+    covered = np.sum(np.pi / 4 * field.diameter_m**2) / field.period_m**2
+    assert covered == pytest.approx(float(covered_share(0.4, np.array(0.06))), rel=0.1)
+
+
+def test_same_seed_same_rocks_another_seed_others(ground: Surface, field: RockField) -> None:
+    again, other = make(ground), make(ground, seed=2)
+    for name in ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up"):
+        assert getattr(field, name).tobytes() == getattr(again, name).tobytes()
+    assert len(other) != len(field) or not np.array_equal(other.position_m, field.position_m)
+
+
+def test_rocks_stand_on_the_ground_along_its_normal(ground: Surface, field: RockField) -> None:
+    x, y, z = field.position_m.T
+    np.testing.assert_allclose(z, ground.height(x, y), atol=1e-12)
+    small = field.diameter_m < 0.4
+    normal = np.column_stack([-ground.gradient(x, y)[small], np.ones(small.sum())])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    np.testing.assert_allclose(field.up[small], normal, atol=1e-9)
+    assert np.all(
+        (field.height_m[1:] / field.diameter_m[1:] >= 0.35) & (field.height_m[1:] / field.diameter_m[1:] <= 0.65)
+    )
+
+
+def test_a_placed_rock_is_found_by_name_and_lies_where_told(ground: Surface, field: RockField) -> None:
+    number = field.by_name("target")
+    assert field.diameter_m[number] == 1.5
+    np.testing.assert_allclose(field.position_m[number, :2], [3.0, 60.0])
+    mesh = field.rock(number)
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert body.is_watertight
+    # along its own vertical it rises half its diameter above the ground point
+    along = (mesh.vertices - field.position_m[number]) @ field.up[number]
+    assert along.max() == pytest.approx(0.75)
+    assert along.min() < -0.1
+    with pytest.raises(KeyError, match="named rocks: target"):
+        field.by_name("adirondack")
+
+
+def test_near_returns_rocks_about_the_place_in_any_period(field: RockField) -> None:
+    home = field.near(2.0, 1.0, 9.0, detail=COARSE)
+    assert set(np.unique(home.rock_of_face)) == {
+        n
+        for n, (x, y) in enumerate(field.position_m[:, :2])
+        if np.hypot((x - 2 + 32) % 64 - 32, (y - 1 + 32) % 64 - 32) <= 9.0
+    }
+    away = field.near(2.0 - 64.0, 1.0 + 128.0, 9.0, detail=COARSE)
+    np.testing.assert_array_equal(away.rock_of_face, home.rock_of_face)
+    np.testing.assert_allclose(away.vertices - [-64.0, 128.0, 0.0], home.vertices, atol=1e-9)
+    assert home.faces.max() == len(home.vertices) - 1
+    assert len(home.rock_of_face) == len(home.faces)
+    np.testing.assert_allclose(np.linalg.norm(home.vertex_normals, axis=1), 1.0, atol=1e-12)
+
+
+def test_near_chooses_detail_by_size_over_distance_and_leaves_out_the_small(field: RockField) -> None:
+    mesh = field.near(3.0, 58.0, 30.0, smallest_m=0.3, above_m=1.5)
+    rocks, triangles = np.unique(mesh.rock_of_face, return_counts=True)
+    assert field.diameter_m[rocks].min() >= 0.3
+    assert triangles[rocks == field.by_name("target")] == 5120
+    assert triangles.min() == 80
+    nothing = field.near(3.0, 58.0, 20.0, smallest_m=90.0)
+    assert nothing.faces.shape == (0, 3)
+    assert nothing.vertices.shape == (0, 3)
+
+
+def test_a_terrain_smaller_than_the_view_repeats(field: RockField) -> None:
+    mesh = field.near(10.0, 10.0, 100.0, smallest_m=1.0, detail=COARSE)
+    _, triangles = np.unique(mesh.rock_of_face, return_counts=True)
+    assert triangles.max() > 80 * 4
+
+
+def test_faces_are_turned_outwards(field: RockField) -> None:
+    mesh = field.near(20.0, 20.0, 10.0, detail=MEDIUM)
+    corners = mesh.vertices[mesh.faces]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    smooth = mesh.vertex_normals[mesh.faces].mean(axis=1)
+    assert np.mean(np.sum(outward * smooth, axis=1) > 0.0) > 0.995
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"abundance": 0.5}, "less than or equal to 0.4"),
+        ({"smallest_m": 4.0}, "must be larger than smallest_m"),
+        ({"placed": (TARGET, TARGET)}, "names must be unique"),
+    ],
+)
+def test_refuses_impossible_rocks(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        RockParameters(**wrong)
+
+
+def test_refuses_more_rocks_than_fit_in_memory_and_unknown_shapes(ground: Surface) -> None:
+    with pytest.raises(ValueError, match=r"choose a larger rocks\.smallest_m"):
+        draw_diameters(RockParameters(abundance=0.4, smallest_m=0.01), 1.0e6, np.random.default_rng(0))
+    strange = PlacedRock(name="strange", east_m=0.0, north_m=0.0, diameter_m=1.0, shape=99)
+    with pytest.raises(ValueError, match="'strange' has shape 99"):
+        make(ground, placed=(strange,))

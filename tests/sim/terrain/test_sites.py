@@ -1,0 +1,136 @@
+"""Sites: their figures beside the field test paper's (section III.A), measured as `marsyard terrain stats` does."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from sim.terrain import Environment, Surface, TerrainParameters, site, sites, synthesise
+from sim.terrain.rocks import RockField
+from sim.terrain.sites import PAPER
+from sim.terrain.statistics import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
+
+FIELD = ("pisgah", "kelso", "ivanpah")
+MARS = ("gusev", "meridiani")
+NAMES = (*FIELD, *MARS, "mars-yard", "heli-benign", "heli-hazardous")
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict[str, TerrainStatistics]:
+    """Figures of the whole extent of 6 km, at half the density of posts: a quarter of the work."""
+    found = {}
+    for name in (*FIELD, *MARS):
+        parameters = site(name).terrain("descent")
+        halved = parameters.model_copy(
+            update={"samples": parameters.samples // 2, "spacing_m": 2 * parameters.spacing_m}
+        )
+        found[name] = terrain_statistics(synthesise(halved, np.random.default_rng(1)))
+    return found
+
+
+def test_all_sites_of_the_issue_are_there() -> None:
+    assert tuple(sites()) == NAMES
+    with pytest.raises(ValueError, match="no site is called 'jezero'; allowed: pisgah"):
+        site("jezero")
+
+
+@pytest.mark.parametrize("name", FIELD + MARS)
+def test_albedo_and_slopes_are_the_papers(name: str, measured: dict[str, TerrainStatistics]) -> None:
+    paper, figures = PAPER[name], measured[name]
+    assert paper.albedo[0] - 1e-6 <= figures.albedo <= paper.albedo[1] + 1e-6
+    least, most = paper.mean_slope_deg
+    assert least <= figures.mean_slope_30_m_deg <= most
+    assert least <= figures.mean_slope_90_m_deg <= most
+
+
+def test_kelso_rises_over_200_m_and_ivanpah_is_the_flattest(measured: dict[str, TerrainStatistics]) -> None:
+    assert measured["kelso"].relief_m > 200.0
+    for other in ("pisgah", "kelso"):
+        assert measured["ivanpah"].mean_slope_30_m_deg < measured[other].mean_slope_30_m_deg
+        assert measured["ivanpah"].mean_slope_90_m_deg < measured[other].mean_slope_90_m_deg
+
+
+def test_contrast_at_pisgah_is_like_that_at_the_mars_sites(measured: dict[str, TerrainStatistics]) -> None:
+    """'Similar to contrast measured on descent images synthesized' at most MER sites: within a third."""
+    for name in MARS:
+        assert measured["pisgah"].contrast == pytest.approx(measured[name].contrast, rel=1 / 3)
+    assert measured["pisgah"].contrast < 0.1
+
+
+def test_sites_have_what_their_users_need() -> None:
+    for one in sites().values():
+        assert one.descent is not None or one.ground is not None
+        assert one.ground_texture.amplitudes
+        assert one.rock_texture.amplitudes
+        finest = one.ground_texture.coarsest_m / 2 ** (len(one.ground_texture.amplitudes) - 1)
+        assert finest < 0.002, "texture reaches a millimetre"
+    for name in FIELD + MARS:
+        assert site(name).terrain().spacing_m == 1.5
+        assert site(name).terrain("ground").spacing_m == 0.025
+    with pytest.raises(ValueError, match="mars-yard has no terrain at the scale 'descent'"):
+        site("mars-yard").terrain("descent")
+    with pytest.raises(ValueError, match="allowed: descent, ground"):
+        site("gusev").terrain("orbit")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_grounds_can_be_made_with_their_rocks(name: str) -> None:
+    """A sixteenth of the extent each way keeps the posts, and what stands on them."""
+    parameters = site(name).terrain("ground")
+    scale = {"samples": 512} if name != "kelso" else {"samples": 1024, "spacing_m": 0.1}
+    surface = synthesise(parameters.model_copy(update=scale), np.random.default_rng(1))
+    assert np.isfinite(surface.levels[0]).all()
+    if parameters.rocks is not None:
+        field = RockField.on(surface, parameters.rocks, np.random.default_rng(1))
+        assert len(field) > 0
+
+
+def test_mean_slope_of_a_plane_wave_and_of_a_part() -> None:
+    side, spacing = 256, 2.0
+    samples = np.full((side, side, 2), 0.2, dtype=np.float32)
+    turn = 2 * np.pi * np.arange(side) / side
+    samples[..., 0] = 10.0 * np.sin(2 * turn)[None, :]
+    surface = Surface.from_samples(samples, spacing)
+    # a sine's mean absolute slope is 2 / pi of its steepest; none across it
+    steepest = 10.0 * 2 * 2 * np.pi / 512
+    assert mean_slope_deg(surface, 16.0) == pytest.approx(np.degrees(steepest * 2 / np.pi) / 2, rel=0.02)
+    # around the crossing at x = 256 m the slope is the steepest all along
+    part = mean_slope_deg(surface, 4.0, (246.0, 0.0, 266.0, 500.0))
+    assert part == pytest.approx(np.degrees(np.arctan(steepest)) / 2, rel=0.02)
+    assert np.isnan(mean_slope_deg(surface, 300.0))
+
+
+def test_contrast_of_a_level_checkered_ground_is_its_albedos() -> None:
+    samples = np.zeros((64, 64, 2), dtype=np.float32)
+    samples[..., 1] = 0.2
+    samples[:, :32, 1] = 0.1
+    assert image_contrast(Surface.from_samples(samples, 6.5), 6.5) == pytest.approx(1 / 3, rel=1e-6)
+
+
+def test_light_of_the_sky_grows_with_dust() -> None:
+    high = np.radians(45.0)
+    shares = [Environment(optical_depth=tau).sky_share(high) for tau in (0.0, 0.2, 0.5, 0.9)]
+    assert shares[0] == 0.0
+    assert all(a < b for a, b in pairwise(shares))
+    assert Environment(optical_depth=0.0).direct_share(high) == 1.0
+    # Without absorption and with isotropic scattering Eddington's approximation has a closed form: over black ground
+    # (2 + 3 mu + (2 - 3 mu) exp(-tau / mu)) / (4 + 3 tau) of the light comes through (Shettle & Weinman 1970).
+    clear = Environment(optical_depth=1.0, single_scattering_albedo=0.9999999, asymmetry=0.0)
+    for mu in (1.0, 0.5):
+        sun = np.arcsin(mu)
+        total = clear.direct_share(sun) * (mu + clear.sky_share(sun)) / mu
+        expected = (2 + 3 * mu + (2 - 3 * mu) * np.exp(-1.0 / mu)) / (4 + 3)
+        assert total == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_terrain_with_its_landforms_can_be_set_from_a_file() -> None:
+    parameters = TerrainParameters.model_validate(
+        {
+            "samples": 256,
+            "dunes": {"wavelength_m": 40.0},
+            "rocks": {"placed": [{"name": "a", "east_m": 1, "north_m": 2, "diameter_m": 0.5}]},
+        }
+    )
+    assert parameters.dunes is not None
+    assert parameters.rocks is not None
+    assert TerrainParameters.model_validate_json(parameters.model_dump_json()) == parameters
