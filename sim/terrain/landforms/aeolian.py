@@ -11,7 +11,7 @@ from sim.terrain.landforms.ground import Ground, LandformParameters, smooth_pair
 from sim.terrain.landforms.kernels import add_dunes
 
 #: Samples a slip face should have along its slope.
-SAMPLES_ON_SLIP_FACE = 3.0
+SAMPLES_ON_SLIP_FACE = 2.1
 
 
 class Dunes(LandformParameters):

@@ -85,17 +85,17 @@ class Fans(LandformParameters):
         rounding = APEX_ROUNDING * self.radius_m
         slope = float(np.tan(np.radians(self.slope_deg)))
         raise_cones(broad.height, broad.tone, broad.spacing_m, apexes, slope, self.concavity, rounding)
-        cover = finer(broad.tone, ground.side)
-        kept = np.float32(self.playa_relief) + np.float32(1.0 - self.playa_relief) * cover
+        if self.polygons is not None:
+            fissures = self.polygons.fissures(ground, rng)
+            bare = np.float32(1.0) - fitted(broad.tone, fissures.side)
+            np.multiply(fissures.height, bare, out=fissures.height)
+            np.multiply(fissures.tone, bare, out=fissures.tone)
+        kept = finer(np.float32(self.playa_relief) + np.float32(1.0 - self.playa_relief) * broad.tone, ground.side)
         np.multiply(ground.height, kept, out=ground.height)
         np.multiply(ground.tone, kept, out=ground.tone)
         broad.tone[...] *= np.float32(self.fan_contrast)
         ground.add(broad)
         if self.polygons is not None:
-            fissures = self.polygons.fissures(ground, rng)
-            bare = np.float32(1.0) - fitted(cover, fissures.side)
-            np.multiply(fissures.height, bare, out=fissures.height)
-            np.multiply(fissures.tone, bare, out=fissures.tone)
             ground.add(fissures)
         if self.washes_per_fan:
             self._add_washes(ground, apexes, rng)
