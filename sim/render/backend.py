@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
+from ctypes.util import find_library
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -28,9 +29,19 @@ class RenderingError(RuntimeError):
     """OpenGL cannot draw here; the message says why and what to do."""
 
 
+#: The library that each backend loads.
+_LIBRARIES: dict[Backend, str] = {"osmesa": "OSMesa", "egl": "EGL"}
+
+
 def default_backend() -> Backend:
-    """The backend of the environment variable ``MARSYARD_GL``, or OSMesa."""
-    wanted = os.environ.get(BACKEND_VARIABLE, "osmesa").lower()
+    """The backend of the environment variable ``MARSYARD_GL``; without it OSMesa, or EGL where only that is installed.
+
+    Recent Mesa no longer has OSMesa, so that new distributions lack it.
+    """
+    wanted = os.environ.get(BACKEND_VARIABLE, "").lower()
+    if not wanted:
+        installed = [backend for backend in BACKENDS if find_library(_LIBRARIES[backend])]
+        return installed[0] if installed else "osmesa"
     for backend in BACKENDS:
         if wanted == backend:
             return backend
@@ -208,7 +219,8 @@ def _import_pyrender(backend: Backend) -> Any:
     os.environ["PYOPENGL_PLATFORM"] = backend
     try:
         import pyrender
-    except ImportError as error:
+    # PyOpenGL meets a missing library with an AttributeError of the functions that it could not find
+    except (ImportError, AttributeError, OSError) as error:
         raise RenderingError(
             f"OpenGL through {backend} cannot be loaded ({error}); run 'marsyard doctor' to see what is missing"
         ) from error

@@ -65,6 +65,15 @@ def test_an_unknown_backend_is_named(monkeypatch) -> None:
         default_backend()
 
 
+@pytest.mark.parametrize(("installed", "chosen"), [(("OSMesa", "EGL"), "osmesa"), (("EGL",), "egl"), ((), "osmesa")])
+def test_without_a_choice_the_installed_backend_is_taken(monkeypatch, installed, chosen) -> None:
+    from sim.render import backend
+
+    monkeypatch.delenv("MARSYARD_GL", raising=False)
+    monkeypatch.setattr(backend, "find_library", lambda name: f"lib{name}.so" if name in installed else None)
+    assert backend.default_backend() == chosen
+
+
 def test_a_process_keeps_to_one_backend() -> None:
     program = (
         "from sim.render.backend import DepthRenderer, RenderingError\n"
