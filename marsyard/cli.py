@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, ParamSpec
 
 import typer
 
-from campaigns.errors import CampaignError
 from marsyard.terrain_command import app as terrain
 
 if TYPE_CHECKING:
@@ -63,6 +62,9 @@ def _says_what_is_wrong(command: Callable[Parameters, None]) -> Callable[Paramet
 
     @functools.wraps(command)
     def guarded(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        # here, so that `doctor` starts, and says so, where another package stands in for ours
+        from campaigns.errors import CampaignError
+
         try:
             command(*args, **kwargs)
         except CampaignError as error:
@@ -88,6 +90,7 @@ def run(
 ) -> None:
     """Run a campaign, judge its requirements, and write its report."""
     from campaigns.engine import run_campaign
+    from campaigns.errors import CampaignError
     from campaigns.loading import load_campaign
     from campaigns.workers import available_cores
     from marsyard.outcome import conclude
