@@ -1,0 +1,59 @@
+"""Measures the bars, prints them, and writes docs/validation.md: ``python -m benchmarks.validation [--only NAME]``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.validation import document, geometry_checks, light_checks, motion_checks
+from benchmarks.validation.records import Measure
+
+CHECKS = (*geometry_checks.CHECKS, *motion_checks.CHECKS, *light_checks.CHECKS)
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.validation", description=__doc__)
+    names = [check.name for check in CHECKS]
+    parser.add_argument("--only", action="append", choices=names, help="this check; may be given again for another")
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer samples, the same bars; nothing is kept and no page is written"
+    )
+    return parser.parse_args()
+
+
+def _print(console: Console, title: str, measures: list[Measure]) -> None:
+    table = Table(title=title, title_justify="left")
+    for column in ("claim", "bar", "measured", "", "how"):
+        table.add_column(column, overflow="fold")
+    for measure in measures:
+        verdict = "-" if measure.bar is None else ("[green]met" if measure.passed else "[bold red]missed")
+        bar = "" if measure.bar is None else document.shown(measure, measure.bar)
+        table.add_row(measure.claim, bar, document.shown(measure, measure.measured), verdict, measure.how)
+    console.print(table)
+
+
+def main() -> int:
+    arguments = _arguments()
+    console = Console()
+    measured: dict[str, list[Measure]] = {}
+    for check in CHECKS:
+        if arguments.only and check.name not in arguments.only:
+            continue
+        start = time.perf_counter()
+        measured[check.name] = list(check.run(arguments.quick))
+        _print(console, f"{check.name} ({time.perf_counter() - start:.0f} s)", measured[check.name])
+        if not arguments.quick:
+            # after each check, so that an interruption loses no more than one
+            document.write(CHECKS, document.keep({check.name: measured[check.name]}, arguments.quick))
+    missed = [measure.claim for measures in measured.values() for measure in measures if not measure.passed]
+    for claim in missed:
+        console.print(f"[bold red]missed:[/] {claim}")
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

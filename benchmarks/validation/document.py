@@ -1,0 +1,100 @@
+"""Keeps the figures as JSON and writes docs/validation.md from them and the template."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+from benchmarks.validation.records import Check, Measure
+from benchmarks.validation.scenes import renderer
+from sim.processor import processor_features
+
+ROOT = Path(__file__).parents[2]
+TEMPLATE = Path(__file__).parent / "template.md"
+DOCUMENT = ROOT / "docs" / "validation.md"
+RESULTS = ROOT / "benchmarks" / "results" / "validation.json"
+SPEED = ROOT / "benchmarks" / "results" / "descent.json"
+#: Versions that a figure can depend on.
+PACKAGES = ("marsyard", "numpy", "scipy", "numba", "pyrender2", "trimesh")
+
+
+def figure(value: float) -> str:
+    """Two significant digits; shares as per cent to two places."""
+    return f"{value:.2g}"
+
+
+def shown(measure: Measure, value: float) -> str:
+    """A value in its unit; a share that must be large is shown in per cent."""
+    if measure.sense == "at least":
+        return f"{100.0 * value:.2f} %"
+    return f"{figure(value)} {measure.unit}".strip()
+
+
+def keep(measured: dict[str, list[Measure]], quick: bool) -> dict[str, dict]:
+    """Adds these checks' figures to those kept before, and returns all."""
+    kept: dict[str, dict] = json.loads(RESULTS.read_text())["checks"] if RESULTS.exists() else {}
+    environment = _environment(quick)
+    for name, measures in measured.items():
+        kept[name] = {"environment": environment, "measures": [asdict(measure) for measure in measures]}
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps({"checks": {name: kept[name] for name in sorted(kept)}}, indent=1) + "\n")
+    return kept
+
+
+def _environment(quick: bool) -> dict[str, str]:
+    return {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {processor_features()}",
+        "gl": renderer().description(),
+        "versions": ", ".join(f"{name} {version(name)}" for name in PACKAGES),
+        "samples": "few (--quick)" if quick else "all",
+    }
+
+
+def write(checks: Sequence[Check], kept: dict[str, dict]) -> None:
+    """Writes the page; rows stand in the order of the checks, so that runs differ by their figures alone."""
+    text = TEMPLATE.read_text()
+    sections: dict[str, list[str]] = {}
+    for check in checks:
+        rows = sections.setdefault(check.section, [])
+        for stored in kept.get(check.name, {}).get("measures", []):
+            rows.append(_row(Measure(**stored)))
+    for section, rows in sections.items():
+        head = ["| claim | bar | measured | | how |", "|---|---|---|---|---|"]
+        text = text.replace("{" + section + "}", "\n".join(head + rows) if rows else "Not measured yet.")
+    text = text.replace("{environment}", _environments(checks, kept)).replace("{Speed}", _speed())
+    DOCUMENT.write_text(text)
+
+
+def _row(measure: Measure) -> str:
+    verdict = "" if measure.bar is None else ("met" if measure.passed else "**missed**")
+    bar = "reported" if measure.bar is None else f"{measure.sense} {shown(measure, measure.bar)}"
+    return f"| {measure.claim} | {bar} | {shown(measure, measure.measured)} | {verdict} | {measure.how} |"
+
+
+def _environments(checks: Sequence[Check], kept: dict[str, dict]) -> str:
+    """Where the figures are from; one line where all are from one machine."""
+    where: dict[str, list[str]] = {}
+    for check in checks:
+        if check.name in kept:
+            one = kept[check.name]["environment"]
+            text = f"{one['machine']}; OpenGL {one['gl']}; {one['versions']}; samples: {one['samples']}"
+            where.setdefault(text, []).append(check.name)
+    if not where:
+        return "Nothing has been measured yet."
+    if len(where) == 1:
+        return f"Measured on {next(iter(where))}."
+    return "\n".join(f"- {', '.join(names)}: measured on {text}." for text, names in where.items())
+
+
+def _speed() -> str:
+    if not SPEED.exists():
+        return "Not measured yet."
+    rows = ["| what | core-seconds |", "|---|---|"]
+    for name, seconds in json.loads(SPEED.read_text())["core_seconds"].items():
+        rows.append(f"| {name} | {figure(seconds)} |")
+    return "\n".join(rows)

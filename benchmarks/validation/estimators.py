@@ -1,0 +1,149 @@
+"""How far a picture's patches have moved: symmetric Gauss-Newton, and fits to the peak of the correlation.
+
+Nothing here is shared with the algorithms under test: the estimator that judges the renderer stands on its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy import ndimage
+from scipy.interpolate import BSpline
+
+#: Side of a patch and half of it, pixels.
+PATCH, HALF = 31, 15
+#: Smoothing of both pictures before they are compared, pixels.
+SIGMA_PX = 1.0
+#: Picture needed around a patch: its shift and the reach of the quintic spline.
+MARGIN = HALF + 6
+
+
+@cache
+def _quintic() -> tuple[BSpline, BSpline]:
+    basis = BSpline.basis_element(np.arange(-3.0, 4.0), extrapolate=False)
+    return basis, basis.derivative()
+
+
+def _taps(shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whole part of shifts, and the weights of the six spline coefficients around, with their derivatives."""
+    whole = np.floor(shift).astype(int)
+    away = (shift - whole)[:, None] - np.arange(-2.0, 4.0)
+    value, slope = _quintic()
+    return whole, np.nan_to_num(value(away)), np.nan_to_num(slope(away))
+
+
+class SmoothPicture:
+    """A picture smoothed by a Gaussian of one pixel, to be evaluated between its pixels by a quintic spline."""
+
+    def __init__(self, picture: np.ndarray) -> None:
+        smoothed = ndimage.gaussian_filter(picture.astype(np.float64), SIGMA_PX)
+        self._coefficients = ndimage.spline_filter(smoothed, order=5)
+
+    def patches(self, centres: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values of patches about `centres` + `shift` (both (u, v), shape (n, 2)), and their derivatives by u and v.
+
+        Shapes (n, PATCH, PATCH) and (n, 2, PATCH, PATCH).
+        """
+        columns, wu, du = _taps(shift[:, 0])
+        rows, wv, dv = _taps(shift[:, 1])
+        first_row = (centres[:, 1] + rows - HALF - 2)[:, None] + np.arange(PATCH + 5)
+        first_column = (centres[:, 0] + columns - HALF - 2)[:, None] + np.arange(PATCH + 5)
+        block = self._coefficients[first_row[:, :, None], first_column[:, None, :]]
+        along = sliding_window_view(block, 6, axis=2)
+        across_value = np.einsum("nrck,nk->nrc", along, wu)
+        across_slope = np.einsum("nrck,nk->nrc", along, du)
+        down_value = sliding_window_view(across_value, 6, axis=1)
+        value = np.einsum("nrck,nk->nrc", down_value, wv)
+        by_v = np.einsum("nrck,nk->nrc", down_value, dv)
+        by_u = np.einsum("nrck,nk->nrc", sliding_window_view(across_slope, 6, axis=1), wv)
+        return value, np.stack([by_u, by_v], axis=1)
+
+
+@dataclass(frozen=True)
+class Shifts:
+    """What symmetric Gauss-Newton found.
+
+    Attributes
+    ----------
+    found
+        (u, v) by which each patch moved from the first picture to the second, shape (n, 2).
+    response
+        Shape (n, 2, PATCH, PATCH, 2): how the estimate (first axis) answers to motion of each pixel (last axis). A
+        patch whose pixels do not all move alike is expected to be found at the sum of its pixels' motions so weighted.
+    """
+
+    found: np.ndarray
+    response: np.ndarray
+
+    def expected(self, motion: np.ndarray) -> np.ndarray:
+        """What should have been found, given each pixel's true motion, shape (n, PATCH, PATCH, 2)."""
+        return np.einsum("nirck,nrck->ni", self.response, motion)
+
+
+def symmetric_shifts(first: SmoothPicture, second: SmoothPicture, centres: np.ndarray, iterations: int = 8) -> Shifts:
+    """Shifts d that make ``first(x - d / 2) = gain * second(x + d / 2) + offset`` in each patch, by least squares."""
+    count = len(centres)
+    shift = np.zeros((count, 2))
+    gain, offset = np.ones(count), np.zeros(count)
+    for _ in range(iterations):
+        a, slope_a = first.patches(centres, -0.5 * shift)
+        b, slope_b = second.patches(centres, 0.5 * shift)
+        away = a - gain[:, None, None] * b - offset[:, None, None]
+        by_shift = 0.5 * (slope_a + gain[:, None, None, None] * slope_b)
+        design = np.concatenate(
+            [by_shift.reshape(count, 2, -1), b.reshape(count, 1, -1), np.ones((count, 1, PATCH * PATCH))], axis=1
+        )
+        normal = design @ design.transpose(0, 2, 1)
+        step = np.linalg.solve(normal, (design @ away.reshape(count, -1, 1)))[..., 0]
+        shift += np.clip(step[:, :2], -0.5, 0.5)
+        gain += step[:, 2]
+        offset += step[:, 3]
+        if np.abs(step[:, :2]).max() < 1e-5:
+            break
+    solver = np.linalg.solve(normal, design)[:, :2].reshape(count, 2, PATCH, PATCH)
+    response = solver[..., None] * by_shift.transpose(0, 2, 3, 1)[:, None]
+    return Shifts(shift, response)
+
+
+def peak_fits(first: np.ndarray, second: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts (u, v) by three-point parabolas along each axis, and by a biquadratic through 3 x 3 values.
+
+    Both fit the peak of the normalised correlation over shifts of up to two pixels.
+    """
+    reach = np.arange(-HALF, HALF + 1)
+    rows, columns = centres[:, 1, None] + reach, centres[:, 0, None] + reach
+    template = _normalised(first[rows[:, :, None], columns[:, None, :]])
+    surface = np.empty((len(centres), 5, 5))
+    for i in range(5):
+        for j in range(5):
+            moved = _normalised(second[(rows + i - 2)[:, :, None], (columns + j - 2)[:, None, :]])
+            surface[:, i, j] = np.sum(template * moved, axis=(1, 2))
+    best = surface[:, 1:4, 1:4].reshape(len(centres), -1).argmax(axis=1)
+    top, left = best // 3, best % 3
+    around = np.arange(3)
+    z = surface[
+        np.arange(len(centres))[:, None, None],
+        (top[:, None] + around)[:, :, None],
+        (left[:, None] + around)[:, None, :],
+    ]
+    whole = np.stack([left, top], axis=-1) - 1.0
+    lines = np.stack([z[:, 1, :], z[:, :, 1]], axis=1)
+    parabola = 0.5 * (lines[..., 0] - lines[..., 2]) / (lines[..., 0] - 2.0 * lines[..., 1] + lines[..., 2])
+    return whole + parabola, whole + _biquadratic(z)
+
+
+def _normalised(patches: np.ndarray) -> np.ndarray:
+    away = patches - patches.mean(axis=(1, 2), keepdims=True, dtype=np.float64)
+    return away / np.sqrt(np.sum(away**2, axis=(1, 2), keepdims=True))
+
+
+def _biquadratic(z: np.ndarray) -> np.ndarray:
+    """Top (u, v) of the quadric through 3 x 3 values by least squares."""
+    v, u = np.mgrid[-1.0:2.0, -1.0:2.0]
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(9, 6)
+    _, bu, bv, uu, uv, vv = np.linalg.pinv(terms) @ z.reshape(-1, 9).T
+    determinant = 4.0 * uu * vv - uv**2
+    return np.stack([(uv * bv - 2.0 * vv * bu) / determinant, (uv * bu - 2.0 * uu * bv) / determinant], axis=-1)

@@ -1,0 +1,198 @@
+"""The bars on light: the opposition peak, cast shadows, and the reflectance law."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
+
+from benchmarks.validation.motion import View, render
+from benchmarks.validation.raycast import Ground, meet_triangles
+from benchmarks.validation.records import Check, Measure
+from benchmarks.validation.scenes import cameras, descent_view, ground_view, renderer, rock_view
+from sim.camera import Cahv
+from sim.frames import direction, rigid
+from sim.render import Photometry, Scene, Sun, Texture
+from sim.terrain import Surface
+
+#: Brightness is then albedo times the cosine of incidence in the sun, and 0 in shadow.
+LAMBERT = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
+FLAT_ALBEDO = 0.2
+LAWS = {
+    "Lambert": Photometry(lunar_share=0.0, surge_amplitude=0.0),
+    "Mars": Photometry(),
+    "dark lava": Photometry(lunar_share=0.6, surge_amplitude=0.9, surge_width=0.08),
+    "narrow surge": Photometry(lunar_share=1.0, surge_amplitude=1.5, surge_width=0.01),
+}
+
+
+def _flat(albedo: float = FLAT_ALBEDO) -> Surface:
+    samples = np.zeros((64, 64, 2), dtype=np.float32)
+    samples[..., 1] = albedo
+    return Surface.from_samples(samples, 64.0)
+
+
+def run_opposition(quick: bool) -> Iterator[Measure]:
+    """The peak's centre, found in the picture alone, against the point opposite the sun."""
+    law = Photometry(lunar_share=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
+    rng = np.random.default_rng(3)
+    surface = _flat()
+    for name, camera in cameras().items():
+        errors = []
+        for _ in range(3 if quick else 10):
+            # the peak is put at a random pixel, the sun opposite
+            pixel = rng.uniform(0.2, 0.8, 2) * camera.size
+            turn = Rotation.align_vectors(np.array([[0.2, 0.1, -1.0]]), camera.boresight()[None])[0]
+            pose = rigid(turn, np.array([0.0, 0.0, 800.0]))
+            _, ray = camera.moved(pose).rays(pixel)
+            if ray[2] > -0.3:
+                continue
+            view = View(Scene(surface, (0.0, 0.0), Sun(-ray), law), camera, pose)
+            radiance = render(renderer(), view).radiance.astype(np.float64)
+            errors.append(np.linalg.norm(_peak(radiance) - pixel))
+        how = f"{len(errors)} suns; centre of the light above 90 % of the peak's height"
+        yield Measure(f"opposition peak from the antisolar point: {name}", max(errors), "px", 0.5, how)
+
+
+def _peak(radiance: np.ndarray) -> np.ndarray:
+    """Centre of what lies within a tenth of the peak's height of its top."""
+    weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)
+    v, u = np.mgrid[: radiance.shape[0], : radiance.shape[1]]
+    return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
+
+
+def _uniform(view: View, sun: Sun) -> View:
+    """The view under another sun, all of one albedo and Lambert's law."""
+    samples = view.scene.surface.levels[0].copy()
+    samples[..., 1] = FLAT_ALBEDO
+    scene = replace(
+        view.scene,
+        surface=Surface.from_samples(samples, view.scene.surface.spacing_m),
+        sun=sun,
+        photometry=LAMBERT,
+        objects=replace(view.scene.objects, albedo=np.full(len(view.scene.objects), FLAT_ALBEDO)),
+        ground_texture=Texture(),
+        object_texture=Texture(),
+    )
+    return replace(view, scene=scene)
+
+
+def _shadow_row(name: str, view: View, sun: Sun, count: int, farthest: float, step: float) -> Measure:
+    view = _uniform(view, sun)
+    frame = render(renderer(), view)
+    points = frame.points_world().reshape(-1, 3)
+    seen = np.flatnonzero(frame.range_m.ravel() < farthest)
+    pixels = np.random.default_rng(6).choice(seen, min(count, seen.size), replace=False)
+    points, normals = points[pixels], frame.normal.reshape(-1, 3)[pixels].astype(np.float64)
+    towards = np.asarray(sun.direction, dtype=np.float64)
+    facing = normals @ towards
+    share = frame.radiance.ravel()[pixels] / (FLAT_ALBEDO * np.maximum(facing, 1e-6))
+    ours = (facing > 0.0) & (share > 0.5)
+    ground = Ground(view.scene.surface)
+    hidden = ground.hides(points, towards, step)
+    rays = np.broadcast_to(towards, points.shape)
+    hidden |= np.isfinite(meet_triangles(view.scene.objects, points, rays, nearest=2e-3))
+    theirs = (facing > 0.0) & ~hidden
+    agree = float(np.mean(ours == theirs))
+    turned = facing <= 0.0
+    how = (
+        f"{pixels.size} random pixels, {np.mean(~theirs):.0%} dark, {np.mean(turned):.0%} turned from the sun; "
+        f"{np.mean(ours & ~theirs):.2%} wrongly lit, {np.mean(theirs & ~ours):.2%} wrongly dark"
+    )
+    return Measure(f"shadows as an independent ray cast has them: {name}", agree, "", 0.995, how, "at least")
+
+
+def run_shadows(quick: bool) -> Iterator[Measure]:
+    count = 2000 if quick else 20000
+    low, lower = (
+        Sun(direction(np.radians(110.0), np.radians(20.0))),
+        Sun(direction(np.radians(245.0), np.radians(10.0))),
+    )
+    pisgah = descent_view("pisgah", 2000.0, (1024, 1024))
+    ground_only = replace(pisgah, scene=replace(pisgah.scene, objects=pisgah.scene.objects.none()))
+    yield _shadow_row("pisgah's ground, sun at 20 deg", ground_only, low, count, 1e5, 0.4)
+    yield _shadow_row("pisgah's ground, sun at 10 deg", ground_only, lower, count, 1e5, 0.4)
+    yield _shadow_row(
+        "kelso's dunes, sun at 10 deg", descent_view("kelso", 1000.0, (1024, 1024)), lower, count, 1e5, 0.4
+    )
+    yield _shadow_row("pisgah with rocks, sun at 20 deg", pisgah, low, count // 2, 1e5, 0.4)
+    yield _shadow_row("ripples from a mast, sun at 10 deg", ground_view("gusev"), lower, count // 2, 40.0, 0.008)
+    rocks = rock_view("gusev", 5.0)
+    yield _shadow_row(
+        "rocks from a mast, sun at 30 deg", rocks, Sun(direction(0.6, np.radians(30.0))), count // 4, 40.0, 0.008
+    )
+
+
+def _single_pixel() -> Cahv:
+    """A camera of few pixels that looks straight down."""
+    return Cahv.from_field_of_view(
+        horizontal_rad=0.002,
+        size=(9, 9),
+        centre=np.zeros(3),
+        axis=np.array([0.0, 0.0, -1.0]),
+        right=np.array([1.0, 0.0, 0.0]),
+    )
+
+
+def _rendered_brightness(law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) -> float:
+    """Brightness of flat ground in the direct sun, from the middle pixel of a picture."""
+    turn = Rotation.align_vectors(-to_eye[None], np.array([[0.0, 0.0, -1.0]]))[0]
+    view = View(Scene(_flat(), (0.0, 0.0), Sun(to_sun), law), _single_pixel(), rigid(turn, 100.0 * to_eye))
+    return float(render(renderer(), view).radiance[4, 4])
+
+
+def _law(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: np.ndarray) -> np.ndarray:
+    """The law as `Photometry` states it, for unit albedo and K, written out again."""
+    g = np.arccos(np.clip(cos_g, -1.0, 1.0))
+    surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)
+    share = law.lunar_share
+    return surge * (2.0 * share * cos_i / (cos_i + cos_e) + (1.0 - share) * cos_i)
+
+
+def run_reflectance(quick: bool) -> Iterator[Measure]:
+    rng = np.random.default_rng(9)
+    pairs = 10 if quick else 40
+    for name, law in LAWS.items():
+        bare = replace(law, sky_share=0.0, surrounding_albedo=0.0)
+        away, off = [], []
+        for _ in range(pairs):
+            first, second = (
+                direction(float(rng.uniform(0.0, 2.0 * np.pi)), float(np.arcsin(rng.uniform(0.15, 1.0))))
+                for _ in range(2)
+            )
+            there, back = _rendered_brightness(bare, first, second), _rendered_brightness(bare, second, first)
+            # I/F over the cosine of incidence is pi times the bidirectional reflectance
+            away.append(abs(there / first[2] / (back / second[2]) - 1.0))
+            expected = FLAT_ALBEDO * bare.normalisation() * _law(bare, first[2], second[2], float(first @ second))
+            off.append(abs(there / expected - 1.0))
+        how = f"{pairs} pairs of sun and eye over flat ground"
+        yield Measure(f"rendered reflectance is reciprocal: {name}", max(away), "", 1e-3, how)
+        yield Measure(f"rendered brightness against the formula: {name}", max(off), "", 1e-3, how)
+        yield Measure(
+            f"spherical albedo from the stated one: {name}",
+            abs(_spherical_albedo(bare, 17 if quick else 20) * bare.normalisation() - 1.0),
+            "",
+            0.01,
+            "the law integrated over sun and eye by Sobol points",
+        )
+
+
+def _spherical_albedo(law: Photometry, log2_points: int) -> float:
+    """Share of light from all sides that the law with A = K = 1 returns, by quasi Monte Carlo.
+
+    Sun and eye are drawn in proportion to their cosines, so that the mean of I/F over the cosine of incidence is it.
+    """
+    one, two, turn = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(log2_points).T
+    cos_i, cos_e = np.sqrt(1.0 - one), np.sqrt(1.0 - two)
+    cos_g = cos_i * cos_e + np.sqrt(one * two) * np.cos(2.0 * np.pi * turn)
+    return float(np.mean(_law(law, cos_i, cos_e, cos_g) / cos_i))
+
+
+CHECKS = (
+    Check("opposition", "Light", run_opposition),
+    Check("shadows", "Light", run_shadows),
+    Check("reflectance", "Light", run_reflectance),
+)

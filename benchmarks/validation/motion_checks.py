@@ -1,0 +1,111 @@
+"""The bars on motion: over every site from 2 km, and over rock from a mast."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.validation.estimators import PATCH
+from benchmarks.validation.motion import STEPS_PX, Motion, View, measure
+from benchmarks.validation.records import Check, Measure
+from benchmarks.validation.scenes import descent_view, renderer, rock_view
+from sim.terrain.sites import sites
+
+BAR_PX, CONTROL_BAR_PX = 0.02, 0.005
+DESCENT_HEIGHT_M = 2000.0
+DISTANCES_M = (10.0, 5.0, 2.0)
+ROCK_SITE = "gusev"
+#: 256 patches of 31 x 31 from the air.
+DESCENT_SIZE = (512, 512)
+#: 210 patches, for the control of 256 samples a pixel.
+CONTROL_SIZE = (486, 455)
+CONTROL_SAMPLES = 16
+#: Where the control is taken: where an estimator that locks to pixels is worst, and halfway.
+CONTROL_STEPS_PX = np.array([0.25, 0.5])
+QUICK_STEPS_PX = np.array([0.3, 0.5, 0.8])
+
+
+def bias(errors: Sequence[np.ndarray]) -> float:
+    """Largest mean error along either axis over the steps."""
+    return float(max(np.abs(error.mean(axis=0)).max() for error in errors))
+
+
+def uncertainty(errors: Sequence[np.ndarray]) -> float:
+    """Largest standard error of those means."""
+    return float(max((error.std(axis=0, ddof=1) / np.sqrt(len(error))).max() for error in errors))
+
+
+def _row(claim: str, errors: Sequence[np.ndarray], bar: float, steps: np.ndarray) -> Measure:
+    scatter = max(error.std(axis=0, ddof=1).max() for error in errors)
+    patches = min(len(error) for error in errors)
+    how = (
+        f"{patches} patches, {len(steps)} steps from {steps[0]:.2g} to {steps[-1]:.2g} px; "
+        f"one patch scatters by {scatter:.2g} px, the mean by {uncertainty(errors):.1g} px"
+    )
+    return Measure(claim, bias(errors), "px", bar, how)
+
+
+def _fits(motions: Sequence[Motion]) -> tuple[float, float]:
+    """Largest mean errors of parabola and biquadratic; the median patch, for a parabola can run away."""
+    return tuple(  # type: ignore[return-value]
+        float(max(np.abs(np.median(getattr(motion, fit), axis=0)).max() for motion in motions))
+        for fit in ("parabola", "biquadratic")
+    )
+
+
+def run(quick: bool) -> Iterator[Measure]:
+    steps = QUICK_STEPS_PX if quick else STEPS_PX
+    fits: list[tuple[float, float]] = []
+    for name, where in sites().items():
+        if where.descent is None:
+            continue
+        motions = list(measure(renderer(), descent_view(name, DESCENT_HEIGHT_M, DESCENT_SIZE), steps))
+        fits.append(_fits(motions))
+        yield _row(f"bias of motion, {name} from 2 km", [motion.error for motion in motions], BAR_PX, steps)
+    for distance in DISTANCES_M:
+        # from 10 m the rock holds fewer than 200 patches side by side: let them overlap
+        stride = 24 if distance > 5.0 else PATCH
+        motions = list(measure(renderer(), rock_view(ROCK_SITE, distance), steps, stride=stride))
+        fits.append(_fits(motions))
+        rock = _commonest_rock(motions[0])
+        on_rock = [motion.error[motion.body == rock] for motion in motions]
+        yield _row(f"bias of motion, rock at {distance:g} m", on_rock, BAR_PX, steps)
+        around = [motion.error[motion.body != rock] for motion in motions]
+        if min(len(error) for error in around) >= 200:
+            yield _row(f"bias of motion, grazed ground and rocks around it, {distance:g} m", around, BAR_PX, steps)
+    raw = replace(rock_view(ROCK_SITE, 2.0, CONTROL_SIZE), footprint=1.0 / 64.0)
+    errors = [motion.error for motion in measure(renderer(), raw, np.array([0.25, 0.5, 0.75]))]
+    yield Measure(
+        "the same of raw point samples, rock at 2 m: what the bar catches", bias(errors), "px", None, "3 steps"
+    )
+    for index, fit in enumerate(("parabola", "biquadratic")):
+        worst = max(one[index] for one in fits)
+        yield Measure(
+            f"pixel locking of a {fit} through the correlation's peak", worst, "px", None, "of the same pictures"
+        )
+
+
+def _commonest_rock(motion: Motion) -> int:
+    rocks = motion.body[motion.body >= 0]
+    return int(np.bincount(rocks).argmax())
+
+
+def _controlled() -> Iterator[tuple[str, View]]:
+    yield "gusev from 2 km", descent_view("gusev", DESCENT_HEIGHT_M, CONTROL_SIZE)
+    yield "rock at 5 m", rock_view(ROCK_SITE, 5.0, CONTROL_SIZE)
+
+
+def run_control(quick: bool) -> Iterator[Measure]:
+    samples = 4 if quick else CONTROL_SAMPLES
+    for name, view in _controlled():
+        motions = list(measure(renderer(), view, CONTROL_STEPS_PX, samples))
+        claim = f"the estimator's own bias, {name}, {samples**2} samples a pixel"
+        yield _row(claim, [motion.error for motion in motions], CONTROL_BAR_PX, CONTROL_STEPS_PX)
+
+
+CHECKS = (
+    Check("motion", "Motion of the picture", run),
+    Check("motion-control", "Motion of the picture", run_control),
+)

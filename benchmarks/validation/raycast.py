@@ -1,0 +1,127 @@
+"""An independent ray cast: SciPy's B-spline and bisection for the ground, brute force for triangles.
+
+Nothing here is taken from the renderer: heights come from `scipy.ndimage.map_coordinates`, triangles are met by solving
+for the weights of their corners.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from sim.render import Objects
+from sim.terrain import Surface
+
+#: Rays and steps along them that are held at a time.
+BLOCK = 2_000_000
+
+
+class Ground:
+    """A surface's heights as SciPy evaluates them."""
+
+    def __init__(self, surface: Surface) -> None:
+        self._control = surface.levels[0][..., 0].astype(np.float64)
+        self._spacing = surface.spacing_m
+        self.lowest, self.highest = float(self._control.min()), float(self._control.max())
+
+    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        places = np.stack([np.ravel(y), np.ravel(x)]) / self._spacing
+        return map_coordinates(self._control, places, order=3, mode="grid-wrap", prefilter=False).reshape(np.shape(x))
+
+    def gradient(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Slopes by central differences over a hundredth of a sample."""
+        d = 0.01 * self._spacing
+        by_x = (self.height(x + d, y) - self.height(x - d, y)) / (2.0 * d)
+        by_y = (self.height(x, y + d) - self.height(x, y - d)) / (2.0 * d)
+        return np.stack([by_x, by_y], axis=-1)
+
+    def clearance(self, origins: np.ndarray, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Height of points along rays above the ground."""
+        x, y, z = (origins[:, k] + t * directions[:, k] for k in range(3))
+        return z - self.height(x, y)
+
+    def cast(self, origins: np.ndarray, directions: np.ndarray, farthest: float, step: float) -> np.ndarray:
+        """Distance of each ray to the ground, found by steps of at most `step` m and bisection; infinite if none."""
+        found = np.full(len(directions), np.inf)
+        with np.errstate(divide="ignore"):
+            above = np.where(directions[:, 2] < 0.0, (self.highest - origins[:, 2]) / directions[:, 2], 0.0)
+            below = np.where(directions[:, 2] < 0.0, (self.lowest - origins[:, 2]) / directions[:, 2], np.inf)
+        start, stop = np.clip(above, 0.0, farthest), np.clip(below, 0.0, farthest)
+        order = np.argsort(stop - start)
+        while order.size:
+            longest = float((stop - start)[order].max())
+            count = max(int(BLOCK / (longest / step + 2)), 1)
+            block, order = order[-count:], order[:-count]
+            found[block] = self._cast_block(origins[block], directions[block], start[block], stop[block], step)
+        return found
+
+    def _cast_block(
+        self, origins: np.ndarray, directions: np.ndarray, start: np.ndarray, stop: np.ndarray, step: float
+    ) -> np.ndarray:
+        steps = int(np.ceil((stop - start).max() / step)) + 2
+        t = start[:, None] + (stop - start)[:, None] * np.linspace(0.0, 1.0, steps)
+        x, y, z = (origins[:, k, None] + t * directions[:, k, None] for k in range(3))
+        under = z - self.height(x, y) < 0.0
+        first = under.argmax(axis=1)
+        hit = under[np.arange(len(t)), first] & (first > 0)
+        high = t[np.arange(len(t)), first]
+        low = t[np.arange(len(t)), np.maximum(first - 1, 0)]
+        for _ in range(45):
+            middle = 0.5 * (low + high)
+            beneath = self.clearance(origins, directions, middle) < 0.0
+            high, low = np.where(beneath, middle, high), np.where(beneath, low, middle)
+        return np.where(hit, 0.5 * (low + high), np.inf)
+
+    def hides(self, points: np.ndarray, towards: np.ndarray, step: float) -> np.ndarray:
+        """Whether the ground stands between points on it and something far away."""
+        reach = max((self.highest - float(points[:, 2].min())) / max(towards[2], 1e-3), step)
+        t = np.concatenate([[0.05 * step], np.arange(step, reach + step, step)])
+        hidden = np.zeros(len(points), dtype=bool)
+        size = max(BLOCK // t.size, 1)
+        for first in range(0, len(points), size):
+            part = points[first : first + size]
+            x, y, z = (part[:, k, None] + t * towards[k] for k in range(3))
+            hidden[first : first + size] = (z - self.height(x, y) < 0.0).any(axis=1)
+        return hidden
+
+
+def meet_triangles(objects: Objects, origins: np.ndarray, directions: np.ndarray, nearest: float = 0.0) -> np.ndarray:
+    """Distance of each ray to the nearest triangle beyond `nearest`, infinite if none; every body that it may meet."""
+    found = np.full(len(directions), np.inf)
+    for body in range(len(objects)):
+        corners = objects.triangles[objects.first_triangle[body] : objects.first_triangle[body + 1]]
+        rays = _passing(corners, origins, directions)
+        if rays.size:
+            distance = _nearest_of(corners, origins[rays], directions[rays], nearest)
+            found[rays] = np.minimum(found[rays], distance)
+    return found
+
+
+def _passing(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Rays that pass a body nearer than its farthest corner lies from its middle."""
+    middle = corners.reshape(-1, 3).mean(axis=0)
+    radius = np.linalg.norm(corners - middle, axis=-1).max()
+    to_middle = middle - origins
+    along = np.sum(to_middle * directions, axis=1)
+    return np.flatnonzero((np.sum(to_middle**2, axis=1) - along**2 <= radius**2) & (along > -radius))
+
+
+def _nearest_of(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray, nearest: float) -> np.ndarray:
+    """Solves ``origin + t direction = a + p (b - a) + q (c - a)`` for each ray and triangle by Cramer's rule."""
+    a, b, c = (corners[None, :, k] for k in range(3))
+    first, second = b - a, c - a
+    normal = np.cross(first, second)
+    found = np.empty(len(directions))
+    size = max(BLOCK // (4 * corners.shape[0]), 1)
+    for at in range(0, len(directions), size):
+        origin, direction = origins[at : at + size, None], directions[at : at + size, None]
+        away = origin - a
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = -1.0 / np.sum(direction * normal, axis=-1)
+            t = np.sum(away * normal, axis=-1) * scale
+            across = np.cross(away, direction)
+            p = np.sum(second * across, axis=-1) * scale
+            q = -np.sum(first * across, axis=-1) * scale
+        hit = (p >= -1e-12) & (q >= -1e-12) & (p + q <= 1.0 + 1e-12) & (t > nearest)
+        found[at : at + size] = np.where(hit, t, np.inf).min(axis=1)
+    return found

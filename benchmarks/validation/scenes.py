@@ -1,0 +1,199 @@
+"""The scenes and cameras that the checks look at."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from benchmarks.validation.motion import View
+from sim.camera import Cahv, Cahvore, CameraModel, read_camera
+from sim.frames import direction, rigid
+from sim.render import Objects, Photometry, Renderer, Scene, Sun, Texture, process_renderer
+from sim.render.backend import default_backend
+from sim.sensor.presets import preset
+from sim.terrain import Surface, TerrainBank
+from sim.terrain.rocks import PlacedRock, RockField, RockParameters
+from sim.terrain.sites import Site, SiteTexture, site
+
+#: The bank from which the checks take their terrains.
+SEED = 20
+HAZCAM_LABEL = Path(__file__).parents[3] / "shared/data/mer_opportunity/1F483288473EFFCMUFP1214L0M1.IMG"
+#: Where the descents look: anywhere.
+DESCENT_PLACE = (1000.0, 1200.0)
+#: Where the large rock lies, its size, and how high the mast's camera stands.
+ROCK_PLACE, ROCK_DIAMETER_M, MAST_M = (50.0, 50.0), 2.5, 1.6
+#: Ground that is as bright as its albedo, from wherever it is seen.
+PAINT = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0)
+OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
+
+
+def renderer() -> Renderer:
+    return process_renderer(default_backend())
+
+
+def forward(camera: CameraModel) -> CameraModel:
+    """The camera alone, at the body's origin."""
+    return camera.moved(rigid(Rotation.identity(), -np.asarray(camera.c)))
+
+
+def made_hazcam() -> Cahvore:
+    """A 124 deg camera like MER's hazcams, its pupil moving by millimetres; for machines without a label of one."""
+    pinhole = Cahv.from_focal_length(
+        focal_m=5.58e-3,
+        pixel_pitch_m=12e-6,
+        size=(1024, 1024),
+        centre=np.zeros(3),
+        axis=np.array([1.0, 0.0, 0.0]),
+        right=np.array([0.0, -1.0, 0.0]),
+    )
+    return Cahvore.from_cahv(
+        pinhole, r=np.array([0.0, -0.02, 0.002]), e=np.array([0.006, 0.006, 0.006]), linearity=-0.1
+    )
+
+
+def label_hazcam() -> CameraModel | None:
+    """Opportunity's front hazcam from a picture's label, at the origin of body axes that look ahead; None without."""
+    if not HAZCAM_LABEL.exists():
+        return None
+    # the rover's axes are x forward, y right, z down
+    turned = rigid(Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
+    return forward(read_camera(HAZCAM_LABEL).moved(turned))
+
+
+def cameras() -> dict[str, CameraModel]:
+    """Every type of camera, in body axes."""
+    made: dict[str, CameraModel | None] = {
+        "MER descent camera, CAHVOR, 45 deg": preset("mer-descent-flown").cameras()[0],
+        "MER navcam, CAHVOR, 45 deg": forward(preset("mer-navcam").cameras()[0]),
+        "hazcam, CAHVORE, 124 deg": made_hazcam(),
+        "Opportunity's hazcam from its label, CAHVORE, 124 deg": label_hazcam(),
+        "research pancam, 16 mm": forward(preset("research-pancam").cameras()[0]),
+        "Sony XC-55": preset("xc-55").cameras()[0],
+    }
+    return {name: camera for name, camera in made.items() if camera is not None}
+
+
+def looks_down(camera: CameraModel) -> bool:
+    return bool(camera.boresight()[2] < -0.9)
+
+
+def level_pose(position: np.ndarray) -> RigidTransform:
+    return rigid(Rotation.identity(), position)
+
+
+def law_of(where: Site) -> Photometry:
+    given = where.photometry
+    return Photometry(
+        lunar_share=given.lunar_share, surge_amplitude=given.surge_amplitude, surge_width=given.surge_width
+    )
+
+
+def texture_of(given: SiteTexture) -> Texture:
+    return Texture(given.coarsest_m, given.amplitudes)
+
+
+@cache
+def descent_surface(name: str) -> Surface:
+    return TerrainBank(site(name).terrain("descent"), SEED).terrain(0)
+
+
+@cache
+def ground_surface(name: str) -> Surface:
+    return TerrainBank(site(name).terrain("ground"), SEED).terrain(0)
+
+
+def rocks(
+    surface: Surface,
+    parameters: RockParameters | None,
+    place: tuple[float, float],
+    reach_m: float,
+    above_m: float,
+    albedo: float,
+) -> Objects:
+    """The rocks around a place."""
+    if parameters is None:
+        return Objects.none()
+    field = RockField.on(surface, parameters, np.random.default_rng(SEED))
+    mesh = field.near(*place, reach_m, above_m=above_m)
+    return Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=albedo)
+
+
+def descent_view(name: str, height_m: float, size: tuple[int, int]) -> View:
+    """The middle of the descent camera's picture of a site from a height, tilted a little."""
+    where, surface = site(name), descent_surface(name)
+    whole = preset("mer-descent-flown").cameras()[0]
+    camera = whole.cropped((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
+    scene = Scene(
+        surface,
+        DESCENT_PLACE,
+        Sun(direction(np.radians(110.0), np.radians(40.0))),
+        law_of(where),
+        rocks(
+            surface,
+            where.terrain("descent").rocks,
+            DESCENT_PLACE,
+            0.5 * height_m,
+            height_m,
+            where.photometry.rock_albedo,
+        ),
+        texture_of(where.ground_texture),
+        texture_of(where.rock_texture),
+    )
+    ground = float(surface.height(*DESCENT_PLACE))
+    tilt = Rotation.from_euler("zyx", [20.0, 5.0, -4.0], degrees=True)
+    return View(scene, camera, rigid(tilt, np.array([*DESCENT_PLACE, ground + height_m])))
+
+
+def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None) -> View:
+    """A large rock among others, from a mast: `distance_m` from the camera to the rock's near side."""
+    where, surface = site(name), ground_surface(name)
+    ground = float(surface.height(*ROCK_PLACE))
+    # half its diameter from its centre, seen from above at some angle
+    away = np.sqrt(max(distance_m**2 - 0.5 * MAST_M**2, 0.0)) + 0.4 * ROCK_DIAMETER_M
+    eye = np.array([ROCK_PLACE[0] - away, ROCK_PLACE[1], ground + MAST_M])
+    target = PlacedRock(
+        name="target", east_m=ROCK_PLACE[0], north_m=ROCK_PLACE[1], diameter_m=ROCK_DIAMETER_M, shape=3, yaw_deg=20.0
+    )
+    parameters = (where.terrain("ground").rocks or RockParameters()).model_copy(update={"placed": (target,)})
+    things = rocks(surface, parameters, (eye[0], eye[1]), away + 6.0, MAST_M, where.photometry.rock_albedo)
+    whole = forward(preset("research-pancam").cameras()[0])
+    if size is None:
+        size = whole.size
+    camera = whole.cropped((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
+    scene = Scene(
+        surface,
+        (eye[0], eye[1]),
+        Sun(direction(np.radians(200.0), np.radians(40.0))),
+        law_of(where),
+        things,
+        texture_of(where.ground_texture),
+        texture_of(where.rock_texture),
+        mesh_finest_m=0.04,
+        mesh_reach_m=600.0,
+        mesh_lines=641,
+        mesh_in_view=True,
+    )
+    down = np.arctan2(MAST_M - 0.3 * ROCK_DIAMETER_M, away - 0.3 * ROCK_DIAMETER_M)
+    return View(scene, camera, rigid(Rotation.from_euler("y", down), eye))
+
+
+def ground_view(name: str) -> View:
+    """Ground without rocks, from a mast that looks down by 20 deg."""
+    surface, where = ground_surface(name), site(name)
+    eye = np.array([*ROCK_PLACE, float(surface.height(*ROCK_PLACE)) + MAST_M])
+    scene = Scene(
+        surface,
+        ROCK_PLACE,
+        Sun(direction(np.radians(200.0), np.radians(40.0))),
+        law_of(where),
+        ground_texture=texture_of(where.ground_texture),
+        mesh_finest_m=0.04,
+        mesh_reach_m=600.0,
+        mesh_lines=641,
+        mesh_in_view=True,
+    )
+    camera = forward(preset("mer-navcam").cameras()[0])
+    return View(scene, camera, rigid(Rotation.from_euler("y", 20.0, degrees=True), eye))
