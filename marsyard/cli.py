@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, ParamSpec
 
 import typer
 
+from marsyard.render_command import render
 from marsyard.terrain_command import app as terrain
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ app = typer.Typer(
     "2 the command or a file is wrong; 3 not enough cases to say.",
 )
 app.add_typer(terrain, name="terrain")
+app.command()(render)
 
 
 class Exit(IntEnum):

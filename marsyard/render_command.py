@@ -1,0 +1,377 @@
+"""`marsyard render`: a picture of a site with its truth layers, its camera model, and all that it was made from."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float32, UInt16
+
+    from scenarios.views import SiteGround
+    from sim.camera import CameraModel
+    from sim.render import Frame, Scene
+    from sim.sensor import AutoExposure
+
+#: Exit status where the command or a file is wrong, as elsewhere.
+WRONG = 2
+#: What a picture is written as: 16-bit picture, truth layers, camera model, and what it was made from.
+ENDINGS = (".png", ".npz", ".cahvor", ".json")
+#: Radiance factor of the largest number in a picture without detector.
+FULL_SCALE_RADIANCE_FACTOR = 1.0
+HIGHEST_M = 20000.0
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What to take a picture of, and from where; angles in degrees, lengths in metres."""
+
+    site: str
+    camera: str
+    scale: str
+    altitude_m: float
+    east_m: float
+    north_m: float
+    azimuth_deg: float
+    elevation_deg: float
+    sun_azimuth_deg: float
+    sun_elevation_deg: float
+    seed: int
+
+    @classmethod
+    def usual(cls, site: str, camera: str, **settings: Any) -> Shot:
+        """A picture from the camera's usual stance where not set otherwise. Raises ValueError for what cannot be."""
+        from scenarios.views import STANCES
+        from sim.sensor import PRESETS
+        from sim.terrain import sites
+
+        _known("site", site, sites())
+        _known("camera", camera, PRESETS)
+        stance = STANCES[camera]
+        usual = {
+            "scale": stance.scale,
+            "altitude_m": stance.height_m,
+            "east_m": 0.0,
+            "north_m": 0.0,
+            "azimuth_deg": 0.0,
+            "elevation_deg": stance.elevation_deg,
+            "sun_azimuth_deg": 250.0,
+            "sun_elevation_deg": 35.0,
+            "seed": 1,
+        }
+        given = {name: value for name, value in settings.items() if value is not None}
+        shot = cls(site=site, camera=camera, **(usual | given))
+        shot._check()
+        return shot
+
+    def _check(self) -> None:
+        from sim.terrain import site
+
+        ranges = {
+            "altitude": (self.altitude_m, 0.0, HIGHEST_M),
+            "elevation": (self.elevation_deg, -90.0, 90.0),
+            "sun-elevation": (self.sun_elevation_deg, 0.0, 90.0),
+        }
+        for name, (value, low, high) in ranges.items():
+            above = value >= low if name == "elevation" else value > low
+            if not (above and value <= high):
+                least = f"{low:g}" if name == "elevation" else f"more than {low:g}"
+                raise ValueError(f"--{name} {value:g} is out of range; allowed: {least} to {high:g}")
+        free = {"east": self.east_m, "north": self.north_m, "azimuth": self.azimuth_deg}
+        for name, value in (free | {"sun-azimuth": self.sun_azimuth_deg}).items():
+            if not math.isfinite(value):
+                raise ValueError(f"--{name} {value} is not a finite number")
+        known = site(self.site)
+        scales = [scale for scale in ("descent", "ground") if getattr(known, scale) is not None]
+        if self.scale not in scales:
+            raise ValueError(
+                f"site {self.site} has no terrain at the scale '{self.scale}', from which camera {self.camera} is to "
+                f"look; with --scale: {', '.join(scales)}"
+            )
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of one camera, or of one of a pair.
+
+    Attributes
+    ----------
+    suffix
+        What tells the pictures of a pair apart: ``-left``, ``-right``; empty for a single camera.
+    camera
+        The camera model in the world frame.
+    frame, scene
+        Radiance and truth, and what was drawn.
+    exposed
+        The detector at the exposure time that was found; None without detector.
+    counts
+        What the detector delivered; None without detector.
+    """
+
+    suffix: str
+    camera: CameraModel
+    frame: Frame
+    scene: Scene
+    exposed: AutoExposure | None
+    counts: UInt16[np.ndarray, "rows columns"] | None
+
+    def sixteen_bit(self) -> UInt16[np.ndarray, "rows columns"]:
+        """Counts moved to the upper bits, or radiance factor in 65535ths of the full scale."""
+        import numpy as np
+
+        if self.exposed is not None and self.counts is not None:
+            multiplied: UInt16[np.ndarray, "rows columns"] = self.counts * np.uint16(self.multiplied_by)
+            return multiplied
+        share = np.clip(self.frame.radiance / FULL_SCALE_RADIANCE_FACTOR, 0.0, 1.0)
+        scaled: UInt16[np.ndarray, "rows columns"] = np.rint(65535.0 * share).astype(np.uint16)
+        return scaled
+
+    @property
+    def multiplied_by(self) -> int:
+        """By what counts are multiplied to fill 16 bits; 1 without detector."""
+        return 1 if self.exposed is None else int(2 ** (16 - self.exposed.detector.parameters.bits))
+
+
+def render(
+    site: Annotated[str, typer.Argument(metavar="SITE", help="A site from `marsyard terrain list`.")],
+    camera: Annotated[
+        str, typer.Option("--camera", metavar="NAME", help="Such as mer-navcam; a wrong name lists those there are.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="PREFIX", help="Path of the files without their endings.")],
+    scale: Annotated[
+        str | None, typer.Option("--scale", metavar="SCALE", help="descent or ground; by default the camera's usual.")
+    ] = None,
+    altitude: Annotated[
+        float | None, typer.Option("--altitude", metavar="M", help="Height above the ground; by default the usual.")
+    ] = None,
+    east: Annotated[float, typer.Option("--east", metavar="M", help="Place on the terrain, which repeats.")] = 0.0,
+    north: Annotated[float, typer.Option("--north", metavar="M", help="Place on the terrain, which repeats.")] = 0.0,
+    azimuth: Annotated[
+        float, typer.Option("--azimuth", metavar="DEG", help="Where the camera looks, clockwise from north.")
+    ] = 0.0,
+    elevation: Annotated[
+        float | None, typer.Option("--elevation", metavar="DEG", help="Of its axis above the horizon; -90: down.")
+    ] = None,
+    sun_azimuth: Annotated[float, typer.Option("--sun-azimuth", metavar="DEG", help="Clockwise from north.")] = 250.0,
+    sun_elevation: Annotated[float, typer.Option("--sun-elevation", metavar="DEG", help="Above the horizon.")] = 35.0,
+    detector: Annotated[
+        bool, typer.Option("--detector/--radiance", help="Counts of the camera's detector, or radiance factor.")
+    ] = True,
+    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Of the terrain and the noise.")] = 1,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+) -> None:
+    """Render a site: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; -left and -right for a pair."""
+    from sim.render.backend import RenderingError
+
+    try:
+        shot = Shot.usual(
+            site,
+            camera,
+            scale=scale,
+            altitude_m=altitude,
+            east_m=east,
+            north_m=north,
+            azimuth_deg=azimuth,
+            elevation_deg=elevation,
+            sun_azimuth_deg=sun_azimuth,
+            sun_elevation_deg=sun_elevation,
+            seed=seed,
+        )
+        _check_files(out, camera, overwrite)
+        for picture in take(shot, detector=detector):
+            typer.echo(", ".join(str(path) for path in write(picture, shot, out)))
+    except (ValueError, RenderingError) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(WRONG) from None
+    except OSError as error:
+        typer.echo(f"error: cannot write to {out}: {error}", err=True)
+        raise typer.Exit(WRONG) from None
+
+
+def take(shot: Shot, *, detector: bool = True) -> list[Picture]:
+    """The picture, or both pictures of a stereo pair."""
+    import numpy as np
+
+    from scenarios.views import Eye, SiteGround, camera_pose, site_scene
+    from sim.frames import direction
+    from sim.render import PixelRays, Sun, process_renderer
+    from sim.render.backend import default_backend
+    from sim.sensor import preset
+    from sim.terrain import site
+
+    ground = SiteGround.of(site(shot.site), "descent" if shot.scale == "descent" else "ground", seed=shot.seed)
+    of_camera = preset(shot.camera)
+    cameras = of_camera.cameras()
+    place = (shot.east_m, shot.north_m, shot.altitude_m)
+    pose = camera_pose(ground.surface, of_camera.design, *place, shot.azimuth_deg, shot.elevation_deg)
+    sun = Sun(direction(np.radians(shot.sun_azimuth_deg), np.radians(shot.sun_elevation_deg)))
+    rays = [PixelRays.of(camera) for camera in cameras]
+    # The cameras of a pair are so close together that one scene serves both.
+    scene = site_scene(ground, Eye.of(rays[0], pose, ground.surface), sun)
+    pictures = []
+    for number, camera in enumerate(cameras):
+        frame = process_renderer(default_backend()).render(scene, rays[number], pose)
+        exposed, counts = _exposed(shot, ground, camera, number, frame) if detector else (None, None)
+        suffix = "" if len(cameras) == 1 else ("-left", "-right")[number]
+        pictures.append(Picture(suffix, camera.moved(pose), frame, scene, exposed, counts))
+    return pictures
+
+
+def _exposed(
+    shot: Shot, ground: SiteGround, camera: CameraModel, number: int, frame: Frame
+) -> tuple[AutoExposure, UInt16[np.ndarray, "rows columns"]]:
+    """What the camera's detector delivers at the site, exposed automatically; its rows are not summed."""
+    from sim.sensor import AutoExposureParameters, Detector, auto_expose, natural_fall_off, preset
+    from sim.streams import Streams
+
+    streams = Streams(shot.seed, "render", number)
+    of_camera, air = preset(shot.camera), ground.site.environment
+    # The preset's light may be another planet's.
+    responsivity = of_camera.light.responsivity_e_s(1.0 / math.sqrt(air.solar_irradiance))
+    parameters = of_camera.detector.model_copy(update={"responsivity_e_s": responsivity, "rows_summed": 1})
+    detector = Detector.drawn(natural_fall_off(camera), parameters, streams.generator("detector response"))
+    radiance = _above_air(ground, shot, frame)
+    exposed = auto_expose(detector, radiance, AutoExposureParameters(), streams.generator("test pictures"))
+    return exposed, exposed.detector.expose(radiance, streams.generator("detector noise"))
+
+
+def _above_air(ground: SiteGround, shot: Shot, frame: Frame) -> Float32[np.ndarray, "rows columns"]:
+    """Radiance factor over sunlight above the air: the frame's is over the sunlight that reaches the ground."""
+    import numpy as np
+
+    share = ground.site.environment.direct_share(math.radians(shot.sun_elevation_deg))
+    return frame.radiance * np.float32(share)
+
+
+def layers(picture: Picture) -> dict[str, Any]:
+    """The truth layers, each of the picture's rows and columns, and the pose."""
+    import numpy as np
+
+    from sim.render import process_renderer
+    from sim.render.backend import default_backend
+
+    frame, scene = picture.frame, picture.scene
+    directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
+    phase = np.degrees(np.arccos(np.clip(-(directions @ scene.sun.direction), -1.0, 1.0)))
+    ground = np.isfinite(frame.range_m)
+    # Drawn once more by the sun alone: what stays black has no direct light.
+    direct = replace(scene.photometry, sky_share=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
+    by_sun = process_renderer(default_backend()).render(
+        replace(scene, photometry=direct), frame.rays, frame.world_from_body
+    )
+    names = np.append(scene.objects.names, [-2, -1])  # the last two: what bodies -2 and -1 stand for
+    return {
+        "radiance_factor": frame.radiance,
+        "range_m": frame.range_m,
+        "point_m": frame.points_world(),
+        "normal": frame.normal,
+        "object": names[frame.body].astype(np.int32),
+        "shadow": ground & (by_sun.radiance <= 0.0),
+        "phase_deg": np.where(ground, phase.reshape(ground.shape), np.nan).astype(np.float32),
+        "world_from_body": frame.world_from_body.as_matrix(),
+    }
+
+
+def write(picture: Picture, shot: Shot, prefix: Path) -> list[Path]:
+    """Writes a picture's files and returns their paths."""
+    import json
+
+    import cv2
+    import numpy as np
+
+    from sim.camera import write_cahvor
+
+    png, npz, cahvor, sidecar = (_path(prefix, picture.suffix, ending) for ending in ENDINGS)
+    done, encoded = cv2.imencode(".png", picture.sixteen_bit())
+    if not done:
+        raise ValueError(f"{png} could not be encoded")
+    png.write_bytes(encoded.tobytes())
+    with npz.open("wb") as file:
+        np.savez(file, **layers(picture))
+    comment = f"{shot.camera}{picture.suffix} at {shot.site}, world frame: x east, y north, z up, metres"
+    write_cahvor(picture.camera, cahvor, comment)
+    sidecar.write_text(json.dumps(record(picture, shot), indent=2) + "\n", encoding="utf-8")
+    return [png, npz, cahvor, sidecar]
+
+
+def record(picture: Picture, shot: Shot) -> dict[str, Any]:
+    """All that a picture was made from, and what its numbers mean."""
+    from importlib.metadata import version
+
+    from sim.render.backend import default_backend
+    from sim.terrain import site
+
+    columns, rows = picture.camera.size
+    scene, exposed = picture.scene, picture.exposed
+    if exposed is None:
+        meaning: dict[str, Any] = {
+            "holds": "radiance factor (I/F) over the sunlight that reaches the ground",
+            "full_scale_radiance_factor": FULL_SCALE_RADIANCE_FACTOR,
+        }
+    else:
+        meaning = {
+            "holds": "counts of the detector, in the upper bits",
+            "multiplied_by": picture.multiplied_by,
+            "exposure_s": exposed.detector.parameters.exposure_s,
+            "auto_exposure_converged": exposed.converged,
+        }
+    return {
+        "marsyard": version("marsyard"),
+        "shot": asdict(shot),
+        "picture": picture.suffix.lstrip("-") or "single",
+        "size": {"columns": columns, "rows": rows},
+        "png": meaning,
+        "npz": {
+            "object": "number of the rock seen; -1 ground, -2 sky",
+            "shadow": "no direct sunlight: a cast shadow, or a face turned away from the sun",
+            "frame": "world: x east, y north, z up, metres",
+        },
+        "world_from_body": picture.frame.world_from_body.as_matrix().tolist(),
+        "sun_direction": scene.sun.direction.tolist(),
+        "photometry": asdict(scene.photometry),
+        "mesh": {name: getattr(scene, name) for name in ("mesh_finest_m", "mesh_reach_m", "mesh_lines")},
+        "rocks_drawn": len(scene.objects),
+        "site": site(shot.site).model_dump(mode="json"),
+        "detector": None if exposed is None else exposed.detector.parameters.model_dump(mode="json"),
+        "gl_backend": default_backend(),
+    }
+
+
+def _path(prefix: Path, suffix: str, ending: str) -> Path:
+    return prefix.with_name(f"{prefix.name}{suffix}{ending}")
+
+
+def _check_files(prefix: Path, camera: str, overwrite: bool) -> None:
+    """Raises ValueError where the files cannot be written, or are there and may not be replaced."""
+    from sim.sensor import preset
+
+    folder = prefix.parent
+    if prefix.name in ("", ".", ".."):
+        raise ValueError(f"--out {prefix} names no file; a path without ending is needed, such as pictures/gusev")
+    if not folder.is_dir():
+        raise ValueError(f"--out {prefix}: there is no folder {folder}")
+    if not os.access(folder, os.W_OK):
+        raise ValueError(f"--out {prefix}: the folder {folder} cannot be written to")
+    suffixes = ("",) if preset(camera).design.baseline_m is None else ("-left", "-right")
+    paths = [_path(prefix, suffix, ending) for suffix in suffixes for ending in ENDINGS]
+    there = [str(path) for path in paths if path.exists()]
+    if there and not overwrite:
+        raise ValueError(f"{', '.join(there)}: there already; --overwrite replaces what is there")
+
+
+def _known(kind: str, name: str, names: Iterable[str]) -> None:
+    """Raises ValueError for an unknown name, with what may have been meant."""
+    allowed = list(names)
+    if name in allowed:
+        return
+    close = get_close_matches(name, allowed, n=1) or [one for one in allowed if name and name in one]
+    meant = f"; did you mean {' or '.join(close)}?" if close else "."
+    raise ValueError(f"no {kind} is called '{name}'{meant} Allowed: {', '.join(allowed)}")

@@ -1,0 +1,288 @@
+"""Views of a site: its ground, the rocks that a camera can tell apart, its light, and where cameras look from.
+
+This is what scenarios near the ground share. A `SiteGround` is a site's terrain of the bank with its rocks; an `Eye`
+says where a camera is and how fine it sees; `site_scene` puts both together under a sun as the scene that the renderer
+draws. One scene serves all pictures taken close to its eye: a stereo pair, or a rover's next few steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from sim.frames import rigid
+from sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture
+from sim.sensor import CameraDesign
+from sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
+from sim.terrain.sites import SiteTexture
+
+Scale = Literal["descent", "ground"]
+
+#: Rocks smaller than this many pixels are left out.
+SMALLEST_ROCK_PX = 1.5
+#: Triangles of coarsely drawn rocks that a scene may have: beyond, smaller rocks are left out. Near ones, drawn finely,
+#: come to about half as many again.
+ROCK_TRIANGLES = 600_000
+#: Triangles of a rock drawn coarsely, as nearly all are.
+_COARSE_TRIANGLES = 80
+#: Rocks out of sight whose shadows may fall into the picture are kept within this many heights of the eye, and metres.
+_BESIDE_HEIGHTS, _BESIDE_M = 3.0, 5.0
+#: Ratio between the sizes of neighbouring classes of rocks.
+_CLASS_RATIO = float(np.sqrt(2.0))
+#: Spacing of the mesh over the height of the eye, by how much it grows with distance, and how far it reaches.
+_MESH_FINEST, _MESH_GROWTH, _MESH_REACH_HEIGHTS, _MESH_REACH_M = 0.0085, 0.012, 14.0, 700.0
+
+
+@dataclass(frozen=True)
+class SiteGround:
+    """The ground of a site at one scale.
+
+    Attributes
+    ----------
+    site
+        The site: its light and how its ground scatters it.
+    terrain
+        What the surface was made from.
+    surface
+        The terrain.
+    rocks
+        Its rocks; None where it has none.
+    """
+
+    site: Site
+    terrain: TerrainParameters
+    surface: Surface
+    rocks: RockField | None
+
+    @classmethod
+    def of(cls, site: Site, scale: Scale | None = None, *, seed: int = 1, number: int = 0) -> SiteGround:
+        """Terrain `number` of a site's bank, from the disk or built; by default at the site's coarsest scale.
+
+        Raises ValueError where the site has no terrain at that scale.
+        """
+        terrain = site.terrain(scale)
+        bank = TerrainBank(terrain, seed)
+        return cls(site, terrain, bank.terrain(number), bank.rocks(number))
+
+    def photometry(self, sun: Sun) -> Photometry:
+        """How this ground scatters the light of this sun and of the sky of the site's air."""
+        law = self.site.photometry
+        sky = self.site.environment.sky_share(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
+        return Photometry(
+            lunar_share=law.lunar_share,
+            surge_amplitude=law.surge_amplitude,
+            surge_width=law.surge_width,
+            sky_share=sky,
+            sky_radiance=sky,
+            surrounding_albedo=self.terrain.albedo,
+        )
+
+
+@dataclass(frozen=True)
+class Eye:
+    """Where a camera is, which way it faces and how fine it sees: what decides the detail of a scene.
+
+    Attributes
+    ----------
+    east_m, north_m, height_m
+        Its place, and its height above the ground there.
+    pixel_rad
+        Angle that a pixel takes.
+    azimuth_rad, half_width_rad
+        Middle and half width of the sector that it sees, clockwise from north; a half width of pi is all round.
+    reach_m
+        Horizontal distance beyond which it sees no ground; infinite where it sees the horizon.
+    """
+
+    east_m: float
+    north_m: float
+    height_m: float
+    pixel_rad: float
+    azimuth_rad: float = 0.0
+    half_width_rad: float = np.pi
+    reach_m: float = np.inf
+
+    @classmethod
+    def of(cls, rays: PixelRays, world_from_body: RigidTransform, surface: Surface) -> Eye:
+        """The eye of a camera at this pose."""
+        east, north, up = (float(value) for value in world_from_body.apply(rays.centre))
+        height = up - float(surface.height(east, north))
+        axis = world_from_body.rotation.apply(rays.axis)
+        elevation, widest = float(np.arcsin(np.clip(axis[2], -1.0, 1.0))), rays.half_angle_rad
+        beside = float(np.cos(elevation))
+        half_width = np.pi if np.sin(widest) >= beside or widest >= np.pi / 2 else np.arcsin(np.sin(widest) / beside)
+        highest = elevation + widest
+        # twice as far as level ground, for slopes that fall away
+        reach = 2.0 * height / np.tan(-highest) + _BESIDE_M if highest < -np.radians(5.0) else np.inf
+        return cls(
+            east,
+            north,
+            height,
+            float(np.median(rays.pixel_angles)),
+            float(np.arctan2(axis[0], axis[1])),
+            float(min(half_width + np.radians(3.0), np.pi)),
+            float(reach),
+        )
+
+
+def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
+    """The scene that a camera sees from here: ground, the rocks it can tell apart, texture and light.
+
+    Near the ground only what is in view is drawn (`Scene.mesh_in_view`); from a descent's height the whole mesh serves
+    all pictures.
+    """
+    spacing = ground.surface.spacing_m
+    finest = max(_MESH_FINEST * eye.height_m, 0.8 * spacing)
+    reach = max(_MESH_REACH_HEIGHTS * eye.height_m, _MESH_REACH_M)
+    half = int(np.ceil(np.arcsinh(reach / finest * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
+    return Scene(
+        ground.surface,
+        (eye.east_m, eye.north_m),
+        sun,
+        ground.photometry(sun),
+        objects=rocks_in_sight(ground, eye, reach),
+        ground_texture=_texture(ground.site.ground_texture),
+        object_texture=_texture(ground.site.rock_texture),
+        mesh_finest_m=finest,
+        mesh_reach_m=reach,
+        mesh_lines=2 * half + 1,
+        mesh_in_view=True,
+    )
+
+
+def rocks_in_sight(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Objects:
+    """The rocks that the eye can tell apart, and those near it whose shadows it may see; bodies carry rocks' numbers.
+
+    Where rocks of `SMALLEST_ROCK_PX` would come to more than about `ROCK_TRIANGLES`, only larger ones are taken.
+    """
+    field = ground.rocks
+    if field is None or len(field) == 0:
+        return Objects.none()
+    smallest_rad = smallest_rock_rad(field, eye)
+    reach = min(farthest_m, eye.reach_m)
+    parts = []
+    for low, members in _size_classes(field):
+        # from above, even rocks right below are far away
+        horizontal = np.sqrt(max((low * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - eye.height_m**2, 0.0))
+        radius = float(min(horizontal, reach))
+        if radius > 0.0:
+            mesh = _subset(field, members).near(eye.east_m, eye.north_m, radius, above_m=eye.height_m)
+            seen = _in_sector(mesh, eye)
+            names = members[mesh.rock_of_face[seen]].astype(np.int32)
+            albedo = ground.site.photometry.rock_albedo
+            parts.append(Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces[seen], names, albedo))
+    return Objects.joined(parts) if parts else Objects.none()
+
+
+def smallest_rock_rad(field: RockField, eye: Eye) -> float:
+    """Angle under which the smallest rocks are seen that are worth drawing.
+
+    Rocks of diameter D are drawn to the distance D / angle: n of them to the square metre of a sector of half width w
+    make ``80 w D**2 n / angle**2`` triangles.
+    """
+    if np.isfinite(eye.reach_m):
+        return SMALLEST_ROCK_PX * eye.pixel_rad
+    squares = float(np.sum(field.diameter_m**2)) / field.period_m**2
+    affordable = np.sqrt(_COARSE_TRIANGLES * eye.half_width_rad * squares / ROCK_TRIANGLES)
+    return float(max(SMALLEST_ROCK_PX * eye.pixel_rad, affordable))
+
+
+@dataclass(frozen=True)
+class Stance:
+    """How a camera usually stands: at which scale of terrain, how high, and how far its axis points above the horizon.
+
+    The elevation of a camera that looks down is -90 deg.
+    """
+
+    scale: Scale
+    height_m: float
+    elevation_deg: float
+
+
+#: Usual stances of the cameras of `sim.sensor.PRESETS`: the first picture of a descent, masts of 1.5 m, MER's hazcams
+#: 0.53 m above the ground (Maki et al. 2003), a helicopter at 10 m.
+STANCES: Mapping[str, Stance] = MappingProxyType(
+    {
+        "mer-descent-flown": Stance("descent", 2000.0, -90.0),
+        "mer-descent-field": Stance("descent", 2000.0, -90.0),
+        "mer-navcam": Stance("ground", 1.5, -18.0),
+        "mer-hazcam": Stance("ground", 0.53, -40.0),
+        "research-navcam": Stance("ground", 1.5, -18.0),
+        "research-pancam": Stance("ground", 1.5, -8.0),
+        "xc-55": Stance("ground", 10.0, -90.0),
+    }
+)
+
+
+def camera_pose(
+    surface: Surface,
+    design: CameraDesign,
+    east_m: float,
+    north_m: float,
+    height_m: float,
+    azimuth_deg: float,
+    elevation_deg: float,
+) -> RigidTransform:
+    """Pose of the body of a camera whose axis points this way; at -90 deg the azimuth is the picture's upper edge's."""
+    if design.down:
+        return nadir_pose(surface, east_m, north_m, height_m, azimuth_deg, 90.0 + elevation_deg)
+    return mast_pose(surface, east_m, north_m, height_m, azimuth_deg, elevation_deg)
+
+
+def mast_pose(
+    surface: Surface, east_m: float, north_m: float, height_m: float, azimuth_deg: float, elevation_deg: float
+) -> RigidTransform:
+    """Pose of a mast's frame (x forward, y left, z up) above the ground, looking this way.
+
+    Azimuth is clockwise from north, elevation above the horizon.
+    """
+    turn = Rotation.from_euler("ZY", [90.0 - azimuth_deg, -elevation_deg], degrees=True)
+    return rigid(turn, _above(surface, east_m, north_m, height_m))
+
+
+def nadir_pose(
+    surface: Surface, east_m: float, north_m: float, altitude_m: float, azimuth_deg: float = 0.0, tilt_deg: float = 0.0
+) -> RigidTransform:
+    """Pose of a body whose camera looks along -z: straight down, or tilted forward towards the azimuth.
+
+    The azimuth, clockwise from north, is that of the picture's upper edge.
+    """
+    turn = Rotation.from_euler("ZX", [-azimuth_deg, tilt_deg], degrees=True)
+    return rigid(turn, _above(surface, east_m, north_m, altitude_m))
+
+
+def _above(surface: Surface, east_m: float, north_m: float, height_m: float) -> Float64[np.ndarray, "3"]:
+    return np.array([east_m, north_m, float(surface.height(east_m, north_m)) + height_m])
+
+
+def _texture(of_site: SiteTexture) -> Texture:
+    return Texture(of_site.coarsest_m, of_site.amplitudes)
+
+
+def _size_classes(field: RockField) -> list[tuple[float, Int64[np.ndarray, "members"]]]:
+    """Smallest diameter and rocks' numbers of each class of sizes."""
+    smallest = float(field.diameter_m.min())
+    number = np.floor(np.log(field.diameter_m / smallest) / np.log(_CLASS_RATIO) + 1e-9).astype(int)
+    return [(smallest * _CLASS_RATIO ** int(one), np.flatnonzero(number == one)) for one in np.unique(number)]
+
+
+def _subset(field: RockField, members: Int64[np.ndarray, "members"]) -> RockField:
+    """The field of some of its rocks, which are counted anew."""
+    arrays = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up")
+    return replace(field, names={}, **{name: getattr(field, name)[members] for name in arrays})
+
+
+def _in_sector(mesh: RockMesh, eye: Eye) -> Bool[np.ndarray, "triangles"]:
+    """Which triangles lie in the eye's sector or close beside it."""
+    away = mesh.vertices[mesh.faces[:, 0], :2] - (eye.east_m, eye.north_m)
+    beside = np.arctan2(away[:, 0], away[:, 1]) - eye.azimuth_rad
+    turned = np.abs((beside + np.pi) % (2.0 * np.pi) - np.pi)
+    close = max(_BESIDE_HEIGHTS * eye.height_m, _BESIDE_M)
+    inside: Bool[np.ndarray, "triangles"] = (turned <= eye.half_width_rad) | (np.hypot(*away.T) <= close)
+    return inside
