@@ -75,10 +75,14 @@ def run(quick: bool) -> Iterator[Measure]:
         around = [motion.error[motion.body != rock] for motion in motions]
         if min(len(error) for error in around) >= 200:
             yield _row(f"bias of motion, grazed ground and rocks around it, {distance:g} m", around, BAR_PX, steps)
-    raw = replace(rock_view(ROCK_SITE, 2.0, CONTROL_SIZE), footprint=1.0 / 64.0)
+    raw = replace(rock_view(ROCK_SITE, 10.0), footprint=1.0 / 64.0)
     errors = [motion.error for motion in measure(renderer(), raw, np.array([0.25, 0.5, 0.75]))]
     yield Measure(
-        "the same of raw point samples, rock at 2 m: what the bar catches", bias(errors), "px", None, "3 steps"
+        "the same of raw point samples, rock and ground from 10 m: what the bar is to catch",
+        bias(errors),
+        "px",
+        None,
+        "3 steps",
     )
     for index, fit in enumerate(("parabola", "biquadratic")):
         worst = max(one[index] for one in fits)

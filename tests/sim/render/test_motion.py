@@ -1,0 +1,88 @@
+"""A picture moves as its camera does: quick versions of the bars that `make validate` measures in full."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.validation.estimators import PATCH, SmoothPicture, symmetric_shifts
+from benchmarks.validation.motion import View, measure, patch_grid
+from sim.camera import Cahv
+from sim.frames import direction, rigid
+from sim.render import Objects, Photometry, Scene, Sun, Texture
+from sim.terrain import TerrainParameters, synthesise
+from sim.terrain.rocks import PlacedRock, RockField, RockParameters
+
+SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
+#: The bar of the means over all patches, in full measurements of 200 patches and more.
+BAR_PX = 0.02
+
+
+def test_the_estimator_finds_a_known_shift() -> None:
+    """Bumps of some pixels in size drawn at their exact places; the second picture darker, by its own gain."""
+    rng = np.random.default_rng(2)
+    places, sizes, heights = rng.uniform(0, 160, (900, 2)), rng.uniform(2.0, 5.0, 900), rng.uniform(-1, 1, 900)
+    v, u = np.mgrid[:160, :160].astype(np.float64)
+
+    def picture(shift: np.ndarray) -> np.ndarray:
+        drawn = np.zeros((160, 160))
+        for (x, y), size, height in zip(places + shift, sizes, heights, strict=True):
+            drawn += height * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * size**2))
+        return drawn
+
+    shift = np.array([0.37, -0.22])
+    first, second = SmoothPicture(picture(np.zeros(2))), SmoothPicture(0.8 * picture(shift) + 0.1)
+    shifts = symmetric_shifts(first, second, patch_grid((160, 160)))
+    np.testing.assert_allclose(shifts.found, np.broadcast_to(shift, shifts.found.shape), atol=2e-3)
+    # and where all pixels of a patch move alike, that motion is what it expects to find
+    everywhere = np.broadcast_to(shift, (len(shifts.found), PATCH, PATCH, 2))
+    np.testing.assert_allclose(shifts.expected(everywhere), np.broadcast_to(shift, shifts.found.shape), atol=1e-9)
+
+
+def test_a_descent_picture_moves_as_the_camera_does(renderer, rough, descent_camera) -> None:
+    texture = Texture(3.0, (0.03,) * 6)
+    scene = Scene(rough, (380.0, 200.0), SUN, Photometry(), ground_texture=texture)
+    camera = descent_camera().cropped(256, 256, (512, 512))
+    pose = rigid(Rotation.from_euler("zyx", [20.0, 5.0, -4.0], degrees=True), np.array([380.0, 200.0, 2000.0]))
+    for motion in measure(renderer, View(scene, camera, pose), np.array([0.3, 0.75])):
+        assert len(motion.error) >= 200
+        # an order better than the bar: without rocks nothing in the picture has an edge
+        assert np.abs(motion.error.mean(axis=0)).max() < 0.1 * BAR_PX
+
+
+@pytest.mark.parametrize("distance_m", [5.0, 2.0])
+def test_a_rock_from_a_mast_moves_as_the_camera_does(renderer, distance_m) -> None:
+    parameters = TerrainParameters(
+        samples=512, spacing_m=0.05, rms_slope_deg=3.0, slope_baseline_m=1.0, outer_scale_m=10.0, craters_per_km2=0.0
+    )
+    surface = synthesise(parameters, np.random.default_rng(5))
+    target = PlacedRock(name="target", east_m=10.0, north_m=10.0, diameter_m=2.0, shape=3, yaw_deg=20.0)
+    field = RockField.on(surface, RockParameters(abundance=0.05, placed=(target,)), np.random.default_rng(1))
+    eye = np.array([9.2 - distance_m, 10.0, float(surface.height(10.0, 10.0)) + 1.4])
+    mesh = field.near(eye[0], eye[1], distance_m + 3.0, above_m=1.4)
+    rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=0.15)
+    scene = Scene(
+        surface,
+        (eye[0], eye[1]),
+        SUN,
+        Photometry(),
+        rocks,
+        Texture(0.2, (0.05,) * 6),
+        Texture(0.2, (0.06,) * 8),
+        mesh_finest_m=0.04,
+        mesh_reach_m=200.0,
+        mesh_in_view=True,
+    )
+    camera = Cahv.from_focal_length(
+        focal_m=16e-3,
+        pixel_pitch_m=4.65e-6,
+        size=(512, 384),
+        centre=np.zeros(3),
+        axis=np.array([1.0, 0.0, 0.0]),
+        right=np.array([0.0, -1.0, 0.0]),
+    )
+    down = np.arctan2(0.9, distance_m)
+    view = View(scene, camera, rigid(Rotation.from_euler("y", down), eye))
+    for motion in measure(renderer, view, np.array([0.3, 0.75])):
+        on_rock = motion.error[motion.body >= 0]
+        assert len(on_rock) > 60
+        assert np.abs(on_rock.mean(axis=0)).max() < BAR_PX

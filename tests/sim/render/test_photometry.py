@@ -1,0 +1,92 @@
+"""The reflectance law as rendered: reciprocity, albedo by an independent integration, and the opposition peak."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
+
+from sim.camera import Cahv, Cahvore
+from sim.frames import direction, rigid
+from sim.render import Photometry, PixelRays, Scene, Sun
+from sim.terrain import Surface
+
+ALBEDO = 0.2
+LAWS = {
+    "Lambert": Photometry(lunar_share=0.0, surge_amplitude=0.0),
+    "Mars": Photometry(),
+    "narrow surge": Photometry(lunar_share=1.0, surge_amplitude=1.5, surge_width=0.01),
+}
+each_law = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
+
+
+@pytest.fixture(scope="module")
+def flat() -> Surface:
+    samples = np.zeros((64, 64, 2), dtype=np.float32)
+    samples[..., 1] = ALBEDO
+    return Surface.from_samples(samples, 64.0)
+
+
+def _brightness(renderer, flat: Surface, law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) -> float:
+    """Radiance factor of flat ground in the direct sun alone."""
+    camera = Cahv.from_field_of_view(
+        horizontal_rad=0.002,
+        size=(9, 9),
+        centre=np.zeros(3),
+        axis=np.array([0.0, 0.0, -1.0]),
+        right=np.array([1.0, 0.0, 0.0]),
+    )
+    pose = rigid(Rotation.align_vectors(-to_eye[None], np.array([[0.0, 0.0, -1.0]]))[0], 100.0 * to_eye)
+    scene = Scene(flat, (0.0, 0.0), Sun(to_sun), replace(law, sky_share=0.0, surrounding_albedo=0.0))
+    return float(renderer.render(scene, PixelRays.of(camera), pose).radiance[4, 4])
+
+
+@each_law
+def test_sun_and_eye_can_change_places(renderer, flat, law) -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(3):
+        azimuths, heights = rng.uniform(0.0, 2.0 * np.pi, 2), np.arcsin(rng.uniform(0.15, 1.0, 2))
+        sun, eye = (direction(float(a), float(h)) for a, h in zip(azimuths, heights, strict=True))
+        there, back = _brightness(renderer, flat, law, sun, eye), _brightness(renderer, flat, law, eye, sun)
+        # I/F over the cosine of incidence is pi times the bidirectional reflectance
+        assert there / sun[2] == pytest.approx(back / eye[2], rel=1e-5)
+
+
+@each_law
+def test_the_law_returns_the_stated_share_of_light(law) -> None:
+    """Sun and eye drawn in proportion to their cosines: the mean of I/F over cos i is the spherical albedo."""
+    one, two, turn = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(17).T
+    cos_i, cos_e = np.sqrt(1.0 - one), np.sqrt(1.0 - two)
+    g = np.arccos(np.clip(cos_i * cos_e + np.sqrt(one * two) * np.cos(2.0 * np.pi * turn), -1.0, 1.0))
+    surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)
+    disc = 2.0 * law.lunar_share * cos_i / (cos_i + cos_e) + (1.0 - law.lunar_share) * cos_i
+    assert law.normalisation() * np.mean(surge * disc / cos_i) == pytest.approx(1.0, rel=0.01)
+
+
+def _hazcam() -> Cahvore:
+    pinhole = Cahv.from_focal_length(
+        focal_m=5.58e-3,
+        pixel_pitch_m=24e-6,
+        size=(512, 512),
+        centre=np.zeros(3),
+        axis=np.array([0.0, 0.0, -1.0]),
+        right=np.array([1.0, 0.0, 0.0]),
+    )
+    return Cahvore.from_cahv(pinhole, r=np.array([0.0, -0.02, 0.002]), e=np.full(3, 0.006), linearity=-0.1)
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_the_opposition_peak_is_opposite_the_sun(renderer, flat, descent_camera, wide) -> None:
+    """The peak's centre, found in the picture alone, within half a pixel."""
+    camera = _hazcam() if wide else descent_camera(512)
+    law = Photometry(lunar_share=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
+    pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))
+    for opposite in np.array([[150.3, 201.8], [330.6, 255.1]]):
+        _, ray = camera.moved(pose).rays(opposite)
+        frame = renderer.render(Scene(flat, (0.0, 0.0), Sun(-ray), law), PixelRays.of(camera), pose)
+        radiance = frame.radiance.astype(np.float64)
+        weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)
+        v, u = np.mgrid[:512, :512]
+        peak = np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
+        assert np.linalg.norm(peak - opposite) < 0.5
