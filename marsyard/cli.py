@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, ParamSpec
 
 import typer
 
+from marsyard.gallery_command import gallery
 from marsyard.render_command import render
 from marsyard.terrain_command import app as terrain
 
@@ -31,6 +32,7 @@ app = typer.Typer(
 )
 app.add_typer(terrain, name="terrain")
 app.command()(render)
+app.command()(gallery)
 
 
 class Exit(IntEnum):

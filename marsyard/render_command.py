@@ -196,8 +196,8 @@ def render(
         raise typer.Exit(WRONG) from None
 
 
-def take(shot: Shot, *, detector: bool = True) -> list[Picture]:
-    """The picture, or both pictures of a stereo pair."""
+def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Picture]:
+    """The picture; of a stereo pair both, or the left one alone."""
     import numpy as np
 
     from scenarios.views import Eye, SiteGround, camera_pose, site_scene
@@ -213,11 +213,12 @@ def take(shot: Shot, *, detector: bool = True) -> list[Picture]:
     place = (shot.east_m, shot.north_m, shot.altitude_m)
     pose = camera_pose(ground.surface, of_camera.design, *place, shot.azimuth_deg, shot.elevation_deg)
     sun = Sun(direction(np.radians(shot.sun_azimuth_deg), np.radians(shot.sun_elevation_deg)))
-    rays = [PixelRays.of(camera) for camera in cameras]
+    taken = cameras if both else cameras[:1]
+    rays = [PixelRays.of(camera) for camera in taken]
     # The cameras of a pair are so close together that one scene serves both.
     scene = site_scene(ground, Eye.of(rays[0], pose, ground.surface), sun)
     pictures = []
-    for number, camera in enumerate(cameras):
+    for number, camera in enumerate(taken):
         frame = process_renderer(default_backend()).render(scene, rays[number], pose)
         exposed, counts = _exposed(shot, ground, camera, number, frame) if detector else (None, None)
         suffix = "" if len(cameras) == 1 else ("-left", "-right")[number]

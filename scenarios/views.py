@@ -213,8 +213,8 @@ STANCES: Mapping[str, Stance] = MappingProxyType(
         "mer-descent-field": Stance("descent", 2000.0, -90.0),
         "mer-navcam": Stance("ground", 1.5, -18.0),
         "mer-hazcam": Stance("ground", 0.53, -40.0),
-        "research-navcam": Stance("ground", 1.5, -18.0),
-        "research-pancam": Stance("ground", 1.5, -8.0),
+        "research-navcam": Stance("ground", 1.5, -13.0),
+        "research-pancam": Stance("ground", 1.5, -5.0),
         "xc-55": Stance("ground", 10.0, -90.0),
     }
 )

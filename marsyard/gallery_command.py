@@ -1,0 +1,240 @@
+"""`marsyard gallery`: every site through the cameras that fit it, on one page."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marsyard.render_command import WRONG, Shot, take
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import UInt8
+
+    from marsyard.render_command import Picture
+
+    Grey = UInt8[np.ndarray, "rows columns"]
+
+PAGE, SHEET = "index.html", "contact-sheet.png"
+#: Widest the pictures on the page are, and the quality of their JPEG files.
+PAGE_WIDTH_PX, PAGE_QUALITY, FULL_QUALITY = 760, 82, 92
+#: The contact sheet: cells, gap, height of the labels, the bytes it may take, and the greys tried to stay below them.
+COLUMNS, CELL_PX, GAP_PX, LABEL_PX, SHEET_BYTES = 4, (240, 180), 8, 22, 300_000
+SHEET_GREYS = (64, 48, 40, 32, 26, 21, 16, 12, 8)
+#: Display: percentiles of the brightness that become almost black and white, how much of the first, and the gamma.
+BLACK_PERCENTILE, WHITE_PERCENTILE, BLACK_SHARE, GAMMA = 0.5, 99.7, 0.6, 0.65
+
+#: Site, camera, and what differs from the camera's usual stance.
+PLATES: Sequence[tuple[str, str, dict[str, Any]]] = (
+    ("gusev", "mer-descent-flown", {"altitude_m": 1400.0, "sun_azimuth_deg": 270.0, "sun_elevation_deg": 30.0}),
+    ("gusev", "mer-navcam", {"east_m": 30.0, "north_m": 40.0, "azimuth_deg": 340.0, "sun_azimuth_deg": 265.0}),
+    ("gusev", "mer-hazcam", {"azimuth_deg": 20.0, "sun_azimuth_deg": 285.0, "sun_elevation_deg": 40.0}),
+    ("meridiani", "mer-descent-flown", {"altitude_m": 1400.0, "sun_azimuth_deg": 270.0, "sun_elevation_deg": 25.0}),
+    ("meridiani", "mer-navcam", {"azimuth_deg": 190.0, "sun_azimuth_deg": 275.0, "sun_elevation_deg": 22.0}),
+    ("pisgah", "mer-descent-field", {"altitude_m": 1400.0, "sun_azimuth_deg": 120.0, "sun_elevation_deg": 30.0}),
+    ("pisgah", "research-navcam", {"azimuth_deg": 200.0, "sun_azimuth_deg": 290.0, "sun_elevation_deg": 40.0}),
+    ("kelso", "mer-descent-field", {"altitude_m": 2000.0, "sun_azimuth_deg": 110.0, "sun_elevation_deg": 25.0}),
+    ("kelso", "research-navcam", {"azimuth_deg": 20.0, "sun_azimuth_deg": 105.0, "sun_elevation_deg": 20.0}),
+    ("ivanpah", "mer-descent-field", {"altitude_m": 2000.0, "sun_azimuth_deg": 250.0, "sun_elevation_deg": 35.0}),
+    ("ivanpah", "research-navcam", {"azimuth_deg": 100.0, "sun_azimuth_deg": 190.0, "sun_elevation_deg": 35.0}),
+    ("mars-yard", "research-navcam", {"azimuth_deg": 40.0, "sun_azimuth_deg": 140.0, "sun_elevation_deg": 40.0}),
+    ("mars-yard", "research-pancam", {"azimuth_deg": 40.0, "sun_azimuth_deg": 140.0, "sun_elevation_deg": 40.0}),
+    ("heli-benign", "xc-55", {"sun_azimuth_deg": 140.0, "sun_elevation_deg": 45.0}),
+    ("heli-hazardous", "xc-55", {"sun_azimuth_deg": 140.0, "sun_elevation_deg": 45.0}),
+    ("heli-hazardous", "xc-55", {"altitude_m": 30.0, "sun_azimuth_deg": 140.0, "sun_elevation_deg": 30.0}),
+)
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A picture for the page: what it shows, its greys, and its file of full size beside the page."""
+
+    shot: Shot
+    grey: Grey
+    file: str
+
+    @property
+    def caption(self) -> str:
+        """Camera, height and direction, sun."""
+        s = self.shot
+        facing = "looking straight down" if s.elevation_deg == -90.0 else f"looking to {s.azimuth_deg:g}°"
+        return (
+            f"{s.camera}, {s.altitude_m:g} m above the ground, {facing}; "
+            f"sun {s.sun_elevation_deg:g}° high at {s.sun_azimuth_deg:g}°"
+        )
+
+
+def gallery(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the page and its pictures.")] = Path(
+        "gallery"
+    ),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a gallery that is there.")] = False,
+) -> None:
+    """Render every site through the cameras that fit it: one page, and a contact sheet. Takes about a minute."""
+    from sim.render.backend import RenderingError
+
+    try:
+        _check_folder(out, overwrite)
+        plates = []
+        for number, (site, camera, settings) in enumerate(PLATES, start=1):
+            typer.echo(f"{number} of {len(PLATES)}: {site}, {camera}", err=True)
+            plates.append(plate(number, Shot.usual(site, camera, **settings)))
+        typer.echo(write_gallery(plates, out))
+    except (ValueError, RenderingError) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(WRONG) from None
+    except OSError as error:
+        typer.echo(f"error: cannot write to {out}: {error}", err=True)
+        raise typer.Exit(WRONG) from None
+
+
+def plate(number: int, shot: Shot) -> Plate:
+    """One picture as its camera's detector delivers it; of a pair the left one."""
+    return Plate(shot, displayed(take(shot, both=False)[0]), f"{number:02d}-{shot.site}-{shot.camera}.jpg")
+
+
+def displayed(picture: Picture) -> Grey:
+    """Counts above the offset as greys for the eye.
+
+    White is the brightest ground; a brighter sky is pressed into the upper greys (Reinhard et al. 2002, eq. 4).
+    """
+    import numpy as np
+
+    if picture.exposed is None or picture.counts is None:
+        raise ValueError("only what a detector delivered can be displayed")
+    signal = np.clip(picture.counts - picture.exposed.detector.parameters.offset_dn, 0.0, None)
+    ground = signal[np.isfinite(picture.frame.range_m)]
+    white = float(np.percentile(ground if ground.size else signal, WHITE_PERCENTILE))
+    black = BLACK_SHARE * float(np.percentile(signal, BLACK_PERCENTILE))
+    share = np.clip((signal - black) / max(white - black, 1.0), 0.0, None)
+    brightest = max(float(np.percentile(share, WHITE_PERCENTILE)), 1.0)
+    pressed = np.clip(share * (1.0 + share / brightest**2) / (1.0 + share), 0.0, 1.0)
+    grey: Grey = np.rint(255.0 * pressed**GAMMA).astype(np.uint8)
+    return grey
+
+
+def write_gallery(plates: Sequence[Plate], folder: Path) -> Path:
+    """Writes the page, the pictures beside it and the contact sheet; the page's path."""
+    from importlib.metadata import version
+
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    from sim.terrain import sites
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for one in plates:
+        (folder / one.file).write_bytes(_jpeg(one.grey, FULL_QUALITY))
+    (folder / SHEET).write_bytes(contact_sheet(plates))
+    order = dict.fromkeys(one.shot.site for one in plates)
+    groups = [(sites()[name], [_shown(one) for one in plates if one.shot.site == name]) for name in order]
+    environment = Environment(
+        loader=PackageLoader("reports"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template("gallery.html.j2").render(groups=groups, version=version("marsyard"))
+    (folder / PAGE).write_text(page, encoding="utf-8")
+    return folder / PAGE
+
+
+def contact_sheet(plates: Sequence[Plate]) -> bytes:
+    """All pictures small, as a PNG file of at most `SHEET_BYTES`, with as many greys as fit."""
+    import cv2
+    import numpy as np
+
+    wide, high = CELL_PX
+    rows = -(-len(plates) // COLUMNS)
+    size = (rows * (high + LABEL_PX + GAP_PX) + GAP_PX, COLUMNS * (wide + GAP_PX) + GAP_PX)
+    sheet = np.full(size, 24, dtype=np.uint8)
+    for number, one in enumerate(plates):
+        top = GAP_PX + number // COLUMNS * (high + LABEL_PX + GAP_PX)
+        left = GAP_PX + number % COLUMNS * (wide + GAP_PX)
+        sheet[top : top + high, left : left + wide] = _cell(one.grey)
+        label = f"{one.shot.site}  {one.shot.camera}  {one.shot.altitude_m:g} m"
+        place = (left + 1, top + high + LABEL_PX - 8)
+        cv2.putText(sheet, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 235, 1, cv2.LINE_AA)
+    encoded = b""
+    for greys in SHEET_GREYS:
+        step = 255.0 / (greys - 1)
+        coarse = np.rint(np.rint(sheet / step) * step).astype(np.uint8)
+        encoded = _encoded(".png", coarse, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        if len(encoded) <= SHEET_BYTES:
+            break
+    return encoded
+
+
+def _cell(grey: Grey) -> Grey:
+    """The middle of a picture in the shape of a cell."""
+    import cv2
+    import numpy as np
+
+    rows, columns = grey.shape
+    wide, high = CELL_PX
+    kept = min(rows, round(columns * high / wide))
+    first = (rows - kept) // 3  # rather its upper part, where the horizon is
+    shrunk: Grey = np.asarray(
+        cv2.resize(grey[first : first + kept], CELL_PX, interpolation=cv2.INTER_AREA), dtype=np.uint8
+    )
+    return shrunk
+
+
+def _shown(one: Plate) -> dict[str, Any]:
+    """What the page's template takes of a picture."""
+    import base64
+
+    import cv2
+    import numpy as np
+
+    rows, columns = one.grey.shape
+    width = min(PAGE_WIDTH_PX, columns)
+    small = cv2.resize(one.grey, (width, round(rows * width / columns)), interpolation=cv2.INTER_AREA)
+    inline = base64.b64encode(_jpeg(np.asarray(small, dtype=np.uint8), PAGE_QUALITY)).decode()
+    s = one.shot
+    command = (
+        f"marsyard render {s.site} --camera {s.camera} --scale {s.scale} --altitude {s.altitude_m:g} "
+        f"--east {s.east_m:g} --north {s.north_m:g} "
+        f"--azimuth {s.azimuth_deg:g} --elevation {s.elevation_deg:g} --sun-azimuth {s.sun_azimuth_deg:g} "
+        f"--sun-elevation {s.sun_elevation_deg:g} --out {s.site}"
+    )
+    return {
+        "source": f"data:image/jpeg;base64,{inline}",
+        "file": one.file,
+        "columns": columns,
+        "rows": rows,
+        "caption": one.caption,
+        "command": command,
+    }
+
+
+def _jpeg(grey: Grey, quality: int) -> bytes:
+    import cv2
+
+    return _encoded(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def _encoded(ending: str, grey: Grey, options: Sequence[int]) -> bytes:
+    import cv2
+
+    done, encoded = cv2.imencode(ending, grey, options)
+    if not done:
+        raise ValueError(f"a picture could not be encoded as {ending}")
+    return encoded.tobytes()
+
+
+def _check_folder(folder: Path, overwrite: bool) -> None:
+    """Raises ValueError where the gallery cannot be written, or is there and may not be replaced."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--out {folder} is a file; a folder is needed")
+    there = [name for name in (PAGE, SHEET) if (folder / name).exists()]
+    if there and not overwrite:
+        raise ValueError(f"{folder / there[0]}: there already; --overwrite replaces what is there")
+    above = next(one for one in (folder, *folder.absolute().parents) if one.exists())
+    if not os.access(above, os.W_OK):
+        raise ValueError(f"--out {folder}: the folder {above} cannot be written to")

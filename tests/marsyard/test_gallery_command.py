@@ -1,0 +1,107 @@
+"""`marsyard gallery`: its plates are possible, its page stands alone, its contact sheet is small."""
+
+from __future__ import annotations
+
+import re
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from marsyard import cli, gallery_command
+from marsyard.gallery_command import PAGE, PLATES, SHEET, SHEET_BYTES, Plate, contact_sheet, displayed, write_gallery
+from marsyard.render_command import Shot, take
+from sim.sensor import PRESETS
+from sim.terrain import sites
+
+
+class _Links(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.texts: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found += [value for name, value in attrs if name in ("href", "src") and value]
+        self.texts += [value or "" for name, value in attrs if tag == "img" and name == "alt"]
+
+
+@pytest.fixture(scope="module")
+def plates() -> list[Plate]:
+    """Plates of noise, as hard to compress as pictures can be."""
+    rng = np.random.default_rng(1)
+    return [
+        Plate(
+            Shot.usual(site, camera, **settings),
+            rng.integers(0, 256, (480, 640), dtype=np.uint8),
+            f"{number}-{site}.jpg",
+        )
+        for number, (site, camera, settings) in enumerate(PLATES)
+    ]
+
+
+def test_every_site_and_every_kind_of_camera_is_shown(plates: list[Plate]) -> None:
+    assert {plate.shot.site for plate in plates} == set(sites())
+    assert {plate.shot.camera for plate in plates} == set(PRESETS)
+    for plate in plates:
+        site = sites()[plate.shot.site]
+        assert site.descent is None or any(p.shot.scale == "descent" for p in plates if p.shot.site == site.name)
+
+
+def test_page_needs_only_the_pictures_beside_it(plates: list[Plate], tmp_path: Path) -> None:
+    page = write_gallery(plates, tmp_path / "new" / "gallery")
+    links = _Links()
+    text = page.read_text()
+    links.feed(text)
+    assert page.name == PAGE
+    for link in links.found:
+        if link.startswith("#"):
+            assert f'id="{link[1:]}"' in text
+        elif not link.startswith("data:image/jpeg;base64,"):
+            assert (page.parent / link).is_file()
+    assert len(links.texts) == len(plates)
+    assert all(plate.caption in links_text for plate, links_text in zip(plates, links.texts, strict=True))
+    for command in re.findall(r"<code>(marsyard render [^<]*)</code>", text):
+        assert "--camera" in command
+
+
+def test_contact_sheet_is_small(plates: list[Plate]) -> None:
+    smooth = np.linspace(0.0, 255.0, 640 * 480).reshape(480, 640)
+    rng = np.random.default_rng(2)
+    pictures = [
+        Plate(one.shot, np.clip(smooth + rng.normal(0.0, 6.0, smooth.shape), 0, 255).astype(np.uint8), one.file)
+        for one in plates
+    ]
+    sheet = contact_sheet(pictures)
+    assert len(sheet) <= SHEET_BYTES
+    decoded = cv2.imdecode(np.frombuffer(sheet, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert decoded is not None
+    assert len(np.unique(decoded)) > 8
+
+
+def test_display_uses_the_greys_and_keeps_their_order() -> None:
+    picture = take(Shot.usual("heli-hazardous", "xc-55"))[0]
+    grey = displayed(picture)
+    assert grey.shape == picture.frame.radiance.shape
+    assert np.percentile(grey, 99.8) > 240
+    assert np.percentile(grey, 0.5) < 110
+    assert picture.counts is not None
+    order = np.argsort(picture.counts, axis=None)
+    assert (np.diff(grey.ravel()[order].astype(int)) >= 0).all()
+
+
+@pytest.mark.parametrize("name", [PAGE, SHEET])
+def test_gallery_that_is_there_stays(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text("mine")
+    monkeypatch.setattr(gallery_command, "PLATES", ())
+    monkeypatch.setattr(sys, "argv", ["marsyard", "gallery", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert f"{tmp_path / name}: there already" in capfd.readouterr().err
+    assert (tmp_path / name).read_text() == "mine"
