@@ -114,6 +114,7 @@ class DepthRenderer:
                 f"no OpenGL context through {backend} ({error}); run 'marsyard doctor' to see what is missing"
             ) from error
         _draw_single_sampled(self._offscreen._renderer)
+        _compile_shaders_once(self._offscreen._renderer)
         self._pyrender = pyrender
         self._scene: Any = None
         self._flags = 0
@@ -225,6 +226,31 @@ def _import_pyrender(backend: Backend) -> Any:
             f"OpenGL through {backend} cannot be loaded ({error}); run 'marsyard doctor' to see what is missing"
         ) from error
     return pyrender
+
+
+def _compile_shaders_once(renderer: Any) -> None:
+    """Makes pyrender find the shaders that it has compiled.
+
+    pyrender looks them up by the current context. PyOpenGL tells OSMesa's context by a new pointer object each time, so
+    that every picture would compile its shaders anew and leave the old ones behind, some 0.3 MB. A renderer has one
+    context for life.
+    """
+    programs = renderer._program_cache
+    compile_program = programs.get_program
+    compiled: dict[Any, Any] = {}
+
+    def get_program(
+        vertex_shader: str,
+        fragment_shader: str,
+        geometry_shader: str | None = None,
+        defines: dict[str, Any] | None = None,
+    ) -> Any:
+        key = (vertex_shader, fragment_shader, geometry_shader, tuple(sorted((defines or {}).items())))
+        if key not in compiled:
+            compiled[key] = compile_program(vertex_shader, fragment_shader, geometry_shader, defines)
+        return compiled[key]
+
+    programs.get_program = get_program
 
 
 def _draw_single_sampled(renderer: Any) -> None:

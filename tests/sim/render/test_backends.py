@@ -7,6 +7,10 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
+from sim.frames import rigid
+from sim.render import Photometry, PixelRays, Scene, Sun
 
 DRAW = """
 import sys
@@ -72,6 +76,19 @@ def test_without_a_choice_the_installed_backend_is_taken(monkeypatch, installed,
     monkeypatch.delenv("MARSYARD_GL", raising=False)
     monkeypatch.setattr(backend, "find_library", lambda name: f"lib{name}.so" if name in installed else None)
     assert backend.default_backend() == chosen
+
+
+def test_shaders_are_compiled_once(renderer, rough, descent_camera) -> None:
+    """Not once a picture: each would leave 0.3 MB behind."""
+    rays = PixelRays.of(descent_camera(64))
+    scene = Scene(rough, (0.0, 0.0), Sun(np.array([0.0, 0.0, 1.0])), Photometry())
+    pose = rigid(Rotation.identity(), np.array([0.0, 0.0, 500.0]))
+    renderer.render(scene, rays, pose)
+    programs = renderer._views[rays.view_side_px]._offscreen._renderer._program_cache._program_cache
+    compiled = len(programs)
+    for _ in range(3):
+        renderer.render(scene, rays, pose)
+    assert len(programs) == compiled
 
 
 def test_a_process_keeps_to_one_backend() -> None:
