@@ -1,5 +1,60 @@
-"""Runs every benchmark: ``python -m benchmarks``."""
+"""Runs every benchmark, prints the figures and keeps them: ``python -m benchmarks``."""
 
-from benchmarks import descent
+from __future__ import annotations
 
-descent.main()
+import datetime as dt
+import json
+import os
+import platform
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+
+from benchmarks import descent, pictures
+from benchmarks.timing import Figure
+from sim.processor import processor_features
+from sim.render import process_renderer
+from sim.render.backend import default_backend
+
+RESULTS = Path(__file__).parent / "results" / "benchmarks.json"
+PACKAGES = ("marsyard", "numpy", "numba", "pyrender2", "opencv-python-headless")
+
+
+def main() -> None:
+    """Measures, prints and keeps."""
+    cv2.setNumThreads(1)
+    figures = [
+        # first, while nothing else has grown the process
+        *pictures.memory(120),
+        *descent.frame(15),
+        *descent.case(7),
+        *pictures.wall_seconds_of_a_frame(9),
+        *pictures.beside_pyrender(5),
+        *pictures.rover_pictures(3),
+        *descent.new_terrains(2),
+    ]
+    print(f"{'core-seconds, unless said otherwise':<52}{'median':>8}{'least':>8}{'most':>8}  {'bar':<8}")
+    for figure in figures:
+        mark = "" if figure.met else "  MISSED"
+        low, high = min(figure.values), max(figure.values)
+        print(f"{figure.name:<52}{figure.median:8.3f}{low:8.3f}{high:8.3f}  {figure.asked:<8}{mark}")
+    keep(figures)
+
+
+def keep(figures: list[Figure]) -> None:
+    """Writes the figures with the machine and the versions that they came from."""
+    record = {
+        "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
+        "machine": {"platform": platform.platform(), "processor": processor_features(), "cores": os.cpu_count()},
+        "versions": {name: version(name) for name in PACKAGES},
+        "gl": process_renderer(default_backend()).description(),
+        "figures": {figure.name: {"median": figure.median, "asked": figure.asked} for figure in figures},
+    }
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps(record, indent=2) + "\n")
+    print(f"kept in {RESULTS}")
+
+
+if __name__ == "__main__":
+    main()
