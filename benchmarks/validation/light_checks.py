@@ -100,10 +100,11 @@ def _shadow_row(name: str, view: View, sun: Sun, count: int, farthest: float, st
     hidden |= np.isfinite(meet_triangles(view.scene.objects, points, rays, nearest=2e-3))
     theirs = (facing > 0.0) & ~hidden
     agree = float(np.mean(ours == theirs))
-    turned = facing <= 0.0
+    cast = (facing > 0.0) & hidden
+    found = f", of which {np.mean(~ours[cast]):.0%} are dark in the picture" if cast.any() else ""
     how = (
-        f"{pixels.size} random pixels, {np.mean(~theirs):.0%} dark, {np.mean(turned):.0%} turned from the sun; "
-        f"{np.mean(ours & ~theirs):.2%} wrongly lit, {np.mean(theirs & ~ours):.2%} wrongly dark"
+        f"{pixels.size} random pixels, {np.mean(facing <= 0.0):.1%} turned from the sun, "
+        f"{np.mean(cast):.1%} in cast shadow{found}; {np.mean(theirs & ~ours):.2%} wrongly dark"
     )
     return Measure(f"shadows as an independent ray cast has them: {name}", agree, "", 0.995, how, "at least")
 
