@@ -14,9 +14,7 @@ from marsyard.render_command import WRONG, Shot, take
 
 if TYPE_CHECKING:
     import numpy as np
-    from jaxtyping import UInt8
-
-    from marsyard.render_command import Picture
+    from jaxtyping import Bool, Float64, UInt8
 
     Grey = UInt8[np.ndarray, "rows columns"]
 
@@ -95,21 +93,24 @@ def gallery(
 
 def plate(number: int, shot: Shot) -> Plate:
     """One picture as its camera's detector delivers it; of a pair the left one."""
-    return Plate(shot, displayed(take(shot, both=False)[0]), f"{number:02d}-{shot.site}-{shot.camera}.jpg")
+    import numpy as np
+
+    picture = take(shot, both=False)[0]
+    if picture.exposed is None or picture.counts is None:
+        raise ValueError("only what a detector delivered can be displayed")
+    signal = np.clip(picture.counts - picture.exposed.detector.parameters.offset_dn, 0.0, None)
+    grey = displayed(signal, np.isfinite(picture.frame.range_m))
+    return Plate(shot, grey, f"{number:02d}-{shot.site}-{shot.camera}.jpg")
 
 
-def displayed(picture: Picture) -> Grey:
-    """Counts above the offset as greys for the eye.
+def displayed(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarray, "rows columns"]) -> Grey:
+    """Counts above the offset as greys for the eye, given which pixels see the ground.
 
     White is the brightest ground; a brighter sky is pressed into the upper greys (Reinhard et al. 2002, eq. 4).
     """
     import numpy as np
 
-    if picture.exposed is None or picture.counts is None:
-        raise ValueError("only what a detector delivered can be displayed")
-    signal = np.clip(picture.counts - picture.exposed.detector.parameters.offset_dn, 0.0, None)
-    ground = signal[np.isfinite(picture.frame.range_m)]
-    white = float(np.percentile(ground if ground.size else signal, WHITE_PERCENTILE))
+    white = float(np.percentile(signal[ground] if ground.any() else signal, WHITE_PERCENTILE))
     black = BLACK_SHARE * float(np.percentile(signal, BLACK_PERCENTILE))
     share = np.clip((signal - black) / max(white - black, 1.0), 0.0, None)
     brightest = max(float(np.percentile(share, WHITE_PERCENTILE)), 1.0)

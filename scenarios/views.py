@@ -37,6 +37,8 @@ _BESIDE_HEIGHTS, _BESIDE_M = 3.0, 5.0
 _CLASS_RATIO = float(np.sqrt(2.0))
 #: Spacing of the mesh over the height of the eye, by how much it grows with distance, and how far it reaches.
 _MESH_FINEST, _MESH_GROWTH, _MESH_REACH_HEIGHTS, _MESH_REACH_M = 0.0085, 0.012, 14.0, 700.0
+#: Height of the eye below which a picture shows little of the mesh.
+_LOW_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -134,8 +136,7 @@ class Eye:
 def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
     """The scene that a camera sees from here: ground, the rocks it can tell apart, texture and light.
 
-    Near the ground only what is in view is drawn (`Scene.mesh_in_view`); from a descent's height the whole mesh serves
-    all pictures.
+    Near the ground only what is in view is drawn (`Scene.mesh_in_view`); from higher up one mesh serves all pictures.
     """
     spacing = ground.surface.spacing_m
     finest = max(_MESH_FINEST * eye.height_m, 0.8 * spacing)
@@ -152,7 +153,7 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
         mesh_finest_m=finest,
         mesh_reach_m=reach,
         mesh_lines=2 * half + 1,
-        mesh_in_view=True,
+        mesh_in_view=eye.height_m < _LOW_M,
     )
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from marsyard import cli, gallery_command
 from marsyard.gallery_command import PAGE, PLATES, SHEET, SHEET_BYTES, Plate, contact_sheet, displayed, write_gallery
-from marsyard.render_command import Shot, take
+from marsyard.render_command import Shot
 from sim.sensor import PRESETS
 from sim.terrain import sites
 
@@ -83,14 +83,22 @@ def test_contact_sheet_is_small(plates: list[Plate]) -> None:
 
 
 def test_display_uses_the_greys_and_keeps_their_order() -> None:
-    picture = take(Shot.usual("heli-hazardous", "xc-55"))[0]
-    grey = displayed(picture)
-    assert grey.shape == picture.frame.radiance.shape
-    assert np.percentile(grey, 99.8) > 240
-    assert np.percentile(grey, 0.5) < 110
-    assert picture.counts is not None
-    order = np.argsort(picture.counts, axis=None)
+    rng = np.random.default_rng(3)
+    ground = np.ones((120, 160), dtype=bool)
+    ground[:20] = False
+    signal = np.where(ground, rng.normal(800.0, 100.0, ground.shape), 3000.0)
+    grey = displayed(signal, ground)
+    assert (grey[~ground] > 250).all()
+    assert np.ptp(np.percentile(grey[ground], [1.0, 99.0])) > 60
+    order = np.argsort(signal, axis=None)
     assert (np.diff(grey.ravel()[order].astype(int)) >= 0).all()
+    # without sky the brightest ground is white
+    assert np.percentile(displayed(signal[20:], ground[20:]), 99.8) > 250
+
+
+@pytest.mark.parametrize("dark", [np.zeros((8, 8)), np.full((8, 8), 7.0)])
+def test_even_pictures_can_be_displayed(dark: np.ndarray) -> None:
+    assert len(np.unique(displayed(dark, np.zeros((8, 8), dtype=bool)))) == 1
 
 
 @pytest.mark.parametrize("name", [PAGE, SHEET])
