@@ -26,7 +26,7 @@ from sim.terrain import Surface
 
 NO_TEXTURE = Texture()
 #: Most posts along a side of the grid on which the ground's shadow is swept.
-SHADOW_SIDE = 2048
+SHADOW_SIDE = 4096
 NO_SHADOW = (np.full((1, 1), -np.inf, dtype=np.float32), 1.0, 0)
 
 
@@ -207,6 +207,7 @@ class Renderer:
             np.asarray(scene.sun.direction, dtype=np.float64),
             scene.photometry.law(scene.sun, scene.caster_diameter_m),
             *scene.shadow,
+            scene.height_range_m[1],
             scene.ground_texture.arrays(),
             scene.object_texture.arrays(),
             scene.objects.normals,

@@ -92,8 +92,8 @@ def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach:
 
 
 @njit(cache=True, inline="always")
-def ground_lit(shadow: Array32, inverse_spacing: float, softness: float, x: float, y: float, z: float) -> float:
-    """Share of the sun's disc that the ground leaves free at a place."""
+def shadow_clearance(shadow: Array32, inverse_spacing: float, x: float, y: float, z: float) -> float:
+    """How far a place lies above the ground's shadow, metres."""
     row_mask = shadow.shape[0] - 1
     gx = x * inverse_spacing
     gy = y * inverse_spacing
@@ -107,8 +107,65 @@ def ground_lit(shadow: Array32, inverse_spacing: float, softness: float, x: floa
     j1 = (j + 1) & row_mask
     edge = (1.0 - fy) * ((1.0 - fx) * shadow[i0, j0] + fx * shadow[i0, j1])
     edge += fy * ((1.0 - fx) * shadow[i1, j0] + fx * shadow[i1, j1])
-    lit: float = min(max((z - edge) / softness + 0.5, 0.0), 1.0)
-    return lit
+    clearance: float = z - edge
+    return clearance
+
+
+@njit(cache=True)
+def hidden_from_sun(
+    field: Level, inverse_spacing: float, x: float, y: float, z: float, sun: Array, highest: float
+) -> bool:
+    """Whether the ground hides the sun from a place on it, by steps of half a sample or of the clearance reached."""
+    spacing = 1.0 / inverse_spacing
+    t = 0.25 * spacing
+    farthest = (highest - z) / max(sun[2], 1e-6)
+    while t < farthest:
+        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, x + t * sun[0], y + t * sun[1])
+        clearance = z + t * sun[2] - height
+        if clearance < 0.0:
+            return True
+        t += max(0.5 * spacing, clearance)
+    return False
+
+
+@njit(cache=True)
+def first_ground(
+    field: Level,
+    inverse_spacing: float,
+    x0: float,
+    y0: float,
+    z0: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    guess: float,
+) -> float:
+    """Distance at which a flat ray first dips below the ground, on the way to a guess and past it.
+
+    The mesh that gives the guess does not hold every crest. The ray is followed from four fifths of the guess by steps
+    of a sample, longer where it runs high above the ground, and the crossing halved down to a hundredth of a sample.
+    """
+    spacing = 1.0 / inverse_spacing
+    before = 0.8 * guess
+    t = before
+    farthest = 1.25 * guess + 4.0 * spacing
+    while t < farthest:
+        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, x0 + t * dx, y0 + t * dy)
+        clearance = z0 + t * dz - height
+        if clearance < 0.0:
+            break
+        before = t
+        t += max(spacing, 1.5 * clearance)
+    if t >= farthest or t == before:
+        return guess
+    while t - before > 0.01 * spacing:
+        middle = 0.5 * (before + t)
+        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, x0 + middle * dx, y0 + middle * dy)
+        if z0 + middle * dz < height:
+            t = middle
+        else:
+            before = middle
+    return 0.5 * (before + t)
 
 
 @njit(cache=True)
@@ -123,4 +180,14 @@ def height_range(field: Level) -> tuple[float, float]:
     return float(low), float(high)
 
 
-__all__ = ["Array", "Array32", "Level", "ground_lit", "height_range", "meet_ground", "sweep_shadow"]
+__all__ = [
+    "Array",
+    "Array32",
+    "Level",
+    "first_ground",
+    "height_range",
+    "hidden_from_sun",
+    "meet_ground",
+    "shadow_clearance",
+    "sweep_shadow",
+]

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, ground_lit, meet_ground
+from sim.render.kernels.ground import Array32, first_ground, hidden_from_sun, meet_ground, shadow_clearance
 from sim.render.kernels.hierarchy import Hierarchy, anything_hit
 from sim.render.kernels.intersection import hit_triangle
 from sim.render.kernels.texture import texture
@@ -23,6 +23,10 @@ FLATTEST = 0.01
 FINE_UNTIL = 8.0
 #: Footprint, in samples, up to which the finest level is taken: the B-spline itself holds nothing finer than this.
 SHARP_UNTIL = 1.2
+#: Distance from a shadow's edge, in spacings of its grid, within which the grid is not believed.
+UNSURE = 0.1
+#: Sine of the angle below which a ray may pass over crests that the mesh does not hold.
+GRAZING = 0.4
 #: Slack of a triangle's edge, as a share: so that no ray slips between two triangles.
 SLACK = 1e-9
 
@@ -158,6 +162,7 @@ def shade(
     shadow: Array32,
     shadow_spacing: float,
     shadow_level: int,
+    highest: float,
     ground_texture: tuple[float, Array],
     object_texture: tuple[float, Array],
     normals: Array,
@@ -193,6 +198,8 @@ def shade(
         ground, diameter of what casts a shadow from the body's place, angular radius of the sun.
     shadow, shadow_spacing, shadow_level
         Height of the ground's shadow on the grid of a level of the surface; one side is 1 where there is none.
+    highest
+        Height that no ground exceeds.
     ground_texture, object_texture
         Coarsest cell and amplitudes of octaves.
     normals, body_of_triangle, albedos, tree
@@ -242,6 +249,8 @@ def shade(
             stretched = t * pixel_angles[n] / max(-dz, FLATTEST)
             first_guess = t
             if stretched <= FINE_UNTIL * spacing:
+                if dz > -GRAZING:
+                    t = first_ground(finest, inverse_spacing, x0, y0, z0, dx, dy, dz, t)
                 t = meet_ground(finest, inverse_spacing, x0, y0, z0, dx, dy, dz, t)
                 met = t != first_guess
             else:
@@ -316,10 +325,14 @@ def shade(
                     # the terrain itself, where the pixel saw it smoothed: its own bumps must not shade a smooth ground
                     height, _slope_x, _slope_y, _albedo = sample(levels[shadow_level], 1.0 / shadow_spacing, x, y)
                     z = max(z, height)
-                lit = ground_lit(shadow, 1.0 / shadow_spacing, 0.25 * shadow_spacing, x, y, z)
+                clear = shadow_clearance(shadow, 1.0 / shadow_spacing, x, y, z)
+                lit = 1.0 if clear > 0.0 else 0.0
+                if abs(clear) < UNSURE * shadow_spacing and triangle < 0 and met:
+                    # at the shadow's edge the swept grid is too coarse: look towards the sun from here
+                    lit = 0.0 if hidden_from_sun(finest, inverse_spacing, x, y, z, sun, highest) else 1.0
             if lit > 0.0 and things:
-                # lifted off its facet by a millimetre and half a pixel, so that it does not shade itself
-                lift = 1e-3 + 0.5 * t * pixel_angles[n]
+                # lifted off its own facet, so that this and those beside do not shade it by rounding
+                lift = 1e-4 + (0.05 * t * pixel_angles[n] if triangle >= 0 else 0.0)
                 if anything_hit(tree, x + lift * nx, y + lift * ny, z + lift * nz, sun, 0.0):
                     lit = 0.0
             cos_g = min(max(-(dx * sun[0] + dy * sun[1] + dz * sun[2]), -1.0), 1.0)

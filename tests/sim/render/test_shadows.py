@@ -14,9 +14,9 @@ from sim.terrain.rocks import RockField, RockParameters
 ALBEDO = 0.2
 #: Brightness is then albedo times the cosine of incidence in the sun, and 0 in shadow.
 LAMBERT = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
-#: Share of pixels on which the two agree today. The bar is 0.995 (docs/validation.md); it is missed under a low sun,
-#: for the ground's shadow is swept over the terrain's posts. The tests keep it from getting worse.
-GROUND_BAR, ROCK_BAR = 0.95, 0.995
+#: Share of pixels on which the two agree. The bar is 0.995 (docs/validation.md), met over the sites; ground as rough as
+#: this test's under a sun of 10 deg is held to what it reaches, 0.9925, so that it does not get worse.
+GROUND_BAR, ROCK_BAR = 0.99, 0.995
 
 
 def _even(surface: Surface) -> Surface:
