@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 from scipy.spatial.transform import RigidTransform
@@ -104,9 +105,10 @@ def _ground_shadow(
         return NO_SHADOW
     drop = spacing * up / abs(main)
     reach = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, height.shape[0]))
-    rows_towards_sun = height if along_y else np.ascontiguousarray(height.T)
+    # OpenCV transposes by blocks, some five times faster than a copy of NumPy's view
+    rows_towards_sun = height if along_y else cv2.transpose(height)
     swept = sweep_shadow(rows_towards_sun, float(np.sign(main)), drop, side / abs(main), reach)
-    return (swept if along_y else np.ascontiguousarray(swept.T)), spacing, level
+    return (swept if along_y else cv2.transpose(swept)), spacing, level
 
 
 @dataclass(frozen=True)
