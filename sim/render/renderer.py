@@ -8,6 +8,7 @@ Distortion is therefore exact and not a resampling of a pinhole picture.
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 
@@ -262,6 +263,8 @@ class Renderer:
         triangles = scene.objects.triangles[numbers]
         self._view_renderer(side).load(ground_mesh(scene.surface, x, y), triangles, numbers)
         self._loaded[side] = scene
+        if not scene.mesh_in_view:
+            _return_freed_memory()
 
     def _draw(
         self,
@@ -283,6 +286,16 @@ class Renderer:
             far = 2.0 * scene.mesh_reach_m + clearance_m
             drawn.append(renderer.draw(PinholeView(pose, float(focal), near_m=0.05 * clearance_m, far_m=far)))
         return np.stack([depth for depth, _ in drawn]), np.stack([numbers for _, numbers in drawn])
+
+
+def _return_freed_memory() -> None:
+    """Gives the memory of the scene before back to the system.
+
+    A scene's large arrays come and go between small ones; without this the C library keeps some 1 MB a scene.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 #: Rays along each side of a picture from which the ground that it shows is found.
