@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bisect
 import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Annotated, Any, Literal, Protocol, Self
@@ -69,16 +70,16 @@ def _check_limits(shape: Shape, limits: tuple[float, float] | None) -> None:
         raise ValueError(f"truncate = [{low}, {high}]: the distribution has no probability between the limits")
 
 
-class Dispersion(BaseModel):
+class Dispersion(BaseModel, ABC):
     """What every dispersion states: its distribution and where it was taken from."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     source: str = ""
 
+    @abstractmethod
     def quantile(self, probability: float) -> Any:
         """The value below which a draw falls with this probability, which lies strictly between 0 and 1."""
-        raise NotImplementedError
 
     def extremes(self) -> tuple[Any, ...]:
         """Values that stand for all that can be drawn, to be held against what the parameter allows."""

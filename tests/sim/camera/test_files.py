@@ -25,7 +25,6 @@ from sim.camera import (
     write_cahvor,
 )
 
-SHARED = Path(__file__).parents[3].parent / "shared" / "data" / "mer_opportunity"
 
 LABEL = """PDS_VERSION_ID                    = PDS3
 RECORD_TYPE                       = FIXED_LENGTH
@@ -100,12 +99,11 @@ def written(folder: Path, text: str, name: str = "camera.cahvor") -> Path:
 # ----- PDS3 labels -----
 
 
-def test_opportunitys_labels_read_as_they_are(labelled: dict[str, CameraModel]) -> None:
-    if not SHARED.is_dir():
-        pytest.skip(f"needs Opportunity's frames in {SHARED}, which are not there")
+def test_opportunitys_labels_read_as_they_are(labelled: dict[str, CameraModel], shared_data: Path) -> None:
     for name, expected in labelled.items():
-        assert read_camera(SHARED / name) == expected
-        assert read_cameras(str(SHARED / name)) == (expected,)
+        label = shared_data / "mer_opportunity" / name
+        assert read_camera(label) == expected
+        assert read_cameras(str(label)) == (expected,)
 
 
 def test_label_of_cahvore(tmp_path: Path, hazcam: Cahvore) -> None:
