@@ -25,7 +25,6 @@ from sim.camera import (
     write_cahvor,
 )
 
-
 LABEL = """PDS_VERSION_ID                    = PDS3
 RECORD_TYPE                       = FIXED_LENGTH
 ^IMAGE                            = 3
