@@ -2,5 +2,6 @@
 
 from sim.dynamics.descent import DescentParameters, ParachuteDescent
 from sim.dynamics.state import State
+from sim.dynamics.trajectory import Motion, Trajectory
 
-__all__ = ["DescentParameters", "ParachuteDescent", "State"]
+__all__ = ["DescentParameters", "Motion", "ParachuteDescent", "State", "Trajectory"]
