@@ -7,10 +7,12 @@ import tempfile
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from weakref import WeakValueDictionary
 
 import numpy as np
+from jaxtyping import Float32
 
-from sim.cache import cache_directory
+from sim.cache import UNFINISHED, cache_directory, make_room, touch
 from sim.terrain.embedding import RealExtent, embed
 from sim.terrain.parameters import TerrainParameters
 from sim.terrain.rocks.field import RockField
@@ -18,13 +20,20 @@ from sim.terrain.substreams import substream
 from sim.terrain.surface import SMALLEST_LEVEL, Surface
 from sim.terrain.synthesis import synthesise
 
+#: What a terrain's samples do not depend on but through its parameters: sites, figures, and the rocks upon it.
+NOT_OF_THE_SAMPLES = ("environment.py", "presets.py", "rocks", "sites.py", "statistics.py")
+#: Samples of the terrains that this process uses, by their files: these are not removed to make room.
+_IN_USE: WeakValueDictionary[Path, np.ndarray] = WeakValueDictionary()
+
 
 @cache
 def _code_version() -> str:
     """Hash of the code that makes a terrain: a change of it makes cached terrains unknown, never wrong."""
     digest = hashlib.sha256(np.__version__.encode())
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
+    folder = Path(__file__).parent
+    for path in sorted(folder.rglob("*.py")):
+        if path.relative_to(folder).parts[0] not in NOT_OF_THE_SAMPLES:
+            digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
@@ -33,7 +42,7 @@ class TerrainBank:
     """Numbered terrains of one kind.
 
     Terrain k is a pure function of the parameters, the seed and k. On disk it is one array of all levels, memory-mapped
-    by every worker that uses it, so workers share its pages.
+    by every worker that uses it, so workers share its pages. The disk's share is bounded: see `sim.cache.make_room`.
     """
 
     parameters: TerrainParameters
@@ -42,9 +51,13 @@ class TerrainBank:
     def terrain(self, number: int) -> Surface:
         """Terrain `number`, from the disk if it is there, otherwise built and kept."""
         path = self._path(number)
-        if not self._is_whole(path):
-            self._build(number, path)
-        return self._read(path)
+        flat = self._kept(path)
+        if flat is None:
+            flat = self._build(number, path)
+        else:
+            touch(path)
+        _IN_USE[path] = flat
+        return self._surface(flat)
 
     def rocks(self, number: int) -> RockField | None:
         """The rocks of terrain `number`, built anew each time; None where the parameters ask for none."""
@@ -73,17 +86,29 @@ class TerrainBank:
         paths = [path for path in (source.dtm, source.ortho) if path is not None and path.exists()]
         return " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
 
-    def _build(self, number: int, path: Path) -> None:
+    def _kept(self, path: Path) -> Float32[np.ndarray, "samples"] | None:
+        """Samples of all levels, memory-mapped; None where the file is missing or damaged."""
+        try:
+            flat = np.load(path, mmap_mode="r").view(np.ndarray)
+        except (FileNotFoundError, ValueError, EOFError):
+            return None
+        return flat if flat.size == self._size() else None
+
+    def _build(self, number: int, path: Path) -> Float32[np.ndarray, "samples"]:
+        make_room(path.parent, 4 * self._size(), set(_IN_USE))
         built = synthesise(self.parameters, self._rng(number))
-        # Written aside and moved into place, so that neither an interruption nor a second builder leaves half a file.
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
+        # Written aside and moved into place, so that neither an interruption nor a second builder leaves half a file;
+        # mapped before, so that another process may remove it again at once.
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=UNFINISHED, delete=False) as part:
             try:
                 np.save(part, np.concatenate([level.reshape(-1) for level in built.levels]))
                 part.close()
+                flat = np.load(part.name, mmap_mode="r").view(np.ndarray)
                 Path(part.name).replace(path)
             except BaseException:
                 Path(part.name).unlink(missing_ok=True)
                 raise
+        return flat
 
     def _sides(self) -> list[int]:
         sides = [self.parameters.samples]
@@ -91,17 +116,11 @@ class TerrainBank:
             sides.append(sides[-1] // 2)
         return sides
 
-    def _is_whole(self, path: Path) -> bool:
-        if not path.exists():
-            return False
-        try:
-            size = int(np.load(path, mmap_mode="r").size)
-        except (ValueError, EOFError):
-            return False
-        return size == 2 * sum(side**2 for side in self._sides())
+    def _size(self) -> int:
+        """Values in a terrain's file: height and albedo on every level."""
+        return 2 * sum(side**2 for side in self._sides())
 
-    def _read(self, path: Path) -> Surface:
-        flat = np.load(path, mmap_mode="r").view(np.ndarray)
+    def _surface(self, flat: Float32[np.ndarray, "samples"]) -> Surface:
         levels, start = [], 0
         for side in self._sides():
             stop = start + 2 * side**2

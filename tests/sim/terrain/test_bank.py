@@ -1,3 +1,6 @@
+import hashlib
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -50,3 +53,41 @@ def test_terrains_are_read_only(cache: Path) -> None:
     level = TerrainBank(SMALL, seed=1).terrain(0).levels[0]
     with pytest.raises(ValueError, match="read-only"):
         level[0, 0, 0] = np.float32(1.0)
+
+
+def test_a_terrain_not_in_use_makes_room_for_the_next(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bank = TerrainBank(SMALL, seed=1)
+    held = bank.terrain(0)
+    size = next(cache.iterdir()).stat().st_size
+    monkeypatch.setenv("MARSYARD_CACHE_GB", f"{2.5 * size / 1e9:.12f}")
+    first = set(cache.iterdir())
+    built = _bytes(bank, 1)
+    second = set(cache.iterdir()) - first
+    bank.terrain(2)
+    assert len(list(cache.iterdir())) == 2
+    assert first <= set(cache.iterdir()), "held by this process"
+    assert not second & set(cache.iterdir())
+    assert _bytes(bank, 1) == built
+    assert np.isfinite(held.levels[0]).all()
+
+
+def test_a_terrain_removed_by_another_process_stays_readable(cache: Path) -> None:
+    surface = TerrainBank(SMALL, seed=1).terrain(0)
+    before = surface.levels[0].tobytes()
+    next(cache.iterdir()).unlink()
+    assert surface.levels[0].tobytes() == before
+
+
+def test_many_processes_may_build_at_once_in_a_cache_too_small(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each finds its terrains whole, whatever the others remove; nothing half-written is left."""
+    monkeypatch.setenv("MARSYARD_CACHE_GB", "0.0002")
+    with ProcessPoolExecutor(3, mp_context=multiprocessing.get_context("spawn")) as pool:
+        seen = list(pool.map(_digests, range(3)))
+    assert seen[0] == seen[1] == seen[2]
+    assert not list(cache.glob("*.part"))
+    assert sum(path.stat().st_size for path in cache.iterdir()) <= 5 * 45_000 + 3 * 45_000
+
+
+def _digests(_: int) -> list[str]:
+    bank = TerrainBank(SMALL, seed=1)
+    return [hashlib.sha256(_bytes(bank, number % 8)).hexdigest() for number in range(24)]
