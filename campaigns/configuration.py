@@ -21,18 +21,36 @@ CRASHED = "CRASHED"
 MOST_CASES = 1_000_000_000
 
 
+#: Populations that every campaign has; any other name in a population is a column of true and false.
+POPULATIONS = ("all", "completed", "valid")
+
+
 class Requirement(BaseModel):
-    """A bound that a column's absolute value must keep in a stated fraction of the cases, with a stated confidence."""
+    """What must hold in a stated fraction of a population of cases, with a stated confidence.
+
+    With a `bound`, that the metric's absolute value is at most the bound; a case without a number fails. Without one
+    the metric is a column of true and false (`answered`, say) that must be true.
+
+    `population` is `all`, `completed`, `valid` (the cases with an answer) or any column of true and false; several are
+    joined by " and ", as in `valid and room`. `decide_by = "estimate"` compares the rate that was seen with the
+    probability, whatever its interval, which is stated beside it: for requirements that are not asked at a confidence.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     id: Annotated[str, Field(min_length=1)]
     statement: str = ""
     metric: Annotated[str, Field(min_length=1)]
-    bound: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
+    bound: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)] | None = None
     probability: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)]
     confidence: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)]
-    population: Literal["all", "valid", "completed"] = "all"
+    population: Annotated[str, Field(pattern=r"^[A-Za-z]\w*( and [A-Za-z]\w*)*$")] = "all"
+    decide_by: Literal["confidence", "estimate"] = "confidence"
+
+    @property
+    def population_columns(self) -> tuple[str, ...]:
+        """Columns of true and false that the population takes its members from."""
+        return tuple(part for part in self.population.split(" and ") if part not in POPULATIONS)
 
 
 class Retain(BaseModel):

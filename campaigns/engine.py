@@ -8,13 +8,16 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from campaigns import record
-from campaigns.configuration import CRASHED, CampaignConfiguration
+from campaigns.configuration import CRASHED, POPULATIONS, CampaignConfiguration
 from campaigns.errors import ConfigurationError, Problem, not_allowed
 from campaigns.execution import Row, configuration_text, prepare_input, run_cases
 from campaigns.replay import case_directory, replay_with, save_replay
 from campaigns.sampling import Campaign
 from campaigns.store import ROWS_FILE, TABLE_FILE, RowStore, write_table
 from campaigns.workers import Workers
+
+#: What a requirement without a bound, and a population, ask a column to be.
+FLAG = "column of true and false"
 
 
 class Watch(Protocol):
@@ -78,7 +81,8 @@ def _run_into(store: RowStore, campaign: Campaign, directory: Path, workers: Wor
 def _conclude(store: RowStore, configuration: CampaignConfiguration, directory: Path, state: str) -> list[Row]:
     """Writes the table of the rows that are stored, and into the record how far the campaign came."""
     rows = list(store.rows())
-    write_table(directory / TABLE_FILE, rows, [requirement.metric for requirement in configuration.requirements])
+    measures = [requirement.metric for requirement in configuration.requirements if requirement.bound is not None]
+    write_table(directory / TABLE_FILE, rows, measures)
     crashed = sum(row["outcome"] == CRASHED for row in rows)
     counts = {"cases_finished": len(rows), "cases_crashed": crashed}
     record.update(directory, {"state": state, "finished_utc": record.utc_now(), **counts})
@@ -98,20 +102,28 @@ def _prepare(campaign: Campaign, workers: Workers, watch: Watch) -> None:
 
 
 def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Path) -> None:
-    """Holds the requirements' metrics against the columns of a finished case, before more cases are spent on them.
+    """Holds what requirements ask for against the columns of a finished case, before more cases are spent on them.
 
     Raises
     ------
     ConfigurationError
-        Where a requirement asks for a column that is not there, or is not of numbers.
+        Where a requirement asks for a column that is not there, or is of another kind: numbers for a metric with a
+        bound, true and false for a metric without one and for a population.
     """
-    numbers = [name for name, value in row.items() if isinstance(value, int | float) and "time" not in name]
-    numbers = [name for name in numbers if name not in ("case", "answered")]
-    problems = [
-        Problem(configuration.name, f"requirements[{place}].metric", not_allowed("column", requirement.metric, numbers))
-        for place, requirement in enumerate(configuration.requirements)
-        if not isinstance(row.get(requirement.metric), int | float)
-    ]
+    flags = [name for name, value in row.items() if isinstance(value, bool)]
+    numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
+    numbers = [name for name in numbers if "time" not in name]
+    problems = []
+    for place, requirement in enumerate(configuration.requirements):
+        key = f"requirements[{place}]"
+        kind, allowed = ("column of numbers", numbers) if requirement.bound is not None else (FLAG, flags)
+        if requirement.metric not in allowed:
+            message = not_allowed(kind, requirement.metric, allowed)
+            problems.append(Problem(configuration.name, f"{key}.metric", message))
+        for name in requirement.population_columns:
+            if name not in flags:
+                message = not_allowed(FLAG, name, (*POPULATIONS, *flags))
+                problems.append(Problem(configuration.name, f"{key}.population", message))
     if problems:
         stopped = Problem(str(directory), "", "the campaign was stopped; the rows so far are kept")
         raise ConfigurationError([*problems, stopped])
@@ -122,7 +134,7 @@ def showcase_case(configuration: CampaignConfiguration, rows: Sequence[Row]) -> 
     completed = [row for row in rows if row["outcome"] != CRASHED]
     if configuration.retain.showcase == "none" or not completed:
         return None
-    metric = configuration.requirements[0].metric if configuration.requirements else None
+    metric = next((asked.metric for asked in configuration.requirements if asked.bound is not None), None)
     scored = [(abs(float(row[metric])), row) for row in completed if row["answered"] and metric and metric in row]
     known = [(size, row) for size, row in scored if size == size]
     if configuration.retain.showcase == "first" or not known:

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from campaigns.configuration import CampaignConfiguration
 from campaigns.sampling import leaves
+from reports.wording import asked_text
 
 
 def catalogue_table(campaigns: Mapping[str, Path]) -> Table:
@@ -63,11 +64,7 @@ def _dispersions(configuration: CampaignConfiguration) -> Table:
 def _requirements(configuration: CampaignConfiguration) -> Table:
     table = _table("Requirements", "id", "statement", "asked")
     for asked in configuration.requirements:
-        terms = (
-            f"|{asked.metric}| <= {asked.bound:g} in at least {asked.probability:.6g} of {asked.population} cases, "
-            f"at {asked.confidence:.6g} confidence"
-        )
-        table.add_row(Text(asked.id), Text(asked.statement), Text(terms))
+        table.add_row(Text(asked.id), Text(asked.statement), Text(asked_text(asked, asked.metric)))
     return table
 
 

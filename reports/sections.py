@@ -15,7 +15,7 @@ from reports.columns import axis_columns, driver_columns, label, numbers
 from reports.stored import StoredRun, table
 from reports.tables import error_summaries, outcome_counts, statistics_rows
 from reports.verdicts import Overall, Verdict, members
-from reports.wording import NOTHING, count, number, percent, stated
+from reports.wording import NOTHING, asked_text, count, number, percent
 
 #: Rows of the tables of single cases; the rows that are left out are counted.
 _MOST_CASES = 10
@@ -76,10 +76,7 @@ class CaseTable:
 
 def verdict_row(verdict: Verdict) -> VerdictRow:
     """A verdict as the page shows it."""
-    asked = (
-        f"|{label(verdict.metric)}| ≤ {verdict.bound:g} in at least {stated(verdict.probability)} of "
-        f"{verdict.population} cases, at {stated(verdict.confidence)} confidence"
-    )
+    asked = asked_text(verdict, label(verdict.metric))
     bounds = NOTHING if verdict.n == 0 else f"{percent(verdict.lower)} to {percent(verdict.upper)}"
     further = NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}"
     evidence = [count(verdict.n, "case"), f"{verdict.failures:,} failed"]

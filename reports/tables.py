@@ -15,7 +15,7 @@ from rich.text import Text
 from reports.columns import axis_columns, label, numbers
 from reports.statistics import ErrorSummary, summarize
 from reports.verdicts import ENGINE_FAILURES, Status, Verdict
-from reports.wording import NOTHING, interval, number, percent, stated
+from reports.wording import NOTHING, asked_text, interval, number, percent, stated
 
 _STYLES = {Status.PASS: "bold green", Status.FAIL: "bold red", Status.INSUFFICIENT: "bold yellow"}
 
@@ -105,8 +105,7 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
 
 def _requirement(verdict: Verdict) -> Text:
     text = Text(verdict.requirement_id, style="bold")
-    asked = f"|{verdict.metric}| <= {verdict.bound:g} in {stated(verdict.probability)} of {verdict.population} cases"
-    text.append(f"\n{asked}, {stated(verdict.confidence)} confidence", style="dim")
+    text.append(f"\n{asked_text(verdict, verdict.metric)}", style="dim")
     return text
 
 

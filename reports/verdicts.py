@@ -1,9 +1,9 @@
 """Verdicts on requirements: what stored rows show, at what confidence, and how much more evidence it takes.
 
-A requirement asks that `metric <= bound` (in magnitude) holds for a stated fraction of a population of cases, at a
-stated confidence. Its status follows from one-sided Clopper-Pearson bounds of the success rate, as for independent
-cases. Where cases share terrains they are not independent: the verdict then says so and carries the bounds that hold
-nevertheless.
+A requirement asks that `metric <= bound` (in magnitude), or a column of true and false, holds for a stated fraction of
+a population of cases, at a stated confidence. Its status follows from one-sided Clopper-Pearson bounds of the success
+rate, as for independent cases; or from the rate alone where the requirement is decided by the estimate. Where cases
+share terrains they are not independent: the verdict then says so and carries the bounds that hold nevertheless.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from reports.wording import count, percent, stated
 
 #: Outcomes of cases that the engine could not finish; the algorithm under test may be innocent of them.
 ENGINE_FAILURES = frozenset({"CRASHED", "HUNG", "KILLED", "TIMED_OUT", "TIMEOUT"})
+#: Value of a requirement's `decide_by` that has the rate seen compared with the probability.
+ESTIMATE = "estimate"
 
 
 class Status(StrEnum):
@@ -34,36 +36,18 @@ class Status(StrEnum):
     INSUFFICIENT = "INSUFFICIENT"
 
 
-class Population(StrEnum):
-    """Which cases a requirement is about."""
-
-    ALL = "all"
-    COMPLETED = "completed"
-    VALID = "valid"
-
-    @property
-    def meaning(self) -> str:
-        """The population in words."""
-        return _POPULATION_MEANINGS[self]
-
-
-_POPULATION_MEANINGS = {
-    Population.ALL: "every case, crashed ones included",
-    Population.COMPLETED: "every case that ran to its end",
-    Population.VALID: "every case with an answer",
-}
-
-
 @dataclass(frozen=True)
 class Verdict:
     """One requirement judged.
 
     Attributes
     ----------
-    requirement_id, statement, metric, bound, probability, confidence, population
-        The requirement, as the campaign states it; NaN for a number that is missing or is none.
+    requirement_id, statement, metric, bound, probability, confidence, population, decide_by
+        The requirement, as the campaign states it; NaN for a number that is missing or is none. Without a bound the
+        metric is a column of true and false.
     status
-        PASS where the lower bound reaches the probability, FAIL where the upper bound is below it, else INSUFFICIENT.
+        PASS where the lower bound reaches the probability, FAIL where the upper bound is below it, else INSUFFICIENT;
+        where the estimate decides, PASS if it reaches the probability, else FAIL.
     n, failures
         Cases of the population, and those that did not succeed (a metric that is missing or NaN is a failure).
     estimate, lower, upper
@@ -92,14 +76,15 @@ class Verdict:
     lower: float
     upper: float
     further_cases: int | None
+    decide_by: str = "confidence"
     reason: str = ""
     terrains: int | None = None
     clustered: ClusteredEvidence | None = None
 
     @property
     def clustered_status(self) -> Status | None:
-        """The status by the bounds that allow for shared terrains; None where no terrain is shared."""
-        if self.clustered is None:
+        """The status by the bounds for shared terrains; None where none is shared or the estimate decides."""
+        if self.clustered is None or self.decide_by == ESTIMATE:
             return None
         return _status(self.clustered.lower, self.clustered.upper, self.probability)
 
@@ -120,11 +105,12 @@ class Verdict:
         if self.clustered is None:
             return ""
         shared = self.clustered
+        verdict = "" if self.clustered_status is None else f": {self.clustered_status}"
         return (
             f"{count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} and so are not independent, as the "
-            f"verdict takes them to be. Allowing for that ({shared.method}, effective n {shared.effective_n:.4g}), the "
-            f"success rate is at least {percent(shared.lower)} at {stated(self.confidence)} confidence: "
-            f"{self.clustered_status}.{self._more_terrains()}"
+            f"bounds take them to be. Allowing for that ({shared.method}, effective n {shared.effective_n:.4g}), the "
+            f"success rate is at least {percent(shared.lower)} at {stated(self.confidence)} confidence"
+            f"{verdict}.{self._more_terrains()}"
         )
 
     def _more_terrains(self) -> str:
@@ -187,28 +173,46 @@ def crashed_cases(frame: pd.DataFrame) -> int:
 
 
 def succeeded(frame: pd.DataFrame, metric: str, bound: float) -> Bool[np.ndarray, " n"]:
-    """Whether |metric| <= bound, case by case; False where the metric is missing or is not a number."""
+    """Whether |metric| <= bound, or the metric is true where the bound is NaN, case by case; False where missing."""
+    if math.isnan(bound):
+        return _true(frame, metric)
     values = pd.to_numeric(frame[metric], errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
     return np.asarray(np.abs(values) <= bound, dtype=np.bool_)
 
 
 def members(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    """Which cases belong to a population.
+    """Which cases belong to a population: `all`, `completed`, `valid`, a column of true and false, or several of these
+    joined by " and ".
 
     Raises
     ------
     ValueError
-        Where the population is unknown or the rows do not tell who belongs to it.
+        Where the rows do not tell who belongs to it.
     """
-    if population == Population.ALL:
+    chosen = np.ones(len(frame), dtype=np.bool_)
+    for part in population.split(" and "):
+        chosen &= _members_of(frame, part)
+    return chosen
+
+
+def _members_of(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
+    if population == "all":
         return np.ones(len(frame), dtype=np.bool_)
-    if population == Population.COMPLETED:
+    if population == "completed":
         return ~_engine_failed(frame)
-    if population != Population.VALID:
-        raise ValueError(f"the population {population!r} is unknown; known are {', '.join(Population)}")
-    if "answered" not in frame:
-        raise ValueError("the rows have no column 'answered', by which the population 'valid' is known")
-    return frame["answered"].eq(True).fillna(False).to_numpy(dtype=np.bool_)
+    column = "answered" if population == "valid" else population
+    if not is_flag(frame, column):
+        raise ValueError(f"the rows have no column '{column}' of true and false, by which a population is known")
+    return _true(frame, column)
+
+
+def is_flag(frame: pd.DataFrame, column: str) -> bool:
+    """Whether a column holds true and false, and nothing else but gaps."""
+    return column in frame and all(isinstance(value, bool | np.bool_) for value in frame[column].dropna().unique())
+
+
+def _true(frame: pd.DataFrame, column: str) -> Bool[np.ndarray, " n"]:
+    return np.asarray(frame[column].eq(True).fillna(False).to_numpy(dtype=np.bool_))
 
 
 def _engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
@@ -239,7 +243,9 @@ def _weighed(verdict: Verdict, chosen: pd.DataFrame) -> Verdict:
     n, failures = success.size, int((~success).sum())
     lower = proportion_lower(n - failures, n, verdict.confidence)
     upper = proportion_upper(n - failures, n, verdict.confidence)
-    status = _status(lower, upper, verdict.probability)
+    estimate = (n - failures) / n
+    bounds = (estimate, estimate) if verdict.decide_by == ESTIMATE else (lower, upper)
+    status = _status(*bounds, verdict.probability)
     undecided = status is Status.INSUFFICIENT
     groups = _terrain_groups(chosen)
     shared = groups is not None and int(groups.max()) + 1 < n
@@ -248,7 +254,7 @@ def _weighed(verdict: Verdict, chosen: pd.DataFrame) -> Verdict:
         status=status,
         n=n,
         failures=failures,
-        estimate=(n - failures) / n,
+        estimate=estimate,
         lower=lower,
         upper=upper,
         further_cases=further_cases_needed(n, failures, verdict.probability, verdict.confidence) if undecided else None,
@@ -280,10 +286,10 @@ def _fault(frame: pd.DataFrame, verdict: Verdict) -> str:
         value = getattr(verdict, name)
         if not 0.0 < value < 1.0:
             return f"The requirement's {name} is {value}; it must lie between 0 and 1, both excluded."
-    if not math.isfinite(verdict.bound):
-        return "The requirement states no bound."
     if verdict.metric not in frame:
         return f"The rows have no column '{verdict.metric}', which is the requirement's metric."
+    if not math.isfinite(verdict.bound) and not is_flag(frame, verdict.metric):
+        return "The requirement states no bound, and its metric is no column of true and false."
     return ""
 
 
@@ -296,7 +302,8 @@ def _unjudged(requirement: Mapping[str, Any]) -> Verdict:
         bound=_number(requirement.get("bound")),
         probability=_number(requirement.get("probability")),
         confidence=_number(requirement.get("confidence")),
-        population=str(requirement.get("population", Population.ALL)),
+        population=str(requirement.get("population", "all")),
+        decide_by=str(requirement.get("decide_by", "confidence")),
         status=Status.INSUFFICIENT,
         n=0,
         failures=0,

@@ -3,9 +3,55 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol, runtime_checkable
 
 #: Stands where there is nothing to say.
 NOTHING = "–"
+
+#: Populations in words where their names alone would not read well; others are columns of true and false.
+_POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "valid answers"}
+
+
+@runtime_checkable
+class Asked(Protocol):
+    """A requirement, as a campaign states it or as a verdict repeats it; a `bound` of None or NaN is none."""
+
+    @property
+    def bound(self) -> float | None:
+        """Largest magnitude of the metric."""
+
+    @property
+    def probability(self) -> float:
+        """Fraction of the population that must succeed."""
+
+    @property
+    def confidence(self) -> float:
+        """Confidence at which it must."""
+
+    @property
+    def population(self) -> str:
+        """Which cases are asked about."""
+
+    @property
+    def decide_by(self) -> str:
+        """`confidence` or `estimate`."""
+
+
+def asked_text(asked: Asked, metric: str) -> str:
+    """What a requirement asks of a metric, which is named as the reader should see it."""
+    unbounded = asked.bound is None or math.isnan(asked.bound)
+    what = metric if unbounded else f"|{metric}| ≤ {asked.bound:g}"
+    confidence = f"{stated(asked.confidence)} confidence"
+    how = f"by the estimate, bounds at {confidence}" if asked.decide_by == "estimate" else f"at {confidence}"
+    return f"{what} in at least {stated(asked.probability)} of {population_text(asked.population)}, {how}"
+
+
+def population_text(population: str) -> str:
+    """A population in words: ``valid answers``, ``cases with room``, ``valid answers with room``."""
+    parts = population.split(" and ")
+    whole = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
+    flags = [part.replace("_", " ") for part in parts if part not in _POPULATIONS]
+    return f"{whole} with {' and '.join(flags)}" if flags else whole
 
 
 def number(value: float) -> str:

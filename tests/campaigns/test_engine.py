@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -21,7 +22,7 @@ import pytest
 from fake_campaign import Silence, write_campaign
 
 from campaigns import record
-from campaigns.engine import run_campaign, showcase_case
+from campaigns.engine import check_metrics, run_campaign, showcase_case
 from campaigns.errors import CampaignError, ConfigurationError, StoreError
 from campaigns.loading import load_campaign
 from campaigns.products import load_products
@@ -182,6 +183,22 @@ def test_a_metric_that_no_case_has_stops_the_campaign_early(
     assert "unknown column 'velocity_eror_m_s' (did you mean 'velocity_error_m_s'?)" in str(caught.value)
     assert record.read(tmp_path / "run")["state"] == "interrupted"
     assert len(rows_of(tmp_path / "run")) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("metric='velocity_error_m_s'", "[0].metric: unknown column of true and false 'velocity_error_m_s'"),
+        ("metric='answered'\nbound=1", "[0].metric: unknown column of numbers 'answered'"),
+        ("metric='answered'\npopulation='valid and rom'", "[0].population: unknown column of true and false 'rom'"),
+    ],
+)
+def test_requirements_ask_for_columns_of_their_kind(campaign_file: CampaignFile, change: str, said: str) -> None:
+    requirement = f"[[requirements]]\nid='a'\nprobability=0.9\nconfidence=0.9\n{change}"
+    configuration = load_campaign(str(campaign_file(requirement=requirement))).configuration
+    row = {"case": 0, "answered": True, "velocity_error_m_s": 1.0}
+    with pytest.raises(ConfigurationError, match=re.escape(said)):
+        check_metrics(configuration, row, Path("runs"))
 
 
 def test_where_every_case_crashes_the_metric_still_has_its_column(

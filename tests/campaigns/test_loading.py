@@ -141,9 +141,10 @@ def test_the_campaign_itself(campaign_file: CampaignFile, head: str, said: str) 
         ("probability = 1.0", "requirements[0].probability: input should be less than 1, got 1.0"),
         ("confidence = 90", "requirements[0].confidence: input should be less than 1, got 90"),
         (
-            "population = 'some'",
-            "requirements[0].population: input should be 'all', 'valid' or 'completed', got",
+            "population = 'valid or not'",
+            "requirements[0].population: string should match pattern",
         ),
+        ("decide_by = 'luck'", "requirements[0].decide_by: input should be 'confidence' or 'estimate', got 'luck'"),
         ("metrik = 'x'", "requirements[0].metrik: unknown key (did you mean 'metric'?); allowed: bound, confidence"),
     ],
 )

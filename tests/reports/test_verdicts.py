@@ -132,6 +132,36 @@ def test_what_cannot_be_judged_is_said(velocity: dict[str, Any], changes: dict[s
     assert said in verdict.note
 
 
+def test_a_share_is_asked_of_a_column_of_true_and_false() -> None:
+    frame = _rows(100, 0).assign(answered=np.arange(100) >= 10, room=np.arange(100) >= 5)
+    availability = {"id": "AVAIL", "metric": "answered", "probability": 0.9, "confidence": 0.9}
+    of_all, of_room = (_judge(frame, availability, population=name) for name in ("all", "room"))
+    assert (of_all.n, of_all.failures, of_room.n, of_room.failures) == (100, 10, 95, 5)
+    assert (of_all.status, of_room.status) == (Status.INSUFFICIENT, Status.PASS)
+    # Decided by the estimate, 90 of 100 is 90 %; the bounds stay what they are.
+    by_estimate = _judge(frame, availability, decide_by="estimate")
+    assert (by_estimate.status, by_estimate.lower) == (Status.PASS, of_all.lower)
+    assert _judge(frame, availability, decide_by="estimate", probability=0.91).status is Status.FAIL
+
+
+def test_populations_of_columns_and_of_several() -> None:
+    frame = _rows(100, 20).assign(answered=np.arange(100) >= 10, room=np.arange(100) < 50)
+    asked = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
+    both = _judge(frame, asked, population="valid and room")
+    assert (both.n, both.failures) == (40, 10)
+    # A case that does not say whether it belongs (a crashed one) does not.
+    unknown = frame.astype({"room": object})
+    unknown.loc[49, "room"] = None
+    assert _judge(unknown, asked, population="room").n == 49
+    assert "room" in _judge(frame.assign(room=np.arange(100.0)), asked, population="room").note
+
+
+def test_the_estimate_decides_among_shared_terrains_too(velocity: dict[str, Any]) -> None:
+    verdict = _judge(_rows(400, 0).assign(terrain=np.arange(400) % 8), velocity, decide_by="estimate")
+    assert (verdict.status, verdict.clustered_status) == (Status.PASS, None)
+    assert "8 terrains" in verdict.note
+
+
 def test_valid_cannot_be_told_without_its_column(velocity: dict[str, Any]) -> None:
     assert "answered" in _judge(_rows(5, 0).drop(columns="answered"), velocity).note
 
