@@ -8,8 +8,13 @@ import pytest
 from pydantic import ValidationError
 
 from scenarios.descent import DescentScenario, DescentScenarioParameters
+from scenarios.descent.world import World
 from scenarios.interface import CaseResult
 from sim.streams import Streams
+from sim.terrain import site
+
+#: A site on Mars and one on Earth.
+SITES = ("gusev", "ivanpah")
 
 #: A small world that is built in a moment.
 WORLD = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "place": {"bank": 1}}
@@ -125,6 +130,40 @@ def test_conditions_are_read_from_the_simulated_objects(nominal) -> None:
     assert row["descent_heading_deg"] == 70.0
 
 
+def test_a_site_brings_its_terrain_with_what_is_set_over_it() -> None:
+    """Also when complete parameters are read back, as a campaign's workers do."""
+    stated = {"site": "gusev", "terrain": {"samples": 512, "spacing_m": 8.0, "rocks": {"smallest_m": 2.0}}}
+    p = DescentScenarioParameters.model_validate(stated)
+    of_site = site("gusev").terrain("descent")
+    rocks = of_site.rocks
+    assert rocks is not None
+    changed = {"samples": 512, "spacing_m": 8.0, "rocks": rocks.model_copy(update={"smallest_m": 2.0})}
+    assert p.terrain == of_site.model_copy(update=changed)
+    assert DescentScenarioParameters.model_validate(p.model_dump(mode="json", round_trip=True)) == p
+
+
+def test_a_site_is_lit_as_it_is() -> None:
+    """Gravity, sunlight and reflectance are the site's; signals follow sunlight and air."""
+    small = {"terrain": {"samples": 256, "spacing_m": 16.0}, "place": {"bank": 1}}
+    mars, earth = (World.of(DescentScenarioParameters.model_validate({"site": name} | small)) for name in SITES)
+    assert mars.ground is not None
+    assert mars.sun.angular_radius_rad == pytest.approx(0.00308, rel=0.01)
+    # twice the sunlight and more: Mars' air is dusty
+    assert earth.brightness / mars.brightness > 1.0 / 0.44
+    scene = mars.scene(0.0, 0.0, 1400.0, 8.2e-4, 10.9)
+    assert scene.caster_diameter_m == 10.9
+    assert scene.photometry == mars.ground.photometry(mars.sun)
+    assert len(scene.objects) > 0
+
+
+def test_over_a_site_the_velocity_is_right() -> None:
+    result = _run(site="gusev", **PERFECT)
+    assert result.outcome == "VALID"
+    assert result.row["site"] == "gusev"
+    # relief of 2 deg slopes moves a template against the plane below the lander, by 1 m/s at worst here
+    assert result.row["velocity_error_m_s"] < 1.0
+
+
 def test_no_room_for_a_template_is_an_outcome_without_velocity() -> None:
     """Looking 40 deg aside and turned between pictures, the pictures do not share enough ground."""
     swinging = {"cone_angle_deg": 40.0, "cone_phase_deg": 0.0, "cone_period_s": 7.5, "cone_minor_share": 0.0}
@@ -148,6 +187,8 @@ def test_in_the_dark_nothing_is_reported() -> None:
         ({"descent": {"altitude_first_m": -5.0}}, "altitude_first_m"),
         ({"descent": {"wind_south_m_s": 1.0}}, "wind_south_m_s"),
         ({"render": {"backend": "vulkan"}}, "osmesa"),
+        ({"site": "mars-yard"}, "gusev"),
+        ({"site": "gusev", "terrain": {"sample": 512}}, "terrain.sample"),
     ],
 )
 def test_impossible_parameters_are_named(wrong, names) -> None:

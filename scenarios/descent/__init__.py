@@ -1,0 +1,19 @@
+"""Parachute descent over Mars with three pictures: DIMES' scenario.
+
+Read it in the order of a case: `parameters`, `world`, `flight`, `optics`, `exposure`, `measurement`, `score`;
+`scenario` runs them one after the other.
+"""
+
+from scenarios.descent.flight import placed_descent
+from scenarios.descent.optics import Optics, camera_optics
+from scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
+from scenarios.descent.scenario import DescentScenario
+
+__all__ = [
+    "CameraParameters",
+    "DescentScenario",
+    "DescentScenarioParameters",
+    "Optics",
+    "camera_optics",
+    "placed_descent",
+]

@@ -1,0 +1,145 @@
+"""Everything that a descent campaign may set or disperse."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from sim.dynamics import DescentParameters
+from sim.render.backend import Backend, default_backend
+from sim.sensor import AltimeterParameters, DetectorChoice, DetectorParameters, NavigationParameters
+from sim.terrain import Site, TerrainParameters, site, sites
+
+
+class Place(BaseModel):
+    """Where over which terrain the descent happens."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    bank: Annotated[int, Field(ge=1, le=100000, description="terrains in the bank")] = 4
+    bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
+    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
+    east_m: Annotated[float, Field(description="where the first picture is taken, on the periodic terrain")] = 0.0
+    north_m: Annotated[float, Field(description="where the first picture is taken, on the periodic terrain")] = 0.0
+
+    @model_validator(mode="after")
+    def _terrain_is_in_bank(self) -> Place:
+        if self.terrain >= self.bank:
+            raise ValueError(f"terrain {self.terrain} is not in the bank; allowed: 0 to {self.bank - 1}")
+        return self
+
+
+class SunParameters(BaseModel):
+    """Where the sun stands."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 270.0
+    elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="above the horizon")] = 40.0
+
+
+class LanderParameters(BaseModel):
+    """What of the lander shows in its own pictures.
+
+    Its shadow is that of one disc at the camera's place. The canopy's is the largest by far: 15.09 m nominal, inflated
+    to 0.72 of that across (Witkowski & Bruno 2003, the MER parachute), it hides the sun wholly; backshell and lander,
+    2.65 m across, hide a twentieth of it from 2 km and lie within the canopy's shadow when the sun is high. That the
+    canopy hangs some 40 m above, which moves its shadow by 1 deg of the view, is left out: the zero-phase spot that
+    DIMES masks is 4 deg in radius.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    caster_diameter_m: Annotated[
+        float, Field(ge=0.0, le=100.0, description="diameter of the disc that casts the lander's shadow, m")
+    ] = 10.9
+
+
+class CameraParameters(BaseModel):
+    """The descent camera: 14.67 mm, 12 um pixels, 45 deg; distortion that of an Opportunity navcam (its PDS label)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    focal_length_mm: Annotated[float, Field(gt=1.0, le=1000.0)] = 14.67
+    pixel_pitch_um: Annotated[float, Field(gt=0.5, le=100.0)] = 12.0
+    columns: Annotated[int, Field(ge=64, le=4096)] = 1024
+    rows: Annotated[int, Field(ge=64, le=4096)] = 1024
+    radial_0: Annotated[float, Field(ge=-0.1, le=0.1, description="first term of CAHVOR's R")] = 0.00096
+    radial_1: Annotated[float, Field(ge=-0.5, le=0.5, description="second term of CAHVOR's R")] = -0.002183
+    radial_2: Annotated[float, Field(ge=-0.5, le=0.5, description="third term of CAHVOR's R")] = 0.018547
+    alignment_error_deg: Annotated[
+        float, Field(ge=0.0, le=10.0, description="RMS per axis of the mounting's error, not known to the lander")
+    ] = 0.02
+
+
+class RenderParameters(BaseModel):
+    """How pictures are drawn."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
+        default_factory=default_backend
+    )
+
+
+class DescentScenarioParameters(BaseModel):
+    """Everything that a descent campaign may set or disperse.
+
+    With a `site`, the keys that the table `terrain` sets are changes of the site's own terrain, and light, gravity,
+    texture and rocks are the site's. A site belongs to a campaign, not to a case: it is put into `terrain` when the
+    campaign is read, and cannot be dispersed.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    site: Annotated[str | None, Field(description="preset of terrain, light and gravity; none: a plain terrain")] = None
+    place: Place = Place()
+    terrain: TerrainParameters = TerrainParameters()
+    sun: SunParameters = SunParameters()
+    descent: DescentParameters = DescentParameters()
+    lander: LanderParameters = LanderParameters()
+    camera: CameraParameters = CameraParameters()
+    detector: DetectorChoice = DetectorParameters()
+    altimeter: AltimeterParameters = AltimeterParameters()
+    navigation: NavigationParameters = NavigationParameters()
+    render: RenderParameters = Field(default_factory=RenderParameters)
+
+    @field_validator("site")
+    @classmethod
+    def _site_has_a_terrain(cls, name: str | None) -> str | None:
+        if name is not None and name not in descent_sites():
+            raise ValueError(f"no site for a descent is called '{name}'; allowed: {', '.join(descent_sites())}")
+        return name
+
+    @model_validator(mode="before")
+    @classmethod
+    def _terrain_of_the_site(cls, stated: Any) -> Any:
+        """Completes the table `terrain` with the site's own."""
+        if not isinstance(stated, Mapping) or stated.get("site") not in descent_sites():
+            return stated
+        changes = stated.get("terrain", {})
+        if not isinstance(changes, Mapping):
+            return stated
+        of_site = site(stated["site"]).terrain("descent").model_dump()
+        return {**stated, "terrain": _merged(of_site, changes)}
+
+    @property
+    def preset(self) -> Site | None:
+        """The site; None for a plain terrain."""
+        return None if self.site is None else site(self.site)
+
+
+def descent_sites() -> list[str]:
+    """Names of the sites that have a terrain for descents."""
+    return [name for name, one in sites().items() if one.descent is not None]
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested tables with some of their values changed."""
+    merged = dict(base)
+    for key, value in changes.items():
+        below = merged.get(key)
+        merged[key] = _merged(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+    return merged

@@ -1,0 +1,77 @@
+"""The world of a descent: its terrain, its light, and what the camera sees of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scenarios.descent.parameters import DescentScenarioParameters
+from scenarios.views import Eye, SiteGround, site_scene
+from sim.frames import direction
+from sim.render import Photometry, Scene, Sun
+from sim.terrain import Surface, TerrainBank
+
+#: Sunlight over that at 1 AU for which the descent camera's responsivity is stated: Mars at 1.5 AU.
+SUNLIGHT_OF_RESPONSIVITY = 1.0 / 1.5**2
+#: Half the angle that the sun takes at 1 AU, radians.
+SUN_RADIUS_AT_EARTH_RAD = 0.00465
+
+
+@dataclass(frozen=True)
+class World:
+    """Where a descent happens.
+
+    Attributes
+    ----------
+    surface
+        The terrain.
+    ground
+        The same with its site's light, texture and rocks; None for a plain terrain.
+    sun
+        The sun.
+    brightness
+        Sunlight at the ground over that for which the detector's responsivity is stated.
+    """
+
+    surface: Surface
+    ground: SiteGround | None
+    sun: Sun
+    brightness: float = 1.0
+
+    @classmethod
+    def of(cls, p: DescentScenarioParameters) -> World:
+        """The world of a case; its terrain comes from the disk, or is built."""
+        bank = TerrainBank(p.terrain, p.place.bank_seed)
+        surface = bank.terrain(p.place.terrain)
+        elevation = float(np.radians(p.sun.elevation_deg))
+        towards_sun = direction(np.radians(p.sun.azimuth_deg), elevation)
+        if p.preset is None:
+            return cls(surface, None, Sun(towards_sun))
+        air = p.preset.environment
+        sun = Sun(towards_sun, SUN_RADIUS_AT_EARTH_RAD * float(np.sqrt(air.solar_irradiance)))
+        brightness = air.direct_share(elevation) * air.solar_irradiance / SUNLIGHT_OF_RESPONSIVITY
+        ground = SiteGround(p.preset, p.terrain, surface, bank.rocks(p.place.terrain))
+        return cls(surface, ground, sun, brightness)
+
+    def scene(
+        self, east_m: float, north_m: float, lowest_m: float, pixel_rad: float, caster_diameter_m: float
+    ) -> Scene:
+        """One scene for all pictures of a descent.
+
+        Parameters
+        ----------
+        east_m, north_m
+            Below the first picture.
+        lowest_m
+            Height above the ground of the last picture, which shows the smallest rocks.
+        pixel_rad
+            Angle that a pixel takes.
+        caster_diameter_m
+            Diameter of what casts the lander's shadow.
+        """
+        if self.ground is None:
+            scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry())
+        else:
+            scene = site_scene(self.ground, Eye(east_m, north_m, lowest_m, pixel_rad), self.sun)
+        return replace(scene, caster_diameter_m=caster_diameter_m)
