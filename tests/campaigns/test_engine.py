@@ -180,7 +180,7 @@ def test_a_metric_that_no_case_has_stops_the_campaign_early(
     requirement = "[[requirements]]\nid='a'\nmetric='velocity_eror_m_s'\nbound=1\nprobability=0.9\nconfidence=0.9"
     with pytest.raises(ConfigurationError) as caught:
         run(campaign_file(requirement=requirement), tmp_path / "run", watch, jobs=1)
-    assert "unknown column 'velocity_eror_m_s' (did you mean 'velocity_error_m_s'?)" in str(caught.value)
+    assert "unknown column of numbers 'velocity_eror_m_s' (did you mean 'velocity_error_m_s'?)" in str(caught.value)
     assert record.read(tmp_path / "run")["state"] == "interrupted"
     assert len(rows_of(tmp_path / "run")) == 1
 

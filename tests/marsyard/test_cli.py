@@ -134,7 +134,7 @@ def test_what_is_wrong_goes_before_what_failed(tmp_path: Path, marsyard: Command
     path = write_campaign(tmp_path, _crash(0), dispersions="", requirement=wrong)
     ended = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
     assert ended.status == 2
-    assert "unknown column 'velocity_error_m' (did you mean 'velocity_error_m_s'?)" in ended.err
+    assert "unknown column of numbers 'velocity_error_m' (did you mean 'velocity_error_m_s'?)" in ended.err
 
 
 @pytest.mark.parametrize(
