@@ -13,12 +13,16 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from reports import gallery, sections
 from reports.columns import primary_metric
+from reports.section import Section, SectionMaker, Subject
 from reports.stored import StoredRun, read_run
 from reports.tables import error_summaries, outcome_counts
 from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overall
 
 #: Version of the layout of `report.json`.
 SCHEMA = 1
+
+#: Sections that a page has where the rows hold their columns, in the page's order.
+FURTHER_SECTIONS: tuple[SectionMaker, ...] = ()
 
 PAGE_FILE = "report.html"
 TWIN_FILE = "report.json"
@@ -46,16 +50,23 @@ def write_report(directory: Path) -> Path:
     run = read_run(directory)
     verdicts = judge_campaign(run.frame, run.requirements)
     whole = overall(verdicts, run.frame)
-    _write(directory / TWIN_FILE, json.dumps(summary(run, verdicts, whole), indent=2, allow_nan=False) + "\n")
+    metric = primary_metric(run.frame, run.requirements)
+    bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
+    subject = Subject(run, metric, bound)
+    further = [section for make in FURTHER_SECTIONS if (section := make(subject)) is not None]
+    twin = summary(subject, verdicts, whole, further)
+    _write(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
     page = directory / PAGE_FILE
-    _write(page, _environment().get_template("report.html.j2").render(page_context(run, verdicts, whole)))
+    context = page_context(subject, verdicts, whole, further)
+    _write(page, _environment().get_template("report.html.j2").render(context))
     return page
 
 
-def page_context(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) -> dict[str, Any]:
+def page_context(
+    subject: Subject, verdicts: Sequence[Verdict], whole: Overall, further: Sequence[Section]
+) -> dict[str, Any]:
     """Everything that the page's template is given."""
-    metric = primary_metric(run.frame, run.requirements)
-    bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
+    run, metric, bound = subject.run, subject.metric, subject.bound
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.said("description") or ""),
@@ -65,6 +76,7 @@ def page_context(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) ->
         "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
         "metric": metric,
         "bound": bound,
+        "further": further,
         "outcomes": sections.outcome_grid(run.frame),
         "outcome_plates": gallery.outcome_plates(run.frame),
         "crashed": sections.crashed_rows(run),
@@ -80,9 +92,11 @@ def page_context(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) ->
     return {**context, **_error_sections(run, metric, bound, pictured)}
 
 
-def summary(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) -> dict[str, Any]:
+def summary(
+    subject: Subject, verdicts: Sequence[Verdict], whole: Overall, further: Sequence[Section]
+) -> dict[str, Any]:
     """The report as plain data; NaN and infinities are null."""
-    metric = primary_metric(run.frame, run.requirements)
+    run, metric = subject.run, subject.metric
     summaries = error_summaries(run.frame, metric) if metric is not None else []
     twin = {
         "schema": SCHEMA,
@@ -110,6 +124,7 @@ def summary(run: StoredRun, verdicts: Sequence[Verdict], whole: Overall) -> dict
         "metric": metric,
         "statistics": {name: asdict(summarized) for name, summarized in summaries},
         "worst_cases": [] if metric is None else [row.case for row in sections.worst_cases(run, metric).rows],
+        "sections": {section.key: section.data for section in further},
         "showcases": run.showcases,
     }
     plain: dict[str, Any] = _plain(twin)
