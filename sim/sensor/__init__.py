@@ -1,28 +1,62 @@
 """Instruments: how truth becomes measurements."""
 
 from sim.sensor.altimeter import Altimeter, AltimeterParameters
+from sim.sensor.approach import Approach, ApproachParameters
+from sim.sensor.clock import Clock, ClockParameters
 from sim.sensor.detector import Detector, DetectorParameters
 from sim.sensor.exposure import AutoExposure, AutoExposureParameters, auto_expose
+from sim.sensor.gps import POST_PROCESSED, RTK, STANDALONE, Gps, GpsParameters
+from sim.sensor.imu import Imu, ImuIncrements, ImuParameters, WarmUp
+from sim.sensor.inertial import InertialSolution, NavigationErrors
+from sim.sensor.instrument import Instrument, Readings, Sampling
+from sim.sensor.laser import LaserAltimeter, LaserParameters
 from sim.sensor.motion import ImageMotion
 from sim.sensor.navigation import Navigation, NavigationParameters
 from sim.sensor.optics import natural_fall_off
 from sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, Preset, preset
+from sim.sensor.radar import RadarAltimeter, RadarParameters
+from sim.sensor.ranging import carried_altitudes, height_above_ground, vertical_parts
 
 __all__ = [
+    "POST_PROCESSED",
     "PRESETS",
+    "RTK",
+    "STANDALONE",
     "Altimeter",
     "AltimeterParameters",
+    "Approach",
+    "ApproachParameters",
     "AutoExposure",
     "AutoExposureParameters",
     "CameraDesign",
+    "Clock",
+    "ClockParameters",
     "Detector",
     "DetectorChoice",
     "DetectorParameters",
+    "Gps",
+    "GpsParameters",
     "ImageMotion",
+    "Imu",
+    "ImuIncrements",
+    "ImuParameters",
+    "InertialSolution",
+    "Instrument",
+    "LaserAltimeter",
+    "LaserParameters",
     "Navigation",
+    "NavigationErrors",
     "NavigationParameters",
     "Preset",
+    "RadarAltimeter",
+    "RadarParameters",
+    "Readings",
+    "Sampling",
+    "WarmUp",
     "auto_expose",
+    "carried_altitudes",
+    "height_above_ground",
     "natural_fall_off",
     "preset",
+    "vertical_parts",
 ]

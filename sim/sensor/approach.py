@@ -1,0 +1,167 @@
+"""What navigation believes when the pictures begin: errors carried from the last star reference through entry.
+
+The craft cruises spinning, enters, brakes and hangs from its parachute until the descent proper begins. Over these
+minutes only the errors are propagated, along a nominal profile, in steps that resolve the spin:
+
+    d(attitude)/dt = R (bias + sensitivity error x body rate) + noise
+    d(velocity)/dt = attitude x (R f) + R (bias + sensitivity error x f) + noise
+
+with R the nominal attitude, f the nominal specific force, both errors in world axes, to first order in them (Titterton
+and Weston, Strapdown Inertial Navigation Technology, ch. 12, over minutes and without the errors' effect on gravity).
+The unit's errors are those of the same unit that then measures the descent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial.transform import Rotation
+
+from sim.sensor.imu import Imu
+from sim.sensor.inertial import NavigationErrors
+
+NonNegative = Annotated[float, Field(ge=0.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+
+#: Steps of the propagation per second: at 2 rpm the midpoint rule's error is 5e-5 of what spin averages out.
+STEPS_PER_S = 5.0
+#: Mean of sin^4, the shape of the deceleration over the entry.
+_MEAN_SIN4 = 3.0 / 8.0
+
+
+class ApproachParameters(BaseModel):
+    """From the last star reference to the descent. Defaults are nominal times and speeds of the MER landings.
+
+    Times and speeds: Desai and Knocke (2007), rounded. The reference's errors, and what is left of the spin axis's
+    scale factor after its calibration against the stars in cruise, are assumed.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    attitude_sd_deg: Annotated[NonNegative, Field(description="error of the star reference per axis, deg")] = 0.05
+    velocity_sd_m_s: Annotated[NonNegative, Field(description="error of the velocity known by then, per axis")] = 1.0
+    spin_scale_ppm: Annotated[
+        NonNegative, Field(description="scale error of the spin axis's gyro that its calibration left, ppm")
+    ] = 20.0
+    cruise_s: Annotated[NonNegative, Field(le=20000.0, description="from the star reference to entry, s")] = 900.0
+    entry_s: Annotated[Positive, Field(le=2000.0, description="from entry to the parachute's opening, s")] = 240.0
+    parachute_s: Annotated[Positive, Field(le=2000.0, description="from there to the descent's start, s")] = 80.0
+    spin_rpm: Annotated[float, Field(ge=-10.0, le=10.0, description="spin until the parachute opens, rpm")] = 2.0
+    heading_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="azimuth of the flight at entry")] = 80.0
+    entry_off_nadir_deg: Annotated[float, Field(ge=0.0, le=180.0, description="flight's direction at entry")] = 78.0
+    deploy_off_nadir_deg: Annotated[float, Field(ge=0.0, le=180.0, description="flight's direction at opening")] = 62.0
+    upright_s: Annotated[Positive, Field(description="from the parachute's opening to hanging straight, s")] = 30.0
+    entry_speed_m_s: Annotated[Positive, Field(description="lost from entry to opening, m/s")] = 5000.0
+    parachute_speed_m_s: Annotated[NonNegative, Field(description="lost under the parachute, m/s")] = 340.0
+    inflation_s: Annotated[Positive, Field(description="time constant of that loss, s")] = 8.0
+    gravity_m_s2: Annotated[NonNegative, Field(description="carried by the parachute, m/s2")] = 3.71
+
+    @property
+    def duration_s(self) -> float:
+        """From the star reference to the descent's start, seconds."""
+        return self.cruise_s + self.entry_s + self.parachute_s
+
+
+@dataclass(frozen=True)
+class Approach:
+    """The nominal profile up to the start of the descent.
+
+    Attributes
+    ----------
+    parameters
+        The profile.
+    end_s
+        Time at which the descent starts, seconds.
+    """
+
+    parameters: ApproachParameters
+    end_s: float
+
+    @property
+    def start_s(self) -> float:
+        """Time of the star reference, seconds."""
+        return self.end_s - self.parameters.duration_s
+
+    def calibrated(self, imu: Imu, rng: np.random.Generator) -> Imu:
+        """The unit with the scale factor of its z gyro, about which the craft spins, as the calibration left it."""
+        scale = imu.gyro.scale.copy()
+        scale[2] = 1e-6 * self.parameters.spin_scale_ppm * float(rng.standard_normal())
+        return replace(imu, gyro=replace(imu.gyro, scale=scale))
+
+    def errors(self, imu: Imu, rng: np.random.Generator) -> NavigationErrors:
+        """Errors at the descent's start, the reference's and random walk's drawn; the unit's span must reach back."""
+        p = self.parameters
+        count = int(np.ceil(p.duration_s * STEPS_PER_S))
+        step = p.duration_s / count
+        times = self.start_s + step * (np.arange(count) + 0.5)
+        attitudes, rates, forces = self.attitudes(times), self.body_rates(times), self.specific_forces(times)
+        turned = attitudes.apply(imu.gyro.bias_at(times) + rates @ imu.gyro.sensitivity_error.T) * step
+        turned += imu.gyro.random_walk * np.sqrt(step) * rng.standard_normal(turned.shape)
+        reference = np.radians(p.attitude_sd_deg) * rng.standard_normal(3)
+        attitude = reference + np.cumsum(turned, axis=0)
+        sensed = imu.accelerometer.bias_at(times) + forces @ imu.accelerometer.sensitivity_error.T
+        # at the middle of a step half of its turn has happened
+        gained = (np.cross(attitude - 0.5 * turned, attitudes.apply(forces)) + attitudes.apply(sensed)) * step
+        gained += imu.accelerometer.random_walk * np.sqrt(step) * rng.standard_normal(gained.shape)
+        velocity = p.velocity_sd_m_s * rng.standard_normal(3) + gained.sum(axis=0)
+        return NavigationErrors(attitude_rad=attitude[-1], velocity_m_s=velocity)
+
+    def attitudes(self, times_s: Float64[np.ndarray, "n"]) -> Rotation:
+        """Nominal rotations from body to world axes: body -z along the flight, spinning about it."""
+        spun = self._spin_rate() * np.minimum(times_s - self.start_s, self._deploy_s() - self.start_s)
+        flight = Rotation.from_rotvec(self._off_nadir(times_s)[:, None] * self._turn_axis())
+        return flight * Rotation.from_rotvec(spun[:, None] * np.array([0.0, 0.0, 1.0]))
+
+    def body_rates(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+        """Nominal angular velocities, body axes, rad/s."""
+        turning = self._off_nadir_rate(times_s)[:, None] * self._turn_axis()
+        rates: Float64[np.ndarray, "n 3"] = self.attitudes(times_s).inv().apply(turning)
+        rates[:, 2] += np.where(times_s < self._deploy_s(), self._spin_rate(), 0.0)
+        return rates
+
+    def specific_forces(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+        """Nominal acceleration less gravity, body axes, m/s2: drag, along the spin axis and against the flight."""
+        p = self.parameters
+        entering = np.clip((times_s - self._entry_s()) / p.entry_s, 0.0, 1.0)
+        drag = p.entry_speed_m_s / (p.entry_s * _MEAN_SIN4) * np.sin(np.pi * entering) ** 4
+        hanging = np.maximum(times_s - self._deploy_s(), 0.0)
+        braking = p.parachute_speed_m_s / p.inflation_s * np.exp(-hanging / p.inflation_s) + p.gravity_m_s2
+        drag += np.where(times_s >= self._deploy_s(), braking, 0.0)
+        forces: Float64[np.ndarray, "n 3"] = drag[:, None] * np.array([0.0, 0.0, 1.0])
+        return forces
+
+    def _deploy_s(self) -> float:
+        return self.end_s - self.parameters.parachute_s
+
+    def _entry_s(self) -> float:
+        return self._deploy_s() - self.parameters.entry_s
+
+    def _spin_rate(self) -> float:
+        return float(2.0 * np.pi * self.parameters.spin_rpm / 60.0)
+
+    def _turn_axis(self) -> Float64[np.ndarray, "3"]:
+        # tilts nadir towards the heading: (0, 0, -1) x (sin a, cos a, 0)
+        heading = np.radians(self.parameters.heading_deg)
+        axis: Float64[np.ndarray, "3"] = np.array([np.cos(heading), -np.sin(heading), 0.0])
+        return axis
+
+    def _knots(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """Times at which the flight's direction begins to turn otherwise, and its angle from nadir then."""
+        p = self.parameters
+        times = np.array([self._entry_s(), self._deploy_s(), self._deploy_s() + p.upright_s])
+        return times, np.radians([p.entry_off_nadir_deg, p.deploy_off_nadir_deg, 0.0])
+
+    def _off_nadir(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        times, angles = self._knots()
+        angle: Float64[np.ndarray, "n"] = np.interp(times_s, times, angles)
+        return angle
+
+    def _off_nadir_rate(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        times, angles = self._knots()
+        rates = np.concatenate([[0.0], np.diff(angles) / np.diff(times), [0.0]])
+        rate: Float64[np.ndarray, "n"] = rates[np.searchsorted(times, times_s, side="right")]
+        return rate

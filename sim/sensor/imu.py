@@ -1,0 +1,265 @@
+"""An inertial measurement unit: angle and velocity increments of a motion, with the errors of its class.
+
+The world frame is taken as inertial: the planet's rotation, which flight software knows and takes off, is left out of
+motion and measurement alike. The unit sits at the body's origin, its axes along the body's.
+
+Increments are those of a unit that samples its sensors much faster than it delivers: the angle increment is the exact
+rotation vector between two samples (coning included), the velocity increment the integral of specific force in the
+body axes of the interval's start (sculling included).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.interpolate import CubicSpline
+
+from sim.dynamics import Trajectory
+from sim.sensor.clock import Clock, ClockParameters
+from sim.sensor.stochastic import GaussMarkov
+
+NonNegative = Annotated[float, Field(ge=0.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+
+#: Standard gravity, in which accelerometers are specified.
+STANDARD_GRAVITY_M_S2 = 9.80665
+DEG_H = np.radians(1.0) / 3600.0
+DEG_SQRT_H = np.radians(1.0) / 60.0
+
+
+class WarmUp(BaseModel):
+    """Temperature of the unit less that at which it was calibrated: none, then an exponential approach to a change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    start_s: Annotated[float, Field(description="time at which the change begins, s")] = 0.0
+    change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="change in the end, K")] = 0.0
+    time_constant_s: Annotated[Positive, Field(description="time constant of the approach, s")] = 600.0
+
+    def temperature_k(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        """Temperature less that of the calibration, K."""
+        since = np.maximum(times_s - self.start_s, 0.0)
+        temperature: Float64[np.ndarray, "n"] = -self.change_k * np.expm1(-since / self.time_constant_s)
+        return temperature
+
+
+class ImuParameters(BaseModel):
+    """An inertial measurement unit of the class of Litton's LN-200; spreads are one standard deviation per axis.
+
+    Repeatability of bias (1 deg/h to 3 deg/h, 0.2 mg to 1 mg), its wander in operation (0.35 deg/h over 100 s,
+    0.05 mg over 60 s), random walk, scale factors (100 ppm, 300 ppm) and misalignment: LN-200's data sheet, Northrop
+    Grumman. Size of the counts: NovAtel's table of raw inertial data. Change with temperature and time tags: assumed.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rate_hz: Annotated[Positive, Field(le=10000.0, description="samples per second")] = 400.0
+    gyro_bias_deg_h: Annotated[NonNegative, Field(description="constant gyro bias, deg/h")] = 1.0
+    gyro_wander_deg_h: Annotated[NonNegative, Field(description="gyro bias that wanders, deg/h")] = 0.35
+    gyro_wander_s: Annotated[Positive, Field(description="correlation time of the wandering gyro bias, s")] = 100.0
+    gyro_bias_deg_h_k: Annotated[NonNegative, Field(description="change of gyro bias with temperature, deg/h/K")] = 0.1
+    angular_random_walk_deg_sqrt_h: Annotated[NonNegative, Field(description="angular random walk, deg/sqrt(h)")] = 0.07
+    gyro_scale_ppm: Annotated[NonNegative, Field(description="error of the gyros' scale factors, ppm")] = 100.0
+    gyro_misalignment_mrad: Annotated[NonNegative, Field(description="each gyro's input from another axis, mrad")] = 0.1
+    gyro_count_rad: Annotated[NonNegative, Field(description="angle of a count, rad; 0: no rounding")] = 2.0**-19
+    accelerometer_bias_mg: Annotated[NonNegative, Field(description="constant accelerometer bias, mg")] = 0.3
+    accelerometer_wander_mg: Annotated[NonNegative, Field(description="accelerometer bias that wanders, mg")] = 0.05
+    accelerometer_wander_s: Annotated[
+        Positive, Field(description="correlation time of the wandering accelerometer bias, s")
+    ] = 60.0
+    accelerometer_bias_mg_k: Annotated[
+        NonNegative, Field(description="change of accelerometer bias with temperature, mg/K")
+    ] = 0.02
+    velocity_random_walk_ug_sqrt_hz: Annotated[NonNegative, Field(description="velocity random walk, ug/sqrt(Hz)")] = (
+        50.0
+    )
+    accelerometer_scale_ppm: Annotated[
+        NonNegative, Field(description="error of the accelerometers' scale factors, ppm")
+    ] = 300.0
+    accelerometer_misalignment_mrad: Annotated[
+        NonNegative, Field(description="each accelerometer's input from another axis, mrad")
+    ] = 0.1
+    accelerometer_count_m_s: Annotated[NonNegative, Field(description="velocity of a count, m/s; 0: no rounding")] = (
+        2.0**-14
+    )
+    warm_up: WarmUp = WarmUp()
+    clock: ClockParameters = ClockParameters(offset_sd_s=0.0002, jitter_sd_s=0.00002)
+
+
+@dataclass(frozen=True)
+class Triad:
+    """Three gyros or accelerometers: the errors of one unit. Below, "unit" is rad for gyros and m/s for accelerometers.
+
+    Attributes
+    ----------
+    bias
+        Constant bias, unit/s.
+    bias_per_k
+        Change of bias with temperature, unit/s/K.
+    wander
+        Bias that wanders, unit/s.
+    warm_up
+        Temperature over time.
+    scale
+        Errors of the scale factors, shares.
+    misalignment
+        Input of each sensor (row) from the other axes (columns), radians; its diagonal is 0.
+    random_walk
+        White noise of rate, unit/sqrt(s).
+    count
+        Unit of a count; 0 for no rounding.
+    """
+
+    bias: Float64[np.ndarray, "3"]
+    bias_per_k: Float64[np.ndarray, "3"]
+    wander: GaussMarkov
+    warm_up: WarmUp
+    scale: Float64[np.ndarray, "3"]
+    misalignment: Float64[np.ndarray, "3 3"]
+    random_walk: float
+    count: float
+
+    @property
+    def sensitivity_error(self) -> Float64[np.ndarray, "3 3"]:
+        """What the triad measures of a true input, less that input: this matrix times the input."""
+        error: Float64[np.ndarray, "3 3"] = np.diag(self.scale) + self.misalignment
+        return error
+
+    def bias_at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+        """Bias at these times: constant, wandering and with temperature; unit/s."""
+        thermal = self.warm_up.temperature_k(times_s)[:, None] * self.bias_per_k
+        bias: Float64[np.ndarray, "n 3"] = self.bias + thermal + self.wander.at(times_s)
+        return bias
+
+    def measured(
+        self, true: Float64[np.ndarray, "n 3"], boundaries_s: Float64[np.ndarray, "m"], rng: np.random.Generator
+    ) -> Float64[np.ndarray, "n 3"]:
+        """Measured increments of these true ones between m = n + 1 boundaries; what rounding leaves is carried over."""
+        steps = np.diff(boundaries_s)[:, None]
+        noise = self.random_walk * np.sqrt(steps) * rng.standard_normal(true.shape)
+        bias = self.bias_at(0.5 * (boundaries_s[1:] + boundaries_s[:-1])) * steps
+        measured: Float64[np.ndarray, "n 3"] = true + true @ self.sensitivity_error.T + bias + noise
+        if self.count == 0.0:
+            return measured
+        counts = np.rint(np.cumsum(measured, axis=0) / self.count)
+        return self.count * np.diff(counts, axis=0, prepend=0.0)
+
+
+@dataclass(frozen=True)
+class ImuIncrements:
+    """What the unit delivers.
+
+    Attributes
+    ----------
+    times_s
+        Time tags of the boundaries between samples, seconds, never decreasing; one more than samples.
+    period_s
+        Time between samples as flight software has it.
+    delta_angles_rad
+        Rotation vectors from the body axes at each interval's start to those at its end.
+    delta_velocities_m_s
+        Integrals of specific force over each interval, in the body axes of its start.
+    """
+
+    times_s: Float64[np.ndarray, "m"]
+    period_s: float
+    delta_angles_rad: Float64[np.ndarray, "n 3"]
+    delta_velocities_m_s: Float64[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True)
+class Imu:
+    """One unit: its errors over a span of time are drawn once, its noise with the increments.
+
+    Attributes
+    ----------
+    parameters
+        Its class.
+    gyro, accelerometer
+        Its errors, in rad and m/s.
+    clock
+        Of its time tags.
+    """
+
+    parameters: ImuParameters
+    gyro: Triad
+    accelerometer: Triad
+    clock: Clock
+
+    @classmethod
+    def drawn(cls, parameters: ImuParameters, span_s: tuple[float, float], rng: np.random.Generator) -> Imu:
+        """A unit with its errors drawn for use within a span of time."""
+        p = parameters
+        milli_g = 1e-3 * STANDARD_GRAVITY_M_S2
+        return cls(
+            parameters,
+            gyro=Triad(
+                bias=p.gyro_bias_deg_h * DEG_H * rng.standard_normal(3),
+                bias_per_k=p.gyro_bias_deg_h_k * DEG_H * rng.standard_normal(3),
+                wander=GaussMarkov.drawn(np.full(3, p.gyro_wander_deg_h * DEG_H), p.gyro_wander_s, span_s, rng),
+                warm_up=p.warm_up,
+                scale=1e-6 * p.gyro_scale_ppm * rng.standard_normal(3),
+                misalignment=1e-3 * p.gyro_misalignment_mrad * _off_diagonal(rng),
+                random_walk=p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H,
+                count=p.gyro_count_rad,
+            ),
+            accelerometer=Triad(
+                bias=p.accelerometer_bias_mg * milli_g * rng.standard_normal(3),
+                bias_per_k=p.accelerometer_bias_mg_k * milli_g * rng.standard_normal(3),
+                wander=GaussMarkov.drawn(
+                    np.full(3, p.accelerometer_wander_mg * milli_g), p.accelerometer_wander_s, span_s, rng
+                ),
+                warm_up=p.warm_up,
+                scale=1e-6 * p.accelerometer_scale_ppm * rng.standard_normal(3),
+                misalignment=1e-3 * p.accelerometer_misalignment_mrad * _off_diagonal(rng),
+                random_walk=1e-3 * p.velocity_random_walk_ug_sqrt_hz * milli_g,
+                count=p.accelerometer_count_m_s,
+            ),
+            clock=Clock.drawn(p.clock, rng),
+        )
+
+    def boundaries(self, start_s: float, end_s: float) -> Float64[np.ndarray, "m"]:
+        """True times of the boundaries between samples from a start to the last that is not after an end, seconds."""
+        count = int(np.floor((end_s - start_s) * self.parameters.rate_hz + 1e-9))
+        if count < 1:
+            raise ValueError(f"there is no sample from {start_s} s to {end_s} s at {self.parameters.rate_hz} Hz")
+        times: Float64[np.ndarray, "m"] = start_s + np.arange(count + 1) / self.parameters.rate_hz
+        return times
+
+    def increments(
+        self, trajectory: Trajectory, start_s: float, end_s: float, rng: np.random.Generator
+    ) -> ImuIncrements:
+        """What the unit delivers of a motion from a start to an end, both true times within the span drawn."""
+        boundaries = self.boundaries(start_s, end_s)
+        angles, velocities = true_increments(trajectory, boundaries)
+        return ImuIncrements(
+            times_s=np.maximum.accumulate(self.clock.tags(boundaries, rng)),
+            period_s=1.0 / self.parameters.rate_hz,
+            delta_angles_rad=self.gyro.measured(angles, boundaries, rng),
+            delta_velocities_m_s=self.accelerometer.measured(velocities, boundaries, rng),
+        )
+
+
+def true_increments(
+    trajectory: Trajectory, boundaries_s: Float64[np.ndarray, "m"]
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Rotation vectors between boundaries, and integrals of specific force in the body axes of each interval's start.
+
+    Specific force is integrated in world axes as a cubic spline through the boundaries: for a frequency f its error is
+    of the order of (2 pi f step)^4 / 720 of its amplitude, 1e-9 for a nodding of 1 Hz at 400 samples per second.
+    """
+    motion = trajectory.motion(boundaries_s)
+    attitudes = motion.attitudes
+    forces = attitudes.apply(motion.specific_forces_m_s2)
+    gained = np.diff(CubicSpline(boundaries_s, forces).antiderivative()(boundaries_s), axis=0)
+    at_start = attitudes[:-1].inv()
+    return (at_start * attitudes[1:]).as_rotvec(), at_start.apply(gained)
+
+
+def _off_diagonal(rng: np.random.Generator) -> Float64[np.ndarray, "3 3"]:
+    matrix: Float64[np.ndarray, "3 3"] = rng.standard_normal((3, 3)) * (1.0 - np.eye(3))
+    return matrix
