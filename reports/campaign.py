@@ -12,8 +12,13 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from reports import gallery, sections
+from reports.answers import answers_section
 from reports.columns import primary_metric
+from reports.conditions import conditions_section
+from reports.faults import faults_section
+from reports.landing import landing_section
 from reports.section import Section, SectionMaker, Subject
+from reports.sensitivity import sensitivity_section
 from reports.stored import StoredRun, read_run
 from reports.tables import error_summaries, outcome_counts
 from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overall
@@ -22,7 +27,13 @@ from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overal
 SCHEMA = 1
 
 #: Sections that a page has where the rows hold their columns, in the page's order.
-FURTHER_SECTIONS: tuple[SectionMaker, ...] = ()
+FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
+    answers_section,
+    faults_section,
+    landing_section,
+    sensitivity_section,
+    conditions_section,
+)
 
 PAGE_FILE = "report.html"
 TWIN_FILE = "report.json"

@@ -247,7 +247,7 @@ def _weighed(verdict: Verdict, chosen: pd.DataFrame) -> Verdict:
     bounds = (estimate, estimate) if verdict.decide_by == ESTIMATE else (lower, upper)
     status = _status(*bounds, verdict.probability)
     undecided = status is Status.INSUFFICIENT
-    groups = _terrain_groups(chosen)
+    groups = terrain_groups(chosen)
     shared = groups is not None and int(groups.max()) + 1 < n
     return replace(
         verdict,
@@ -269,7 +269,7 @@ def _status(lower: float, upper: float, probability: float) -> Status:
     return Status.FAIL if upper < probability else Status.INSUFFICIENT
 
 
-def _terrain_groups(chosen: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
+def terrain_groups(chosen: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
     """Which cases share a terrain, from 0; None where no row says. A case of unknown terrain stands alone."""
     if "terrain" not in chosen or bool(chosen["terrain"].isna().all()):
         return None

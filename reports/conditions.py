@@ -1,0 +1,158 @@
+"""Errors and answers by what the case was like: a table for each condition, cut into bins of as many cases each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float
+
+from reports.answers import CONFIDENCE, Share, share_of
+from reports.columns import axis_columns, label, numbers
+from reports.section import Block, Section, Subject
+from reports.sections import Grid
+from reports.statistics import quantile_bounds
+from reports.verdicts import is_flag, members
+from reports.wording import number, percent, stated
+
+#: Beginnings of the columns by which errors are sorted, in the order of the page; the first column of each counts.
+CONDITIONS = (
+    "altitude_1",
+    "altitude_m",
+    "attitude_rate_max",
+    "off_nadir_max",
+    "site",
+    "terrain_kind",
+    "relief",
+    "rms_slope",
+    "terrain",
+    "sun_elevation",
+    "horizontal_speed",
+)
+#: Kinds up to this many are told one by one; numbers of more values are cut into bins.
+MOST_KINDS = 12
+#: Cases in a bin, at least where there are enough for two; and most bins of a condition.
+CASES_PER_BIN, MOST_BINS = 40, 5
+QUANTILE = 0.99
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Cases of one condition.
+
+    Attributes
+    ----------
+    name
+        What they have in common.
+    answered
+        The share that was answered.
+    means, sds
+        Mean and standard deviation of the error's signed parts, in the order of `axis_columns`; NaN for too few.
+    quantile_bound
+        Upper bound of the magnitude's 99 % quantile at 90 % confidence; infinite where the cases are too few.
+    largest
+        The largest magnitude; NaN for none.
+    """
+
+    name: str
+    answered: Share
+    means: Sequence[float]
+    sds: Sequence[float]
+    quantile_bound: float
+    largest: float
+
+
+def conditions_section(subject: Subject) -> Section | None:
+    """Errors by condition; None where the rows hold no errors, no answers or no condition that varies."""
+    frame, metric = subject.frame, subject.metric
+    if metric is None or not is_flag(frame, "answered"):
+        return None
+    tables = {column: [_bin(frame[chosen], metric, name) for name, chosen in bins] for column, bins in cuts(frame)}
+    if not tables:
+        return None
+    blocks = [Block(heading=f"By {label(column)}", grid=_grid(frame, metric, bins)) for column, bins in tables.items()]
+    note = (
+        "Bins hold as many cases each. Answered: with its two-sided Clopper-Pearson interval at "
+        f"{stated(CONFIDENCE)} confidence, as for independent cases. Mean and standard deviation of the errors of the "
+        f"answers. Bound: what the {stated(QUANTILE)} quantile of the magnitude does not exceed, at "
+        f"{stated(CONFIDENCE)} confidence (order statistics); it takes 230 answers."
+    )
+    data = {column: [asdict(one) for one in bins] for column, bins in tables.items()}
+    title = "Errors and answers by condition"
+    return Section("conditions", "Conditions", title, [*blocks, Block(note=note)], data)
+
+
+def cuts(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.ndarray, " n"]]]]]:
+    """Every condition that varies: its column, and its bins with their names and members."""
+    for start in CONDITIONS:
+        columns = [str(name) for name in frame.columns if name == start or str(name).startswith(f"{start}_")]
+        if start == "terrain":
+            columns = [name for name in columns if name == "terrain"]
+        for column in columns[:1]:
+            kinds = frame[column].dropna().nunique()
+            if 2 <= kinds <= MOST_KINDS:
+                yield column, _kinds(frame[column])
+            elif kinds > MOST_KINDS and column != "terrain" and pd.api.types.is_numeric_dtype(frame[column].dtype):
+                yield column, _bins(numbers(frame, column))
+
+
+def _kinds(values: pd.Series) -> list[tuple[str, Bool[np.ndarray, " n"]]]:
+    found = sorted(values.dropna().unique(), key=lambda value: (isinstance(value, str), value))
+    return [(_plain(value), values.eq(value).fillna(False).to_numpy(dtype=np.bool_)) for value in found]
+
+
+def _bins(values: Float[np.ndarray, " n"]) -> list[tuple[str, Bool[np.ndarray, " n"]]]:
+    """Bins of as many cases each; cases without a value are in none."""
+    known = values[np.isfinite(values)]
+    count = int(np.clip(known.size // CASES_PER_BIN, 2, MOST_BINS))
+    edges = np.unique(np.quantile(known, np.linspace(0.0, 1.0, count + 1)))
+    places = np.digitize(values, edges[1:-1])
+    ranges = pairwise(edges.tolist())
+    return [
+        (f"{number(low)} to {number(high)}", np.isfinite(values) & (places == k))
+        for k, (low, high) in enumerate(ranges)
+    ]
+
+
+def _bin(chosen: pd.DataFrame, metric: str, name: str) -> Bin:
+    answered = members(chosen, "valid")
+    valid = chosen[answered]
+    magnitude = np.abs(numbers(valid, metric))
+    magnitude = magnitude[np.isfinite(magnitude)]
+    parts = [numbers(valid, part) for part in _parts(chosen, metric)]
+    parts = [part[np.isfinite(part)] for part in parts]
+    return Bin(
+        name=name,
+        answered=share_of(answered, chosen),
+        means=[float(part.mean()) if part.size else float("nan") for part in parts],
+        sds=[float(part.std(ddof=1)) if part.size > 1 else float("nan") for part in parts],
+        quantile_bound=quantile_bounds(magnitude, QUANTILE, CONFIDENCE)[1],
+        largest=float(magnitude.max()) if magnitude.size else float("nan"),
+    )
+
+
+def _grid(frame: pd.DataFrame, metric: str, bins: Sequence[Bin]) -> Grid:
+    parts = [label(part) for part in _parts(frame, metric)]
+    head = ["", "Cases", "Answered", "Interval"]
+    head += [f"{what}, {part}" for part in parts for what in ("Mean", "SD")]
+    head += [f"{stated(QUANTILE)} bound", "Largest"]
+    rows = []
+    for one in bins:
+        of_parts = [number(value) for pair in zip(one.means, one.sds, strict=True) for value in pair]
+        share = one.answered
+        ends = [number(one.quantile_bound) if np.isfinite(one.quantile_bound) else "n too small", number(one.largest)]
+        interval = f"{percent(share.lower)} to {percent(share.upper)}"
+        rows.append([one.name, f"{share.n:,}", percent(share.share), interval, *of_parts, *ends])
+    return Grid(head, rows)
+
+
+def _parts(frame: pd.DataFrame, metric: str) -> list[str]:
+    """The metric's signed parts; the metric itself where it has none."""
+    return axis_columns(metric, [str(name) for name in frame.columns]) or [metric]
+
+
+def _plain(value: object) -> str:
+    return str(int(value)) if isinstance(value, float | np.floating) and float(value).is_integer() else str(value)
