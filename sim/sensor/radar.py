@@ -22,10 +22,12 @@ from sim.terrain import Surface
 
 #: The ground is scanned in steps of this share of the height, then about its nearest points in ever smaller ones.
 COARSEST_STEP = 1.0 / 64.0
-REFINEMENT = 4
+REFINEMENT = 5
 PASSES = 3
-#: How much nearer ground between the nodes may be than at them, steps: they are kept for the next pass within it.
+#: Ground about a node may be nearer than the node by this and the node's slope, times the step: as much as is kept.
 RELIEF_PER_STEP = 0.2
+#: Slopes beyond this are not looked for.
+STEEPEST = 3.0
 
 
 class RadarParameters(RangingParameters):
@@ -143,9 +145,12 @@ def _search(
             return nearest
         # a node stands for half a step around it: beyond the edge by as much, nearer by what relief may hide there
         beside = angles <= half_angle_rad + step_m / ranges
-        near = ranges <= nearest + RELIEF_PER_STEP * step_m
+        near = beside & (ranges <= nearest + (RELIEF_PER_STEP + STEEPEST) * step_m)
+        offsets, ranges = offsets[near], ranges[near]
+        slopes = _slopes(surface, position_m, offsets, step_m)
+        kept = ranges <= nearest + (RELIEF_PER_STEP + slopes) * step_m
         step_m /= REFINEMENT
-        offsets = _refined(offsets[beside & near], step_m)
+        offsets = _refined(offsets[kept], step_m)
         if not offsets.size:
             return nearest
     return nearest
@@ -167,8 +172,17 @@ def _seen(
     return ranges, np.arccos(np.clip(along / ranges, -1.0, 1.0))
 
 
+def _slopes(
+    surface: Surface, position_m: Float64[np.ndarray, "3"], offsets_m: Float64[np.ndarray, "n 2"], step_m: float
+) -> Float64[np.ndarray, "n"]:
+    """Slope of the ground at offsets in plan, smoothed to the step."""
+    x, y = position_m[0] + offsets_m[:, 0], position_m[1] + offsets_m[:, 1]
+    slopes: Float64[np.ndarray, "n"] = np.linalg.norm(surface.gradient(x, y, _level(surface, step_m)), axis=-1)
+    return slopes
+
+
 def _refined(offsets_m: Float64[np.ndarray, "n 2"], step_m: float) -> Float64[np.ndarray, "m 2"]:
-    """Nodes of a finer grid, `REFINEMENT` times as fine, in the cells about these nodes."""
+    """These nodes, each with its neighbours of a grid `REFINEMENT` times as fine."""
     line = (np.arange(REFINEMENT) - 0.5 * (REFINEMENT - 1)) * step_m
     about = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     refined: Float64[np.ndarray, "m 2"] = (offsets_m[:, None, :] + about).reshape(-1, 2)

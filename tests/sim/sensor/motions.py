@@ -1,0 +1,61 @@
+"""Motions in closed form on which instruments are tested."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from sim.dynamics import Motion, State
+
+GRAVITY = 3.71
+
+
+@dataclass(frozen=True)
+class Swaying:
+    """Spins about the vertical, nods about its own x axis, flies on a parabola and sways to the east."""
+
+    spin_rad_s: float = 0.0
+    nod_rad: float = 0.0
+    nod_rad_s: float = 1.0
+    position_m: tuple[float, float, float] = (0.0, 0.0, 2000.0)
+    velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    acceleration_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sway_m: float = 0.0
+    sway_rad_s: float = 1.0
+    tilt: Rotation = field(default_factory=Rotation.identity)
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        return -np.inf, np.inf
+
+    def state(self, time_s: float) -> State:
+        m = self.motion(np.array([time_s]))
+        return State(
+            time_s,
+            m.positions_m[0],
+            m.velocities_m_s[0],
+            m.attitudes[0],
+            m.body_rates_rad_s[0],
+            m.specific_forces_m_s2[0],
+        )
+
+    def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
+        t = times_s[:, None]
+        east, up, first = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+        nod = Rotation.from_rotvec(self.nod_rad * np.sin(self.nod_rad_s * t) * first)
+        attitudes = self.tilt * Rotation.from_rotvec(self.spin_rad_s * t * up) * nod
+        rates = nod.inv().apply(np.broadcast_to(self.spin_rad_s * up, (times_s.size, 3)).copy())
+        rates = rates + self.nod_rad * self.nod_rad_s * np.cos(self.nod_rad_s * t) * first
+        v, a, k = np.array(self.velocity_m_s), np.array(self.acceleration_m_s2), self.sway_rad_s
+        accelerations = a - self.sway_m * k**2 * np.sin(k * t) * east
+        return Motion(
+            times_s=times_s,
+            positions_m=np.array(self.position_m) + v * t + 0.5 * a * t**2 + self.sway_m * np.sin(k * t) * east,
+            velocities_m_s=v + a * t + self.sway_m * k * np.cos(k * t) * east,
+            attitudes=attitudes,
+            body_rates_rad_s=rates,
+            specific_forces_m_s2=attitudes.inv().apply(accelerations + GRAVITY * up),
+        )
