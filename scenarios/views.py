@@ -177,7 +177,8 @@ def rocks_in_sight(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> 
             seen = _in_sector(mesh, eye)
             names = members[mesh.rock_of_face[seen]].astype(np.int32)
             albedo = ground.site.photometry.rock_albedo
-            parts.append(Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces[seen], names, albedo))
+            bodies = mesh.body_of_face[seen]
+            parts.append(Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces[seen], names, albedo, bodies))
     return Objects.joined(parts) if parts else Objects.none()
 
 

@@ -48,14 +48,17 @@ class Objects:
         faces: Int32[np.ndarray, "triangles 3"],
         name_of_face: Int32[np.ndarray, "triangles"],
         albedo: float,
+        body_of_face: Int32[np.ndarray, "triangles"] | None = None,
     ) -> Objects:
         """Bodies of one albedo from a mesh; faces that follow each other under one name are one body.
+
+        Where several bodies of one name may follow each other, `body_of_face` tells them apart.
 
         Raises ValueError for more triangles than can be told apart in a picture.
         """
         if len(faces) > MOST_TRIANGLES:
             raise ValueError(f"{len(faces)} triangles; at most {MOST_TRIANGLES} can be drawn at once")
-        changes = np.flatnonzero(np.diff(name_of_face)) + 1
+        changes = np.flatnonzero(np.diff(name_of_face if body_of_face is None else body_of_face)) + 1
         first = np.concatenate([[0], changes, [len(faces)]]).astype(np.int64) if len(faces) else np.zeros(1, np.int64)
         counts = np.diff(first)
         return cls(

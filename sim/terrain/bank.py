@@ -89,10 +89,11 @@ class TerrainBank:
     def _kept(self, path: Path) -> Float32[np.ndarray, "samples"] | None:
         """Samples of all levels, memory-mapped; None where the file is missing or damaged."""
         try:
-            flat = np.load(path, mmap_mode="r").view(np.ndarray)
+            flat: Float32[np.ndarray, "samples"] = np.load(path, mmap_mode="r").view(np.ndarray)
         except (FileNotFoundError, ValueError, EOFError):
             return None
-        return flat if flat.size == self._size() else None
+        kept: Float32[np.ndarray, "samples"] = flat
+        return kept if flat.size == self._size() else None
 
     def _build(self, number: int, path: Path) -> Float32[np.ndarray, "samples"]:
         make_room(path.parent, 4 * self._size(), set(_IN_USE))
@@ -103,7 +104,7 @@ class TerrainBank:
             try:
                 np.save(part, np.concatenate([level.reshape(-1) for level in built.levels]))
                 part.close()
-                flat = np.load(part.name, mmap_mode="r").view(np.ndarray)
+                flat: Float32[np.ndarray, "samples"] = np.load(part.name, mmap_mode="r").view(np.ndarray)
                 Path(part.name).replace(path)
             except BaseException:
                 Path(part.name).unlink(missing_ok=True)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from sim.terrain.imported import RealTerrain
 from sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
@@ -60,6 +61,53 @@ class TerrainParameters(BaseModel):
     ] = None
     rocks: Annotated[RockParameters | None, Field(description="rocks on the ground")] = None
 
+    @field_validator("samples")
+    @classmethod
+    def _is_a_power_of_two(cls, samples: int) -> int:
+        if samples & (samples - 1):
+            raise ValueError(f"{samples} is not a power of two")
+        return samples
+
+    def changed(self, changes: Mapping[str, Any]) -> TerrainParameters:
+        """These parameters with some set anew, validated.
+
+        Changes are nested as in a file: ``{"samples": 2048, "rocks": {"abundance": 0.1}}`` keeps all else of the rocks.
+        None takes a landform, the rocks or a source away; a landform that was not there takes its defaults for what is
+        not given. Raises ValueError, naming the first parameter that is wrong.
+        """
+        _check_names(TerrainParameters, changes, "")
+        try:
+            return TerrainParameters.model_validate(_merged(self.model_dump(), changes))
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise ValueError(f"terrain.{where}: {first['msg']}; given: {first['input']!r}") from None
+
 
 #: The landforms in the order in which they are laid upon the fractal ground.
 LANDFORMS = ("fans", "playa", "lava", "swell", "ramp", "gullies", "dunes", "ripples")
+
+
+def _check_names(model: type[BaseModel], changes: Mapping[str, Any], where: str) -> None:
+    """Raises ValueError for the first name that no parameter has, naming those there are."""
+    for name, value in changes.items():
+        if name not in model.model_fields:
+            allowed = ", ".join(model.model_fields)
+            raise ValueError(f"terrain{where} has no parameter '{name}'; allowed: {allowed}")
+        part = _model_of(model, name)
+        if part is not None and isinstance(value, Mapping):
+            _check_names(part, value, f"{where}.{name}")
+
+
+def _model_of(model: type[BaseModel], name: str) -> type[BaseModel] | None:
+    """The model of a parameter that is itself a set of parameters, or None."""
+    kinds = get_args(model.model_fields[name].annotation)
+    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
+
+
+def _merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(values)
+    for name, change in changes.items():
+        before = merged.get(name)
+        merged[name] = _merged(before, change) if isinstance(before, dict) and isinstance(change, Mapping) else change
+    return merged

@@ -47,8 +47,8 @@ PISGAH = Site(
     description="Pisgah lava flow, California: dark pahoehoe and a'a, rough at a few metres and gentle beyond",
     environment=MOJAVE,
     photometry=SitePhotometry(lunar_share=0.6, surge_amplitude=0.9, surge_width=0.08, rock_albedo=0.09),
-    ground_texture=texture(3.0, 0.001, 0.03),
-    rock_texture=texture(0.2, 0.001, 0.06),
+    ground_texture=texture(3.0, 0.001, 0.06, decay=1.28),
+    rock_texture=texture(0.2, 0.001, 0.22, decay=1.05),
     descent=TerrainParameters(
         hurst=0.95,
         rms_slope_deg=2.65,
@@ -58,7 +58,7 @@ PISGAH = Site(
         albedo=0.1,
         albedo_contrast=0.05,
         lava=Lava(lobe_thickness_m=0.9, layers=2.2, aa_relief_m=0.35),
-        rocks=RockParameters(abundance=0.15, smallest_m=1.5),
+        rocks=RockParameters(abundance=0.15, smallest_m=1.5, form="clinker"),
     ),
     ground=ROVER_GROUND.model_copy(
         update={
@@ -70,8 +70,9 @@ PISGAH = Site(
                 lobe_thickness_m=0.12,
                 layers=2.0,
                 aa_block_m=0.35,
-                aa_relief_m=0.06,
-                pahoehoe_relief_m=0.008,
+                aa_share=0.5,
+                aa_relief_m=0.09,
+                pahoehoe_relief_m=0.012,
             ),
             # pahoehoe ropes
             "ripples": Dunes(
@@ -82,7 +83,7 @@ PISGAH = Site(
                 regularity=1.0,
                 repose_deg=34.0,
             ),
-            "rocks": RockParameters(abundance=0.15),
+            "rocks": RockParameters(abundance=0.15, form="clinker"),
         }
     ),
 )
@@ -92,8 +93,8 @@ KELSO = Site(
     description="Kelso dunes, California: bright, repetitive sand dunes over 200 m of relief",
     environment=MOJAVE,
     photometry=SitePhotometry(lunar_share=0.4, surge_amplitude=0.4, surge_width=0.05, rock_albedo=0.3),
-    ground_texture=texture(3.0, 0.001, 0.02),
-    rock_texture=texture(0.2, 0.001, 0.05),
+    ground_texture=texture(3.0, 0.001, 0.02, decay=1.3),
+    rock_texture=texture(0.2, 0.001, 0.1, decay=1.1),
     descent=TerrainParameters(
         hurst=0.7,
         rms_slope_deg=0.6,
@@ -102,7 +103,13 @@ KELSO = Site(
         albedo=0.5,
         albedo_contrast=0.03,
         swell=Swell(relief_m=207.0),
-        dunes=Dunes(wavelength_m=115.0, height_m=4.0, wind_from_deg=290.0, crest_length=1.8, regularity=0.9),
+        dunes=Dunes(
+            wavelength_m=115.0, height_m=4.2, wind_from_deg=290.0, repose_deg=33.0, crest_length=1.8, regularity=0.9
+        ),
+        # smaller dunes upon them
+        ripples=Dunes(
+            wavelength_m=20.0, height_m=0.2, wind_from_deg=280.0, repose_deg=10.0, crest_length=1.5, regularity=0.7
+        ),
     ),
     ground=ROVER_GROUND.model_copy(
         update={
@@ -111,7 +118,9 @@ KELSO = Site(
             "albedo": 0.5,
             "albedo_contrast": 0.03,
             "dunes": Dunes(wavelength_m=34.0, height_m=1.2, wind_from_deg=290.0, crest_length=1.8, regularity=0.9),
-            "ripples": Dunes(wavelength_m=0.3, height_m=0.015, wind_from_deg=285.0, crest_length=3.0, regularity=1.5),
+            "ripples": Dunes(
+                wavelength_m=0.3, height_m=0.015, wind_from_deg=285.0, repose_deg=20.0, crest_length=3.0, regularity=1.5
+            ),
         }
     ),
 )
@@ -121,8 +130,8 @@ IVANPAH = Site(
     description="Ivanpah dry lake, California and Nevada: an almost flat playa between alluvial fans",
     environment=MOJAVE,
     photometry=SitePhotometry(lunar_share=0.3, surge_amplitude=0.3, surge_width=0.05, rock_albedo=0.25),
-    ground_texture=texture(3.0, 0.001, 0.02),
-    rock_texture=texture(0.2, 0.001, 0.06),
+    ground_texture=texture(3.0, 0.001, 0.03, decay=1.22),
+    rock_texture=texture(0.2, 0.001, 0.1, decay=1.1),
     descent=TerrainParameters(
         hurst=0.8,
         rms_slope_deg=0.95,
@@ -149,21 +158,25 @@ GUSEV = Site(
     description="Gusev crater, Mars: cratered volcanic plains of the Spirit landing site",
     environment=MARS,
     photometry=SitePhotometry(rock_albedo=0.16, source=MARS_LAW),
-    ground_texture=texture(3.0, 0.001, 0.03),
-    rock_texture=texture(0.2, 0.001, 0.07),
+    ground_texture=texture(3.0, 0.001, 0.035, decay=1.33),
+    rock_texture=texture(0.2, 0.001, 0.16, decay=1.1),
     descent=TerrainParameters(
         hurst=0.75,
         rms_slope_deg=1.7,
-        craters_per_km2=80.0,
+        craters_per_km2=180.0,
+        crater_diameter_min_m=8.0,
         albedo=0.22,
-        albedo_contrast=0.09,
+        albedo_contrast=0.11,
+        albedo_hurst=-0.15,
         # share covered by rocks at Spirit's landing site, 7 % (Golombek et al. 2006)
         rocks=RockParameters(abundance=0.07, smallest_m=1.0),
     ),
     ground=ROVER_GROUND.model_copy(
         update={
             "albedo": 0.22,
-            "ripples": Dunes(wavelength_m=0.6, height_m=0.02, wind_from_deg=330.0, crest_length=2.0, regularity=1.0),
+            "ripples": Dunes(
+                wavelength_m=0.6, height_m=0.02, wind_from_deg=330.0, repose_deg=18.0, crest_length=2.0, regularity=1.0
+            ),
             "rocks": RockParameters(abundance=0.07),
         }
     ),
@@ -174,22 +187,26 @@ MERIDIANI = Site(
     description="Meridiani Planum, Mars: dark, level plains of ripples, nearly without rocks; Opportunity's site",
     environment=MARS,
     photometry=SitePhotometry(rock_albedo=0.25, source=MARS_LAW),
-    ground_texture=texture(3.0, 0.001, 0.03),
-    rock_texture=texture(0.2, 0.001, 0.07),
+    ground_texture=texture(3.0, 0.001, 0.03, decay=1.34),
+    rock_texture=texture(0.2, 0.001, 0.14, decay=1.1),
     descent=TerrainParameters(
         hurst=0.8,
         rms_slope_deg=1.8,
-        craters_per_km2=25.0,
+        craters_per_km2=56.0,
+        crater_diameter_min_m=8.0,
         albedo=0.14,
-        albedo_contrast=0.08,
+        albedo_contrast=0.1,
+        albedo_hurst=-0.15,
     ),
     ground=ROVER_GROUND.model_copy(
         update={
             "rms_slope_deg": 1.5,
             "craters_per_km2": 300.0,
             "albedo": 0.14,
-            "dunes": Dunes(wavelength_m=2.4, height_m=0.09, wind_from_deg=100.0, crest_length=4.0, regularity=1.5),
-            "ripples": Dunes(wavelength_m=0.25, height_m=0.01, wind_from_deg=60.0, crest_length=3.0),
+            "dunes": Dunes(
+                wavelength_m=2.4, height_m=0.09, wind_from_deg=100.0, repose_deg=20.0, crest_length=4.0, regularity=1.5
+            ),
+            "ripples": Dunes(wavelength_m=0.25, height_m=0.01, wind_from_deg=60.0, repose_deg=20.0, crest_length=3.0),
             "rocks": RockParameters(abundance=0.01, smallest_m=0.03),
         }
     ),
@@ -200,8 +217,8 @@ MARS_YARD = Site(
     description="The Jet Propulsion Laboratory's outdoor Mars Yard: level sand and gravel with rocks",
     environment=PASADENA,
     photometry=SitePhotometry(lunar_share=0.4, surge_amplitude=0.4, surge_width=0.06, rock_albedo=0.2),
-    ground_texture=texture(3.0, 0.001, 0.04),
-    rock_texture=texture(0.2, 0.001, 0.08),
+    ground_texture=texture(3.0, 0.001, 0.04, decay=1.32),
+    rock_texture=texture(0.2, 0.001, 0.17, decay=1.1),
     ground=ROVER_GROUND.model_copy(
         update={
             "rms_slope_deg": 2.0,
@@ -218,8 +235,8 @@ HELI_BENIGN = Site(
     description="Helicopter landing tests, benign: gentle ground with few small rocks",
     environment=PASADENA,
     photometry=SitePhotometry(lunar_share=0.4, surge_amplitude=0.4, surge_width=0.06, rock_albedo=0.22),
-    ground_texture=texture(3.0, 0.001, 0.05),
-    rock_texture=texture(0.2, 0.001, 0.08),
+    ground_texture=texture(3.0, 0.001, 0.05, decay=1.28),
+    rock_texture=texture(0.2, 0.001, 0.17, decay=1.1),
     ground=HELICOPTER_GROUND.model_copy(
         update={"rms_slope_deg": 2.0, "rocks": RockParameters(abundance=0.01, smallest_m=0.08, largest_m=0.6)}
     ),
@@ -230,8 +247,8 @@ HELI_HAZARDOUS = Site(
     description="Helicopter landing tests, hazardous: rocks, slopes and gullies",
     environment=PASADENA,
     photometry=SitePhotometry(lunar_share=0.4, surge_amplitude=0.4, surge_width=0.06, rock_albedo=0.22),
-    ground_texture=texture(3.0, 0.001, 0.05),
-    rock_texture=texture(0.2, 0.001, 0.08),
+    ground_texture=texture(3.0, 0.001, 0.05, decay=1.28),
+    rock_texture=texture(0.2, 0.001, 0.17, decay=1.1),
     ground=HELICOPTER_GROUND.model_copy(
         update={
             "rms_slope_deg": 6.0,

@@ -5,9 +5,10 @@ Figures of the field test's sites and of the MER landing sites: DIMES field test
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -68,17 +69,18 @@ class Site(BaseModel):
     descent: TerrainParameters | None = None
     ground: TerrainParameters | None = None
 
-    def terrain(self, scale: str | None = None) -> TerrainParameters:
-        """The terrain at a scale, 'descent' or 'ground'; by default the coarsest there is.
+    def terrain(self, scale: str | None = None, changes: Mapping[str, Any] | None = None) -> TerrainParameters:
+        """The terrain at a scale, 'descent' or 'ground', with some parameters set anew; by default the coarsest scale.
 
-        Raises ValueError where the site has none at that scale.
+        `changes` are those of `TerrainParameters.changed`: fewer samples for a large bank, a `source` of real terrain
+        in the site's surround. Raises ValueError where the site has no terrain at that scale, or a change is wrong.
         """
         if scale not in (None, "descent", "ground"):
             raise ValueError(f"'{scale}' is no scale of terrain; allowed: descent, ground")
         wanted = (self.descent or self.ground) if scale is None else getattr(self, scale)
         if not isinstance(wanted, TerrainParameters):
             raise ValueError(f"site {self.name} has no terrain at the scale '{scale}'")
-        return wanted
+        return wanted.changed(changes) if changes else wanted
 
 
 @dataclass(frozen=True)

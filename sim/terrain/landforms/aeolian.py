@@ -15,16 +15,17 @@ SAMPLES_ON_SLIP_FACE = 2.1
 
 
 class Dunes(LandformParameters):
-    """A train of transverse bedforms: gentle towards the wind, a slip face at the angle of repose away from it.
+    """A train of transverse bedforms: gentle towards the wind, a slip face with an apron at its foot away from it.
 
-    Dunes and ripples differ in size only. Crests wander and end in defects, as they do where bedforms of a range of
+    Dunes and ripples differ in size, and ripples of wind, which do not avalanche, fall at about 20 deg where dunes rest
+    at the angle of repose (Sharp 1963). Crests wander and end in defects, as they do where bedforms of a range of
     wavelengths interact (Werner & Kocurek 1999). Dry sand rests at 30-34 deg (Bagnold 1941).
     """
 
     wavelength_m: Annotated[float, Field(gt=0.0, description="distance from crest to crest, m")] = 110.0
     height_m: Annotated[float, Field(gt=0.0, description="RMS height of crest over trough, m")] = 5.0
     wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth the wind comes from")] = 270.0
-    repose_deg: Annotated[float, Field(ge=20.0, le=36.0, description="slope of the slip faces")] = 32.0
+    repose_deg: Annotated[float, Field(ge=10.0, le=36.0, description="slope of the faces away from the wind")] = 32.0
     crest_length: Annotated[float, Field(ge=0.5, le=50.0, description="length of crests, wavelengths")] = 4.0
     regularity: Annotated[float, Field(ge=0.3, le=20.0, description="wavelengths over which spacing persists")] = 1.5
     albedo_contrast: Annotated[

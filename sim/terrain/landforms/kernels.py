@@ -111,7 +111,7 @@ def add_dunes(
     steepest: float,
     contrast: float,
 ) -> None:
-    """Adds transverse dunes: a gentle stoss up to the crest, then a slip face of the slope `steepest`.
+    """Adds transverse dunes: a gentle stoss up to the crest, a slip face of the slope `steepest`, a concave apron.
 
     The phase is that of a plane wave (wave_x, wave_y), radians per metre, times a smooth complex modulation of unit
     mean square. Where the modulation vanishes crests end and fork, and the dunes have no height.
@@ -128,12 +128,14 @@ def add_dunes(
             high = crest * min(strength, 1.6)
             turns = (wave_x * x + wave_y * y + math.atan2(imaginary, real)) / (2.0 * math.pi)
             u = turns - math.floor(turns)
-            slip = min(max(high * wave / (2.0 * math.pi * steepest), 0.01), 0.5)
+            # the face falls along a line over its first half, then levels out: 4/3 as long as were it straight
+            slip = min(max(4.0 / 3.0 * high * wave / (2.0 * math.pi * steepest), 0.01), 0.5)
             if u < 1.0 - slip:
                 v = u / (1.0 - slip)
                 shape = 0.25 * v + 0.75 * v * v * (3.0 - 2.0 * v)
             else:
-                shape = (1.0 - u) / slip
+                v = (1.0 - u) / slip
+                shape = 4.0 / 3.0 * v - 1.0 / 3.0 if v > 0.5 else 4.0 / 3.0 * v * v
             height[i, j] += high * shape
             tone[i, j] += contrast * (shape - 0.5) * min(strength, 1.0)
 

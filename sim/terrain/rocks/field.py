@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int32, Int64
 
 from sim.terrain.rocks.kernels import assemble, place_discs
 from sim.terrain.rocks.population import PlacedRock, RockParameters, draw_diameters
-from sim.terrain.rocks.shapes import COARSE, FINEST, SHAPES, UNIT_HEIGHT, rock_shapes
+from sim.terrain.rocks.shapes import COARSE, FINEST, FORMS, SHAPES, SHAPES_OF_FORM, UNIT_HEIGHT, rock_shapes
 from sim.terrain.substreams import substream
 from sim.terrain.surface import Surface
 
@@ -38,12 +38,16 @@ class RockMesh:
         Vertex numbers of each triangle, counter-clockwise seen from outside.
     rock_of_face
         Number of the rock, in its field, that each triangle belongs to.
+    body_of_face
+        Which of the bodies in this mesh each triangle belongs to, counted from 0: where the mesh reaches over more than
+        the terrain's period, a rock is there as often as it repeats.
     """
 
     vertices: Float64[np.ndarray, "vertices 3"]
     vertex_normals: Float64[np.ndarray, "vertices 3"]
     faces: Int32[np.ndarray, "faces 3"]
     rock_of_face: Int32[np.ndarray, "faces"]
+    body_of_face: Int32[np.ndarray, "faces"]
 
 
 @dataclass(frozen=True)
@@ -89,10 +93,11 @@ class RockField:
         drawn = draw_diameters(parameters, surface.period_m**2, substream(rng, "rock sizes"))
         looks = substream(rng, "rock looks")
         ratio = parameters.height_ratio * (1.0 + parameters.height_spread * looks.uniform(-1.0, 1.0, drawn.size))
-        told = _PlacedLooks.of(placed, substream(rng, "placed rocks"))
+        first = FORMS.index(parameters.form) * SHAPES_OF_FORM
+        told = _PlacedLooks.of(placed, first, substream(rng, "placed rocks"))
         diameter = np.concatenate([[rock.diameter_m for rock in placed], drawn])
         height = np.concatenate([[rock.height_m or 0.5 * rock.diameter_m for rock in placed], ratio * drawn])
-        shape = np.concatenate([told.shape, looks.integers(0, SHAPES, drawn.size)]).astype(np.int32)
+        shape = np.concatenate([told.shape, first + looks.integers(0, SHAPES_OF_FORM, drawn.size)]).astype(np.int32)
         yaw = np.concatenate([told.yaw_rad, looks.uniform(-np.pi, np.pi, drawn.size)])
         radius = rock_shapes(COARSE).reach[shape] * diameter
         place = _places(parameters, radius, diameter, surface.period_m, substream(rng, "rock places"))
@@ -226,25 +231,31 @@ class RockField:
             first = np.arange(start, stop, each, dtype=np.int32)
             faces.append((shapes.faces[None] + first[:, None, None]).reshape(-1, 3))
             start = stop
-        rock_of_face = np.repeat(number.astype(np.int32), [rock_shapes(int(level)).faces.shape[0] for level in detail])
+        body_of_face = np.repeat(
+            np.arange(number.size, dtype=np.int32), [rock_shapes(int(level)).faces.shape[0] for level in detail]
+        )
         return RockMesh(
-            vertices, normals, np.concatenate(faces) if faces else np.empty((0, 3), dtype=np.int32), rock_of_face
+            vertices,
+            normals,
+            np.concatenate(faces) if faces else np.empty((0, 3), dtype=np.int32),
+            number.astype(np.int32)[body_of_face],
+            body_of_face,
         )
 
 
 @dataclass(frozen=True)
 class _PlacedLooks:
-    """Shape and turn of the placed rocks, drawn where they are not told."""
+    """Shape and turn of the placed rocks; where not told they are drawn, shapes from the `first` of a form on."""
 
     shape: list[int]
     yaw_rad: list[float]
 
     @classmethod
-    def of(cls, placed: tuple[PlacedRock, ...], rng: np.random.Generator) -> _PlacedLooks:
+    def of(cls, placed: tuple[PlacedRock, ...], first: int, rng: np.random.Generator) -> _PlacedLooks:
         for rock in placed:
             if rock.shape is not None and rock.shape >= SHAPES:
                 raise ValueError(f"rock '{rock.name}' has shape {rock.shape}; allowed: 0 to {SHAPES - 1}")
-        drawn = [(int(rng.integers(0, SHAPES)), float(rng.uniform(-np.pi, np.pi))) for _ in placed]
+        drawn = [(first + int(rng.integers(0, SHAPES_OF_FORM)), float(rng.uniform(-np.pi, np.pi))) for _ in placed]
         return cls(
             [kind if rock.shape is None else rock.shape for rock, (kind, _) in zip(placed, drawn, strict=True)],
             [

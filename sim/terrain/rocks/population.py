@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -26,7 +26,9 @@ class PlacedRock(BaseModel):
     height_m: Annotated[
         Positive | None, Field(description="height above the ground, m; by default half the diameter")
     ] = None
-    shape: Annotated[int | None, Field(ge=0, description="number of its shape; drawn where not given")] = None
+    shape: Annotated[
+        int | None, Field(ge=0, description="its shape: 0 to 15 blocks from angular to rounded, 16 to 31 clinker")
+    ] = None
     yaw_deg: Annotated[float | None, Field(description="turn about its vertical, deg; drawn where not given")] = None
 
 
@@ -49,6 +51,9 @@ class RockParameters(BaseModel):
     height_spread: Annotated[
         float, Field(ge=0.0, lt=1.0, description="half-width of its uniform spread, as a share of the mean")
     ] = 0.3
+    form: Annotated[
+        Literal["block", "clinker"], Field(description="blocks, angular to rounded, or the jagged clinker of a'a")
+    ] = "block"
     placed: Annotated[tuple[PlacedRock, ...], Field(description="rocks at stated places")] = ()
 
     @model_validator(mode="after")

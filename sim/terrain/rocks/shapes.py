@@ -1,4 +1,4 @@
-"""Irregular rock shapes, made once from seeds: blocks cut by planes, angular to rounded, at several resolutions."""
+"""Irregular rock shapes, made once from seeds, at several resolutions: blocks cut by planes, and jagged clinker."""
 
 from __future__ import annotations
 
@@ -9,15 +9,23 @@ import numpy as np
 import trimesh
 from jaxtyping import Float64, Int32
 
-#: Number of different shapes. Even ones of the lower half are angular, those at the end well rounded.
-SHAPES = 16
+#: Number of different shapes of each form. Of the blocks the first are angular, the last rounded.
+SHAPES_OF_FORM = 16
+#: Forms in the order of their shapes' numbers: blocks, and the rough clinker of a'a.
+FORMS = ("block", "clinker")
+SHAPES = SHAPES_OF_FORM * len(FORMS)
 #: Subdivisions of the icosahedron at each level of detail: 80, 320, 1280 and 5120 triangles.
 SUBDIVISIONS = (1, 2, 3, 4)
 COARSE, MEDIUM, FINE, FINEST = range(4)
 #: Height above the ground over diameter of the unit shapes. Each rock is stretched to its own.
 UNIT_HEIGHT = 0.5
-#: Bumps in bands of wavenumber (radians per radius): number of waves and RMS height over the radius.
-_BUMP_WAVENUMBERS, _BUMP_WAVES, _BUMP_RMS = (3.0, 6.5, 13.0), (10, 16, 24), (0.05, 0.018, 0.007)
+#: Exponents of the cuts' union, which rounds their edges, from the most angular to the most rounded.
+_SHARPEST, _ROUNDEST = 200.0, 10.0
+#: Least and most share of a form's height that is under the ground.
+_BURIED = {"block": (0.15, 0.4), "clinker": (0.3, 0.5)}
+#: Bumps in bands of wavenumber (radians per radius): number of waves, and each form's RMS height over the radius.
+_BUMP_WAVENUMBERS, _BUMP_WAVES = (3.0, 6.5, 13.0, 24.0), (10, 16, 24, 32)
+_BUMP_RMS = {"block": (0.03, 0.015, 0.008, 0.004), "clinker": (0.1, 0.045, 0.022, 0.0)}
 
 
 @dataclass(frozen=True)
@@ -67,7 +75,8 @@ class _Block:
     """A star-shaped body: an ellipsoid cut by planes whose edges are rounded, with a bumpy surface.
 
     In its own axes the distance of the surface from the centre along direction d is
-    ``(|d|**-p + sum((n_i . d / c_i)**p))**(-1/p) (1 + bumps(d))``: for large p the smallest of all cuts.
+    ``(|d|**-p + sum((n_i . d / c_i)**p))**(-1/p) (1 + bumps(d))``: for large p the smallest of all cuts. The bumps are
+    waves; clinker's are folded, so that they meet in sharp ridges.
     """
 
     cut_normals: Float64[np.ndarray, "cuts 3"]
@@ -76,28 +85,31 @@ class _Block:
     waves: Float64[np.ndarray, "waves 3"]
     wave_phases: Float64[np.ndarray, "waves"]
     wave_heights: Float64[np.ndarray, "waves"]
+    folded: bool
     axes: Float64[np.ndarray, "3"]
     buried_share: float
 
     @classmethod
     def drawn(cls, number: int) -> _Block:
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(0x70C6, spawn_key=(number,))))
-        roundness = number / (SHAPES - 1)
-        cuts = int(rng.integers(7, 14))
+        form = FORMS[number // SHAPES_OF_FORM]
+        roundness = number % SHAPES_OF_FORM / (SHAPES_OF_FORM - 1)
+        cuts = int(rng.integers(8, 16))
         normals = rng.standard_normal((cuts, 3))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         waves = rng.standard_normal((sum(_BUMP_WAVES), 3))
         waves *= (np.repeat(_BUMP_WAVENUMBERS, _BUMP_WAVES) / np.linalg.norm(waves, axis=1))[:, None]
-        bumps = np.repeat(np.array(_BUMP_RMS) * np.sqrt(2.0 / np.array(_BUMP_WAVES)), _BUMP_WAVES)
+        bumps = np.repeat(np.array(_BUMP_RMS[form]) * np.sqrt(2.0 / np.array(_BUMP_WAVES)), _BUMP_WAVES)
         return cls(
             cut_normals=normals,
-            cut_distances=rng.uniform(0.5, 0.9, cuts),
-            sharpness=float(40.0 * (1.0 - roundness) + 5.0 * roundness),
+            cut_distances=rng.uniform(0.45, 0.85, cuts),
+            sharpness=float(_SHARPEST * (_ROUNDEST / _SHARPEST) ** roundness),
             waves=waves,
             wave_phases=rng.uniform(0.0, 2.0 * np.pi, sum(_BUMP_WAVES)),
             wave_heights=bumps,
+            folded=form == "clinker",
             axes=np.array([1.0, rng.uniform(0.65, 0.95), rng.uniform(0.6, 0.85)]),
-            buried_share=float(rng.uniform(0.15, 0.4)),
+            buried_share=float(rng.uniform(*_BURIED[form])),
         )
 
     def surface(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
@@ -133,7 +145,11 @@ class _Block:
         towards = np.maximum(np.sum(d[:, None, :] * self.cut_normals, axis=-1), 0.0) / self.cut_distances
         radius = (1.0 + np.sum(towards**self.sharpness, axis=1)) ** (-1.0 / self.sharpness)
         phase = np.sum(d[:, None, :] * self.waves, axis=-1) + self.wave_phases
-        bumpy: Float64[np.ndarray, "n"] = radius * (1.0 + np.sum(self.wave_heights * np.cos(phase), axis=1))
+        wave = np.cos(phase)
+        if self.folded:
+            # of the same mean square, 1/2, about the mean 0; the cusps outwards
+            wave = (2.0 / np.pi - np.abs(wave)) / np.sqrt(1.0 - 8.0 / np.pi**2)
+        bumpy: Float64[np.ndarray, "n"] = radius * (1.0 + np.sum(self.wave_heights * wave, axis=1))
         return bumpy
 
     def _raw(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
