@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from sim.dynamics.state import State
+from sim.dynamics.trajectory import Motion
 
 Phase = Annotated[float, Field(ge=-360.0, le=720.0)]
 
@@ -108,6 +109,23 @@ class ParachuteDescent:
         offset: Float64[np.ndarray, "n 3"] = self._from_parachute(times_s) - self._from_parachute(np.zeros(1))
         positions: Float64[np.ndarray, "n 3"] = self.start_m + self._drift(times_s) + offset
         return positions
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """The formula holds at all times."""
+        return -np.inf, np.inf
+
+    def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
+        """Truth at many times."""
+        states = [self.state(float(time)) for time in times_s]
+        return Motion(
+            times_s=times_s,
+            positions_m=np.array([s.position_m for s in states]),
+            velocities_m_s=np.array([s.velocity_m_s for s in states]),
+            attitudes=self.attitudes(times_s),
+            body_rates_rad_s=np.array([s.body_rate_rad_s for s in states]),
+            specific_forces_m_s2=np.array([s.specific_force_m_s2 for s in states]),
+        )
 
     def state(self, time_s: float) -> State:
         """The full state at a time."""
