@@ -9,10 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from algorithms.dimes.options import DimesOptions
 from sim.camera import CameraModel
 from sim.frames import rigid
 from sim.measurements import DescentMeasurements, DetectorCalibration, DetectorImage
+
+#: Heights outside of which nothing is tried: lower than the airbags are large, higher than the atmosphere.
+HEIGHTS_M = (1.0, 1e6)
 
 
 @dataclass(frozen=True)
@@ -107,11 +109,20 @@ def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, 
     return np.asarray(np.array([a.altitude_m for a in measurements.altitudes], dtype=np.float64) + rates * lags)
 
 
-def views(measurements: DescentMeasurements, options: DimesOptions) -> tuple[View, View, View]:
-    """The three binned pictures, each above its own ground plane."""
+def usable_views(measurements: DescentMeasurements, binned_size: tuple[int, int]) -> tuple[View, View, View] | None:
+    """The three binned pictures, each above its own ground plane.
+
+    None where altitudes or times are not finite, the pictures do not follow each other, or a height is out of
+    `HEIGHTS_M`.
+    """
     altitudes = altitudes_at_images(measurements)
+    times = np.array([image.time_s for image in measurements.images])
+    if not (np.all(np.isfinite(altitudes)) and np.all(np.isfinite(times)) and np.all(np.diff(times) > 0.0)):
+        return None
     first, second, third = (
-        view(image, attitude.world_from_body, float(altitude), options.binned_size)
+        view(image, attitude.world_from_body, float(altitude), binned_size)
         for image, attitude, altitude in zip(measurements.images, measurements.attitudes, altitudes, strict=True)
     )
-    return first, second, third
+    lowest, highest = HEIGHTS_M
+    in_range = all(lowest <= one.centre[2] <= highest for one in (first, second, third))
+    return (first, second, third) if in_range else None

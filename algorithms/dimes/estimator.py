@@ -7,16 +7,13 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.dimes.binning import View, altitudes_at_images, views
+from algorithms.dimes.binning import usable_views
 from algorithms.dimes.consistency import combinations
 from algorithms.dimes.details import DimesDetails, PairDetails
 from algorithms.dimes.options import DimesOptions
 from algorithms.dimes.tracking import track_pair
 from algorithms.interface import VelocityEstimate, VelocityOutcome
 from sim.measurements import DescentMeasurements
-
-#: Heights outside of which nothing is tried: lower than the airbags are large, higher than the atmosphere.
-HEIGHTS_M = (1.0, 1e6)
 
 
 @final
@@ -44,30 +41,16 @@ class DimesEstimator:
             If the pictures' size does not bin to the size that the options ask for, or their calibration is not
             possible. Never for what the pictures show or the instruments measure.
         """
-        if not _measurable(measurements):
+        triple = usable_views(measurements, self.options.binned_size)
+        if triple is None:
             return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, DimesDetails((), (), None))
-        first, second, third = views(measurements, self.options)
+        first, second, third = triple
         sun = measurements.sun_direction
-        if not _ordered_above_ground((first, second, third)):
-            return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, DimesDetails((), (), None))
         pairs = (
             track_pair(0, first, second, sun, self.options),
             track_pair(1, second, third, sun, self.options),
         )
         return conclude(pairs, measurements.interval_velocities_m_s, self.options.imu_threshold_m_s)
-
-
-def _measurable(measurements: DescentMeasurements) -> bool:
-    """Whether altitudes and times are finite."""
-    times = [image.time_s for image in measurements.images]
-    return bool(np.all(np.isfinite(altitudes_at_images(measurements))) and np.all(np.isfinite(times)))
-
-
-def _ordered_above_ground(triple: tuple[View, View, View]) -> bool:
-    """Whether the pictures were taken one after the other, from heights at which there is ground to be measured."""
-    lowest, highest = HEIGHTS_M
-    in_range = all(lowest <= view.centre[2] <= highest for view in triple)
-    return in_range and triple[0].time_s < triple[1].time_s < triple[2].time_s
 
 
 def conclude(

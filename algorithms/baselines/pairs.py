@@ -1,0 +1,159 @@
+"""Pairs of pictures rectified to a common camera that looks straight down, and what becomes of their shifts.
+
+The baselines see the same corrected pictures as DIMES, in the same geometry (`algorithms.dimes.rectification`), but all
+of what two pictures share rather than templates; and the IMU checks the change between their two velocities as DIMES'
+check does, with the same threshold. What differs is how the shift is found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from algorithms.dimes.binning import View, usable_views
+from algorithms.dimes.consistency import combinations
+from algorithms.dimes.ground import inside_frame, pixel_angle_rad
+from algorithms.dimes.options import DimesOptions
+from algorithms.dimes.rectification import ground_lattice, rectified_patch
+from algorithms.interface import VelocityEstimate, VelocityOutcome
+from sim.measurements import DescentMeasurements
+
+#: Rectified pixels between the points at which common ground is looked for.
+COARSE_STEP_PX = 8
+
+
+@dataclass(frozen=True)
+class CommonOptions:
+    """What both baselines share; the geometry's numbers are DIMES' own.
+
+    Attributes
+    ----------
+    binned_size, max_speed_m_s, max_off_nadir_rad, border_px, imu_threshold_m_s
+        As in `DimesOptions`.
+    min_side_px
+        Least side of the common square, rectified pixels: the search range twice, so that half of it stays in view.
+    max_side_px
+        Largest side of the common square.
+    """
+
+    binned_size: tuple[int, int] = DimesOptions.binned_size
+    max_speed_m_s: float = DimesOptions.max_speed_m_s
+    max_off_nadir_rad: float = DimesOptions.max_off_nadir_rad
+    border_px: float = DimesOptions.border_px
+    imu_threshold_m_s: float = DimesOptions.imu_threshold_m_s
+    min_side_px: int = 64
+    max_side_px: int = 256
+
+
+#: What both take where they are told nothing else.
+COMMON = CommonOptions()
+
+
+@dataclass(frozen=True)
+class PairPatches:
+    """The same square of ground, were there no motion, in both pictures of a pair.
+
+    Attributes
+    ----------
+    first, second
+        Corrected and rectified, counts, north up, shape (side, side).
+    gsd_m
+        Ground distance between pixels, metres.
+    """
+
+    first: Float[np.ndarray, "side side"]
+    second: Float[np.ndarray, "side side"]
+    gsd_m: float
+
+
+@dataclass(frozen=True)
+class PairMatch:
+    """The shift of one pair.
+
+    Attributes
+    ----------
+    shift_px
+        By how much what the first patch shows is found shifted in the second: (columns, rows), rectified pixels.
+    score
+        What the match's validity is judged by; larger is better.
+    valid
+        Whether it passed.
+    """
+
+    shift_px: Float[np.ndarray, "2"]
+    score: float
+    valid: bool
+
+
+@dataclass(frozen=True)
+class BaselineDetails:
+    """What a baseline found: for each pair its patches, None without common ground, and its match, None without one."""
+
+    patches: tuple[PairPatches | None, ...]
+    matches: tuple[PairMatch | None, ...]
+
+
+Matcher = Callable[[PairPatches], PairMatch | None]
+
+
+def common_square(
+    first: View, second: View, options: CommonOptions
+) -> tuple[Float[np.ndarray, "2"], int, float] | None:
+    """The largest square of ground that both views see at zero motion: its middle, side in pixels, ground distance.
+
+    Sides run east and north. None where it is smaller than `min_side_px`.
+    """
+    gsd = float(second.centre[2]) * pixel_angle_rad(second)
+    reach = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
+    per_side = 2 * int(np.ceil(reach / (COARSE_STEP_PX * gsd))) + 1
+    lattice = ground_lattice(np.zeros(2), per_side, COARSE_STEP_PX * gsd)
+    seen = np.ones(lattice.shape[:2], dtype=bool)
+    for view in (first, second):
+        seen &= inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
+    # Steps to the nearest point that is not seen, counted along rows, columns and diagonals: half sides of squares.
+    steps = cv2.distanceTransform(np.pad(seen, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
+    row, column = np.unravel_index(int(np.argmax(steps)), steps.shape)
+    side = min(2 * (int(steps[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
+    return (lattice[row, column], side, gsd) if side >= options.min_side_px else None
+
+
+def pair_patches(first: View, second: View, options: CommonOptions) -> PairPatches | None:
+    """Both pictures of a pair over their common ground; None where there is too little of it."""
+    found = common_square(first, second, options)
+    if found is None:
+        return None
+    middle, side, gsd = found
+    return PairPatches(rectified_patch(first, middle, side, gsd), rectified_patch(second, middle, side, gsd), gsd)
+
+
+def pair_velocity(patches: PairPatches, match: PairMatch, interval_s: float) -> Float[np.ndarray, "2"]:
+    """Mean velocity of the camera (east, north), m/s: ground moves against it, and rows run south."""
+    return np.asarray(patches.gsd_m * np.array([-match.shift_px[0], match.shift_px[1]]) / interval_s)
+
+
+def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, options: CommonOptions) -> VelocityEstimate:
+    """The velocity over the second pair, if both pairs match and the IMU agrees with their difference."""
+    triple = usable_views(measurements, options.binned_size)
+    if triple is None:
+        return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, BaselineDetails((), ()))
+    views = ((triple[0], triple[1]), (triple[1], triple[2]))
+    patches = tuple(pair_patches(first, second, options) for first, second in views)
+    matches = tuple(None if of_pair is None else matcher(of_pair) for of_pair in patches)
+    details = BaselineDetails(patches, matches)
+    if None in patches:
+        return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, details)
+    velocities = []
+    for (first, second), of_pair, match in zip(views, patches, matches, strict=True):
+        if of_pair is None or match is None or not match.valid:
+            return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None, details)
+        velocities.append(pair_velocity(of_pair, match, second.time_s - first.time_s))
+    if max(np.hypot(*velocity) for velocity in velocities) > options.max_speed_m_s + options.imu_threshold_m_s:
+        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None, details)
+    (agreement,) = combinations([(0, velocities[0])], [(0, velocities[1])], measurements.interval_velocities_m_s)
+    if not agreement.discrepancy_m_s < options.imu_threshold_m_s:
+        return VelocityEstimate(VelocityOutcome.IMU_MISMATCH, None, details)
+    return VelocityEstimate(VelocityOutcome.VALID, velocities[1], details)

@@ -1,0 +1,168 @@
+"""The baselines on rendered descents with exact truth, and against trouble: same bar of honesty as DIMES."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_descent import INTERVAL_S, Flight, flight, render, terrain, tilted, waves
+
+from algorithms.baselines import BaselineDetails, HomographyEstimator, PairPatches, PhaseCorrelationEstimator
+from algorithms.baselines.homography import distortion
+from algorithms.baselines.pairs import COMMON, common_square, pair_patches
+from algorithms.dimes import DimesOptions
+from algorithms.dimes.binning import usable_views
+from algorithms.dimes.ground import inside_frame, square
+from algorithms.interface import VelocityEstimator, VelocityOutcome
+from sim.measurements import DescentMeasurements
+
+ESTIMATORS: dict[str, VelocityEstimator] = {"phase": PhaseCorrelationEstimator(), "homography": HomographyEstimator()}
+both = pytest.mark.parametrize("name", ESTIMATORS)
+
+
+def flown(velocity: tuple[float, float]) -> Flight:
+    step = INTERVAL_S * np.array([*velocity, -75.0])
+    attitudes = (tilted(3.0, 0.0, 0.0), tilted(5.0, 90.0, 120.0), tilted(4.0, 200.0, 250.0))
+    return Flight(np.array([900.0, 1400.0, 2000.0]) + np.outer(np.arange(3), step), attitudes)
+
+
+@pytest.fixture(scope="module")
+def ordinary() -> DescentMeasurements:
+    return render(flown((10.0, 5.0)), noise=np.random.default_rng(1))
+
+
+@both
+@pytest.mark.parametrize("velocity", [(12.0, 0.0), (0.0, 12.0), (-8.0, 9.0)])
+def test_east_is_east_and_north_is_north(name: str, velocity: tuple[float, float]) -> None:
+    answer = ESTIMATORS[name].estimate(render(flown(velocity)))
+    assert answer.outcome is VelocityOutcome.VALID
+    # Half a rectified pixel is 0.6 m/s.
+    np.testing.assert_allclose(answer.velocity_m_s, velocity, atol=0.3)
+
+
+@both
+def test_descents_with_exact_measurements(name: str) -> None:
+    rng = np.random.default_rng(5)
+    flights = [flight(rng, max_tilt_deg=10.0, max_wind=15.0) for _ in range(5)]
+    answers = [ESTIMATORS[name].estimate(render(truth, noise=rng)) for truth in flights]
+    errors = [
+        np.hypot(*(answer.velocity_m_s - truth.velocities[1, :2]))
+        for answer, truth in zip(answers, flights, strict=True)
+        if answer.velocity_m_s is not None
+    ]
+    assert len(errors) >= 4
+    assert max(errors) < 0.5
+
+
+@both
+def test_pictures_of_different_ground_give_no_velocity(name: str) -> None:
+    rng = np.random.default_rng(10)
+    for _ in range(3):
+        truth = flight(rng, max_tilt_deg=10.0)
+        first, other = render(truth, terrain(1), rng), render(truth, terrain(2), rng)
+        mixed = replace(first, images=(first.images[0], other.images[1], first.images[2]))
+        answer = ESTIMATORS[name].estimate(mixed)
+        assert answer.outcome in (VelocityOutcome.NO_VALID_TRACK, VelocityOutcome.IMU_MISMATCH)
+
+
+@both
+def test_imu_that_disagrees_is_believed(name: str, ordinary: DescentMeasurements) -> None:
+    velocities = ordinary.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
+    answer = ESTIMATORS[name].estimate(replace(ordinary, interval_velocities_m_s=velocities))
+    assert answer.outcome is VelocityOutcome.IMU_MISMATCH
+    assert answer.velocity_m_s is None
+
+
+@both
+def test_motion_beyond_the_largest_speed_is_not_reported(name: str) -> None:
+    assert ESTIMATORS[name].estimate(render(flown((45.0, 0.0)))).outcome is not VelocityOutcome.VALID
+
+
+@both
+@pytest.mark.parametrize(
+    "paint",
+    [
+        np.zeros_like,
+        lambda c: np.full_like(c, 4095),
+        lambda c: np.random.default_rng(int(c[0, 0])).integers(0, 4096, c.shape, dtype=np.uint16),
+        lambda c: np.where(np.arange(c.shape[1]) % 2 == 0, 0, 4095).astype(np.uint16) + np.zeros_like(c),
+    ],
+)
+def test_any_picture_gives_an_answer(
+    name: str, paint: Callable[[np.ndarray], np.ndarray], ordinary: DescentMeasurements
+) -> None:
+    images = tuple(replace(image, counts=paint(image.counts)) for image in ordinary.images)
+    answer = ESTIMATORS[name].estimate(replace(ordinary, images=images))
+    # Pictures that are all alike and as sharp as pixels could be matched in place; nothing moves then.
+    assert answer.outcome in (VelocityOutcome.NO_VALID_TRACK, VelocityOutcome.IMU_MISMATCH)
+
+
+@both
+@pytest.mark.parametrize("altitude_m", [-10.0, 1e-3, 3.0, 2e4, np.nan, np.inf])
+def test_any_altitude_gives_an_answer(name: str, altitude_m: float, ordinary: DescentMeasurements) -> None:
+    altitudes = tuple(replace(one, altitude_m=altitude_m) for one in ordinary.altitudes)
+    assert ESTIMATORS[name].estimate(replace(ordinary, altitudes=altitudes)).outcome is not VelocityOutcome.VALID
+
+
+def test_distortion_is_the_largest_change_of_length() -> None:
+    # Projective: about (100, 50) lengths change as finite differences say.
+    homography = np.array([[1.02, 0.01, 3.0], [-0.02, 0.97, 5.0], [1e-4, -2e-4, 1.0]])
+
+    def mapped(point: np.ndarray) -> np.ndarray:
+        x, y, w = homography @ np.array([*point, 1.0])
+        return np.array([x / w, y / w])
+
+    middle, step = np.array([100.0, 50.0]), 1e-4
+    angles = np.linspace(0.0, np.pi, 2001)
+    changes = [
+        np.hypot(*(mapped(middle + step * np.array([np.cos(a), np.sin(a)])) - mapped(middle))) / step - 1.0
+        for a in angles
+    ]
+    found = distortion(homography, float((homography @ np.array([*middle, 1.0]))[2]), mapped(middle))
+    assert found == pytest.approx(np.abs(changes).max(), abs=1e-4)
+
+
+@both
+def test_featureless_and_sky(name: str, ordinary: DescentMeasurements) -> None:
+    flat = render(flown((10.0, 0.0)), terrain(3, 0.0), np.random.default_rng(4))
+    assert ESTIMATORS[name].estimate(flat).outcome is not VelocityOutcome.VALID
+    up = tuple(replace(one, world_from_body=tilted(180.0, 0.0, 0.0)) for one in ordinary.attitudes)
+    assert ESTIMATORS[name].estimate(replace(ordinary, attitudes=up)).outcome is VelocityOutcome.NO_TEMPLATE_AREA
+
+
+@both
+def test_answers_repeat_and_tell_their_matches(name: str, ordinary: DescentMeasurements) -> None:
+    one, other = (ESTIMATORS[name].estimate(ordinary) for _ in range(2))
+    np.testing.assert_array_equal(one.velocity_m_s, other.velocity_m_s)
+    assert isinstance(one.details, BaselineDetails)
+    assert all(match is not None and match.valid for match in one.details.matches)
+    assert all(isinstance(patches, PairPatches) for patches in one.details.patches)
+
+
+def test_common_square_is_seen_by_both_and_as_large_as_can_be() -> None:
+    triple = usable_views(render(flown((0.0, 0.0))), DimesOptions().binned_size)
+    assert triple is not None
+    middle, side, gsd = common_square(triple[0], triple[1], replace(COMMON, max_side_px=1000)) or (None, 0, 0.0)
+    assert middle is not None
+    ground = middle + square(0.5 * side * gsd, 9)
+    for view in triple[:2]:
+        assert inside_frame(view, ground, 0.0, COMMON.max_off_nadir_rad).all()
+    # At nadir the second picture is 256 pixels on a side; turned by 120 deg and tilted, a square within is smaller.
+    assert 140 <= side <= 230
+    assert common_square(triple[0], triple[1], replace(COMMON, min_side_px=side + 16)) is None
+    patches = pair_patches(triple[0], triple[1], COMMON)
+    assert patches is not None
+    # Without motion both patches show the same ground.
+    assert np.corrcoef(patches.first.ravel(), patches.second.ravel())[0, 1] > 0.9
+
+
+def test_on_repetitive_terrain_they_are_right_but_for_whole_waves() -> None:
+    """Waves of 80 m repeat within the search range: a shift by whole waves cannot be told from none."""
+    measured = render(flown((10.0, 5.0)), waves(80.0), np.random.default_rng(4))
+    for estimator in ESTIMATORS.values():
+        answer = estimator.estimate(measured)
+        if answer.velocity_m_s is not None:
+            turns = (answer.velocity_m_s - np.array([10.0, 5.0])) * INTERVAL_S / 80.0
+            assert np.abs(turns - np.rint(turns)).max() < 0.1
