@@ -15,7 +15,7 @@ from sim.sensor.navigation import Navigation, NavigationParameters
 from sim.sensor.optics import natural_fall_off
 from sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, Preset, preset
 from sim.sensor.radar import RadarAltimeter, RadarParameters
-from sim.sensor.ranging import carried_altitudes, height_above_ground, vertical_parts
+from sim.sensor.ranging import height_above_ground
 
 __all__ = [
     "POST_PROCESSED",
@@ -54,9 +54,7 @@ __all__ = [
     "Sampling",
     "WarmUp",
     "auto_expose",
-    "carried_altitudes",
     "height_above_ground",
     "natural_fall_off",
     "preset",
-    "vertical_parts",
 ]

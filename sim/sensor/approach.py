@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.sensor.imu import Imu
 from sim.sensor.inertial import NavigationErrors
+from sim.sensor.quaternions import products
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -112,15 +113,18 @@ class Approach:
 
     def attitudes(self, times_s: Float64[np.ndarray, "n"]) -> Rotation:
         """Nominal rotations from body to world axes: body -z along the flight, spinning about it."""
-        spun = self._spin_rate() * np.minimum(times_s - self.start_s, self._deploy_s() - self.start_s)
         flight = Rotation.from_rotvec(self._off_nadir(times_s)[:, None] * self._turn_axis())
-        return flight * Rotation.from_rotvec(spun[:, None] * np.array([0.0, 0.0, 1.0]))
+        spun = Rotation.from_rotvec(self._spun(times_s)[:, None] * np.array([0.0, 0.0, 1.0]))
+        return Rotation.from_quat(products(flight.as_quat(), spun.as_quat()))
 
     def body_rates(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
         """Nominal angular velocities, body axes, rad/s."""
-        turning = self._off_nadir_rate(times_s)[:, None] * self._turn_axis()
-        rates: Float64[np.ndarray, "n 3"] = self.attitudes(times_s).inv().apply(turning)
-        rates[:, 2] += np.where(times_s < self._deploy_s(), self._spin_rate(), 0.0)
+        # the flight turns about its axis, which its turn leaves where it is: only the spin moves it in the body
+        turning, spun, (first, second, _) = self._off_nadir_rate(times_s), self._spun(times_s), self._turn_axis()
+        rates: Float64[np.ndarray, "n 3"] = np.empty((times_s.size, 3))
+        rates[:, 0] = turning * (np.cos(spun) * first + np.sin(spun) * second)
+        rates[:, 1] = turning * (np.cos(spun) * second - np.sin(spun) * first)
+        rates[:, 2] = np.where(times_s < self._deploy_s(), self._spin_rate(), 0.0)
         return rates
 
     def specific_forces(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
@@ -142,6 +146,10 @@ class Approach:
 
     def _spin_rate(self) -> float:
         return float(2.0 * np.pi * self.parameters.spin_rpm / 60.0)
+
+    def _spun(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        spun: Float64[np.ndarray, "n"] = self._spin_rate() * (np.minimum(times_s, self._deploy_s()) - self.start_s)
+        return spun
 
     def _turn_axis(self) -> Float64[np.ndarray, "3"]:
         # tilts nadir towards the heading: (0, 0, -1) x (sin a, cos a, 0)

@@ -17,9 +17,11 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 from sim.dynamics import Trajectory
 from sim.sensor.clock import Clock, ClockParameters
+from sim.sensor.quaternions import products
 from sim.sensor.stochastic import GaussMarkov
 
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -257,7 +259,8 @@ def true_increments(
     forces = attitudes.apply(motion.specific_forces_m_s2)
     gained = np.diff(CubicSpline(boundaries_s, forces).antiderivative()(boundaries_s), axis=0)
     at_start = attitudes[:-1].inv()
-    return (at_start * attitudes[1:]).as_rotvec(), at_start.apply(gained)
+    turns = Rotation.from_quat(products(at_start.as_quat(), attitudes[1:].as_quat()))
+    return turns.as_rotvec(), at_start.apply(gained)
 
 
 def _off_diagonal(rng: np.random.Generator) -> Float64[np.ndarray, "3 3"]:

@@ -12,6 +12,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from sim.sensor.imu import ImuIncrements
+from sim.sensor.quaternions import running_products
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,8 @@ class InertialSolution:
 
         Velocity increments are turned by the believed attitude, so that its error tilts the specific force.
         """
-        turns = Rotation.from_rotvec(increments.delta_angles_rad)
-        attitudes = _running_products(Rotation.concatenate([attitude, turns]))
+        turns = Rotation.from_rotvec(increments.delta_angles_rad).as_quat()
+        attitudes = Rotation.from_quat(running_products(np.concatenate([attitude.as_quat()[None], turns])))
         gravity = np.array([0.0, 0.0, -gravity_m_s2])
         gained = attitudes[:-1].apply(increments.delta_velocities_m_s) + gravity * increments.period_s
         velocities = velocity_m_s + _running_sums(gained)
@@ -129,20 +130,3 @@ class InertialSolution:
 def _running_sums(steps: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "m 3"]:
     """Sums of the first 0, 1, 2, ... n steps."""
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-
-
-def _running_products(steps: Rotation) -> Rotation:
-    """Products of the first 1, 2, ... n rotations, each step to the right of those before it.
-
-    Pairs are multiplied, the products through pairs found in the same way, and those that end within a pair from them.
-    """
-    count = len(steps)
-    if count == 1:
-        return steps
-    through_pairs = _running_products(steps[: count - 1 : 2] * steps[1::2])
-    products = np.empty((count, 4))
-    products[0] = steps[0].as_quat()
-    products[1::2] = through_pairs.as_quat()
-    if count > 2:
-        products[2::2] = (through_pairs[: (count - 1) // 2] * steps[2::2]).as_quat()
-    return Rotation.from_quat(products)

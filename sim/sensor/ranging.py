@@ -1,4 +1,4 @@
-"""What ranging instruments share: their errors, and the altitude that flight software makes of a reading."""
+"""What ranging instruments share: their errors, and the true altitude to which readings are compared."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from scipy.spatial.transform import Rotation
 
 from sim.sensor.clock import Clock, ClockParameters
 from sim.sensor.instrument import Readings, Sampling
@@ -90,39 +89,3 @@ def height_above_ground(surface: Surface, positions_m: Float64[np.ndarray, "n 3"
     """True altitude: height above the ground straight below, metres."""
     height: Float64[np.ndarray, "n"] = positions_m[:, 2] - surface.height(positions_m[:, 0], positions_m[:, 1])
     return height
-
-
-def vertical_parts(
-    readings: Readings, attitudes: Rotation, axis_body: Float64[np.ndarray, "3"] = DOWN
-) -> Float64[np.ndarray, "n"]:
-    """Altitudes from slant ranges along a body axis, given the believed attitude at each reading, metres."""
-    downward = -attitudes.apply(np.array(axis_body))[..., 2]
-    altitudes: Float64[np.ndarray, "n"] = readings.values * downward
-    return altitudes
-
-
-def carried_altitudes(
-    readings: Readings, times_s: Float64[np.ndarray, "m"], vertical_velocities_m_s: Float64[np.ndarray, "m"]
-) -> Float64[np.ndarray, "m"]:
-    """Altitude at each time as flight software has it: the latest reading carried on with the vertical velocity.
-
-    Parameters
-    ----------
-    readings
-        An altimeter's, in the order of their tags.
-    times_s
-        Time tags at which altitude is wanted.
-    vertical_velocities_m_s
-        Believed upward velocity about then.
-
-    Raises
-    ------
-    ValueError
-        If a time comes before every reading.
-    """
-    latest = np.searchsorted(readings.times_s, times_s, side="right") - 1
-    if latest.size and latest.min() < 0:
-        raise ValueError(f"altitude is asked for at {times_s.min():.4f} s, before the first reading")
-    passed = times_s - readings.times_s[latest]
-    altitudes: Float64[np.ndarray, "m"] = readings.values[latest] + vertical_velocities_m_s * passed
-    return altitudes

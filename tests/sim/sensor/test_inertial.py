@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 from sim.sensor import Imu, ImuIncrements, ImuParameters, InertialSolution, NavigationErrors
 from sim.sensor.clock import Clock, ClockParameters
 from sim.sensor.imu import DEG_H
-from sim.sensor.inertial import _running_products
 from tests.sim.sensor.motions import GRAVITY, Swaying
 from tests.sim.sensor.test_imu import perfect
 
@@ -113,17 +112,6 @@ def test_jitter_beyond_the_period_never_makes_time_run_back() -> None:
     error = (solution.attitude(times) * BUSY.motion(times).attitudes.inv()).magnitude()
     # at most 1.35 rad/s, and jitter of up to four spreads
     assert error.max() < 1.35 * 0.05
-
-
-def test_products_run_on_from_left_to_right() -> None:
-    rng = np.random.default_rng(0)
-    for count in (1, 2, 3, 7, 8, 100):
-        steps = Rotation.from_rotvec(rng.standard_normal((count, 3)))
-        product, expected = Rotation.identity(), []
-        for step in steps:
-            product = product * step
-            expected.append(product.as_matrix())
-        np.testing.assert_allclose(_running_products(steps).as_matrix(), expected, atol=1e-12)
 
 
 def test_navigation_is_known_only_within_its_samples() -> None:

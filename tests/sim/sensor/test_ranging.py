@@ -20,9 +20,7 @@ from sim.sensor import (
     RadarParameters,
     Readings,
     Sampling,
-    carried_altitudes,
     height_above_ground,
-    vertical_parts,
 )
 from sim.sensor.radar import first_return
 from sim.terrain import Surface
@@ -124,14 +122,6 @@ def test_readings_come_at_the_rate_from_a_phase_of_their_own() -> None:
     assert 0.09 < max(phases) < 0.1
 
 
-def test_flight_software_carries_the_latest_altitude_on() -> None:
-    readings = Readings(np.array([0.0, 0.1, 0.2]), np.array([2000.0, 1992.5, 1985.0]))
-    altitudes = carried_altitudes(readings, np.array([0.15, 0.2, 0.26]), np.array([-75.0, -75.0, -50.0]))
-    np.testing.assert_allclose(altitudes, [1988.75, 1985.0, 1982.0])
-    with pytest.raises(ValueError, match="before the first reading"):
-        carried_altitudes(readings, np.array([-0.1]), np.array([0.0]))
-
-
 def test_radar_scale_is_common_and_noise_is_not() -> None:
     still = Swaying(position_m=(0.0, 0.0, 1000.0))
     parameters = RadarParameters(scale_error=0.01, noise=0.001, count_m=0.0)
@@ -226,8 +216,6 @@ def test_a_laser_reads_the_slant_range_of_its_axis() -> None:
     # body -z turned by 20 deg about north points to the west and down: r cos 20 = 100 + 0.1 r sin 20
     expected = 100.0 / (np.cos(np.radians(20.0)) - 0.1 * np.sin(np.radians(20.0)))
     assert readings.values[0] == pytest.approx(expected, abs=1e-4)
-    vertical = vertical_parts(readings, tilted.motion(np.array([0.0])).attitudes)
-    assert vertical[0] == pytest.approx(expected * np.cos(np.radians(20.0)), abs=1e-4)
 
 
 def test_a_laser_that_looks_up_reads_nothing() -> None:
