@@ -63,6 +63,8 @@ RELATIVE_TOLERANCE = 1e-9
 ABSOLUTE_TOLERANCE = 1e-9
 #: The flight is followed until the camera is this far below the thrusters' firing, m, for more than a second.
 BEYOND_FIRING_M = 90.0
+#: Followed backwards, what is damped grows: a nod of 60 deg/s to twice that in half a minute.
+LONGEST_LEAD_S = 30.0
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -125,14 +127,17 @@ class SwingDescent:
         gravity_m_s2
             Acceleration of gravity.
         lead_s
-            How long before the first picture the flight is known.
+            How long before the first picture the flight is known, up to `LONGEST_LEAD_S`.
 
         Raises
         ------
         ValueError
-            If the start is not above the height of the thrusters' firing, or the nod's rate would turn the lander over.
+            If the start is not above the height of the thrusters' firing, the nod's rate would turn the lander over, or
+            the lead is not allowed.
         """
         p = parameters
+        if not 0.0 < lead_s <= LONGEST_LEAD_S:
+            raise ValueError(f"lead_s is {lead_s:.6g}; allowed: above 0, up to {LONGEST_LEAD_S:.6g} s")
         lowest = ground_height_m + p.thruster_firing_m
         if start_m[2] <= lowest:
             raise ValueError(

@@ -91,3 +91,16 @@ def test_tilts_towards_the_azimuth_asked_for() -> None:
     # the line leans so that the lander swings out to the east and its camera, looking along it, looks east of nadir
     looking = coning.attitudes(np.zeros(1)).apply([0.0, 0.0, -1.0])[0]
     np.testing.assert_allclose(looking, [np.sin(np.radians(20.0)), 0.0, -np.cos(np.radians(20.0))], atol=1e-12)
+
+
+def test_motion_holds_the_states() -> None:
+    descent, times = _descent(), np.array([-2.0, 0.0, 7.5])
+    motion = descent.motion(times)
+    for k, time in enumerate(times):
+        state = descent.state(float(time))
+        np.testing.assert_array_equal(motion.positions_m[k], state.position_m)
+        np.testing.assert_array_equal(motion.velocities_m_s[k], state.velocity_m_s)
+        np.testing.assert_array_equal(motion.attitudes[k].as_quat(), state.attitude.as_quat())
+        np.testing.assert_array_equal(motion.body_rates_rad_s[k], state.body_rate_rad_s)
+        np.testing.assert_array_equal(motion.specific_forces_m_s2[k], state.specific_force_m_s2)
+    assert descent.span_s == (-np.inf, np.inf)
