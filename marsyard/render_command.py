@@ -266,7 +266,7 @@ def layers(picture: Picture) -> dict[str, Any]:
     # Drawn once more by the sun alone: what stays black has no direct light.
     direct = replace(scene.photometry, sky_share=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
     by_sun = process_renderer(default_backend()).render(
-        replace(scene, photometry=direct), frame.rays, frame.world_from_body
+        replace(scene, photometry=direct, edge_rays=1), frame.rays, frame.world_from_body
     )
     names = np.append(scene.objects.names, [-2, -1])  # the last two: what bodies -2 and -1 stand for
     return {

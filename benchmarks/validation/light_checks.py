@@ -76,6 +76,8 @@ def _uniform(view: View, sun: Sun) -> View:
         objects=replace(view.scene.objects, albedo=np.full(len(view.scene.objects), FLAT_ALBEDO)),
         ground_texture=Texture(),
         object_texture=Texture(),
+        # one ray a pixel: light is compared where that ray ends
+        edge_rays=1,
     )
     return replace(view, scene=scene)
 

@@ -22,6 +22,23 @@ WIDEST_HALF_ANGLE_RAD = np.radians(52.0)
 
 
 @dataclass(frozen=True)
+class RayBundle:
+    """Rays in body axes, relative to a camera's centre.
+
+    Attributes
+    ----------
+    origins, directions
+        Shape (rays, 3), float32; directions are unit vectors.
+    pixel_angles
+        Angle that the pixel of each ray takes, radians.
+    """
+
+    origins: Float32[np.ndarray, "rays 3"]
+    directions: Float32[np.ndarray, "rays 3"]
+    pixel_angles: Float32[np.ndarray, "rays"]
+
+
+@dataclass(frozen=True)
 class PixelRays:
     """Every pixel's ray in body axes, and the pinhole views that contain them all.
 
@@ -54,6 +71,11 @@ class PixelRays:
     view_from_body: Float64[np.ndarray, "views 3 3"]
     focal_px: Float64[np.ndarray, "views"]
     view_of_pixel: UInt8[np.ndarray, "pixels"]
+
+    @property
+    def bundle(self) -> RayBundle:
+        """The rays alone."""
+        return RayBundle(self.origins, self.directions, self.pixel_angles)
 
     @cached_property
     def axis(self) -> Float64[np.ndarray, "3"]:

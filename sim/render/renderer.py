@@ -18,12 +18,14 @@ from jaxtyping import Float32, Float64, Int32
 from scipy.spatial.transform import RigidTransform
 
 from sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
+from sim.render.edges import Sight, edge_pixels, look_within, rays_within
 from sim.render.kernels.ground import height_range, sweep_shadow
 from sim.render.kernels.shading import shade
+from sim.render.kernels.sight import look
 from sim.render.mesh import graded_offsets, ground_mesh, lines_in_view
 from sim.render.objects import Objects
 from sim.render.photometry import Photometry, Sun, Texture
-from sim.render.rays import VIEW_SIDE_PX, PixelRays
+from sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
 from sim.terrain import Surface
 
 NO_TEXTURE = Texture()
@@ -57,6 +59,8 @@ class Scene:
     mesh_in_view
         Whether only the ground and the objects that a picture shows are drawn. They are loaded anew for every picture
         then, which pays for narrow views of wide scenes; without it one mesh serves all pictures of the scene.
+    edge_rays
+        Rays along each side of a pixel that holds an edge (`sim.render.edges`); 1 draws every pixel by one ray.
     """
 
     surface: Surface
@@ -72,6 +76,7 @@ class Scene:
     mesh_reach_m: float = 20000.0
     mesh_lines: int = 513
     mesh_in_view: bool = False
+    edge_rays: int = 3
 
     @cached_property
     def mesh_offsets(self) -> Float64[np.ndarray, "lines"]:
@@ -190,11 +195,8 @@ class Renderer:
         self._load(scene, rays, rotation, position)
         depth, numbers = self._draw(scene, rays, rotation, position, clearance)
         columns, rows = rays.size
-        radiance = np.empty(rows * columns, dtype=np.float32)
-        distance = np.empty(rows * columns, dtype=np.float64)
-        body = np.empty(rows * columns, dtype=np.int32)
-        normal = np.empty((rows * columns, 3), dtype=np.float32)
-        shade(
+        sight = Sight.unseen(rows * columns, scene.objects)
+        look(
             scene.surface.levels,
             scene.surface.spacing_m,
             depth,
@@ -207,29 +209,28 @@ class Renderer:
             rays.origins,
             rays.directions,
             rays.pixel_angles,
-            np.asarray(scene.sun.direction, dtype=np.float64),
-            scene.photometry.law(scene.sun, scene.caster_diameter_m),
-            *scene.shadow,
-            scene.height_range_m[1],
-            scene.ground_texture.arrays(),
-            scene.object_texture.arrays(),
-            scene.objects.normals,
-            scene.objects.body_of_triangle,
-            scene.objects.albedo,
             scene.objects.hierarchy,
-            radiance,
-            distance,
-            body,
-            normal,
+            sight.distance,
+            sight.triangle,
+            sight.weights,
+            sight.level,
         )
-        return Frame(
+        radiance, body, normal = _shaded(scene, rotation, position, rays.bundle, sight)
+        frame = Frame(
             radiance.reshape(rows, columns),
-            distance.reshape(rows, columns),
+            sight.distance.reshape(rows, columns),
             body.reshape(rows, columns),
             normal.reshape(rows, columns, 3),
             world_from_body,
             rays,
         )
+        if scene.edge_rays > 1:
+            pixels = edge_pixels(frame.radiance, frame.range_m, frame.body)
+            within = rays_within(rays, pixels, scene.edge_rays)
+            seen = look_within(scene.surface, scene.objects, rotation, position, columns, pixels, within, sight)
+            finer, _, _ = _shaded(scene, rotation, position, within, seen)
+            radiance[pixels] = finer.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)
+        return frame
 
     def close(self) -> None:
         """Releases the OpenGL contexts."""
@@ -286,6 +287,47 @@ class Renderer:
             far = 2.0 * scene.mesh_reach_m + clearance_m
             drawn.append(renderer.draw(PinholeView(pose, float(focal), near_m=0.05 * clearance_m, far_m=far)))
         return np.stack([depth for depth, _ in drawn]), np.stack([numbers for _, numbers in drawn])
+
+
+def _shaded(
+    scene: Scene,
+    rotation: Float64[np.ndarray, "3 3"],
+    position: Float64[np.ndarray, "3"],
+    rays: RayBundle,
+    sight: Sight,
+) -> tuple[Float32[np.ndarray, "rays"], Int32[np.ndarray, "rays"], Float32[np.ndarray, "rays 3"]]:
+    """Radiance factor, body's number and normal of what rays meet."""
+    count = len(rays.directions)
+    radiance = np.empty(count, dtype=np.float32)
+    body = np.empty(count, dtype=np.int32)
+    normal = np.empty((count, 3), dtype=np.float32)
+    shade(
+        scene.surface.levels,
+        scene.surface.spacing_m,
+        sight.distance,
+        sight.triangle,
+        sight.weights,
+        sight.level,
+        rotation,
+        position,
+        rays.origins,
+        rays.directions,
+        rays.pixel_angles,
+        np.asarray(scene.sun.direction, dtype=np.float64),
+        scene.photometry.law(scene.sun, scene.caster_diameter_m),
+        *scene.shadow,
+        scene.height_range_m[1],
+        scene.ground_texture.arrays(),
+        scene.object_texture.arrays(),
+        scene.objects.normals,
+        scene.objects.body_of_triangle,
+        scene.objects.albedo,
+        scene.objects.hierarchy,
+        radiance,
+        body,
+        normal,
+    )
+    return radiance, body, normal
 
 
 def _return_freed_memory() -> None:

@@ -129,6 +129,59 @@ def hidden_from_sun(
 
 
 @njit(cache=True)
+def cross_ground(
+    field: Level,
+    inverse_spacing: float,
+    x0: float,
+    y0: float,
+    z0: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    start: float,
+    farthest: float,
+) -> float:
+    """Distance at which a ray first dips below the ground between two distances; infinite where it does not.
+
+    The ray is followed by steps of a sample, longer where it runs high above the ground, and the crossing closed in on
+    by false position (Illinois) to a hundredth of a sample.
+    """
+    spacing = 1.0 / inverse_spacing
+    before = start
+    above = 0.0
+    t = start
+    clearance = 0.0
+    while t < farthest:
+        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, x0 + t * dx, y0 + t * dy)
+        clearance = z0 + t * dz - height
+        if clearance < 0.0:
+            break
+        before = t
+        above = clearance
+        t += max(spacing, 1.5 * clearance)
+    if t >= farthest or t == before:
+        return math.inf
+    below = clearance
+    for _ in range(40):
+        if t - before <= 0.01 * spacing:
+            break
+        middle = before + (t - before) * above / (above - below)
+        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, x0 + middle * dx, y0 + middle * dy)
+        clearance = z0 + middle * dz - height
+        if abs(clearance) < 1e-3 * spacing * max(-dz, 1e-3):
+            return middle
+        if clearance < 0.0:
+            t = middle
+            below = clearance
+            above *= 0.5
+        else:
+            before = middle
+            above = clearance
+            below *= 0.5
+    return 0.5 * (before + t)
+
+
+@njit(cache=True)
 def first_ground(
     field: Level,
     inverse_spacing: float,
@@ -140,32 +193,13 @@ def first_ground(
     dz: float,
     guess: float,
 ) -> float:
-    """Distance at which a flat ray first dips below the ground, on the way to a guess and past it.
+    """Distance at which a flat ray first dips below the ground, from four fifths of the way to a guess to past it.
 
-    The mesh that gives the guess does not hold every crest. The ray is followed from four fifths of the guess by steps
-    of a sample, longer where it runs high above the ground, and the crossing halved down to a hundredth of a sample.
+    The mesh that gives the guess does not hold every crest. The guess itself where the ray does not dip.
     """
-    spacing = 1.0 / inverse_spacing
-    before = 0.8 * guess
-    t = before
-    farthest = 1.25 * guess + 4.0 * spacing
-    while t < farthest:
-        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, x0 + t * dx, y0 + t * dy)
-        clearance = z0 + t * dz - height
-        if clearance < 0.0:
-            break
-        before = t
-        t += max(spacing, 1.5 * clearance)
-    if t >= farthest or t == before:
-        return guess
-    while t - before > 0.01 * spacing:
-        middle = 0.5 * (before + t)
-        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, x0 + middle * dx, y0 + middle * dy)
-        if z0 + middle * dz < height:
-            t = middle
-        else:
-            before = middle
-    return 0.5 * (before + t)
+    farthest = 1.25 * guess + 4.0 / inverse_spacing
+    met = cross_ground(field, inverse_spacing, x0, y0, z0, dx, dy, dz, 0.8 * guess, farthest)
+    return met if met < math.inf else guess
 
 
 @njit(cache=True)
@@ -184,6 +218,7 @@ __all__ = [
     "Array",
     "Array32",
     "Level",
+    "cross_ground",
     "first_ground",
     "height_range",
     "hidden_from_sun",

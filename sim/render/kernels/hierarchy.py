@@ -1,4 +1,4 @@
-"""A bounding volume hierarchy over triangles: whether anything stands in the way of a ray.
+"""A bounding volume hierarchy over triangles: what stands in the way of a ray.
 
 Triangles are sorted along a Morton curve and taken in runs of `LEAF` as the leaves of a complete binary tree, whose
 boxes are built bottom-up: a million triangles in a fraction of a second, the same tree every time.
@@ -101,6 +101,78 @@ def _passes(boxes: Boxes, node: int, x: float, y: float, z: float, ix: float, iy
     near = max(near, min(a, b))
     far = min(far, max(a, b))
     return bool(far >= max(near, 0.0))
+
+
+@njit(cache=True, inline="always")
+def _entry(boxes: Boxes, node: int, x: float, y: float, z: float, ix: float, iy: float, iz: float) -> float:
+    """Distance at which a ray enters a node's box, 0 from within; infinite where it does not."""
+    a = (boxes[node, 0] - x) * ix
+    b = (boxes[node, 3] - x) * ix
+    near = min(a, b)
+    far = max(a, b)
+    a = (boxes[node, 1] - y) * iy
+    b = (boxes[node, 4] - y) * iy
+    near = max(near, min(a, b))
+    far = min(far, max(a, b))
+    a = (boxes[node, 2] - z) * iz
+    b = (boxes[node, 5] - z) * iz
+    near = max(max(near, min(a, b)), 0.0)
+    far = min(far, max(a, b))
+    return near if far >= near else math.inf
+
+
+@njit(cache=True)
+def nearest_hit(
+    tree: Hierarchy, x: float, y: float, z: float, dx: float, dy: float, dz: float, farthest: float
+) -> tuple[float, int, float, float]:
+    """Distance to the nearest triangle that a ray meets, its number, and the weights of its second and third corner.
+
+    The number is -1 where no triangle is nearer than `farthest`, and the distance then that one.
+    """
+    triangles, order, boxes = tree
+    best = farthest
+    best_triangle = -1
+    best_second = 0.0
+    best_third = 0.0
+    if order.size == 0:
+        return best, best_triangle, best_second, best_third
+    ix = 1.0 / (dx if abs(dx) > 1e-12 else 1e-12)
+    iy = 1.0 / (dy if abs(dy) > 1e-12 else 1e-12)
+    iz = 1.0 / (dz if abs(dz) > 1e-12 else 1e-12)
+    first_leaf = boxes.shape[0] // 2
+    stack = np.empty(_STACK, dtype=np.int64)
+    entries = np.empty(_STACK)
+    stack[0] = 0
+    entries[0] = _entry(boxes, 0, x, y, z, ix, iy, iz)
+    waiting = 1
+    while waiting > 0:
+        waiting -= 1
+        if entries[waiting] >= best:
+            continue
+        node = stack[waiting]
+        if node < first_leaf:
+            left = 2 * node + 1
+            to_left = _entry(boxes, left, x, y, z, ix, iy, iz)
+            to_right = _entry(boxes, left + 1, x, y, z, ix, iy, iz)
+            # the nearer child is looked at first
+            near_left = to_left <= to_right
+            for turn in range(2):
+                is_left = near_left == (turn == 1)
+                entry = to_left if is_left else to_right
+                if entry < best:
+                    stack[waiting] = left if is_left else left + 1
+                    entries[waiting] = entry
+                    waiting += 1
+            continue
+        start = (node - first_leaf) * LEAF
+        for k in range(start, min(start + LEAF, order.size)):
+            t, second, third = hit_triangle(triangles, order[k], x, y, z, dx, dy, dz)
+            if 0.0 < t < best and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
+                best = t
+                best_triangle = order[k]
+                best_second = second
+                best_third = third
+    return best, best_triangle, best_second, best_third
 
 
 @njit(cache=True)

@@ -1,4 +1,4 @@
-"""Compiled kernel of the picture: what each pixel's ray meets, and how bright that is."""
+"""Compiled kernel of the picture: how bright what each pixel sees is."""
 
 from __future__ import annotations
 
@@ -8,116 +8,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, first_ground, hidden_from_sun, meet_ground, shadow_clearance
+from sim.render.kernels.ground import Array32, hidden_from_sun, shadow_clearance
 from sim.render.kernels.hierarchy import Hierarchy, anything_hit
-from sim.render.kernels.intersection import hit_triangle
+from sim.render.kernels.sight import FLATTEST, Ints
 from sim.render.kernels.texture import texture
 from sim.terrain.kernels import Array, Level, sample
 
-Ints = NDArray[np.int32]
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
-#: Sine of the flattest angle at which a pixel's footprint on the ground is still drawn out in full.
-FLATTEST = 0.01
-#: Samples of the terrain up to which a footprint is met by the terrain itself, not by a smoothed level of it.
-FINE_UNTIL = 8.0
 #: Footprint, in samples, up to which the finest level is taken: the B-spline itself holds nothing finer than this.
 SHARP_UNTIL = 1.2
 #: Distance from a shadow's edge, in spacings of its grid, within which the grid is not believed.
 UNSURE = 0.1
-#: Sine of the angle below which a ray may pass over crests that the mesh does not hold.
-GRAZING = 0.4
-#: Slack of a triangle's edge, as a share: so that no ray slips between two triangles.
-SLACK = 1e-9
-
-
-@njit(cache=True, inline="always")
-def _ground_depth(depth: Array32, ids: Ints, things: bool, face: int, u: float, v: float) -> float:
-    """Depth of the ground between the samples of a depth picture; 0 where no sample around shows ground.
-
-    Where all four samples show one stretch of ground its inverse depth, linear over a plane's picture, is interpolated;
-    across an edge the nearest sample of the ground is taken.
-    """
-    side = depth.shape[1]
-    i = min(max(math.floor(v), 0), side - 2)
-    j = min(max(math.floor(u), 0), side - 2)
-    fu = u - j
-    fv = v - i
-    a = depth[face, i, j]
-    b = depth[face, i, j + 1]
-    c = depth[face, i + 1, j]
-    d = depth[face, i + 1, j + 1]
-    smallest = min(min(a, b), min(c, d))
-    largest = max(max(a, b), max(c, d))
-    whole = smallest > 0.0 and largest < 1.1 * smallest
-    if whole and things:
-        whole = ids[face, i, j] == 0 and ids[face, i, j + 1] == 0
-        whole = whole and ids[face, i + 1, j] == 0 and ids[face, i + 1, j + 1] == 0
-    if whole:
-        above = (1.0 - fu) / a + fu / b
-        below = (1.0 - fu) / c + fu / d
-        return float(1.0 / ((1.0 - fv) * above + fv * below))
-    nearest = 0.0
-    least = math.inf
-    for di in range(2):
-        for dj in range(2):
-            value = depth[face, i + di, j + dj]
-            far = abs(fv - di) + abs(fu - dj)
-            if value > 0.0 and far < least and (not things or ids[face, i + di, j + dj] == 0):
-                least = far
-                nearest = value
-    return nearest
-
-
-@njit(cache=True)
-def _meet_object(
-    ids: Ints,
-    face: int,
-    u: float,
-    v: float,
-    triangles: Array,
-    x: float,
-    y: float,
-    z: float,
-    dx: float,
-    dy: float,
-    dz: float,
-) -> tuple[float, int, float, float]:
-    """The nearest triangle that a ray meets among those that the four samples around it show.
-
-    Where all four show triangles and the ray meets none of them (it slips to a sliver between), the plane of the
-    nearest sample's triangle is taken.
-    """
-    side = ids.shape[1]
-    i = min(max(math.floor(v), 0), side - 2)
-    j = min(max(math.floor(u), 0), side - 2)
-    best = math.inf
-    best_triangle = -1
-    best_second = 0.0
-    best_third = 0.0
-    shown = 0
-    last = 0
-    for k in range(4):
-        one = ids[face, i + k // 2, j + k % 2]
-        if one <= 0:
-            continue
-        shown += 1
-        if one == last:
-            continue
-        last = one
-        t, second, third = hit_triangle(triangles, one - 1, x, y, z, dx, dy, dz)
-        if 0.0 < t < best and second >= -SLACK and third >= -SLACK and second + third <= 1.0 + SLACK:
-            best = t
-            best_triangle = one - 1
-            best_second = second
-            best_third = third
-    if shown == 4 and best_triangle < 0:
-        one = ids[face, i + (1 if v - i > 0.5 else 0), j + (1 if u - j > 0.5 else 0)]
-        t, second, third = hit_triangle(triangles, one - 1, x, y, z, dx, dy, dz)
-        if 0.0 < t < math.inf:
-            second = min(max(second, 0.0), 1.0)
-            return t, one - 1, second, min(max(third, 0.0), 1.0 - second)
-    return best, best_triangle, best_second, best_third
 
 
 @njit(cache=True, inline="always")
@@ -147,11 +49,10 @@ def _brightness(law: Array, cos_i: float, cos_e: float, cos_g: float) -> float:
 def shade(
     levels: tuple[Level, ...],
     spacing: float,
-    depth: Array32,
-    ids: Ints,
-    focal: Array,
-    view_from_body: Array,
-    face_of_pixel: NDArray[np.uint8],
+    distance: Array,
+    triangle_of_pixel: Ints,
+    weights: Array32,
+    level_of_pixel: NDArray[np.int8],
     world_from_body: Array,
     position: Array,
     origins: Array32,
@@ -170,7 +71,6 @@ def shade(
     albedos: Array,
     tree: Hierarchy,
     radiance: Array32,
-    distance: Array,
     body: Ints,
     normal: Array32,
 ) -> None:
@@ -180,11 +80,8 @@ def shade(
     ----------
     levels, spacing
         The surface's pyramid and the spacing of its level 0.
-    depth, ids, focal, view_from_body
-        Pinhole views from `position`: depth along the axis, number of the triangle plus one (0 for ground), focal
-        lengths in samples, and rotations from body axes to the views' (x right, y down, z forward).
-    face_of_pixel
-        The view that holds each pixel.
+    distance, triangle_of_pixel, weights, level_of_pixel
+        What each ray meets, as `look` finds it.
     world_from_body, position
         Rotation matrix of the body, and world position of the centre of projection.
     origins, directions
@@ -205,19 +102,16 @@ def shade(
     normals, body_of_triangle, albedos, tree
         Triangles that stand on the ground: normals at their corners, the body of each, the bodies' albedos, and the
         triangles themselves with the tree in which shadows look for them.
-    radiance, distance, body, normal
-        Outputs: radiance factor; distance along the ray, infinite for the sky; number of the thing seen (GROUND, SKY);
-        unit normal in world axes.
+    radiance, body, normal
+        Outputs: radiance factor; number of the thing seen (GROUND, SKY); unit normal in world axes.
     """
-    triangles = tree[0]
     sky_share, sky_radiance, bounced = law[4], law[5], law[6]
     caster, sun_radius = law[7], law[8]
-    middle = depth.shape[1] / 2.0 - 0.5
     inverse_spacing = 1.0 / spacing
     top_level = len(levels) - 1
     shadowed = shadow.shape[0] > 1
     finest = levels[0]
-    things = triangles.shape[0] > 0
+    things = tree[0].shape[0] > 0
     w = world_from_body
     for n in range(directions.shape[0]):
         bx = directions[n, 0]
@@ -226,47 +120,16 @@ def shade(
         ox = origins[n, 0]
         oy = origins[n, 1]
         oz = origins[n, 2]
-        face = face_of_pixel[n]
-        p = view_from_body[face]
-        px = p[0, 0] * bx + p[0, 1] * by + p[0, 2] * bz
-        py = p[1, 0] * bx + p[1, 1] * by + p[1, 2] * bz
-        pz = p[2, 0] * bx + p[2, 1] * by + p[2, 2] * bz
-        u = focal[face] * px / pz + middle
-        v = focal[face] * py / pz + middle
         dx = w[0, 0] * bx + w[0, 1] * by + w[0, 2] * bz
         dy = w[1, 0] * bx + w[1, 1] * by + w[1, 2] * bz
         dz = w[2, 0] * bx + w[2, 1] * by + w[2, 2] * bz
         x0 = position[0] + w[0, 0] * ox + w[0, 1] * oy + w[0, 2] * oz
         y0 = position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz
         z0 = position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz
-        t = math.inf
-        smooth = 0
-        met = True
-        guess = _ground_depth(depth, ids, things, face, u, v)
-        if guess > 0.0:
-            # Far away and at a flat angle a pixel takes in many samples along its line of sight: it sees them smoothed.
-            t = guess / pz
-            stretched = t * pixel_angles[n] / max(-dz, FLATTEST)
-            first_guess = t
-            if stretched <= FINE_UNTIL * spacing:
-                if dz > -GRAZING:
-                    t = first_ground(finest, inverse_spacing, x0, y0, z0, dx, dy, dz, t)
-                t = meet_ground(finest, inverse_spacing, x0, y0, z0, dx, dy, dz, t)
-                met = t != first_guess
-            else:
-                smooth = min(int(math.log2(stretched / (FINE_UNTIL * spacing))) + 1, top_level)
-                t = meet_ground(levels[smooth], inverse_spacing / (1 << smooth), x0, y0, z0, dx, dy, dz, t)
-                met = False
-        triangle = -1
-        second = 0.0
-        third = 0.0
-        if things:
-            t_thing, triangle, second, third = _meet_object(ids, face, u, v, triangles, x0, y0, z0, dx, dy, dz)
-            if triangle >= 0 and t_thing < t:
-                t = t_thing
-            else:
-                triangle = -1
-        distance[n] = t
+        t = distance[n]
+        triangle = triangle_of_pixel[n]
+        smooth = max(level_of_pixel[n], 0)
+        met = level_of_pixel[n] == 0
         if t == math.inf:
             radiance[n] = sky_radiance
             body[n] = SKY
@@ -276,6 +139,8 @@ def shade(
         y = y0 + t * dy
         z = z0 + t * dz
         if triangle >= 0:
+            second = weights[n, 0]
+            third = weights[n, 1]
             rest = 1.0 - second - third
             nx = rest * normals[triangle, 0, 0] + second * normals[triangle, 1, 0] + third * normals[triangle, 2, 0]
             ny = rest * normals[triangle, 0, 1] + second * normals[triangle, 1, 1] + third * normals[triangle, 2, 1]

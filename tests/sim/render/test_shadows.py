@@ -43,7 +43,7 @@ def _agreement(frame: Frame, scene: Scene, count: int, step: float) -> tuple[flo
 @pytest.mark.parametrize("azimuth_deg", [110.0, 200.0])
 def test_shadows_of_rough_ground_under_a_low_sun(renderer, rough, descent_camera, azimuth_deg) -> None:
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(12.0)))
-    scene = Scene(_even(rough), (380.0, 200.0), sun, LAMBERT)
+    scene = Scene(_even(rough), (380.0, 200.0), sun, LAMBERT, edge_rays=1)
     pose = rigid(Rotation.from_euler("zxy", [30.0, 12.0, 5.0], degrees=True), np.array([380.0, 200.0, 1500.0]))
     frame = renderer.render(scene, PixelRays.of(descent_camera(512)), pose)
     agree, in_shadow = _agreement(frame, scene, 4000, 0.3)
@@ -67,7 +67,7 @@ def test_shadows_of_rocks(renderer) -> None:
         right=np.array([1.0, 0.0, 0.0]),
     )
     sun = Sun(direction(np.radians(200.0), np.radians(35.0)))
-    scene = Scene(surface, (10.0, 10.0), sun, LAMBERT, rocks, mesh_finest_m=0.1, mesh_reach_m=100.0)
+    scene = Scene(surface, (10.0, 10.0), sun, LAMBERT, rocks, mesh_finest_m=0.1, mesh_reach_m=100.0, edge_rays=1)
     eye = np.array([10.0, 10.0, float(surface.height(10.0, 10.0)) + 8.0])
     frame = renderer.render(scene, PixelRays.of(camera), rigid(Rotation.from_euler("x", 15.0, degrees=True), eye))
     agree, in_shadow = _agreement(frame, scene, 3000, 0.02)

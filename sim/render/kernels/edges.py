@@ -1,0 +1,250 @@
+"""Compiled kernels of pixels that hold an edge: which they are, the rays in them, and what these meet."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sim.render.kernels.ground import Array32, cross_ground
+from sim.render.kernels.hierarchy import Hierarchy, nearest_hit
+from sim.render.kernels.sight import Ints
+from sim.terrain.kernels import Array, Level
+
+Longs = NDArray[np.int64]
+#: Difference of brightness, as a share of the brighter, from which an edge between two things matters: four times
+#: the noise of a picture of SNR 100:1.
+EDGE_CONTRAST = 0.04
+#: Difference of brightness from which there is an edge of light: a shadow's. Texture seldom makes as much.
+LIGHT_CONTRAST = 0.25
+#: Jump in inverse range, as a share of it, and as a multiple of the change beside it, from which something stands
+#: before something else.
+JUMP, STEEPER = 0.02, 3.0
+#: Where the ground is sought, as shares of the range at which a pixel beside has met it.
+AHEAD, BEYOND = 0.95, 1.05
+
+
+@njit(cache=True, inline="always")
+def _jumps(before: float, here: float, there: float, after: float) -> bool:
+    """Whether range jumps between the middle two of four distances along a line, where a plane's would not.
+
+    A plane's inverse range is linear over the picture.
+    """
+    q0 = 1.0 / before
+    q1 = 1.0 / here
+    q2 = 1.0 / there
+    q3 = 1.0 / after
+    step = abs(q2 - q1)
+    return bool(step > JUMP * max(q1, q2) and step > STEEPER * max(abs(q1 - q0), abs(q3 - q2)))
+
+
+@njit(cache=True)
+def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: NDArray[np.bool_]) -> None:
+    """Marks the pixels to both sides of every visible edge: of a thing, of ground before ground, of a shadow.
+
+    Parameters
+    ----------
+    radiance, distance, body
+        A picture and its truth, shape (rows, columns).
+    marked
+        Output of that shape, all False before.
+    """
+    rows, columns = radiance.shape
+    for i in range(rows):
+        for j in range(columns):
+            here = radiance[i, j]
+            for side in range(2):
+                i2 = i + side
+                j2 = j + 1 - side
+                if i2 >= rows or j2 >= columns:
+                    continue
+                there = radiance[i2, j2]
+                difference = abs(there - here)
+                brighter = max(here, there)
+                if difference < EDGE_CONTRAST * brighter:
+                    continue
+                edge = body[i, j] != body[i2, j2] or difference > LIGHT_CONTRAST * brighter
+                if not edge:
+                    i0 = max(i - side, 0)
+                    j0 = max(j - 1 + side, 0)
+                    i3 = min(i2 + side, rows - 1)
+                    j3 = min(j2 + 1 - side, columns - 1)
+                    edge = _jumps(distance[i0, j0], distance[i, j], distance[i2, j2], distance[i3, j3])
+                if edge:
+                    marked[i, j] = True
+                    marked[i2, j2] = True
+
+
+@njit(cache=True)
+def split_rays(rays: Array32, rows: int, columns: int, pixels: Longs, side: int, unit: bool, out: Array32) -> None:
+    """Vectors at side x side places within each of some pixels, from those at all pixels' middles.
+
+    The places are a square grid turned so that no two share a row or a column: an edge along either is found to a
+    part in side**2.
+
+    Parameters
+    ----------
+    rays
+        A vector for each pixel, shape (rows * columns, 3).
+    rows, columns
+        Size of the picture.
+    pixels, side
+        Numbers of the pixels, and places along each side of one.
+    unit
+        Whether the vectors are made unit vectors.
+    out
+        Output, shape (pixels * side**2, 3).
+    """
+    number = 0
+    for pixel in pixels:
+        i = pixel // columns
+        j = pixel - i * columns
+        left = pixel - (1 if j > 0 else 0)
+        right = pixel + (1 if j < columns - 1 else 0)
+        above = pixel - (columns if i > 0 else 0)
+        below = pixel + (columns if i < rows - 1 else 0)
+        across = 1.0 / max(right - left, 1)
+        down = 1.0 / max((below - above) // columns, 1)
+        for k in range(side):
+            for m in range(side):
+                u = (k + (m + 0.5) / side) / side - 0.5
+                v = (m + (side - 1 - k + 0.5) / side) / side - 0.5
+                square = 0.0
+                for axis in range(3):
+                    value = (
+                        rays[pixel, axis]
+                        + u * across * (rays[right, axis] - rays[left, axis])
+                        + v * down * (rays[below, axis] - rays[above, axis])
+                    )
+                    out[number, axis] = value
+                    square += value * value
+                if unit:
+                    for axis in range(3):
+                        out[number, axis] /= math.sqrt(square)
+                number += 1
+
+
+# Fused multiplications round differently, but the same way every time on the same processor.
+@njit(cache=True, fastmath={"contract"})
+def look_closely(
+    levels: tuple[Level, ...],
+    spacing: float,
+    tree: Hierarchy,
+    world_from_body: Array,
+    position: Array,
+    columns: int,
+    pixels: Longs,
+    share: int,
+    origins: Array32,
+    directions: Array32,
+    distance: Array,
+    triangle_of_pixel: Ints,
+    level_of_pixel: NDArray[np.int8],
+    weights: Array32,
+    near: Array,
+    triangle_of_ray: Ints,
+    weights_of_ray: Array32,
+    level_of_ray: NDArray[np.int8],
+) -> None:
+    """What every ray within some pixels meets, among what these pixels and the eight around each see.
+
+    Triangles are sought in the hierarchy and the ground where a pixel around has met it, on the level on which it did,
+    so that neighbouring pixels show one ground.
+
+    Parameters
+    ----------
+    levels, spacing, world_from_body, position
+        As for `look`.
+    tree
+        Triangles that stand on the ground, and their hierarchy.
+    columns
+        Columns of the picture.
+    pixels, share
+        Numbers of the pixels, and how many rays each has.
+    origins, directions
+        The rays in body axes, shape (pixels * share, 3).
+    distance, triangle_of_pixel, level_of_pixel, weights
+        What the picture's pixels meet, from `look`.
+    near, triangle_of_ray, weights_of_ray, level_of_ray
+        The same of the rays: outputs.
+    """
+    inverse_spacing = 1.0 / spacing
+    w = world_from_body
+    rows = distance.size // columns
+    ranges = np.empty(9)
+    found = np.empty(9, dtype=np.int8)
+    for k in range(pixels.size):
+        pixel = pixels[k]
+        row = pixel // columns
+        column = pixel - row * columns
+        count = 0
+        sky = False
+        things = False
+        for i in range(max(row - 1, 0), min(row + 2, rows)):
+            for j in range(max(column - 1, 0), min(column + 2, columns)):
+                n = i * columns + j
+                if distance[n] == math.inf:
+                    sky = True
+                elif triangle_of_pixel[n] >= 0:
+                    things = True
+                else:
+                    # kept in order of range
+                    place = count
+                    while place > 0 and ranges[place - 1] > distance[n]:
+                        ranges[place] = ranges[place - 1]
+                        found[place] = found[place - 1]
+                        place -= 1
+                    ranges[place] = distance[n]
+                    found[place] = level_of_pixel[n]
+                    count += 1
+        for n in range(k * share, (k + 1) * share):
+            bx = directions[n, 0]
+            by = directions[n, 1]
+            bz = directions[n, 2]
+            ox = origins[n, 0]
+            oy = origins[n, 1]
+            oz = origins[n, 2]
+            dx = w[0, 0] * bx + w[0, 1] * by + w[0, 2] * bz
+            dy = w[1, 0] * bx + w[1, 1] * by + w[1, 2] * bz
+            dz = w[2, 0] * bx + w[2, 1] * by + w[2, 2] * bz
+            x0 = position[0] + w[0, 0] * ox + w[0, 1] * oy + w[0, 2] * oz
+            y0 = position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz
+            z0 = position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz
+            t = math.inf
+            level = 0
+            c = 0
+            while c < count and t == math.inf:
+                # places met on one level, each within reach of the one before, are one stretch to be searched
+                level = found[c]
+                start = AHEAD * ranges[c]
+                while c + 1 < count and found[c + 1] == level and AHEAD * ranges[c + 1] < BEYOND * ranges[c]:
+                    c += 1
+                smooth = max(level, 0)
+                scale = inverse_spacing / (1 << smooth)
+                t = cross_ground(levels[smooth], scale, x0, y0, z0, dx, dy, dz, start, BEYOND * ranges[c])
+                c += 1
+            if t == math.inf and count > 0 and not sky:
+                t = ranges[count - 1]
+            triangle = -1
+            second = 0.0
+            third = 0.0
+            if things:
+                t_thing, triangle, second, third = nearest_hit(tree, x0, y0, z0, dx, dy, dz, t)
+                if triangle >= 0:
+                    t = t_thing
+            if t == math.inf and not sky:
+                # a sliver of ground that no pixel around sees
+                t = distance[pixel]
+                triangle = triangle_of_pixel[pixel]
+                level = level_of_pixel[pixel]
+                if triangle >= 0:
+                    second = weights[pixel, 0]
+                    third = weights[pixel, 1]
+            near[n] = t
+            triangle_of_ray[n] = triangle
+            level_of_ray[n] = level
+            if triangle >= 0:
+                weights_of_ray[n, 0] = second
+                weights_of_ray[n, 1] = third
