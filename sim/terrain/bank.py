@@ -92,8 +92,7 @@ class TerrainBank:
             flat: Float32[np.ndarray, "samples"] = np.load(path, mmap_mode="r").view(np.ndarray)
         except (FileNotFoundError, ValueError, EOFError):
             return None
-        kept: Float32[np.ndarray, "samples"] = flat
-        return kept if flat.size == self._size() else None
+        return flat if flat.size == self._size() else None
 
     def _build(self, number: int, path: Path) -> Float32[np.ndarray, "samples"]:
         make_room(path.parent, 4 * self._size(), set(_IN_USE))

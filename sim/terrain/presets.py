@@ -37,6 +37,7 @@ ROVER_GROUND = TerrainParameters(
     craters_per_km2=8000.0,
     crater_diameter_min_m=0.6,
     crater_diameter_max_m=12.0,
+    albedo_hurst=-0.2,
 )
 HELICOPTER_GROUND = ROVER_GROUND.model_copy(
     update={"spacing_m": 0.05, "slope_baseline_m": 3.0, "outer_scale_m": 40.0, "craters_per_km2": 0.0, "albedo": 0.25}
@@ -62,6 +63,8 @@ PISGAH = Site(
     ),
     ground=ROVER_GROUND.model_copy(
         update={
+            "hurst": 0.5,
+            "rms_slope_deg": 4.0,
             "craters_per_km2": 0.0,
             "albedo": 0.1,
             "albedo_contrast": 0.08,
