@@ -14,6 +14,8 @@ from pydantic import Field, model_validator
 from sim.dynamics.kernels import Chain
 from sim.dynamics.wind import WindParameters
 
+#: Greatest tilt of a coning lander over the line's tilt for which the start of a flight is known well enough.
+MOST_LANDER_SHARE = 1.5
 Phase = Annotated[float, Field(ge=-360.0, le=720.0)]
 
 
@@ -119,7 +121,7 @@ class Modes:
 
     @classmethod
     def of(cls, p: SwingParameters, gravity_m_s2: float) -> Modes:
-        """Modes of the parameters' chain."""
+        """Modes of the parameters' chain. Raises ValueError if its lander does not nod far faster than it cones."""
         mass, lander = _mass(p), p.lander_mass_kg * p.mass_centre_m
         first, second = _moments(p, p.line_length_m)
         support = gravity_m_s2 + p.descent_rate_m_s**2 / (2.0 * p.density_scale_height_m)
@@ -135,11 +137,18 @@ class Modes:
         c = lander * (p.line_length_m - first / mass)
         b = _transverse_inertia(p) + lander * (p.mass_centre_m - lander / mass)
         nod = np.sqrt(lander * support * (1.0 + c / a) / (b - c**2 / a))
+        # the lander follows the line's tilt as far as its own swing is fast beside the line's
+        share = (lander * (support - normal / mass) + c * cone**2) / (lander * support - b * cone**2)
+        if not 0.0 < share <= MOST_LANDER_SHARE:
+            raise ValueError(
+                f"mass_centre_m of {p.mass_centre_m:.6g} on line_length_m of {p.line_length_m:.6g} makes the lander nod "
+                f"in {2.0 * np.pi / nod:.3g} s and cone in {2.0 * np.pi / cone:.3g} s; allowed: nods far faster than cones"
+            )
         return cls(
             support_m_s2=float(support),
             cone_rad_s=float(cone),
             nod_rad_s=float(nod),
-            lander_share=float((lander * (support - normal / mass) + c * cone**2) / (lander * support - b * cone**2)),
+            lander_share=float(share),
             line_recoil=float(-c / a),
             canopy_recoil_m=float((first * c / a - lander) / mass),
             normal_force_n=float(normal),

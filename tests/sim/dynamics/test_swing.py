@@ -369,6 +369,8 @@ def test_says_what_is_allowed() -> None:
         SwingDescent.flown(
             SwingParameters(), np.array([0.0, 0.0, 150.0]), np.random.default_rng(0), ground_height_m=GROUND_M
         )
+    with pytest.raises(ValueError, match=r"mass_centre_m of 10 on line_length_m of 20 .*; allowed: nods far faster"):
+        _flown(mass_centre_m=10.0, line_length_m=20.0, gyration_transverse_m=5.0)
     with pytest.raises(ValueError, match="lead_s is 60; allowed: above 0, up to 30 s"):
         SwingDescent.flown(SwingParameters(), START, np.random.default_rng(0), ground_height_m=GROUND_M, lead_s=60.0)
     with pytest.raises(ValidationError, match="bridle_length_m is 60; allowed: up to line_length_m, 47"):
