@@ -78,7 +78,7 @@ def test_invalid_tracks_take_no_part(broken: int) -> None:
 
 
 def track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
-    """Velocity errors of four tracks per case within specification, m/s, shape (cases, pair, template, 2).
+    """Velocity errors of four tracks per case by formula, m/s, shape (cases, pair, template, 2): no product code.
 
     Altitude errors of 1 % (3 sigma), attitude errors of 0.03 deg (0.5 ms at 60 deg/s) and match errors of 0.1 m/s, all
     new in each picture but common to the tracks in it; features anywhere within 39 deg of the nadir. A feature at r
@@ -99,14 +99,6 @@ def track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
             misplaced.append(scale[:, k, None, None] * place + stretch * tilt[:, k, None, :])
         errors[:, pair] = (misplaced[0] - misplaced[1]) / 3.75 + rng.normal(0.0, 0.1, (cases, 2, 2))
     return errors
-
-
-def test_threshold_keeps_right_combinations() -> None:
-    errors = track_errors(np.random.default_rng(11), 200_000)
-    discrepancies = np.linalg.norm(errors[:, 1, None, :, :] - errors[:, 0, :, None, :], axis=-1)
-    # 99 % of single combinations, and nearly all of the best of four.
-    assert np.mean(discrepancies < THRESHOLD) > 0.99
-    assert np.mean(discrepancies.min(axis=(1, 2)) < THRESHOLD) > 0.998
 
 
 @pytest.mark.parametrize("tracks_per_pair", [1, 2])

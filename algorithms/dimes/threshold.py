@@ -1,0 +1,258 @@
+"""The threshold of the IMU check, by Monte Carlo: how far right tracks may stray from the IMU (section II.B).
+
+The paper takes "a velocity threshold established through Monte Carlo simulation". Here that simulation is one of
+geometry: attitudes, altitudes and features are drawn, a feature is seen by the true cameras and placed on the ground by
+the measured ones, and the velocities that follow are compared as DIMES compares them. What pictures look like enters as
+an error of the match alone. Of the errors of altitude and attitude nothing is assumed to be shared between pictures
+but what is stated so: sharing makes right tracks agree better.
+
+The threshold is the smallest multiple of `step_m_s` that keeps a stated share of the descents in which one right track
+is left in each pair, the least that DIMES can work with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from algorithms.dimes.binning import View
+from algorithms.dimes.consistency import combinations
+from algorithms.dimes.ground import ground_from_pixels
+from algorithms.dimes.options import DimesOptions
+from algorithms.dimes.overlap import search_geometry, template_candidates
+from algorithms.dimes.selection import best_candidates
+from sim.camera import Cahv, CameraModel
+from sim.frames import rigid
+from sim.measurements import DetectorCalibration
+
+
+@dataclass(frozen=True)
+class ThresholdInputs:
+    """What the Monte Carlo draws from; standard deviations are of normal distributions.
+
+    Attributes
+    ----------
+    descents
+        Descents with room for two templates in each pair.
+    seed
+        Of the generator.
+    altitudes_m, interval_s
+        Heights of the three pictures and the time between them (paper, section III.C: near 2000, 1700 and 1400 m).
+    max_speed_m_s
+        Horizontal velocities are uniform over the disc of this radius (paper: 30 m/s).
+    max_cone_deg, max_nod_deg
+        Greatest tilt by coning (paper: 30 deg) and by nodding (60 deg/s at a period of 1.2 s: 11.5 deg); uniform up to
+        it in any direction, new in each picture. Rotation about the vertical is uniform.
+    altitude_sd
+        Error of an altitude as a share of it, new in each picture (flight unit: 1 % is 3 sigma).
+    common_attitude_sd_deg, attitude_sd_deg
+        Attitude error per axis common to the pictures (star reference and gyro drift through entry), and new in each.
+    tag_sd_s, max_rate_deg_s
+        Error of a picture's time tag, and body rates up to which it turns into attitude (paper: 60 deg/s).
+    feature_height_sd_m
+        Height of features above or below the level that the altimeter measures: relief.
+    match_sd_m_s
+        Error of a track's velocity per axis by the match itself (0.03 px with the flight camera's noise are 0.05 m/s).
+    imu_sd_m_s
+        Error per axis of the IMU's change of velocity.
+    kept
+        Share of descents with one right track in each pair that must pass the check.
+    step_m_s
+        The threshold is a multiple of this.
+    """
+
+    descents: int = 10_000
+    seed: int = 2004
+    altitudes_m: tuple[float, float, float] = (2000.0, 1719.0, 1438.0)
+    interval_s: float = 3.75
+    max_speed_m_s: float = 30.0
+    max_cone_deg: float = 30.0
+    max_nod_deg: float = 11.5
+    altitude_sd: float = 0.01 / 3.0
+    common_attitude_sd_deg: float = 0.1
+    attitude_sd_deg: float = 0.01
+    tag_sd_s: float = 0.001
+    max_rate_deg_s: float = 60.0
+    feature_height_sd_m: float = 20.0
+    match_sd_m_s: float = 0.1
+    imu_sd_m_s: float = 0.05
+    kept: float = 0.995
+    step_m_s: float = 0.1
+
+
+#: Errors of the velocities of right tracks in m/s, by pair and template, axes east and north.
+TrackErrors = Float[np.ndarray, "descents 2 2 2"]
+
+_NOTHING = np.zeros((256, 256), dtype=np.float32)
+_UNUSED = DetectorCalibration(_NOTHING, 1.0, 0.0, 0.0, 1, 0.0, 1)
+
+
+def descent_camera() -> CameraModel:
+    """The descent camera binned to 256 x 256, without distortion: it would change the errors by less than 1 %."""
+    return Cahv.from_focal_length(
+        focal_m=14.67e-3,
+        pixel_pitch_m=48e-6,
+        size=(256, 256),
+        axis=np.array([0.0, 0.0, -1.0]),
+        right=np.array([1.0, 0.0, 0.0]),
+    )
+
+
+def right_track_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> TrackErrors:
+    """Velocity errors of two right tracks in each pair of `inputs.descents` descents that have room for them."""
+    camera, options = descent_camera(), DimesOptions()
+    found: list[Float[np.ndarray, "2 2 2"]] = []
+    while len(found) < inputs.descents:
+        errors = _descent_errors(inputs, camera, options, rng)
+        if errors is not None:
+            found.append(errors)
+    return np.stack(found)
+
+
+def _descent_errors(
+    inputs: ThresholdInputs, camera: CameraModel, options: DimesOptions, rng: np.random.Generator
+) -> Float[np.ndarray, "2 2 2"] | None:
+    """The errors of one descent; None where a pair has no room for two templates."""
+    true, measured = _views(inputs, camera, rng)
+    velocity = inputs.max_speed_m_s * np.sqrt(rng.uniform()) * _direction(rng)
+    sunless = np.array([0.0, 0.0, -1.0])
+    errors = np.empty((2, 2, 2))
+    for pair in range(2):
+        first, second = measured[pair], measured[pair + 1]
+        places = template_candidates(first, second, search_geometry(first, second, options), sunless, options)
+        appeal = rng.uniform(size=len(places.pixels))
+        chosen = best_candidates(appeal, places.pixels, places.preferred, 2, options.exclusion_px)
+        if len(chosen) < 2:
+            return None
+        heights = inputs.feature_height_sd_m * rng.standard_normal(2)
+        moved = velocity * inputs.interval_s
+        pixels = _seen_again(true[pair], true[pair + 1], places.pixels[chosen], heights, moved)
+        ground, _ = ground_from_pixels(second, pixels, options.max_off_nadir_rad)
+        errors[pair] = (places.ground[chosen] - ground - moved) / inputs.interval_s
+    return np.asarray(errors + inputs.match_sd_m_s * rng.standard_normal((2, 2, 2)))
+
+
+def _seen_again(
+    first: View,
+    second: View,
+    pixels: Float[np.ndarray, "n 2"],
+    heights_m: Float[np.ndarray, " n"],
+    moved_m: Float[np.ndarray, "2"],
+) -> Float[np.ndarray, "n 2"]:
+    """Where the true second camera sees the features, so many metres high, that the true first sees at `pixels`."""
+    origins, rays = first.camera.rays(pixels)
+    features = origins + rays * ((heights_m - origins[:, 2]) / rays[:, 2])[:, None]
+    features[:, :2] -= moved_m
+    return np.asarray(second.camera.project(features)[0])
+
+
+def _views(inputs: ThresholdInputs, camera: CameraModel, rng: np.random.Generator) -> tuple[list[View], list[View]]:
+    """The three true views of a descent and the three as measured."""
+    common = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
+    true, measured = [], []
+    for number, altitude in enumerate(inputs.altitudes_m):
+        attitude = _attitude(inputs, rng)
+        rate = np.radians(inputs.max_rate_deg_s) * rng.uniform() * np.array([*_direction(rng), 0.0])
+        own = np.radians(inputs.attitude_sd_deg) * rng.standard_normal(3)
+        error = Rotation.from_rotvec(common + own + rate * inputs.tag_sd_s * rng.standard_normal())
+        height = altitude * (1.0 + inputs.altitude_sd * rng.standard_normal())
+        time = number * inputs.interval_s
+        true.append(_view(camera, attitude, altitude, time))
+        measured.append(_view(camera, error * attitude, height, time))
+    return true, measured
+
+
+def _attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
+    tilts = (
+        np.radians(limit) * rng.uniform() * np.array([*_direction(rng), 0.0])
+        for limit in (inputs.max_cone_deg, inputs.max_nod_deg)
+    )
+    cone, nod = (Rotation.from_rotvec(tilt) for tilt in tilts)
+    return cone * nod * Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True)
+
+
+def _view(camera: CameraModel, attitude: Rotation, altitude_m: float, time_s: float) -> View:
+    centre = np.array([0.0, 0.0, altitude_m])
+    return View(_NOTHING, _NOTHING, camera.moved(rigid(attitude, centre)), centre, time_s, _UNUSED, 1)
+
+
+def _direction(rng: np.random.Generator) -> Float[np.ndarray, "2"]:
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+@dataclass(frozen=True)
+class Discrepancies:
+    """How far right combinations stray from the IMU, m/s.
+
+    Attributes
+    ----------
+    single
+        With one right track in each pair, shape (descents,).
+    best
+        The best of the four combinations of two right tracks in each pair, shape (descents,).
+    """
+
+    single: Float[np.ndarray, " descents"]
+    best: Float[np.ndarray, " descents"]
+
+
+def discrepancies(errors: TrackErrors, imu_sd_m_s: float, rng: np.random.Generator) -> Discrepancies:
+    """What DIMES' check would find on right tracks with these errors."""
+    imu = imu_sd_m_s * rng.standard_normal((len(errors), 1, 1, 2))
+    all_four = np.linalg.norm(errors[:, 1, None, :, :] - errors[:, 0, :, None, :] - imu, axis=-1)
+    return Discrepancies(single=all_four[:, 0, 0], best=all_four.min(axis=(1, 2)))
+
+
+def threshold_m_s(single: Float[np.ndarray, " descents"], kept: float, step_m_s: float) -> float:
+    """The smallest multiple of the step below which the stated share of discrepancies lies."""
+    return round(step_m_s * float(np.ceil(np.quantile(single, kept) / step_m_s)), 9)
+
+
+@dataclass(frozen=True)
+class Harm:
+    """What the check makes of descents in which one track is wrong: shares of the descents.
+
+    Attributes
+    ----------
+    right
+        A velocity within the requirement is reported.
+    refused
+        None is.
+    wrong
+        One beyond the requirement is.
+    """
+
+    right: float
+    refused: float
+    wrong: float
+
+
+def harm(
+    errors: Float[np.ndarray, "descents 2 templates 2"],
+    wrong_by_m_s: tuple[float, float],
+    threshold_m_s: float,
+    imu_sd_m_s: float,
+    rng: np.random.Generator,
+    required_m_s: float = 5.0,
+) -> Harm:
+    """One of the tracks is wrong by between the two speeds of `wrong_by_m_s` (uniform), in any direction.
+
+    `errors` may have one template a pair: then the wrong track is all that its pair has.
+    """
+    outcomes = np.zeros(3)
+    for tracks in errors:
+        spoilt = tracks.copy()
+        spoilt[rng.integers(2), rng.integers(tracks.shape[1])] += rng.uniform(*wrong_by_m_s) * _direction(rng)
+        change = np.zeros((2, 3))
+        change[1, :2] = imu_sd_m_s * rng.standard_normal(2)
+        best = combinations(list(enumerate(spoilt[0])), list(enumerate(spoilt[1])), change)[0]
+        if not best.discrepancy_m_s < threshold_m_s:
+            outcomes[1] += 1
+        else:
+            outcomes[0 if np.hypot(*spoilt[1, best.second]) <= required_m_s else 2] += 1
+    right, refused, wrong = outcomes / len(errors)
+    return Harm(float(right), float(refused), float(wrong))

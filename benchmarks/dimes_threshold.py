@@ -1,0 +1,76 @@
+"""Derives the threshold of DIMES' IMU check afresh and keeps it: ``python -m benchmarks.dimes_threshold``.
+
+Writes `algorithms/dimes/imu_threshold.json`; a test holds the option's default against it. Takes about two minutes.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import algorithms.dimes.threshold as derivation
+from algorithms.dimes.options import DimesOptions
+from reports.statistics import quantile_bounds
+
+STORED = Path(derivation.__file__).with_name("imu_threshold.json")
+#: Raised when the derivation changes in a way that its inputs do not tell.
+VERSION = 1
+QUANTILES = (0.5, 0.9, 0.95, 0.99, 0.995, 0.999)
+#: How wrong the wrong track is, m/s, between two bounds: at the bar itself, and anywhere up to the search range.
+WRONG_BY_M_S = ((10.0, 10.0), (10.0, 60.0))
+
+
+def derived(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
+    """The threshold, the distribution that it is a quantile of, and what it is worth against one wrong track."""
+    rng = np.random.default_rng(inputs.seed)
+    errors = derivation.right_track_errors(inputs, rng)
+    found = derivation.discrepancies(errors, inputs.imu_sd_m_s, rng)
+    threshold = derivation.threshold_m_s(found.single, inputs.kept, inputs.step_m_s)
+    harms = [
+        {
+            "tracks_per_pair": tracks,
+            "wrong_by_m_s": bounds,
+            **asdict(derivation.harm(errors[:, :, :tracks], bounds, threshold, inputs.imu_sd_m_s, rng)),
+        }
+        for tracks in (1, 2)
+        for bounds in WRONG_BY_M_S
+    ]
+    return {
+        "derivation": "algorithms.dimes.threshold",
+        "derivation_version": VERSION,
+        "versions": {name: version(name) for name in ("marsyard", "numpy", "scipy")},
+        "inputs": asdict(inputs),
+        "track_error_rms_m_s": float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))),
+        "discrepancy_quantiles_m_s": {
+            "one right track in each pair": _quantiles(found.single),
+            "best of two right tracks in each pair": _quantiles(found.best),
+        },
+        "kept": {
+            "one right track in each pair": float(np.mean(found.single < threshold)),
+            "best of two right tracks in each pair": float(np.mean(found.best < threshold)),
+        },
+        "kept_quantile_m_s": float(np.quantile(found.single, inputs.kept)),
+        "kept_quantile_90_percent_bounds_m_s": quantile_bounds(found.single, inputs.kept, 0.95),
+        "threshold_m_s": threshold,
+        "one_wrong_track": harms,
+    }
+
+
+def _quantiles(values: np.ndarray) -> dict[str, float]:
+    return {str(q): float(np.quantile(values, q)) for q in QUANTILES}
+
+
+def main() -> None:
+    record = derived(derivation.ThresholdInputs())
+    STORED.write_text(json.dumps(record, indent=1) + "\n")
+    print(json.dumps(record, indent=1))
+    print(f"kept in {STORED}; the option's default is {DimesOptions().imu_threshold_m_s} m/s")
+
+
+if __name__ == "__main__":
+    main()
