@@ -141,8 +141,9 @@ class Modes:
         share = (lander * (support - normal / mass) + c * cone**2) / (lander * support - b * cone**2)
         if not 0.0 < share <= MOST_LANDER_SHARE:
             raise ValueError(
-                f"mass_centre_m of {p.mass_centre_m:.6g} on line_length_m of {p.line_length_m:.6g} makes the lander nod "
-                f"in {2.0 * np.pi / nod:.3g} s and cone in {2.0 * np.pi / cone:.3g} s; allowed: nods far faster than cones"
+                f"gyration_transverse_m of {p.gyration_transverse_m:.6g} with mass_centre_m of {p.mass_centre_m:.6g} "
+                f"makes the lander nod in {2.0 * np.pi / nod:.3g} s, and it cones in {2.0 * np.pi / cone:.3g} s; "
+                "allowed: nods far faster than cones"
             )
         return cls(
             support_m_s2=float(support),

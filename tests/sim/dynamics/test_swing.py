@@ -364,13 +364,15 @@ def test_says_what_is_allowed() -> None:
     with pytest.raises(ValueError, match=r"altitude 5000 m is not flown through; allowed: .* to 27\d\d"):
         descent.time_of_altitude(5000.0)
     with pytest.raises(ValueError, match=r"nod_rate_deg_s is 110; allowed: below \d+"):
-        _flown(nod_rate_deg_s=110.0, mass_centre_m=0.1, gyration_transverse_m=1.0)
+        _flown(nod_rate_deg_s=110.0, mass_centre_m=0.2, gyration_transverse_m=1.0)
     with pytest.raises(ValueError, match=r"start_m is at z = 150\.0 m; allowed: above the thrusters' firing, 200\.0 m"):
         SwingDescent.flown(
             SwingParameters(), np.array([0.0, 0.0, 150.0]), np.random.default_rng(0), ground_height_m=GROUND_M
         )
-    with pytest.raises(ValueError, match=r"mass_centre_m of 10 on line_length_m of 20 .*; allowed: nods far faster"):
-        _flown(mass_centre_m=10.0, line_length_m=20.0, gyration_transverse_m=5.0)
+    with pytest.raises(
+        ValueError, match=r"gyration_transverse_m of 5 with mass_centre_m of 0\.1 .*; allowed: nods far"
+    ):
+        _flown(mass_centre_m=0.1, gyration_transverse_m=5.0, nod_rate_deg_s=0.0)
     with pytest.raises(ValueError, match="lead_s is 60; allowed: above 0, up to 30 s"):
         SwingDescent.flown(SwingParameters(), START, np.random.default_rng(0), ground_height_m=GROUND_M, lead_s=60.0)
     with pytest.raises(ValidationError, match="bridle_length_m is 60; allowed: up to line_length_m, 47"):
