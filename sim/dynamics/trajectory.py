@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -38,6 +38,7 @@ class Motion:
     specific_forces_m_s2: Float64[np.ndarray, "n 3"]
 
 
+@runtime_checkable
 class Trajectory(Protocol):
     """A motion, consistent in itself: velocity, rate and specific force are derivatives of position and attitude."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -28,6 +28,7 @@ class Readings:
     values: Float64[np.ndarray, "n *quantity"]
 
 
+@runtime_checkable
 class Instrument(Protocol):
     """An instrument with its constant errors drawn, that reads a motion at given true times."""
 
