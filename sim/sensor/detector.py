@@ -78,8 +78,13 @@ class Detector:
     def window(self, column: int, row: int, size: tuple[int, int]) -> Detector:
         """The part of the detector that a subframe reads, given its upper left pixel and its size (columns, rows).
 
-        Its pixels are those of the whole detector, noise apart. What moves through the rows outside while it is
-        cleared and shifted out is not seen; exact for a detector without smear.
+        Its pixels are those of the whole detector, noise apart. The part is cleared and shifted out as if it were all
+        of the detector and lay beside the storage area: its packets gather smear under its own rows alone. A packet of
+        the whole detector also passes `row` rows before the part on its way out, and those after the part when it is
+        cleared, of which a subframe renders nothing. A subframe therefore lacks about ``row * transfer_row_s /
+        exposure_s`` of the mean radiance of these rows, column by column, and the same of the rows after it with
+        `clear_row_s`. It is exact for a detector without smear, as the research rover's cameras and the XC-55 are;
+        where smear matters, expose the whole picture and cut it.
 
         Raises
         ------

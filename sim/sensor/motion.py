@@ -108,7 +108,9 @@ def moving_exposure(
 ) -> Float32[np.ndarray, "rows columns"]:
     """Exposure of every pixel to a moving scene, clearing and transfer included, in units of radiance x seconds.
 
-    Beyond the frame's border the scene is taken to continue as it is at the border.
+    Beyond the frame's border the scene is taken to continue as it is at the border. At 60 deg/s, 4.9 pixels in an
+    exposure of the descent camera, that is wrong by 1.2 % of the mean (rms, Gusev from 2 km) in the outermost pixels,
+    0.5 % in the next, and below 0.15 % from the third on: a seventh of the noise of SNR 100:1.
 
     Parameters
     ----------
