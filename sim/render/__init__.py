@@ -1,11 +1,15 @@
 """Pictures of the terrain through exact camera models, and their truth pixel by pixel."""
 
+from sim.render.clouds import CloudLayer, CloudParameters
 from sim.render.objects import Objects
-from sim.render.photometry import Photometry, Sun, Texture
+from sim.render.photometry import DustySky, Photometry, Sun, Texture
 from sim.render.rays import PixelRays
 from sim.render.renderer import Frame, Renderer, Scene, process_renderer
 
 __all__ = [
+    "CloudLayer",
+    "CloudParameters",
+    "DustySky",
     "Frame",
     "Objects",
     "Photometry",

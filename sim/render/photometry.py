@@ -8,6 +8,8 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, Float64
 
+from sim.render.kernels.sky import scattered_irradiance
+
 #: Angular radius of the sun seen from Mars at 1.52 AU, radians (0.35 deg across).
 SUN_RADIUS_AT_MARS_RAD = 0.00305
 
@@ -30,6 +32,40 @@ class Sun:
     def __post_init__(self) -> None:
         if abs(float(np.linalg.norm(self.direction)) - 1.0) > 1e-9:
             raise ValueError(f"the sun's direction {self.direction} is not a unit vector")
+        if not self.angular_radius_rad > 0.0:
+            raise ValueError(f"the sun's angular radius is {self.angular_radius_rad} rad; more than 0 is needed")
+
+
+@dataclass(frozen=True)
+class DustySky:
+    """A sky that is brighter towards the sun and the horizon, for cameras that see it; the sun's disc is drawn in it.
+
+    Light scattered once in a plane layer of air (Chandrasekhar 1960, section 7)::
+
+        I/F ~ P(g) mu0 / (mu0 - mu) (exp(-tau / mu0) - exp(-tau / mu))
+
+    with the Henyey-Greenstein phase function P and the sines of elevation mu of the view and mu0 of the sun. Light
+    scattered more often has about the same pattern and is brought in by the scale: the irradiance of a level ground
+    under this sky is that of `Photometry.sky_share`. Slopes are lit as by an even sky of that irradiance.
+
+    Attributes
+    ----------
+    optical_depth
+        tau, as it weakens light on its way. Light scattered forward is hardly lost: of air of optical depth t, albedo w
+        and asymmetry g about (1 - w g) t counts (van de Hulst 1980, similarity).
+    asymmetry
+        Mean cosine of the scattering angle.
+    """
+
+    optical_depth: float
+    asymmetry: float
+
+    def __post_init__(self) -> None:
+        if not self.optical_depth > 0.0 or not -1.0 < self.asymmetry < 1.0:
+            raise ValueError(
+                f"a dusty sky of optical depth {self.optical_depth} and asymmetry {self.asymmetry}; "
+                "more than 0, and between -1 and 1, are needed"
+            )
 
 
 @dataclass(frozen=True)
@@ -53,7 +89,9 @@ class Photometry:
     sky_share
         D, diffuse irradiance from the sky over the direct sun's on a plane facing it.
     sky_radiance
-        Radiance factor of the sky, where a pixel sees no ground.
+        Radiance factor of an even sky, where a pixel sees no ground.
+    sky
+        The sky seen there in place of the even one; None for the even one.
     surrounding_albedo
         Albedo of the ground that scatters light onto slopes and into shadows: B is this times the light that falls on
         a level ground.
@@ -65,12 +103,13 @@ class Photometry:
     sky_share: float = 0.15
     sky_radiance: float = 0.1
     surrounding_albedo: float = 0.2
+    sky: DustySky | None = None
 
     def normalisation(self) -> float:
         """K of the law."""
         return 1.0 / _spherical_albedo(self.lunar_share, self.surge_amplitude, self.surge_width)
 
-    def law(self, sun: Sun, caster_diameter_m: float) -> Float64[np.ndarray, "9"]:
+    def law(self, sun: Sun, caster_diameter_m: float) -> Float64[np.ndarray, "8"]:
         """The numbers that the kernel takes, in its order."""
         bounced = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_share)
         return np.array(
@@ -80,12 +119,19 @@ class Photometry:
                 self.surge_width,
                 self.normalisation(),
                 self.sky_share,
-                self.sky_radiance,
                 bounced,
                 caster_diameter_m,
                 sun.angular_radius_rad,
             ]
         )
+
+    def sky_numbers(self, sun: Sun) -> Float64[np.ndarray, "4"]:
+        """What the kernel takes for the sky: even radiance factor, or scale, optical depth and asymmetry."""
+        if self.sky is None:
+            return np.array([self.sky_radiance, 0.0, 0.0, 0.0])
+        depth, asymmetry = self.sky.optical_depth, self.sky.asymmetry
+        scale = self.sky_share / _scattered_irradiance(float(sun.direction[2]), depth, asymmetry)
+        return np.array([0.0, scale, depth, asymmetry])
 
 
 @dataclass(frozen=True)
@@ -106,6 +152,11 @@ class Texture:
     def arrays(self) -> tuple[float, Float64[np.ndarray, "octaves"]]:
         """What the kernel takes."""
         return float(self.coarsest_m), np.asarray(self.amplitudes, dtype=np.float64)
+
+
+@cache
+def _scattered_irradiance(sun_z: float, depth: float, asymmetry: float) -> float:
+    return float(scattered_irradiance(sun_z, depth, asymmetry))
 
 
 @cache

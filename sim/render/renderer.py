@@ -9,7 +9,7 @@ Distortion is therefore exact and not a resampling of a pinhole picture.
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
 import cv2
@@ -18,10 +18,12 @@ from jaxtyping import Float32, Float64, Int32
 from scipy.spatial.transform import RigidTransform
 
 from sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
+from sim.render.clouds import CloudLayer, no_cover
 from sim.render.edges import Sight, edge_pixels, look_within, rays_within
-from sim.render.kernels.ground import height_range, sweep_shadow
-from sim.render.kernels.shading import shade
+from sim.render.kernels.ground import height_range
+from sim.render.kernels.shading import Clouds, shade
 from sim.render.kernels.sight import look
+from sim.render.kernels.sun import Shadow, sweep_shadow
 from sim.render.mesh import graded_offsets, ground_mesh, lines_in_view
 from sim.render.objects import Objects
 from sim.render.photometry import Photometry, Sun, Texture
@@ -31,7 +33,11 @@ from sim.terrain import Surface
 NO_TEXTURE = Texture()
 #: Most posts along a side of the grid on which the ground's shadow is swept.
 SHADOW_SIDE = 4096
-NO_SHADOW = (np.full((1, 1), -np.inf, dtype=np.float32), 1.0, 0)
+NO_SHADOW = ((np.full((1, 1), -np.inf, dtype=np.float32), np.zeros((1, 1), dtype=np.uint8)), 1.0, 0)
+NO_CLOUDS = (no_cover(), np.zeros(5))
+
+#: Direction of the sun, the numbers of the law and of the sky, and clouds, as the kernel takes them.
+Light = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "8"], Float64[np.ndarray, "4"], Clouds]
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,8 @@ class Scene:
         Diameter of what casts a shadow from the camera's place: the lander seen against the sun. 0 for none.
     ground_shadows
         Whether the ground hides the sun from itself.
+    clouds
+        Clouds that dim the sun as they drift; None for none.
     mesh_finest_m, mesh_reach_m, mesh_lines
         Spacing of the mesh at the centre, how far it reaches to each side, and the number of its lines.
     mesh_in_view
@@ -72,6 +80,7 @@ class Scene:
     object_texture: Texture = NO_TEXTURE
     caster_diameter_m: float = 0.0
     ground_shadows: bool = True
+    clouds: CloudLayer | None = None
     mesh_finest_m: float = 12.0
     mesh_reach_m: float = 20000.0
     mesh_lines: int = 513
@@ -90,16 +99,26 @@ class Scene:
         return float(low), float(high)
 
     @cached_property
-    def shadow(self) -> tuple[Float32[np.ndarray, "rows columns"], float, int]:
-        """Height of the ground's shadow on the grid of a level of the surface, the grid's spacing, and the level."""
+    def shadow(self) -> tuple[Shadow, float, int]:
+        """The ground's shadow on the grid of a level of the surface, the grid's spacing, and the level."""
         if not self.ground_shadows or self.sun.direction[2] <= 0.0:
             return NO_SHADOW
         return _ground_shadow(self.surface, self.sun, self.height_range_m)
 
+    def light(self, time_s: float) -> Light:
+        """What the kernel takes: direction of the sun, the law's numbers, the sky's, and the clouds at a time."""
+        photometry, drifting = self.photometry, NO_CLOUDS
+        if self.clouds is not None:
+            more = self.clouds.parameters.sky_light(self.sun)
+            photometry = replace(photometry, sky_share=photometry.sky_share + more)
+            drifting = (self.clouds.cover, self.clouds.numbers(self.sun, time_s))
+        # clouds are not drawn: the sky between them is as bright as ever
+        sky = self.photometry.sky_numbers(self.sun)
+        towards = np.asarray(self.sun.direction, dtype=np.float64)
+        return towards, photometry.law(self.sun, self.caster_diameter_m), sky, drifting
 
-def _ground_shadow(
-    surface: Surface, sun: Sun, height_range_m: tuple[float, float]
-) -> tuple[Float32[np.ndarray, "rows columns"], float, int]:
+
+def _ground_shadow(surface: Surface, sun: Sun, height_range_m: tuple[float, float]) -> tuple[Shadow, float, int]:
     """Sweeps the shadow along whichever axis the sun's azimuth is nearer to."""
     level = int(np.argmax([one.shape[0] <= SHADOW_SIDE for one in surface.levels]))
     spacing = surface.spacing_m * 2.0**level
@@ -113,8 +132,8 @@ def _ground_shadow(
     reach = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, height.shape[0]))
     # OpenCV transposes by blocks, some five times faster than a copy of NumPy's view
     rows_towards_sun = height if along_y else cv2.transpose(height)
-    swept = sweep_shadow(rows_towards_sun, float(np.sign(main)), drop, side / abs(main), reach)
-    return (swept if along_y else cv2.transpose(swept)), spacing, level
+    swept, away = sweep_shadow(rows_towards_sun, float(np.sign(main)), drop, side / abs(main), reach)
+    return ((swept, away) if along_y else (cv2.transpose(swept), cv2.transpose(away))), spacing, level
 
 
 @dataclass(frozen=True)
@@ -170,8 +189,8 @@ class Renderer:
         """Renderer and version strings of OpenGL."""
         return self._view_renderer(VIEW_SIDE_PX).description()
 
-    def render(self, scene: Scene, rays: PixelRays, world_from_body: RigidTransform) -> Frame:
-        """The picture of the scene from this pose.
+    def render(self, scene: Scene, rays: PixelRays, world_from_body: RigidTransform, time_s: float = 0.0) -> Frame:
+        """The picture of the scene from this pose at this time.
 
         Parameters
         ----------
@@ -181,6 +200,8 @@ class Renderer:
             The camera in the body frame, `PixelRays.of(camera)`.
         world_from_body
             Pose of the body.
+        time_s
+            Where the clouds have drifted to; all else stands still.
 
         Raises
         ------
@@ -195,6 +216,7 @@ class Renderer:
         self._load(scene, rays, rotation, position)
         depth, numbers = self._draw(scene, rays, rotation, position, clearance)
         columns, rows = rays.size
+        light = scene.light(time_s)
         sight = Sight.unseen(rows * columns, scene.objects)
         look(
             scene.surface.levels,
@@ -215,7 +237,7 @@ class Renderer:
             sight.weights,
             sight.level,
         )
-        radiance, body, normal = _shaded(scene, rotation, position, rays.bundle, sight)
+        radiance, body, normal = _shaded(scene, rotation, position, rays.bundle, sight, light)
         frame = Frame(
             radiance.reshape(rows, columns),
             sight.distance.reshape(rows, columns),
@@ -228,7 +250,7 @@ class Renderer:
             pixels = edge_pixels(frame.radiance, frame.range_m, frame.body)
             within = rays_within(rays, pixels, scene.edge_rays)
             seen = look_within(scene.surface, scene.objects, rotation, position, columns, pixels, within, sight)
-            finer, _, _ = _shaded(scene, rotation, position, within, seen)
+            finer, _, _ = _shaded(scene, rotation, position, within, seen, light)
             radiance[pixels] = finer.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)
         return frame
 
@@ -295,6 +317,7 @@ def _shaded(
     position: Float64[np.ndarray, "3"],
     rays: RayBundle,
     sight: Sight,
+    light: Light,
 ) -> tuple[Float32[np.ndarray, "rays"], Int32[np.ndarray, "rays"], Float32[np.ndarray, "rays 3"]]:
     """Radiance factor, body's number and normal of what rays meet."""
     count = len(rays.directions)
@@ -313,8 +336,7 @@ def _shaded(
         rays.origins,
         rays.directions,
         rays.pixel_angles,
-        np.asarray(scene.sun.direction, dtype=np.float64),
-        scene.photometry.law(scene.sun, scene.caster_diameter_m),
+        *light,
         *scene.shadow,
         scene.height_range_m[1],
         scene.ground_texture.arrays(),

@@ -8,31 +8,28 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, hidden_from_sun, shadow_clearance
+from sim.render.kernels.ground import Array32
 from sim.render.kernels.hierarchy import Hierarchy, anything_hit
 from sim.render.kernels.sight import FLATTEST, Ints
+from sim.render.kernels.sky import sky_brightness
+from sim.render.kernels.sun import (
+    UNSURE,
+    Shadow,
+    cloud_cover,
+    disc_above,
+    disc_overlap,
+    shadow_clearance,
+    sun_over_ground,
+)
 from sim.render.kernels.texture import texture
 from sim.terrain.kernels import Array, Level, sample
 
+#: Cover of a layer of clouds, and its numbers.
+Clouds = tuple[Array32, Array]
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
 #: Footprint, in samples, up to which the finest level is taken: the B-spline itself holds nothing finer than this.
 SHARP_UNTIL = 1.2
-#: Distance from a shadow's edge, in spacings of its grid, within which the grid is not believed.
-UNSURE = 0.1
-
-
-@njit(cache=True, inline="always")
-def _disc_overlap(first: float, second: float, apart: float) -> float:
-    """Share of the second disc that the first covers; radii and distance of their centres."""
-    if apart >= first + second:
-        return 0.0
-    if apart <= abs(first - second):
-        return min((first / second) ** 2, 1.0)
-    alpha = math.acos((apart * apart + first * first - second * second) / (2.0 * apart * first))
-    beta = math.acos((apart * apart + second * second - first * first) / (2.0 * apart * second))
-    area = first * first * (alpha - 0.5 * math.sin(2.0 * alpha)) + second * second * (beta - 0.5 * math.sin(2.0 * beta))
-    return area / (math.pi * second * second)
 
 
 @njit(cache=True, inline="always")
@@ -60,7 +57,9 @@ def shade(
     pixel_angles: Array32,
     sun: Array,
     law: Array,
-    shadow: Array32,
+    sky: Array,
+    clouds: Clouds,
+    shadow: Shadow,
     shadow_spacing: float,
     shadow_level: int,
     highest: float,
@@ -91,10 +90,15 @@ def shade(
     sun
         Unit vector to the sun, world axes.
     law
-        Lunar share, surge amplitude, surge width, normalisation, sky share, sky radiance, light from the surrounding
-        ground, diameter of what casts a shadow from the body's place, angular radius of the sun.
+        Lunar share, surge amplitude, surge width, normalisation, sky share, light from the surrounding ground, diameter
+        of what casts a shadow from the body's place, angular radius of the sun.
+    sky
+        What the sky's brightness comes from, as `sky_brightness` takes it.
+    clouds
+        Cover of a layer of clouds, and its numbers: cells a metre, height, drift to east and north, share of the sun
+        that a cloud keeps; the last is 0 where there are no clouds.
     shadow, shadow_spacing, shadow_level
-        Height of the ground's shadow on the grid of a level of the surface; one side is 1 where there is none.
+        The ground's shadow on the grid of a level of the surface; one side is 1 where there is none.
     highest
         Height that no ground exceeds.
     ground_texture, object_texture
@@ -105,11 +109,14 @@ def shade(
     radiance, body, normal
         Outputs: radiance factor; number of the thing seen (GROUND, SKY); unit normal in world axes.
     """
-    sky_share, sky_radiance, bounced = law[4], law[5], law[6]
-    caster, sun_radius = law[7], law[8]
+    sky_share, bounced, caster, sun_radius = law[4], law[5], law[6], law[7]
+    cover, drift = clouds
+    dimmed = drift[4] > 0.0
+    across = math.sqrt(sun[0] * sun[0] + sun[1] * sun[1])
+    row_m = shadow_spacing / max(abs(sun[0]), abs(sun[1]), 1e-9)
     inverse_spacing = 1.0 / spacing
     top_level = len(levels) - 1
-    shadowed = shadow.shape[0] > 1
+    shadowed = shadow[0].shape[0] > 1
     finest = levels[0]
     things = tree[0].shape[0] > 0
     w = world_from_body
@@ -131,7 +138,8 @@ def shade(
         smooth = max(level_of_pixel[n], 0)
         met = level_of_pixel[n] == 0
         if t == math.inf:
-            radiance[n] = sky_radiance
+            cos_g = dx * sun[0] + dy * sun[1] + dz * sun[2]
+            radiance[n] = sky_brightness(sky, sun[2], sun_radius, dz, cos_g, pixel_angles[n])
             body[n] = SKY
             normal[n] = 0.0
             continue
@@ -190,11 +198,18 @@ def shade(
                     # the terrain itself, where the pixel saw it smoothed: its own bumps must not shade a smooth ground
                     height, _slope_x, _slope_y, _albedo = sample(levels[shadow_level], 1.0 / shadow_spacing, x, y)
                     z = max(z, height)
-                clear = shadow_clearance(shadow, 1.0 / shadow_spacing, x, y, z)
-                lit = 1.0 if clear > 0.0 else 0.0
-                if abs(clear) < UNSURE * shadow_spacing and triangle < 0 and met:
+                clear, rows = shadow_clearance(shadow, 1.0 / shadow_spacing, x, y, z)
+                # half the depth of the penumbra, which a disc casts past what is so far away
+                soft = sun_radius * rows * row_m / across
+                if triangle >= 0 or not met:
+                    lit = disc_above(clear / soft)
+                elif clear <= -UNSURE * shadow_spacing - soft:
+                    lit = 0.0
+                elif clear < UNSURE * shadow_spacing + soft:
                     # at the shadow's edge the swept grid is too coarse: look towards the sun from here
-                    lit = 0.0 if hidden_from_sun(finest, inverse_spacing, x, y, z, sun, highest) else 1.0
+                    lit = sun_over_ground(
+                        finest, inverse_spacing, shadow, shadow_spacing, row_m, x, y, z, sun, sun_radius, highest
+                    )
             if lit > 0.0 and things:
                 # lifted off its own facet, so that this and those beside do not shade it by rounding
                 lift = 1e-4 + (0.05 * t * pixel_angles[n] if triangle >= 0 else 0.0)
@@ -202,7 +217,12 @@ def shade(
                     lit = 0.0
             cos_g = min(max(-(dx * sun[0] + dy * sun[1] + dz * sun[2]), -1.0), 1.0)
             if caster > 0.0 and cos_g > 0.9:
-                lit *= 1.0 - _disc_overlap(0.5 * caster / t, sun_radius, math.acos(cos_g))
+                lit *= 1.0 - disc_overlap(0.5 * caster / t, sun_radius, math.acos(cos_g))
+            if dimmed:
+                up = max(drift[1] - z, 0.0) / sun[2]
+                lit *= 1.0 - drift[4] * cloud_cover(
+                    cover, drift[0], x + up * sun[0] - drift[2], y + up * sun[1] - drift[3]
+                )
             if lit > 0.0:
                 value += lit * _brightness(law, cos_i, cos_e, cos_g)
         radiance[n] = albedo * value

@@ -1,0 +1,233 @@
+"""How much of the sun's disc a place sees: past the ground, past a round body, and through clouds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sim.render.kernels.ground import Array32
+from sim.terrain.kernels import Array, Level, sample
+
+#: Height and reach of the ground's shadow on the posts of a grid (`sweep_shadow`).
+Shadow = tuple[Array32, NDArray[np.uint8]]
+#: Rows of the grid that one unit of a shadow's stored reach stands for.
+REACH_ROWS = 4
+#: Height over a shadow's edge, in spacings of its grid, within which the grid is not believed.
+UNSURE = 0.3
+
+
+@njit(cache=True)
+def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach: int) -> Shadow:
+    """Height of the shadow over every post of a periodic grid: below it the ground hides the sun's middle.
+
+    The sun stands towards growing rows. A shadow falls by `drop` and shifts by `-slip` columns from one row to the one
+    before; a row's shadow is cast by the ground and the shadow of the row after it.
+
+    Parameters
+    ----------
+    height
+        Heights, shape (rows, columns); rows run towards the sun.
+    along
+        1.0 where rows run towards the sun as stored, -1.0 where they run away from it.
+    drop
+        How far a shadow falls from one row to the next, metres.
+    slip
+        Columns by which the sun's direction moves along from one row to the next.
+    reach
+        Rows that the longest shadow covers: the sweep starts as many before the first.
+
+    Returns
+    -------
+    The shadow's height, and how many rows away what casts it is, in units of `REACH_ROWS`, rounded up.
+    """
+    rows, columns = height.shape
+    row_mask, column_mask = rows - 1, columns - 1
+    shadow = np.empty_like(height)
+    away = np.empty(height.shape, dtype=np.uint8)
+    whole = math.floor(slip)
+    share = np.float32(slip - whole)
+    rest = np.float32(1.0) - share
+    fall = np.float32(drop)
+    before = np.full(columns, np.float32(-1e9), dtype=np.float32)
+    caster = np.empty(columns, dtype=np.float32)
+    rows_before = np.zeros(columns, dtype=np.int32)
+    rows_away = np.empty(columns, dtype=np.int32)
+    for k in range(rows + reach):
+        step = rows + reach - 1 - k
+        i = step & row_mask if along > 0.0 else (rows - 1 - step) & row_mask
+        source = (i + 1) & row_mask if along > 0.0 else (i - 1) & row_mask
+        for j in range(columns):
+            caster[j] = max(height[source, j], before[j])
+            rows_away[j] = 0 if height[source, j] >= before[j] else rows_before[j]
+        for j in range(columns):
+            a = (j + whole) & column_mask
+            b = (a + 1) & column_mask
+            before[j] = rest * caster[a] + share * caster[b] - fall
+            rows_before[j] = max(rows_away[a], rows_away[b]) + 1
+        if step < rows:
+            for j in range(columns):
+                shadow[i, j] = before[j]
+                away[i, j] = min((rows_before[j] + REACH_ROWS - 1) // REACH_ROWS, 255)
+    return shadow, away
+
+
+@njit(cache=True, inline="always")
+def shadow_clearance(shadow: Shadow, inverse_spacing: float, x: float, y: float, z: float) -> tuple[float, float]:
+    """How far a place lies above the ground's shadow, metres, and how many rows away what casts the shadow is."""
+    height, away = shadow
+    row_mask = height.shape[0] - 1
+    gx = x * inverse_spacing
+    gy = y * inverse_spacing
+    j = math.floor(gx)
+    i = math.floor(gy)
+    fx = gx - j
+    fy = gy - i
+    i0 = i & row_mask
+    i1 = (i + 1) & row_mask
+    j0 = j & row_mask
+    j1 = (j + 1) & row_mask
+    edge = (1.0 - fy) * ((1.0 - fx) * height[i0, j0] + fx * height[i0, j1])
+    edge += fy * ((1.0 - fx) * height[i1, j0] + fx * height[i1, j1])
+    farthest = max(max(away[i0, j0], away[i0, j1]), max(away[i1, j0], away[i1, j1]))
+    return z - edge, float(farthest * REACH_ROWS)
+
+
+@njit(cache=True, inline="always")
+def disc_above(offset: float) -> float:
+    """Share of a disc above a straight line that lies `offset` radii below its middle."""
+    if offset >= 1.0:
+        return 1.0
+    if offset <= -1.0:
+        return 0.0
+    return 0.5 + (offset * math.sqrt(1.0 - offset * offset) + math.asin(offset)) / math.pi
+
+
+@njit(cache=True, inline="always")
+def disc_overlap(first: float, second: float, apart: float) -> float:
+    """Share of the second disc that the first covers; radii and distance of their centres."""
+    if apart >= first + second:
+        return 0.0
+    if apart <= abs(first - second):
+        return min((first / second) ** 2, 1.0)
+    alpha = math.acos((apart * apart + first * first - second * second) / (2.0 * apart * first))
+    beta = math.acos((apart * apart + second * second - first * first) / (2.0 * apart * second))
+    area = first * first * (alpha - 0.5 * math.sin(2.0 * alpha)) + second * second * (beta - 0.5 * math.sin(2.0 * beta))
+    return area / (math.pi * second * second)
+
+
+@njit(cache=True)
+def _lowest_near(
+    field: Level, inverse_spacing: float, x: float, y: float, z: float, sun: Array, nearest: float
+) -> float:
+    """Least clearance over distance of the line to the sun about a place on it: the vertex of a parabola there."""
+    step = min(0.25 / inverse_spacing, 0.5 * nearest)
+    before, middle, after = 0.0, 0.0, 0.0
+    at = nearest
+    for k in range(4):
+        t = nearest + (k - 1) * step if k < 3 else at
+        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, x + t * sun[0], y + t * sun[1])
+        ratio = (z + t * sun[2] - height) / t
+        if k == 0:
+            before = ratio
+        elif k == 1:
+            middle = ratio
+        elif k == 2:
+            after = ratio
+            bend = before - 2.0 * middle + after
+            if bend > 0.0:
+                at = nearest + min(max(0.5 * (before - after) / bend, -1.0), 1.0) * step
+        else:
+            middle = min(middle, ratio)
+    return middle
+
+
+@njit(cache=True)
+def sun_over_ground(
+    field: Level,
+    inverse_spacing: float,
+    shadow: Shadow,
+    shadow_spacing: float,
+    row_m: float,
+    x: float,
+    y: float,
+    z: float,
+    sun: Array,
+    radius: float,
+    highest: float,
+) -> float:
+    """Share of the sun's disc that a place on the ground sees over the ground, by steps towards the sun.
+
+    The smallest angle between the sun's middle and the ground below it, in radii of the sun, tells the share, as if
+    the skyline were straight and level across the disc. Ground turned from the sun's middle has none of it. The walk
+    ends where the swept shadow says that all the rest is clear.
+
+    Parameters
+    ----------
+    field, inverse_spacing
+        The finest level.
+    shadow, shadow_spacing
+        The ground's shadow, and the spacing of its grid.
+    row_m
+        Distance along the sun's direction from one row of the shadow's grid to the next.
+    x, y, z
+        The place.
+    sun, radius
+        Unit vector to the sun, and the angle that half its disc takes.
+    highest
+        Height that no ground exceeds.
+    """
+    spacing = 1.0 / inverse_spacing
+    _height, slope_x, slope_y, _albedo = sample(field, inverse_spacing, x, y)
+    if sun[2] - slope_x * sun[0] - slope_y * sun[1] <= 0.0:
+        return 0.0
+    across = math.sqrt(sun[0] * sun[0] + sun[1] * sun[1])
+    lowest = radius
+    nearest = 0.0
+    t = 0.25 * spacing
+    steps = 0
+    farthest = (highest - z) / max(sun[2] - radius, 1e-3)
+    while t < farthest:
+        px = x + t * sun[0]
+        py = y + t * sun[1]
+        pz = z + t * sun[2]
+        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, px, py)
+        clearance = pz - height
+        if clearance * across / t < lowest:
+            lowest = clearance * across / t
+            nearest = t
+        if lowest <= -radius:
+            return 0.0
+        steps += 1
+        if steps % 4 == 0:
+            clear, rows = shadow_clearance(shadow, 1.0 / shadow_spacing, px, py, pz)
+            if clear > UNSURE * shadow_spacing + radius * (t + rows * row_m) / across:
+                break
+        # half the clearance: no slope up to 60 deg is stepped over
+        t += max(0.5 * spacing, 0.5 * (clearance - radius * t))
+    if lowest < radius:
+        lowest = min(lowest, _lowest_near(field, inverse_spacing, x, y, z, sun, nearest) * across)
+    share: float = disc_above(lowest / radius)
+    return share
+
+
+@njit(cache=True, inline="always")
+def cloud_cover(cover: Array32, inverse_cell: float, x: float, y: float) -> float:
+    """Cover of a periodic layer of clouds at one place, bilinear between its cells."""
+    row_mask = cover.shape[0] - 1
+    gx = x * inverse_cell
+    gy = y * inverse_cell
+    j = math.floor(gx)
+    i = math.floor(gy)
+    fx = gx - j
+    fy = gy - i
+    i0 = i & row_mask
+    i1 = (i + 1) & row_mask
+    j0 = j & row_mask
+    j1 = (j + 1) & row_mask
+    south = (1.0 - fx) * cover[i0, j0] + fx * cover[i0, j1]
+    north = (1.0 - fx) * cover[i1, j0] + fx * cover[i1, j1]
+    between: float = (1.0 - fy) * south + fy * north
+    return between

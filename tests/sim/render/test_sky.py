@@ -1,0 +1,106 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
+
+from sim.camera import Cahv
+from sim.frames import direction, rigid
+from sim.render import DustySky, Frame, Photometry, PixelRays, Scene, Sun
+from sim.render.kernels.sky import sky_brightness
+from sim.terrain import Surface
+
+DUSTY = Photometry(sky_share=0.25, sky=DustySky(optical_depth=0.35, asymmetry=0.65))
+
+
+def _flat() -> Surface:
+    samples = np.zeros((64, 64, 2), dtype=np.float32)
+    samples[..., 1] = 0.2
+    return Surface.from_samples(samples, 8.0)
+
+
+def _ahead(size: int = 200) -> Cahv:
+    """A camera of 40 deg that looks north and up by 10 deg."""
+    up = np.radians(10.0)
+    return Cahv.from_field_of_view(
+        horizontal_rad=np.radians(40.0),
+        size=(size, size),
+        centre=np.zeros(3),
+        axis=np.array([0.0, np.cos(up), np.sin(up)]),
+        right=np.array([1.0, 0.0, 0.0]),
+    )
+
+
+def _from_mast(renderer, camera: Cahv, sun: Sun, photometry: Photometry) -> Frame:
+    scene = Scene(_flat(), (0.0, 0.0), sun, photometry, mesh_finest_m=0.5, mesh_reach_m=5000.0)
+    return renderer.render(scene, PixelRays.of(camera), rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5])))
+
+
+@pytest.mark.parametrize("elevation_deg", [15.0, 40.0, 90.0])
+@pytest.mark.parametrize("depth", [0.1, 0.9, 3.0])
+def test_the_sky_lights_a_level_ground_as_its_share_says(elevation_deg, depth) -> None:
+    law = replace(DUSTY, sky=DustySky(optical_depth=depth, asymmetry=0.65))
+    sun = Sun(direction(0.3, np.radians(elevation_deg)))
+    numbers = law.sky_numbers(sun)
+    squared, turn = qmc.Sobol(2, rng=np.random.default_rng(2)).random_base2(14).T
+    up, level, azimuth = np.sqrt(squared), np.sqrt(1.0 - squared), 2.0 * np.pi * turn
+    looks = np.stack([level * np.sin(azimuth), level * np.cos(azimuth), up], axis=1)
+    away = looks @ sun.direction
+    # drawn in proportion to the sine of elevation; the sun's own disc is left out
+    seen = [
+        sky_brightness(numbers, sun.direction[2], 1e-9, look[2], min(cos_g, np.cos(1e-3)), 1e-3)
+        for look, cos_g in zip(looks, away, strict=True)
+    ]
+    assert np.mean(seen) == pytest.approx(0.25, rel=0.01)
+
+
+def test_the_sky_against_the_formula(renderer) -> None:
+    camera, sun = _ahead(), Sun(direction(np.radians(160.0), np.radians(35.0)))
+    frame = _from_mast(renderer, camera, sun, DUSTY)
+    _, looks = camera.rays(camera.pixel_grid())
+    sky = ~np.isfinite(frame.range_m) & (looks[..., 2] > 0.01)
+    mu, mu0 = looks[..., 2][sky], sun.direction[2]
+    phase = (1 - 0.65**2) / (1 + 0.65**2 - 2 * 0.65 * (looks @ sun.direction)[sky]) ** 1.5
+    expected = phase * mu0 / (mu0 - mu) * (np.exp(-0.35 / mu0) - np.exp(-0.35 / mu))
+    ratio = frame.radiance[sky] / expected
+    np.testing.assert_allclose(ratio, np.median(ratio), rtol=1e-4)
+
+
+def test_the_sky_is_brighter_towards_the_sun_and_the_horizon(renderer) -> None:
+    camera = _ahead()
+    even = replace(DUSTY, sky=DustySky(optical_depth=0.35, asymmetry=0.0))
+    ahead, behind, unbent = (
+        _from_mast(renderer, camera, Sun(direction(azimuth, np.radians(40.0))), law).radiance[:, 100]
+        for azimuth, law in ((0.0, DUSTY), (np.pi, DUSTY), (np.pi, even))
+    )
+    _, looks = camera.rays(camera.pixel_grid())
+    top, middle, low = (int(np.abs(looks[:, 100, 2] - np.sin(np.radians(e))).argmin()) for e in (28.0, 15.0, 1.5))
+    assert ahead[top] > 2.0 * behind[top]
+    assert unbent[low] > unbent[middle] > unbent[top]
+
+
+def test_the_suns_disc_carries_the_direct_sun(renderer) -> None:
+    camera = _ahead(400)
+    sun = Sun(direction(np.radians(3.0), np.radians(14.0)))
+    frame = _from_mast(renderer, camera, sun, DUSTY)
+    disc = frame.radiance > 1000.0
+    angle = np.square(PixelRays.of(camera).pixel_angles.reshape(disc.shape))
+    # radiance factor is pi times radiance over the irradiance of a plane facing the sun
+    assert (frame.radiance * angle)[disc].sum() == pytest.approx(np.pi, rel=0.03)
+    at, visible = camera.project(1e9 * sun.direction)
+    assert visible
+    rows, columns = np.nonzero(disc)
+    assert np.abs([columns.mean() - at[0], rows.mean() - at[1]]).max() < 0.25
+
+
+def test_an_even_sky_has_no_sun_in_it(renderer) -> None:
+    sun = Sun(direction(np.radians(3.0), np.radians(14.0)))
+    frame = _from_mast(renderer, _ahead(), sun, Photometry(sky_radiance=0.3))
+    assert set(frame.radiance[~np.isfinite(frame.range_m)]) == {np.float32(0.3)}
+
+
+@pytest.mark.parametrize(("depth", "asymmetry"), [(0.0, 0.6), (-1.0, 0.6), (0.5, 1.0), (0.5, -1.0)])
+def test_refuses_a_sky_that_cannot_be(depth, asymmetry) -> None:
+    with pytest.raises(ValueError, match="dusty sky of optical depth"):
+        DustySky(optical_depth=depth, asymmetry=asymmetry)
