@@ -154,7 +154,11 @@ class Integer(Dispersion):
 
 
 class Choice(Dispersion):
-    """One of `values`, all alike or by their `weights`, which need not sum to one."""
+    """One of `values`, all alike or by their `weights`, which need not sum to one.
+
+    Where the parameter is a table each value is one, and stands for the whole of it: what it does not set has its
+    default.
+    """
 
     distribution: Literal["choice"]
     values: Annotated[list[Any], Field(min_length=1)]

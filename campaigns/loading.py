@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from campaigns.configuration import CampaignConfiguration, Key, key_text, problems_of
+from campaigns.dispersions import Choice
 from campaigns.errors import ConfigurationError, Problem, not_allowed
 from campaigns.sampling import Campaign, leaves
 from scenarios.interface import Scenario
@@ -146,8 +147,8 @@ def _parse(key: str, value: str) -> dict[str, Any]:
 
 
 def _under(path: str, fixed: set[str]) -> bool:
-    """Whether a path is one of those fixed, or inside one of them."""
-    return any(path == other or path.startswith(f"{other}.") for other in fixed)
+    """Whether a path is one of those fixed, inside one of them, or a table that holds one of them."""
+    return any(f"{path}.".startswith(f"{other}.") or other.startswith(f"{path}.") for other in fixed)
 
 
 def _paths_set(tables: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -219,10 +220,12 @@ def _dispersion_problems(document: _Document, campaign: Campaign) -> list[Proble
     problems = []
     for path, dispersion in campaign.configuration.dispersions.items():
         if path not in known:
-            tables = any(leaf.startswith(f"{path}.") for leaf in known)
-            message = "is a table; disperse one of its values" if tables else not_allowed("parameter", path, known)
-            problems.append(document.problem(("dispersions", path), message))
-            continue
+            table = any(leaf.startswith(f"{path}.") for leaf in known)
+            if not (table and isinstance(dispersion, Choice)):
+                unknown = not_allowed("parameter", path, known)
+                message = "is a table; disperse one of its values, or choose between tables" if table else unknown
+                problems.append(document.problem(("dispersions", path), message))
+                continue
         for value in dispersion.extremes():
             refused = _refusal(campaign, {path: value})
             if refused:

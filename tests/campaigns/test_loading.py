@@ -80,6 +80,11 @@ def test_parameters(campaign_file: CampaignFile, parameters: str, said: str) -> 
         ("terrain = {distribution='integer', low=0.5, high=2}", "terrain.low: input should be a valid integer"),
         ("terrain = {distribution='integer', low=3, high=2}", "low = 3 must not be above high = 2"),
         ("terrain = {distribution='uniform', low=0, high=3}", "input should be a valid integer"),
+        (
+            "wind = {distribution='choice', values=[{}, {est_m_s=3}]}",
+            "reaches {'est_m_s': 3}, which the parameter does not take: wind.est_m_s: unknown key",
+        ),
+        ("wind = {distribution='choice', values=[{}, 3]}", "reaches 3, which the parameter does not take"),
         ("kind = {distribution='choice', values=['a', 'B']}", "reaches 'B', which the parameter does not take"),
         ("kind = {distribution='choice', values=['a'], weights=[1, 2]}", "2 weights for 1 values"),
         ("kind = {distribution='choice', values=[]}", "kind.values: list should have at least 1 item"),
@@ -272,3 +277,15 @@ def test_no_file_ends_in_a_traceback(tmp_path: Path, changes: dict[str, object])
 def test_no_override_ends_in_a_traceback(campaign_file: CampaignFile, override: str) -> None:
     with contextlib.suppress(ConfigurationError):
         load_campaign(str(campaign_file()), [override])
+
+
+def test_a_choice_between_tables_draws_whole_tables(campaign_file: CampaignFile) -> None:
+    """What a table does not set has its default, whatever the campaign's own parameters say."""
+    choice = "[dispersions]\nwind = {distribution='choice', values=[{}, {east_m_s=3}, {north_m_s=-4, east_m_s=5}]}"
+    path = str(campaign_file("wind = {north_m_s = 20}", dispersions=choice))
+    campaign = load_campaign(path)
+    drawn = {tuple(campaign.parameters(case).wind.model_dump().values()) for case in range(40)}  # type: ignore[attr-defined]
+    assert drawn == {(0.0, 0.0), (3.0, 0.0), (5.0, -4.0)}
+    # a value set within the table is not drawn over
+    fixed = load_campaign(path, ["wind.east_m_s=7"])
+    assert fixed.configuration.dispersions == {}
