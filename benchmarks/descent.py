@@ -11,7 +11,7 @@ from scenarios.descent import (
     DescentScenario,
     DescentScenarioParameters,
     camera_optics,
-    placed_descent,
+    flown_descent,
 )
 from sim.render import process_renderer
 from sim.render.backend import default_backend
@@ -25,7 +25,7 @@ def frame(repeats: int) -> list[Figure]:
     scene, surface = descent_scene()
     optics = camera_optics(CameraParameters())
     renderer = process_renderer(default_backend())
-    pose = placed_descent(DescentScenarioParameters(), surface).state(1.0).world_from_body
+    pose = flown_descent(DescentScenarioParameters(), surface, Streams(1, "bench", 0)).state(1.0).world_from_body
     return [
         Figure(
             "descent frame, 1024 x 1024",

@@ -4,7 +4,7 @@ Read it in the order of a case: `parameters`, `world`, `flight`, `optics`, `expo
 `scenario` runs them one after the other.
 """
 
-from scenarios.descent.flight import placed_descent
+from scenarios.descent.flight import flown_descent
 from scenarios.descent.optics import Optics, camera_optics
 from scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
 from scenarios.descent.scenario import DescentScenario
@@ -15,5 +15,5 @@ __all__ = [
     "DescentScenarioParameters",
     "Optics",
     "camera_optics",
-    "placed_descent",
+    "flown_descent",
 ]

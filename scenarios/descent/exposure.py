@@ -1,29 +1,23 @@
-"""The three pictures, taken through the camera as it is truly mounted."""
+"""The three pictures, taken through the camera as it truly is."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import UInt16
+from jaxtyping import Float32, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from scenarios.descent.faults import delivered
+from scenarios.descent.haze import veiled
+from scenarios.descent.heat_shield import HeatShield
 from scenarios.descent.optics import Optics
 from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.descent.world import World
 from sim.dynamics import State
-from sim.render import process_renderer
+from sim.render import Frame, process_renderer
 from sim.sensor import Detector, ImageMotion
 from sim.streams import Streams
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """Truth and picture of one exposure."""
-
-    state: State
-    counts: UInt16[np.ndarray, "rows columns"]
 
 
 def expose(
@@ -33,16 +27,17 @@ def expose(
     optics: Optics,
     detector: Detector,
     streams: Streams,
-) -> list[Exposure]:
-    """The pictures of these states, in their order."""
+) -> list[UInt16[np.ndarray, "rows columns"]]:
+    """The pictures of these states as they are delivered, in their order."""
     renderer = process_renderer(p.render.backend)
     first, last = states[0].position_m, states[-1].position_m
     lowest = float(last[2] - world.surface.height(last[0], last[1]))
     pixel_rad = float(np.median(optics.rays.pixel_angles))
     scene = world.scene(float(first[0]), float(first[1]), lowest, pixel_rad, p.lander.caster_diameter_m)
     mounting = _mounting(p, streams)
+    shield = _shield(p, states[0], streams)
     noise = streams.generator("detector noise")
-    exposures = []
+    pictures = []
     for state in states:
         frame = renderer.render(scene, optics.rays, state.world_from_body * mounting)
         # the camera sits at the body's origin: its mounting turns it, but moves it nowhere
@@ -53,12 +48,29 @@ def expose(
             state.velocity_m_s,
             state.attitude.apply(state.body_rate_rad_s),
         )
-        light = frame.radiance * np.float32(world.brightness)
-        exposures.append(Exposure(state, detector.expose(light, noise, motion)))
-    return exposures
+        pictures.append(detector.expose(_light(p, world, frame, shield, state.time_s), noise, motion))
+    return delivered(p.faults, pictures)
+
+
+def _light(
+    p: DescentScenarioParameters, world: World, frame: Frame, shield: HeatShield | None, time_s: float
+) -> Float32[np.ndarray, "rows columns"]:
+    """Radiance factor at the lens, over the sunlight for which the detector's responsivity is stated."""
+    radiance = frame.radiance
+    if p.faults.haze > 0.0:
+        radiance = veiled(frame, p.faults.haze, world.sun, world.air)
+    if shield is not None:
+        radiance = shield.over(radiance, frame, world.sun, time_s)
+    return radiance * np.float32(world.brightness)
 
 
 def _mounting(p: DescentScenarioParameters, streams: Streams) -> RigidTransform:
     """How the camera is truly turned in the body: by a little, not known to the lander."""
     tilt = np.radians(p.camera.alignment_error_deg) * streams.generator("camera alignment").standard_normal(3)
     return RigidTransform.from_rotation(Rotation.from_rotvec(tilt))
+
+
+def _shield(p: DescentScenarioParameters, first: State, streams: Streams) -> HeatShield | None:
+    if p.faults.heat_shield_deg == 0.0:
+        return None
+    return HeatShield.drawn(first, float(np.radians(p.faults.heat_shield_deg)), streams.generator("heat shield"))

@@ -1,52 +1,108 @@
-"""What the lander's computer holds when the third picture has arrived."""
+"""What the lander's computer holds: pictures, attitudes propagated from the stars, altitudes, velocity changes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64, UInt16
 
-from scenarios.descent.exposure import Exposure
-from scenarios.descent.flight import mean_velocities
-from scenarios.descent.optics import Optics
+from scenarios.descent.faults import faulty_altitudes, faulty_attitudes
+from scenarios.descent.flight import LEAD_S, gravity_m_s2, nominal_times_s
+from scenarios.descent.optics import calibrated_camera
 from scenarios.descent.parameters import DescentScenarioParameters
-from sim.dynamics import ParachuteDescent
-from sim.measurements import AltitudeMeasurement, DescentMeasurements, DetectorImage
-from sim.render import Sun
-from sim.sensor import Altimeter, Detector, Navigation
+from scenarios.descent.world import World
+from sim.dynamics import SwingDescent
+from sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
+from sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter
 from sim.streams import Streams
+
+#: How long before the first picture and after the last instant of interest the inertial unit is read, s.
+MARGIN_S = 0.1
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """One descent's instruments, their constant errors drawn.
+
+    Attributes
+    ----------
+    navigation
+        Attitude and velocity as propagated on board, from shortly before the first picture to the thrusters' firing.
+    altimeter
+        The radar.
+    clock
+        Of the pictures' time tags.
+    """
+
+    navigation: InertialSolution
+    altimeter: RadarAltimeter
+    clock: Clock
+
+    @classmethod
+    def drawn(cls, p: DescentScenarioParameters, world: World, descent: SwingDescent, streams: Streams) -> Instruments:
+        """The instruments of a case, and what navigation makes of its motion."""
+        return cls(
+            navigation=_navigated(p, descent, streams),
+            altimeter=RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
+            clock=Clock.drawn(p.clock, streams.generator("image clock")),
+        )
+
+
+def _navigated(p: DescentScenarioParameters, descent: SwingDescent, streams: Streams) -> InertialSolution:
+    """Navigation from the last star reference, before entry, to the thrusters' firing."""
+    start, end = -LEAD_S + MARGIN_S, descent.thruster_firing_s + MARGIN_S
+    approach = Approach(p.approach, start)
+    unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
+    imu = approach.calibrated(unit, streams.generator("inertial unit's calibration"))
+    errors = approach.errors(imu, streams.generator("approach"))
+    increments = imu.increments(descent, start, end, streams.generator("inertial noise"))
+    state = descent.state(start)
+    attitude, velocity = errors.believed(state.attitude, state.velocity_m_s)
+    return InertialSolution.propagated(increments, attitude, velocity, gravity_m_s2(p))
 
 
 def measure(
     p: DescentScenarioParameters,
-    descent: ParachuteDescent,
-    exposures: Sequence[Exposure],
-    sun: Sun,
-    optics: Optics,
+    world: World,
+    descent: SwingDescent,
+    pictures: Sequence[UInt16[np.ndarray, "rows columns"]],
     detector: Detector,
-    altimeter: Altimeter,
+    instruments: Instruments,
     streams: Streams,
 ) -> DescentMeasurements:
-    """Pictures and readings. Attitude and altitude are those of the tagged times, not of the exposures."""
-    navigation = Navigation.drawn(p.navigation, streams.generator("navigation bias"))
-    clock = streams.generator("image time tags")
-    attitude_noise = streams.generator("attitude noise")
-    altitude_noise = streams.generator("altimeter noise")
-    velocity_noise = streams.generator("velocity noise")
-    camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
-    images, attitudes, altitudes = [], [], []
-    for exposure in exposures:
-        tag = navigation.tag(exposure.state.time_s, clock)
-        at_tag = descent.state(tag)
-        images.append(DetectorImage(exposure.counts, tag, camera, detector.calibration))
-        attitudes.append(navigation.attitude(at_tag.attitude, tag, attitude_noise))
-        altitudes.append(AltitudeMeasurement(altimeter.measure(at_tag.position_m, altitude_noise), tag))
-    true = mean_velocities([exposure.state for exposure in exposures])
-    velocities = [navigation.velocity(one, velocity_noise) for one in true]
+    """Pictures and readings: attitudes at the pictures' tags, altitudes of the radar's last readings before them."""
+    times = np.array(nominal_times_s(p))
+    tags = instruments.clock.tags(times, streams.generator("image time tags"))
+    model = calibrated_camera(p.camera, streams.generator("camera calibration"))
+    camera = model.binned(columns=1, rows=p.detector.rows_summed)
+    images = [
+        DetectorImage(counts, float(tag), camera, detector.calibration)
+        for counts, tag in zip(pictures, tags, strict=True)
+    ]
+    attitudes = [
+        AttitudeMeasurement(attitude, float(tag))
+        for attitude, tag in zip(instruments.navigation.attitude(tags), tags, strict=True)
+    ]
+    attitudes = faulty_attitudes(p.faults, attitudes, streams.generator("attitude fault"))
+    altitudes = faulty_altitudes(p.faults, _altitudes(descent, times, instruments.altimeter, streams))
     return DescentMeasurements(
         images=(images[0], images[1], images[2]),
         attitudes=(attitudes[0], attitudes[1], attitudes[2]),
         altitudes=(altitudes[0], altitudes[1], altitudes[2]),
-        interval_velocities_m_s=np.stack(velocities),
-        sun_direction=sun.direction,
+        interval_velocities_m_s=instruments.navigation.mean_velocities(tags),
+        sun_direction=world.sun.direction,
     )
+
+
+def _altitudes(
+    descent: SwingDescent, times_s: Float64[np.ndarray, "3"], altimeter: RadarAltimeter, streams: Streams
+) -> list[AltitudeMeasurement]:
+    """The radar's last readings before the pictures, with their own tags."""
+    at = altimeter.sampling.latest(times_s)
+    readings = altimeter.measure(descent, at, streams.generator("altimeter noise"))
+    return [
+        AltitudeMeasurement(float(value), float(tag))
+        for value, tag in zip(readings.values, readings.times_s, strict=True)
+    ]

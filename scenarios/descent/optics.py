@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from scenarios.descent.parameters import CameraParameters
 from sim.camera import Cahv, Cahvor
@@ -26,13 +26,33 @@ class Optics:
 @cache
 def camera_optics(parameters: CameraParameters) -> Optics:
     """The descent camera in the body frame: at its origin, looking down, columns to the east at zero attitude."""
-    pinhole = Cahv.from_focal_length(
-        focal_m=parameters.focal_length_mm * 1e-3,
-        pixel_pitch_m=parameters.pixel_pitch_um * 1e-6,
-        size=(parameters.columns, parameters.rows),
-        centre=np.zeros(3),
+    camera = _camera(parameters, 1.0, (0.0, 0.0), 0.0)
+    return Optics(camera, PixelRays.of(camera), natural_fall_off(camera))
+
+
+def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) -> Cahvor:
+    """The camera as calibrated: that of `camera_optics`, which is the true one, with the calibration's errors."""
+    p = parameters
+    focal, column, row, distortion = rng.standard_normal(4)
+    return _camera(
+        p, 1.0 + p.focal_error * focal, p.centre_error_px * np.array([column, row]), p.distortion_error_px * distortion
+    )
+
+
+def _camera(
+    p: CameraParameters, focal: float, centre_px: Float64[np.ndarray, "2"] | tuple[float, float], corner_px: float
+) -> Cahvor:
+    """The camera with its focal length scaled, its centre moved, and its corners moved outwards by distortion."""
+    middle = (0.5 * (p.columns - 1), 0.5 * (p.rows - 1))
+    focal_px = p.focal_length_mm / (1e-3 * p.pixel_pitch_um)
+    pinhole = Cahv.from_axes(
+        (focal * focal_px, focal * focal_px),
+        (p.columns, p.rows),
         axis=np.array([0.0, 0.0, -1.0]),
         right=np.array([1.0, 0.0, 0.0]),
+        image_centre=(middle[0] + float(centre_px[0]), middle[1] + float(centre_px[1])),
     )
-    camera = Cahvor.from_cahv(pinhole, r=np.array([parameters.radial_0, parameters.radial_1, parameters.radial_2]))
-    return Optics(camera, PixelRays.of(camera), natural_fall_off(camera))
+    # CAHVOR moves a point at the angle a from the axis outwards by (R0 + R1 tan(a)^2 + ...) of its distance
+    corner = float(np.hypot(*middle))
+    radial_1 = p.radial_1 + corner_px / corner / (corner / focal_px) ** 2
+    return Cahvor.from_cahv(pinhole, r=np.array([p.radial_0, radial_1, p.radial_2]))

@@ -7,9 +7,19 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from sim.dynamics import DescentParameters
+from algorithms.dimes import DimesOptions
+from scenarios.descent.faults import Faults
+from scenarios.estimators import check_estimator
+from sim.dynamics import SwingParameters
 from sim.render.backend import Backend, default_backend
-from sim.sensor import AltimeterParameters, DetectorChoice, DetectorParameters, NavigationParameters
+from sim.sensor import (
+    ApproachParameters,
+    ClockParameters,
+    DetectorChoice,
+    DetectorParameters,
+    ImuParameters,
+    RadarParameters,
+)
 from sim.terrain import Site, TerrainParameters, site, sites
 
 
@@ -57,6 +67,28 @@ class LanderParameters(BaseModel):
     ] = 10.9
 
 
+class LandingParameters(BaseModel):
+    """From the answer to the ground: see `scenarios.descent.landing`. All but the burn are assumed."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    computation_s: Annotated[
+        float, Field(ge=0.0, le=1000.0, description="from the third picture to the answer on the flight computer, s")
+    ] = 14.0
+    least_steered_m_s: Annotated[
+        float, Field(ge=0.0, le=100.0, description="speed up to which the thrusters do not steer, m/s")
+    ] = 5.0
+    most_steered_m_s: Annotated[
+        float, Field(ge=0.0, le=100.0, description="most that steering takes out: the burn's 80 m/s tilted by 15 deg")
+    ] = 20.0
+    steering_error: Annotated[
+        float, Field(ge=0.0, le=1.0, description="RMS error of the steering per axis over what it takes out")
+    ] = 0.1
+    burn_error_m_s: Annotated[
+        float, Field(ge=0.0, le=50.0, description="RMS of what the burn adds per axis, steered or not, m/s")
+    ] = 1.0
+
+
 class CameraParameters(BaseModel):
     """The descent camera: 14.67 mm, 12 um pixels, 45 deg; distortion that of an Opportunity navcam (its PDS label)."""
 
@@ -72,6 +104,16 @@ class CameraParameters(BaseModel):
     alignment_error_deg: Annotated[
         float, Field(ge=0.0, le=10.0, description="RMS per axis of the mounting's error, not known to the lander")
     ] = 0.02
+    focal_error: Annotated[
+        float, Field(ge=0.0, le=0.05, description="RMS relative error of the calibrated focal length")
+    ] = 0.0002
+    centre_error_px: Annotated[
+        float,
+        Field(ge=0.0, le=50.0, description="RMS error of the calibrated image centre per axis, full-frame pixels"),
+    ] = 0.5
+    distortion_error_px: Annotated[
+        float, Field(ge=0.0, le=50.0, description="RMS error of the calibrated distortion in the picture's corners, px")
+    ] = 0.3
 
 
 class RenderParameters(BaseModel):
@@ -98,12 +140,22 @@ class DescentScenarioParameters(BaseModel):
     place: Place = Place()
     terrain: TerrainParameters = TerrainParameters()
     sun: SunParameters = SunParameters()
-    descent: DescentParameters = DescentParameters()
+    descent: SwingParameters = SwingParameters()
     lander: LanderParameters = LanderParameters()
     camera: CameraParameters = CameraParameters()
+    faults: Faults = Faults()
+    algorithm: Annotated[
+        str, Field(description="estimator under test: dimes, phase-correlation, homography, or your own 'module:Class'")
+    ] = "dimes"
+    dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
     detector: DetectorChoice = DetectorParameters()
-    altimeter: AltimeterParameters = AltimeterParameters()
-    navigation: NavigationParameters = NavigationParameters()
+    imu: ImuParameters = ImuParameters()
+    approach: ApproachParameters = ApproachParameters()
+    altimeter: RadarParameters = RadarParameters()
+    clock: Annotated[ClockParameters, Field(description="of the pictures' time tags")] = ClockParameters(
+        offset_sd_s=0.001, jitter_sd_s=0.0005
+    )
+    landing: LandingParameters = LandingParameters()
     render: RenderParameters = Field(default_factory=RenderParameters)
 
     @field_validator("site")
@@ -111,6 +163,12 @@ class DescentScenarioParameters(BaseModel):
     def _site_has_a_terrain(cls, name: str | None) -> str | None:
         if name is not None and name not in descent_sites():
             raise ValueError(f"no site for a descent is called '{name}'; allowed: {', '.join(descent_sites())}")
+        return name
+
+    @field_validator("algorithm")
+    @classmethod
+    def _algorithm_is_there(cls, name: str) -> str:
+        check_estimator(name)
         return name
 
     @model_validator(mode="before")

@@ -6,73 +6,140 @@ import hashlib
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt16
 
-from algorithms.dimes import DimesDetails, dimes_products
+from algorithms.dimes import DimesDetails, dimes_products, propagated
+from algorithms.dimes.binning import altitudes_at_images
 from algorithms.interface import VelocityEstimate
-from scenarios.descent.exposure import Exposure
-from scenarios.descent.flight import PICTURES, off_nadir_deg
+from scenarios.descent.flight import PICTURES, mean_velocities, off_nadir_deg
+from scenarios.descent.landing import Touchdown
+from scenarios.descent.measurement import Instruments
 from scenarios.descent.parameters import DescentScenarioParameters
+from scenarios.descent.world import World
 from scenarios.interface import Scalar
+from sim.dynamics import State
 from sim.measurements import DescentMeasurements
 from sim.processor import processor_features
-from sim.render import Sun, process_renderer
-from sim.sensor import Altimeter
+from sim.render import process_renderer
+from sim.sensor import height_above_ground
+
+Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
+Horizontal = Float64[np.ndarray, "2"]
 
 
-def score(estimate: VelocityEstimate, true_velocity: Float64[np.ndarray, "3"]) -> dict[str, Scalar]:
-    """Horizontal velocity and its error against the true mean velocity between the second and third picture."""
-    estimated = np.full(2, np.nan) if estimate.velocity_m_s is None else estimate.velocity_m_s
-    error = estimated - true_velocity[:2]
+def carried_to_firing(
+    estimate: VelocityEstimate, measurements: DescentMeasurements, instruments: Instruments, firing_s: float
+) -> Horizontal | None:
+    """The reported velocity, carried on to the thrusters' firing by the inertial unit; None where none was reported."""
+    if estimate.velocity_m_s is None:
+        return None
+    now = instruments.navigation.velocity(np.array([firing_s]))[0]
+    return propagated(estimate.velocity_m_s, measurements.interval_velocities_m_s[1, :2], now[:2])
+
+
+def score(
+    estimate: VelocityEstimate, states: Sequence[State], carried: Horizontal | None, at_firing: State
+) -> dict[str, Scalar]:
+    """Errors of the velocity that was reported, and of what the inertial unit made of it by the thrusters' firing.
+
+    The reported one is held against the true mean velocity of the camera between the second and third picture, the
+    carried one against the camera's true velocity when the thrusters fire.
+    """
     return {
-        "velocity_error_m_s": float(np.hypot(*error)),
-        "velocity_error_x_m_s": float(error[0]),
-        "velocity_error_y_m_s": float(error[1]),
-        "velocity_estimated_x_m_s": float(estimated[0]),
-        "velocity_estimated_y_m_s": float(estimated[1]),
-        "velocity_true_x_m_s": float(true_velocity[0]),
-        "velocity_true_y_m_s": float(true_velocity[1]),
+        **_errors("velocity", estimate.velocity_m_s, mean_velocities(states)[1, :2]),
+        **_errors("firing_velocity", carried, at_firing.velocity_m_s[:2]),
     }
+
+
+def _errors(name: str, estimated: Horizontal | None, true: Horizontal) -> dict[str, Scalar]:
+    given = np.full(2, np.nan) if estimated is None else estimated
+    error = given - true
+    row: dict[str, Scalar] = {f"{name}_error_m_s": float(np.hypot(*error))}
+    for kind, values in (("error", error), ("estimated", given), ("true", true)):
+        row |= {f"{name}_{kind}_{axis}_m_s": float(value) for axis, value in zip("xy", values, strict=True)}
+    return row
 
 
 def conditions(
-    p: DescentScenarioParameters,
-    exposures: Sequence[Exposure],
-    measurements: DescentMeasurements,
-    altimeter: Altimeter,
-    sun: Sun,
+    p: DescentScenarioParameters, world: World, states: Sequence[State], at_firing: State
 ) -> dict[str, Scalar]:
     """What the case was like, read from the simulated objects."""
-    states = [exposure.state for exposure in exposures]
+    sun = world.sun.direction
+    fault, size = p.faults.name_and_size
+    heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
     row: dict[str, Scalar] = {
         "site": p.site or "plain",
         "terrain": p.place.terrain,
+        "fault": fault,
+        "fault_size": size,
         "place_east_m": p.place.east_m,
         "place_north_m": p.place.north_m,
-        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun.direction[0], sun.direction[1])) % 360.0),
-        "sun_elevation_deg": float(np.degrees(np.arcsin(sun.direction[2]))),
+        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0], sun[1])) % 360.0),
+        "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(sun[2], -1.0, 1.0)))),
         "horizontal_speed_m_s": float(np.hypot(*states[-1].velocity_m_s[:2])),
-        "descent_rate_m_s": float(-states[-1].velocity_m_s[2]),
+        "descent_rate_m_s": float(-np.diff([states[0].position_m[2], states[-1].position_m[2]])[0])
+        / (states[-1].time_s - states[0].time_s),
+        "firing_after_s": at_firing.time_s - states[-1].time_s,
     }
-    for number, state in enumerate(states, start=1):
-        attitude_error = measurements.attitudes[number - 1].world_from_body * state.attitude.inv()
-        true_altitude = altimeter.true_altitude(state.position_m)
-        row[f"altitude_{number}_m"] = true_altitude
-        row[f"altitude_error_{number}_m"] = measurements.altitudes[number - 1].altitude_m - true_altitude
+    for number, (state, height) in enumerate(zip(states, heights, strict=True), start=1):
+        row[f"altitude_{number}_m"] = float(height)
         row[f"off_nadir_{number}_deg"] = off_nadir_deg(state)
         row[f"attitude_rate_{number}_deg_s"] = float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
-        row[f"attitude_error_{number}_deg"] = float(np.degrees(attitude_error.magnitude()))
-        row[f"tag_error_{number}_s"] = measurements.images[number - 1].time_s - state.time_s
     row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in states)
     row["attitude_rate_max_deg_s"] = max(float(row[f"attitude_rate_{k}_deg_s"]) for k in range(1, PICTURES + 1))
     return row
 
 
-def provenance(p: DescentScenarioParameters, exposures: Sequence[Exposure]) -> dict[str, Scalar]:
+def instrument_errors(world: World, states: Sequence[State], measurements: DescentMeasurements) -> dict[str, Scalar]:
+    """Errors of what was measured, divided into what the three pictures share and what each has of its own.
+
+    The shared part of an attitude error is the mean of the three rotation vectors (world axes), the own part the RMS
+    length of what is left; altitude errors, as shares of the altitude, likewise. Altitudes are those at the pictures,
+    over the ground straight below: relief that the radar sees nearer is part of their error.
+    """
+    turned = np.stack(
+        [
+            (measured.world_from_body * state.attitude.inv()).as_rotvec()
+            for measured, state in zip(measurements.attitudes, states, strict=True)
+        ]
+    )
+    heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
+    shares = altitudes_at_images(measurements) / heights - 1.0
+    tags = np.array([image.time_s for image in measurements.images]) - np.array([state.time_s for state in states])
+    true_change, change = (
+        np.diff(velocities[:, :2], axis=0)[0]
+        for velocities in (mean_velocities(states), measurements.interval_velocities_m_s)
+    )
+    row: dict[str, Scalar] = {
+        "attitude_error_common_deg": float(np.degrees(np.linalg.norm(turned.mean(axis=0)))),
+        "attitude_error_own_deg": float(
+            np.degrees(np.sqrt(np.mean(np.sum((turned - turned.mean(axis=0)) ** 2, axis=1))))
+        ),
+        "altitude_error_common": float(shares.mean()),
+        "altitude_error_own": float(np.sqrt(np.mean((shares - shares.mean()) ** 2))),
+        "velocity_change_error_m_s": float(np.hypot(*(change - true_change))),
+    }
+    for number, (rotation, share, tag) in enumerate(zip(turned, shares, tags, strict=True), start=1):
+        row[f"attitude_error_{number}_deg"] = float(np.degrees(np.linalg.norm(rotation)))
+        row[f"altitude_error_{number}_m"] = float(share * heights[number - 1])
+        row[f"tag_error_{number}_s"] = float(tag)
+    return row
+
+
+def landing_row(landed: Touchdown) -> dict[str, Scalar]:
+    """What the answer did to the landing."""
+    return {
+        "touchdown_speed_with_m_s": float(np.hypot(*landed.with_answer)),
+        "touchdown_speed_without_m_s": float(np.hypot(*landed.without_answer)),
+        "answer_punctual": landed.punctual,
+    }
+
+
+def provenance(p: DescentScenarioParameters, pictures: Pictures) -> dict[str, Scalar]:
     """Hash of the pictures, and what their last bits depend on."""
     digest = hashlib.sha256()
-    for exposure in exposures:
-        digest.update(np.ascontiguousarray(exposure.counts).tobytes())
+    for counts in pictures:
+        digest.update(np.ascontiguousarray(counts).tobytes())
     return {
         "image_hash": digest.hexdigest(),
         "gl_backend": p.render.backend,
@@ -81,14 +148,12 @@ def provenance(p: DescentScenarioParameters, exposures: Sequence[Exposure]) -> d
     }
 
 
-def products(
-    exposures: Sequence[Exposure], estimate: VelocityEstimate, true_velocity: Float64[np.ndarray, "3"]
-) -> dict[str, object]:
+def products(pictures: Pictures, estimate: VelocityEstimate, states: Sequence[State]) -> dict[str, object]:
     """Arrays from which the case's figures are drawn."""
-    kept: dict[str, object] = {f"image_{number}": one.counts for number, one in enumerate(exposures, start=1)}
+    kept: dict[str, object] = {f"image_{number}": counts for number, counts in enumerate(pictures, start=1)}
     if isinstance(estimate.details, DimesDetails):
         kept.update(dimes_products(estimate.details))
-    kept["velocity_true_m_s"] = true_velocity[:2]
+    kept["velocity_true_m_s"] = mean_velocities(states)[1, :2]
     if estimate.velocity_m_s is not None:
         kept["velocity_estimated_m_s"] = estimate.velocity_m_s
     return kept

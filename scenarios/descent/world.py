@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scenarios.descent.faults import faulty_terrain
 from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.views import Eye, SiteGround, site_scene
 from sim.frames import direction
 from sim.render import Photometry, Scene, Sun
-from sim.terrain import Surface, TerrainBank
+from sim.terrain import Environment, Surface, TerrainBank
 
 #: Sunlight over that at 1 AU for which the descent camera's responsivity is stated: Mars at 1.5 AU.
 SUNLIGHT_OF_RESPONSIVITY = 1.0 / 1.5**2
@@ -39,10 +40,16 @@ class World:
     sun: Sun
     brightness: float = 1.0
 
+    @property
+    def air(self) -> Environment:
+        """The site's air; that of Mars over a plain terrain."""
+        return Environment() if self.ground is None else self.ground.site.environment
+
     @classmethod
     def of(cls, p: DescentScenarioParameters) -> World:
         """The world of a case; its terrain comes from the disk, or is built."""
-        bank = TerrainBank(p.terrain, p.place.bank_seed)
+        terrain = faulty_terrain(p.faults, p.terrain)
+        bank = TerrainBank(terrain, p.place.bank_seed)
         surface = bank.terrain(p.place.terrain)
         elevation = float(np.radians(p.sun.elevation_deg))
         towards_sun = direction(np.radians(p.sun.azimuth_deg), elevation)
@@ -51,7 +58,7 @@ class World:
         air = p.preset.environment
         sun = Sun(towards_sun, SUN_RADIUS_AT_EARTH_RAD * float(np.sqrt(air.solar_irradiance)))
         brightness = air.direct_share(elevation) * air.solar_irradiance / SUNLIGHT_OF_RESPONSIVITY
-        ground = SiteGround(p.preset, p.terrain, surface, bank.rocks(p.place.terrain))
+        ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.place.terrain))
         return cls(surface, ground, sun, brightness)
 
     def scene(

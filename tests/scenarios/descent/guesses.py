@@ -1,0 +1,12 @@
+"""A velocity estimator of a user's own, for tests: it believes the inertial unit."""
+
+from algorithms.interface import VelocityEstimate, VelocityOutcome
+from sim.measurements import DescentMeasurements
+
+
+class Inertial:
+    """The inertial velocity over the second pair."""
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """Always an answer."""
+        return VelocityEstimate(VelocityOutcome.VALID, measurements.interval_velocities_m_s[1, :2].copy())

@@ -1,0 +1,61 @@
+"""What tests of descents share: a small world, a descent, and instruments without errors."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from scenarios.descent import DescentScenario, DescentScenarioParameters
+from scenarios.interface import CaseResult
+from sim.streams import Streams
+
+#: A small world that is built in a moment.
+WORLD = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "place": {"bank": 1}}
+FLAT = {"samples": 1024, "spacing_m": 3.0, "rms_slope_deg": 0.0, "craters_per_km2": 0.0}
+DESCENT = {
+    "wind_east_m_s": 14.0,
+    "wind_north_m_s": -9.0,
+    "gust_intensity_m_s": 0.5,
+    "cone_angle_deg": 12.0,
+    "nod_rate_deg_s": 30.0,
+    "heading_deg": 70.0,
+}
+_NO_CLOCK = {"offset_sd_s": 0.0, "jitter_sd_s": 0.0}
+#: Instruments without errors.
+PERFECT: Mapping[str, Mapping[str, Any]] = {
+    "camera": {"alignment_error_deg": 0.0, "focal_error": 0.0, "centre_error_px": 0.0, "distortion_error_px": 0.0},
+    "altimeter": {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": _NO_CLOCK},
+    "clock": _NO_CLOCK,
+    "approach": {"attitude_sd_deg": 0.0, "velocity_sd_m_s": 0.0, "spin_scale_ppm": 0.0},
+    "imu": {
+        "gyro_bias_deg_h": 0.0,
+        "gyro_wander_deg_h": 0.0,
+        "angular_random_walk_deg_sqrt_h": 0.0,
+        "gyro_scale_ppm": 0.0,
+        "gyro_misalignment_mrad": 0.0,
+        "gyro_count_rad": 0.0,
+        "accelerometer_bias_mg": 0.0,
+        "accelerometer_wander_mg": 0.0,
+        "velocity_random_walk_ug_sqrt_hz": 0.0,
+        "accelerometer_scale_ppm": 0.0,
+        "accelerometer_misalignment_mrad": 0.0,
+        "accelerometer_count_m_s": 0.0,
+        "clock": _NO_CLOCK,
+    },
+}
+#: A detector whose noise does not show: a million times the light and the well of the flight camera's.
+NOISELESS = {
+    "responsivity_e_s": 1.019e13,
+    "full_well_e": 1.7e11,
+    "gain_e_dn": 4.15e7,
+    "response_spread": 0.0,
+    "calibration_error": 0.0,
+}
+
+
+def parameters(**parts: Any) -> DescentScenarioParameters:
+    """Parameters of a descent over the small world."""
+    return DescentScenarioParameters.model_validate(WORLD | {"descent": DESCENT} | parts)
+
+
+def run(case: int = 0, **parts: Any) -> CaseResult:
+    """One descent over the small world."""
+    return DescentScenario().run(parameters(**parts), Streams(1, "test", case))

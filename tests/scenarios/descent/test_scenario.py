@@ -1,0 +1,194 @@
+"""Whole descents: truth, measurement and score hang together."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scenarios.interface import CaseResult
+from sim.streams import Streams
+from tests.scenarios.descent.settings import DESCENT, FLAT, PERFECT, WORLD, run
+
+
+@pytest.fixture(scope="module")
+def nominal() -> CaseResult:
+    return run()
+
+
+def _timeless(row: Any) -> dict[str, Any]:
+    return {name: value for name, value in row.items() if "time" not in name}
+
+
+def test_a_case_is_a_function_of_its_parameters_and_streams(nominal) -> None:
+    other = run(case=1)
+    again = run()
+    assert _timeless(again.row) == _timeless(nominal.row)
+    assert other.row["image_hash"] != nominal.row["image_hash"]
+
+
+@pytest.mark.parametrize("name", ["velocity", "firing_velocity"])
+def test_the_error_is_the_estimate_less_the_truth(nominal, name) -> None:
+    row = nominal.row
+    assert nominal.answered
+    for axis in "xy":
+        assert row[f"{name}_error_{axis}_m_s"] == pytest.approx(
+            row[f"{name}_estimated_{axis}_m_s"] - row[f"{name}_true_{axis}_m_s"], abs=1e-12
+        )
+    assert row[f"{name}_error_m_s"] == pytest.approx(math.hypot(row[f"{name}_error_x_m_s"], row[f"{name}_error_y_m_s"]))
+
+
+def test_figures_are_drawn_from_what_was_scored(nominal) -> None:
+    row = nominal.row
+    for kind in ("true", "estimated"):
+        stored = [row[f"velocity_{kind}_x_m_s"], row[f"velocity_{kind}_y_m_s"]]
+        np.testing.assert_allclose(nominal.products[f"velocity_{kind}_m_s"], stored)
+    assert all(nominal.products[f"image_{k}"].shape == (256, 1024) for k in (1, 2, 3))
+
+
+def test_truth_is_the_mean_velocity_of_the_camera() -> None:
+    """Without swing and gusts the lander drifts with the wind, which is even above its boundary layer of 500 m."""
+    still = {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "gust_intensity_m_s": 0.0}
+    row = run(descent=DESCENT | still).row
+    assert row["velocity_true_x_m_s"] == pytest.approx(14.0, abs=1e-6)
+    assert row["velocity_true_y_m_s"] == pytest.approx(-9.0, abs=1e-6)
+    # in the boundary layer the wind falls off, and the canopy with it
+    assert 0.0 < float(row["firing_velocity_true_x_m_s"]) < 14.0
+
+
+@pytest.mark.parametrize("wind", [(25.0, 0.0), (0.0, 25.0), (-18.0, -18.0)])
+def test_with_perfect_instruments_over_flat_ground_the_velocity_is_right(wind) -> None:
+    """Signs and axes of the whole chain: 0.15 m/s is a tenth of a binned pixel over 3.75 s.
+
+    Carried to the thrusters' firing by a perfect inertial unit, the velocity is as right as it was.
+    """
+    east, north = wind
+    descent = DESCENT | {"wind_east_m_s": east, "wind_north_m_s": north}
+    result = run(**PERFECT, terrain=FLAT, descent=descent)
+    row = result.row
+    assert result.outcome == "VALID"
+    assert row["velocity_error_m_s"] < 0.15
+    for axis in "xy":
+        assert row[f"firing_velocity_error_{axis}_m_s"] == pytest.approx(row[f"velocity_error_{axis}_m_s"], abs=0.01)
+
+
+def test_perfect_instruments_are_told_to_be(nominal) -> None:
+    """Over flat ground nothing is left but the altitude's way from the radar's last reading to the picture."""
+    row = run(**PERFECT, terrain=FLAT).row
+    for name in ("attitude_error_common_deg", "attitude_error_own_deg"):
+        assert row[name] < 1e-4 < nominal.row[name]
+    # a tenth of a second at 0.3 m/s2 and at half a swing's 2 m/s: 0.1 m of 1400
+    assert abs(float(row["altitude_error_common"])) < 1e-4 < abs(float(nominal.row["altitude_error_common"]))
+    assert row["velocity_change_error_m_s"] < 1e-3 < nominal.row["velocity_change_error_m_s"]
+
+
+def test_errors_of_instruments_are_of_their_class() -> None:
+    """Radar: 1 % is 3 sigma of all errors together; navigation: a tenth of a degree after 20 minutes at 1 deg/h."""
+    rows = [run(case).row for case in range(4)]
+    altitude = np.array([float(row["altitude_error_common"]) for row in rows])
+    attitude = np.array([float(row["attitude_error_common_deg"]) for row in rows])
+    own = np.array([float(row["attitude_error_own_deg"]) for row in rows])
+    assert np.abs(altitude).max() < 0.015
+    assert 0.01 < attitude.max() < 0.5
+    # between pictures the gyros drift by little: tags that are off by 1 ms at 20 deg/s are most of it
+    assert own.max() < 0.1
+
+
+def test_an_attitude_error_makes_the_velocity_error_it_must() -> None:
+    """An error of attitude common to all pictures turns the displacement that the pictures show, descent and all.
+
+    First order in the error b: ``b x v``. Tolerance: a template 20 deg from nadir adds 13 % to the descent's share.
+    """
+    steady = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
+    errors, expected = [], []
+    for case in range(4):
+        row = run(case, **PERFECT, terrain=FLAT, descent=steady, faults={"attitude_error_deg": 0.8}).row
+        fallen = float(row["altitude_2_m"]) - float(row["altitude_3_m"])
+        velocity = [row["velocity_true_x_m_s"], row["velocity_true_y_m_s"], -fallen / 3.75]
+        errors.append([row["velocity_error_x_m_s"], row["velocity_error_y_m_s"]])
+        turn = Streams(1, "test", case).generator("attitude fault").uniform(-np.pi, np.pi)
+        tilt = np.radians(0.8) * np.array([np.cos(turn), np.sin(turn), 0.0])
+        expected.append(np.cross(tilt, velocity)[:2])
+        assert row["attitude_error_common_deg"] == pytest.approx(0.8, abs=1e-3)
+        assert row["attitude_error_own_deg"] < 1e-3
+    np.testing.assert_allclose(errors, expected, atol=0.15, rtol=0.13)
+    assert np.abs(expected).max() > 1.0
+
+
+def test_an_altitude_error_common_to_all_pictures_scales_the_velocity() -> None:
+    """2 % too high: displacements come out 2 % too large, and so does the velocity."""
+    steady = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "wind_east_m_s": 25.0}
+    row = run(**PERFECT, terrain=FLAT, descent=steady, faults={"altitude_error": 0.02}).row
+    assert row["velocity_error_x_m_s"] == pytest.approx(0.02 * float(row["velocity_true_x_m_s"]), abs=0.12)
+    assert row["altitude_error_common"] == pytest.approx(0.02, abs=1e-4)
+
+
+def test_conditions_are_read_from_the_simulated_objects(nominal) -> None:
+    row = nominal.row
+    assert row["altitude_1_m"] == pytest.approx(2000.0, abs=20.0)
+    assert row["altitude_1_m"] - row["altitude_3_m"] == pytest.approx(7.5 * row["descent_rate_m_s"], abs=40.0)
+    assert row["off_nadir_max_deg"] == max(row[f"off_nadir_{k}_deg"] for k in (1, 2, 3))
+    assert 0.0 < row["off_nadir_max_deg"] < 12.0 + 15.0
+    assert row["sun_azimuth_deg"] == pytest.approx(270.0)
+    assert row["sun_elevation_deg"] == pytest.approx(40.0)
+    assert len(row["image_hash"]) == 64
+    assert row["descent_wind_east_m_s"] == 14.0
+    assert row["descent_heading_deg"] == 70.0
+    assert (row["fault"], row["fault_size"], row["site"]) == ("none", 0.0, "plain")
+    # 1300 m at about 72 m/s
+    assert 15.0 < float(row["firing_after_s"]) < 21.0
+
+
+def test_no_room_for_a_template_is_an_outcome_without_velocity() -> None:
+    """Swinging from 42 deg to the other side the pictures do not share enough ground, by truth as by measurement."""
+    swinging = {"cone_angle_deg": 42.0, "cone_phase_deg": 0.0, "cone_minor_share": 0.0}
+    result = run(descent=DESCENT | swinging)
+    assert result.outcome == "NO_TEMPLATE_AREA"
+    assert result.row["room"] is False
+    assert not result.answered
+    for name in ("velocity", "firing_velocity"):
+        assert math.isnan(float(result.row[f"{name}_error_m_s"]))
+        assert math.isfinite(float(result.row[f"{name}_true_x_m_s"]))
+
+
+def test_room_is_judged_by_truth_alone(nominal) -> None:
+    """Altitudes measured at half make DIMES look in the wrong places; the geometry has not changed."""
+    wrong = run(faults={"altitude_error": 0.4})
+    for name in ("room", "room_first_pair", "room_second_pair"):
+        assert wrong.row[name] == nominal.row[name]
+    assert nominal.row["room"] is True
+
+
+def test_in_the_dark_nothing_is_reported() -> None:
+    result = run(detector={"responsivity_e_s": 1.0})
+    assert result.outcome == "NO_VALID_TRACK"
+    assert not result.answered
+
+
+def test_over_a_site_the_velocity_is_right() -> None:
+    result = run(site="gusev", **PERFECT)
+    assert result.outcome == "VALID"
+    assert result.row["site"] == "gusev"
+    # relief of 2 deg slopes moves a template against the plane below the lander, by 1 m/s at worst here
+    assert result.row["velocity_error_m_s"] < 1.0
+
+
+def test_real_terrain_can_be_descended_on(tmp_path) -> None:
+    """A terrain model from a file in the site's surround; the pictures are of it."""
+    heights = 30.0 * np.sin(np.arange(200) / 9.0)[:, None] * np.cos(np.arange(200) / 7.0)
+    np.savez(tmp_path / "dtm.npz", dem=heights, dem_gsd=8.0)
+    middle = {"place": {"bank": 1, "east_m": 1536.0, "north_m": 1536.0}}
+    source = {"source": {"dtm": str(tmp_path / "dtm.npz")}}
+    result = run(site="gusev", terrain=WORLD["terrain"] | source, **middle)
+    without = run(site="gusev", **middle)
+    assert result.outcome == "VALID"
+    assert result.row["image_hash"] != without.row["image_hash"]
+    # crests and hollows of 30 m up to 500 m aside
+    assert result.row["velocity_error_m_s"] < 4.0
+
+
+def test_another_algorithm_is_given_the_same() -> None:
+    result = run(algorithm="tests.scenarios.descent.guesses:Inertial")
+    assert result.outcome == "VALID"
+    assert result.row["velocity_estimated_x_m_s"] == pytest.approx(14.0, abs=8.0)
+    assert "tracks" not in result.products
