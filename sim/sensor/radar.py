@@ -20,7 +20,7 @@ from sim.sensor.instrument import Readings, Sampling
 from sim.sensor.ranging import DOWN, RangingParameters, RangingUnit
 from sim.terrain import Surface
 
-#: The ground is scanned in steps of this share of the height, then about its nearest points in ever smaller ones.
+#: The ground is first scanned in steps of this share of the height, then about its nearest points in smaller ones.
 COARSEST_STEP = 1.0 / 64.0
 REFINEMENT = 5
 PASSES = 3
@@ -110,14 +110,16 @@ def first_return(
     hold the nearest give it to 0.05 % of the height. Ground that is near but outside this square has not been seen, so
     the square grows until the range found is within it.
     """
-    step = COARSEST_STEP * _clearance(surface, position_m)
-    if step <= 0.0:
+    clearance = position_m[2] - float(surface.height(float(position_m[0]), float(position_m[1])))
+    if clearance <= 0.0:
         return 0.0
     tilt = float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))
     widest = np.sin(min(tilt + half_angle_rad, 0.5 * np.pi))
     nearest_angle = max(tilt - half_angle_rad, 0.0)
-    reach = min(1.2 * step / COARSEST_STEP / max(np.cos(nearest_angle), 0.05), max_range_m)
+    reach = min(1.2 * clearance / max(np.cos(nearest_angle), 0.05), max_range_m)
     while True:
+        # far out the steps grow with the reach, which bounds the number of nodes
+        step = COARSEST_STEP * max(clearance, 0.5 * reach)
         found = _search(surface, position_m, axis, half_angle_rad, step, reach * widest)
         if found <= reach or reach >= max_range_m:
             return found if found <= max_range_m else np.inf
@@ -193,7 +195,3 @@ def _level(surface: Surface, step_m: float) -> int:
     """The level of the pyramid whose samples are about as far apart as a step, or closer."""
     level = np.floor(np.log2(max(step_m / surface.spacing_m, 1.0)))
     return int(min(level, len(surface.levels) - 1))
-
-
-def _clearance(surface: Surface, position_m: Float64[np.ndarray, "3"]) -> float:
-    return float(position_m[2] - surface.height(float(position_m[0]), float(position_m[1])))

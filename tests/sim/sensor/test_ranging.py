@@ -82,6 +82,7 @@ each = pytest.mark.parametrize("make", PERFECT, ids=["radar", "laser", "gps"])
 @each
 def test_without_errors_truth_is_read(make: Callable[..., Instrument]) -> None:
     instrument = make(np.random.default_rng(0), **PERFECT[make])
+    assert isinstance(instrument, Instrument)
     times = instrument.sampling.within(0.0, 10.0)
     readings = instrument.measure(DESCENT, times, np.random.default_rng(1))
     true = DESCENT.motion(times).positions_m
@@ -205,7 +206,21 @@ def test_first_return_is_that_of_a_dense_scan(height: float, tilt_deg: float) ->
 
 
 def test_a_radar_sees_nothing_above_the_horizon() -> None:
-    assert first_return(FLAT, np.array([0.0, 0.0, 1000.0]), _axis(150.0), np.radians(30.0), 5000.0) == np.inf
+    for height in (1000.0, 1.0):
+        assert first_return(FLAT, np.array([0.0, 0.0, height]), _axis(150.0), np.radians(30.0), 5000.0) == np.inf
+
+
+def test_a_radar_on_a_ledge_finds_the_ground_far_below() -> None:
+    heights = np.zeros((SIDE, SIDE))
+    edge = SIDE // 2
+    heights[:, :edge] = 400.0
+    # 1 m above the ledge, 20 m from its edge, looking 60 deg down to the east with a narrow beam
+    position = np.array([edge * SPACING - 20.0, MIDDLE, 401.0])
+    found = first_return(_surface(heights), position, _axis(60.0), np.radians(2.0), 5000.0)
+    assert found < 10.0
+    position = np.array([edge * SPACING + 15.0, MIDDLE, 401.0])
+    found = first_return(_surface(heights), position, _axis(60.0), np.radians(2.0), 5000.0)
+    assert found == pytest.approx(401.0 / np.cos(np.radians(58.0)), rel=5e-3)
 
 
 def test_a_laser_reads_the_slant_range_of_its_axis() -> None:
