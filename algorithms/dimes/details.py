@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from algorithms.dimes.binning import View
 from algorithms.dimes.consistency import Combination
+from algorithms.dimes.ground import ground_from_pixels, pixels_from_ground
 from algorithms.dimes.validity import TrackMetrics, ValidityCheck
 
 
@@ -24,6 +26,9 @@ class Track:
         Middle of the template, (u, v) in the pair's earlier binned picture.
     match_pixel
         Where it was found, (u, v) in the later binned picture; NaN where that cannot be said.
+    ground_m
+        Ground point under the template's middle, (east, north) of the point below the earlier camera; the window's
+        middle is the point at the same offset from the later one.
     template, window
         Rectified and corrected patches, counts, north up: shapes (template_px, template_px), (window_px, window_px).
     match
@@ -40,6 +45,7 @@ class Track:
     index: int
     template_pixel: Float[np.ndarray, "2"]
     match_pixel: Float[np.ndarray, "2"]
+    ground_m: Float[np.ndarray, "2"]
     template: Float[np.ndarray, "n n"]
     window: Float[np.ndarray, "w w"]
     match: Float[np.ndarray, "2"]
@@ -70,6 +76,8 @@ class PairDetails:
         Number of places on the coarse grid that had room for template and window.
     tracks
         The templates tracked, valid or not.
+    views
+        The pair's earlier and later binned picture with their cameras.
     """
 
     overlap_polygon: Float[np.ndarray, "n 2"]
@@ -77,6 +85,7 @@ class PairDetails:
     gsd_m: float
     candidates: int
     tracks: tuple[Track, ...]
+    views: tuple[View, View]
 
 
 @dataclass(frozen=True)
@@ -117,7 +126,14 @@ TRACK_COLUMNS = (
     "valid",
     "velocity_east_m_s",
     "velocity_north_m_s",
+    "ground_east_m",
+    "ground_north_m",
+    *(f"failed_{check.name.lower()}" for check in ValidityCheck),
 )
+#: Points along a side of the lattice that pictures are rectified by for figures: enough for a horizon's perspective.
+LATTICE_POINTS = 49
+#: Ground further from the nadir than this is left out of figures: a little more than DIMES uses.
+FIGURE_OFF_NADIR_RAD = float(np.deg2rad(60.0))
 
 
 def _track_row(track: Track) -> list[float]:
@@ -133,7 +149,44 @@ def _track_row(track: Track) -> list[float]:
         m.second_peak_ratio,
         float(track.valid),
         *map(float, track.velocity_m_s),
+        *map(float, track.ground_m),
+        *(float(check in track.failed) for check in ValidityCheck),
     ]
+
+
+def rectified_lattice(
+    pair: PairDetails,
+) -> tuple[Float[np.ndarray, "3"], tuple[Float[np.ndarray, "n n 2"], Float[np.ndarray, "n n 2"]]]:
+    """Where the virtual camera's picture of a pair comes from, by few points: what Figs. 7-9 show above is drawn so.
+
+    Returns
+    -------
+    frame
+        East and north of the lattice's first point (its upper left) from the point below each camera, and its step,
+        metres. Rows run south.
+    pixels
+        Pixels (u, v) of the earlier and the later picture at the lattice's points; NaN where the camera cannot see.
+    """
+    spans = np.stack([_footprint(view) for view in pair.views])
+    low, high = spans[:, 0].min(axis=0), spans[:, 1].max(axis=0)
+    step = float((high - low).max()) / (LATTICE_POINTS - 1)
+    middle = 0.5 * (low + high)
+    along = (np.arange(LATTICE_POINTS) - 0.5 * (LATTICE_POINTS - 1)) * step
+    ground = np.stack(np.meshgrid(middle[0] + along, middle[1] - along), axis=-1)
+    pixels = []
+    for view in pair.views:
+        seen, visible = pixels_from_ground(view, ground)
+        pixels.append(np.where(visible[..., None], seen, np.nan))
+    return np.array([ground[0, 0, 0], ground[0, 0, 1], step]), (pixels[0], pixels[1])
+
+
+def _footprint(view: View) -> Float[np.ndarray, "2 2"]:
+    """Least and greatest (east, north) of the ground that a view sees, out to `FIGURE_OFF_NADIR_RAD`."""
+    columns, rows = view.size
+    steps = np.linspace(0.0, 1.0, 17)
+    u, v = np.meshgrid(steps * (columns - 1.0), steps * (rows - 1.0))
+    ground, _ = ground_from_pixels(view, np.column_stack([u.ravel(), v.ravel()]), FIGURE_OFF_NADIR_RAD)
+    return np.stack([ground.min(axis=0), ground.max(axis=0)])
 
 
 def dimes_products(details: DimesDetails) -> dict[str, Any]:
@@ -141,9 +194,12 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
 
     Keys: `tracks` (one row a track) with `tracks_columns`; `template_<pair>_<k>`, `window_<pair>_<k>` and
     `match_<pair>_<k>` (row, column) for every track; `overlap_<pair>` and `zero_phase_<pair>` (pixels of the earlier
-    picture, and for the spot of the later one too); `combinations` (first, second, discrepancy_m_s) with
-    `combinations_columns`. Widths are in rectified pixels, contrasts per binned pixel, pixels (u, v) binned.
+    picture, and for the spot of the later one too); `gsd_<pair>` (metres); `rectified_frame_<pair>` and
+    `rectified_<pair>_<side>` (see `rectified_lattice`; side 0 is the earlier picture); `combinations` (first, second,
+    discrepancy_m_s) with `combinations_columns`, and `chosen` (first, second; empty for none). Widths are in rectified
+    pixels, contrasts per binned pixel, pixels (u, v) binned, ground in metres (see `Track`); `failed_...` are 0 or 1.
     """
+    chosen = () if details.chosen is None else (details.chosen.first, details.chosen.second)
     rows = [_track_row(track) for track in details.tracks]
     found = [[c.first, c.second, c.discrepancy_m_s] for c in details.combinations]
     products: dict[str, Any] = {
@@ -151,10 +207,16 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
         "tracks_columns": list(TRACK_COLUMNS),
         "combinations": np.array(found, dtype=np.float64).reshape(-1, 3),
         "combinations_columns": ["first", "second", "discrepancy_m_s"],
+        "chosen": np.array(chosen, dtype=np.float64),
     }
     for number, pair in enumerate(details.pairs):
         products[f"overlap_{number}"] = pair.overlap_polygon
         products[f"zero_phase_{number}"] = pair.zero_phase_pixels
+        products[f"gsd_{number}"] = np.array([pair.gsd_m])
+        frame, lattices = rectified_lattice(pair)
+        products[f"rectified_frame_{number}"] = frame
+        for side, pixels in enumerate(lattices):
+            products[f"rectified_{number}_{side}"] = pixels
     for track in details.tracks:
         name = f"{track.pair}_{track.index}"
         products[f"template_{name}"] = track.template

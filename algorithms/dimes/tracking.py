@@ -75,6 +75,7 @@ def track_template(
         index=place[1],
         template_pixel=pixel,
         match_pixel=match_pixel,
+        ground_m=ground,
         template=template,
         window=window,
         match=corner + 0.5 * (geometry.template_px - 1),
@@ -110,4 +111,5 @@ def track_pair(
             )
             for index, (candidate, contrast) in enumerate(zip(chosen, contrasts, strict=True))
         ),
+        views=(first, second),
     )

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from synthetic_descent import CAMERA, ROWS_SUMMED, calibration
 
+from algorithms.dimes.binning import view
 from algorithms.dimes.consistency import combinations, propagated
 from algorithms.dimes.details import PairDetails, Track
 from algorithms.dimes.estimator import conclude
 from algorithms.dimes.options import DimesOptions
 from algorithms.dimes.validity import TrackMetrics, ValidityCheck, failed_checks
 from algorithms.interface import VelocityEstimate, VelocityOutcome
+from sim.measurements import DetectorImage
 
 THRESHOLD = DimesOptions().imu_threshold_m_s
 METRICS = TrackMetrics(contrast=0.02, peak=0.9, peak_width_px=4.0, second_peak_ratio=0.3, on_border=False)
@@ -18,15 +22,19 @@ METRICS = TrackMetrics(contrast=0.02, peak=0.9, peak_width_px=4.0, second_peak_r
 
 def track(pair: int, index: int, velocity: np.ndarray, failed: tuple[ValidityCheck, ...] = ()) -> Track:
     none = np.zeros((3, 3))
-    return Track(
-        pair, index, np.zeros(2), np.zeros(2), none, none, np.ones(2), none, METRICS, failed, np.asarray(velocity)
-    )
+    return Track(pair, index, *(np.zeros(2),) * 3, none, none, np.ones(2), none, METRICS, failed, np.asarray(velocity))
+
+
+def pair_of(*tracks: Track) -> PairDetails:
+    """Tracks of a pair; of its pictures nothing is asked."""
+    picture = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.binned(1, ROWS_SUMMED), calibration())
+    nadir = view(picture, Rotation.identity(), 2000.0, (256, 256))
+    return PairDetails(np.zeros((0, 2)), np.zeros((2, 2)), 5.0, 1, tracks, (nadir, nadir))
 
 
 def concluded(first: list[np.ndarray], second: list[np.ndarray], interval_velocities: np.ndarray) -> VelocityEstimate:
     pairs = [
-        PairDetails(np.zeros((0, 2)), np.zeros((2, 2)), 5.0, 1, tuple(track(p, k, v) for k, v in enumerate(velocities)))
-        for p, velocities in enumerate((first, second))
+        pair_of(*(track(p, k, v) for k, v in enumerate(velocities))) for p, velocities in enumerate((first, second))
     ]
     return conclude((pairs[0], pairs[1]), interval_velocities, THRESHOLD)
 
@@ -61,18 +69,12 @@ def test_one_track_per_pair_is_enough_and_none_is_not() -> None:
 def test_invalid_tracks_take_no_part(broken: int) -> None:
     good, bad = np.array([5.0, 5.0]), np.array([25.0, 5.0])
     pairs = [
-        PairDetails(
-            np.zeros((0, 2)),
-            np.zeros((2, 2)),
-            5.0,
-            1,
-            (track(p, 0, bad, (ValidityCheck.PEAK_HEIGHT,)), track(p, 1, good if p != broken else bad)),
-        )
+        pair_of(track(p, 0, bad, (ValidityCheck.PEAK_HEIGHT,)), track(p, 1, good if p != broken else bad))
         for p in range(2)
     ]
     answer = conclude((pairs[0], pairs[1]), np.zeros((2, 3)), THRESHOLD)
     assert answer.outcome is VelocityOutcome.IMU_MISMATCH
-    invalid = PairDetails(np.zeros((0, 2)), np.zeros((2, 2)), 5.0, 1, (track(0, 0, good, (ValidityCheck.CONTRAST,)),))
+    invalid = pair_of(track(0, 0, good, (ValidityCheck.CONTRAST,)))
     answer = conclude((invalid, pairs[1]), np.zeros((2, 3)), THRESHOLD)
     assert answer.outcome is VelocityOutcome.NO_VALID_TRACK
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from synthetic_descent import (
     INTERVAL_S,
@@ -302,9 +303,10 @@ def test_products_have_the_keys_that_reports_read(ordinary: DescentMeasurements)
     products = dimes_products(details)
     assert products["tracks_columns"] == [
         "pair", "template", "template_u", "template_v", "match_u", "match_v", "contrast", "peak", "peak_width",
-        "second_peak_ratio", "valid", "velocity_east_m_s", "velocity_north_m_s",
+        "second_peak_ratio", "valid", "velocity_east_m_s", "velocity_north_m_s", "ground_east_m", "ground_north_m",
+        "failed_contrast", "failed_peak_height", "failed_peak_width", "failed_second_peak", "failed_search_border",
     ]  # fmt: skip
-    assert products["tracks"].shape == (4, 13)
+    assert products["tracks"].shape == (4, 20)
     np.testing.assert_array_equal(products["tracks"][:, 0], [0, 0, 1, 1])
     for track in details.tracks:
         name = f"{track.pair}_{track.index}"
@@ -316,6 +318,34 @@ def test_products_have_the_keys_that_reports_read(ordinary: DescentMeasurements)
     assert products["combinations"].shape == (4, 3)
     assert products["overlap_0"].shape[1] == 2
     assert all(isinstance(value, np.ndarray | list) for value in products.values())
+
+
+def test_products_tell_what_failed_and_what_was_chosen(ordinary: DescentMeasurements) -> None:
+    details = details_of(ESTIMATOR.estimate(ordinary))
+    assert details.chosen is not None
+    products = dimes_products(details)
+    np.testing.assert_array_equal(products["chosen"], [details.chosen.first, details.chosen.second])
+    flat = details_of(ESTIMATOR.estimate(_painted(ordinary, lambda k, c: np.full_like(c, 1000))))
+    products = dimes_products(flat)
+    assert products["chosen"].size == 0
+    column = products["tracks_columns"].index("failed_contrast")
+    np.testing.assert_array_equal(products["tracks"][:, column], 1.0)
+
+
+def test_rectified_lattice_puts_tracks_where_the_pictures_have_them(ordinary: DescentMeasurements) -> None:
+    details = details_of(ESTIMATOR.estimate(ordinary))
+    products = dimes_products(details)
+    for track in details.tracks:
+        west, north, step = products[f"rectified_frame_{track.pair}"]
+        moved = track.velocity_m_s * INTERVAL_S
+        for side, ground, pixel in (
+            (0, track.ground_m, track.template_pixel),
+            (1, track.ground_m - moved, track.match_pixel),
+        ):
+            column, row = (ground[0] - west) / step, (north - ground[1]) / step
+            pixels = products[f"rectified_{track.pair}_{side}"]
+            found = [ndimage.map_coordinates(pixels[..., k], [[row], [column]], order=3)[0] for k in (0, 1)]
+            np.testing.assert_allclose(found, pixel, atol=0.1)
 
 
 def test_nothing_given_is_changed_and_answers_repeat(ordinary: DescentMeasurements) -> None:
