@@ -1,6 +1,5 @@
 """Instruments: how truth becomes measurements."""
 
-from sim.sensor.altimeter import Altimeter, AltimeterParameters
 from sim.sensor.approach import Approach, ApproachParameters
 from sim.sensor.clock import Clock, ClockParameters
 from sim.sensor.detector import Detector, DetectorParameters
@@ -11,7 +10,6 @@ from sim.sensor.inertial import InertialSolution, NavigationErrors
 from sim.sensor.instrument import Instrument, Readings, Sampling
 from sim.sensor.laser import LaserAltimeter, LaserParameters
 from sim.sensor.motion import ImageMotion
-from sim.sensor.navigation import Navigation, NavigationParameters
 from sim.sensor.optics import natural_fall_off
 from sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, Preset, preset
 from sim.sensor.radar import RadarAltimeter, RadarParameters
@@ -22,8 +20,6 @@ __all__ = [
     "PRESETS",
     "RTK",
     "STANDALONE",
-    "Altimeter",
-    "AltimeterParameters",
     "Approach",
     "ApproachParameters",
     "AutoExposure",
@@ -44,9 +40,7 @@ __all__ = [
     "Instrument",
     "LaserAltimeter",
     "LaserParameters",
-    "Navigation",
     "NavigationErrors",
-    "NavigationParameters",
     "Preset",
     "RadarAltimeter",
     "RadarParameters",
