@@ -133,9 +133,10 @@ def replay(
         Path | None, typer.Option("--out", metavar="DIR", help="Folder for its products; by default DIR/cases/CASE.")
     ] = None,
 ) -> None:
-    """Run one case again, keep its pictures and intermediate results, and compare its row with the stored one."""
+    """Run one case again, keep and draw its intermediate results, and compare its row with the stored one."""
     from campaigns.replay import case_directory, save_replay
     from campaigns.replay import replay as run_again
+    from reports.dimes_figures import write_case_figures
 
     replayed = run_again(directory, case)
     target = out if out is not None else case_directory(directory, case)
@@ -144,6 +145,9 @@ def replay(
     if replayed.row["error"]:
         typer.echo(replayed.row["traceback"] or replayed.row["error"])
     typer.echo(f"products: {target}")
+    figure = write_case_figures(target, replayed.products)
+    if figure is not None:
+        typer.echo(f"figure: {figure}")
     if replayed.stored is None:
         typer.echo("the campaign has no row of this case to compare with")
     elif replayed.differing:

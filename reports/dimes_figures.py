@@ -1,14 +1,16 @@
 """Pictures of one DIMES case, laid out as Figs. 7 to 9 of the field test's paper (`papers/dimes-field-test.txt`).
 
 Two image pairs side by side. Below, the pictures as delivered, with the templates as red squares and the tracked places
-as green ones; above, the rectified templates and their windows framed in blue, with the template's place in green.
-A square drawn with dashes belongs to a track that failed a validity check.
+as green ones; above, the pictures rectified to a camera that looks straight down, with the templates in red, their
+search windows in blue and the tracked places in green. Between them stand templates and windows as DIMES correlates
+them, which the paper does not show. A square drawn with dashes belongs to a track that failed a validity check.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Polygon, Rectangle
+from scipy import ndimage
 
 from reports.svg import INK, in_page_style
 
@@ -24,6 +27,8 @@ TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
 _DEFAULT_SIDE = 15.0
 _PAIRS = (0, 1)
 _MOST_TRACKS = 2
+#: Side of a rectified picture as drawn, pixels.
+_RECTIFIED_PX = 384
 #: Numbers that a template may have; more than two a pair are not drawn, but their numbers are.
 _TEMPLATES = range(100)
 
@@ -82,7 +87,7 @@ def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
     ValueError
         Where the products do not hold the three pictures; see `is_dimes_case`.
     """
-    figure = Figure(figsize=(12.0, 4.95), layout="constrained")
+    figure = Figure(figsize=(12.0, 8.3), layout="constrained")
     halves = figure.add_gridspec(1, 2)
     for pair in _PAIRS:
         _draw_pair(figure.add_subfigure(halves[pair]), products, pair)
@@ -92,21 +97,41 @@ def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
 @in_page_style
 def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
     """One image pair of a case, 0 or 1; raises as `draw_dimes_case` does."""
-    figure = Figure(figsize=(6.0, 4.95), layout="constrained")
+    figure = Figure(figsize=(6.0, 8.3), layout="constrained")
     _draw_pair(figure, products, pair)
     return figure
+
+
+def write_case_figures(directory: Path, products: Mapping[str, Any]) -> Path | None:
+    """Writes a case's figure, as `draw_dimes_case` draws it, into a folder as `dimes.png`.
+
+    Returns its path; None where the products are not those of a DIMES case.
+
+    Raises
+    ------
+    OSError
+        Where it cannot be written.
+    """
+    if not is_dimes_case(products):
+        return None
+    path = directory / "dimes.png"
+    draw_dimes_case(products).savefig(path, dpi=110, facecolor="#ffffff", metadata={"Software": None})
+    return path
 
 
 def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> None:
     pictures = [_picture(products, f"image_{number}") for number in (pair + 1, pair + 2)]
     ours = [track for track in tracks(products) if track.pair == pair][:_MOST_TRACKS]
-    grid = figure.add_gridspec(2, 1, height_ratios=(1.0, 1.95))
-    upper = grid[0].subgridspec(1, 2 * _MOST_TRACKS)
+    grid = figure.add_gridspec(3, 1, height_ratios=(1.95, 1.0, 1.95))
+    upper = grid[0].subgridspec(1, 2)
+    for side, picture in enumerate(pictures):
+        _draw_rectified(figure.add_subplot(upper[side]), products, picture, ours, (pair, side))
+    middle = grid[1].subgridspec(1, 2 * _MOST_TRACKS)
     for place in range(_MOST_TRACKS):
         track = ours[place] if place < len(ours) else None
-        _draw_template(figure.add_subplot(upper[2 * place]), track)
-        _draw_window(figure.add_subplot(upper[2 * place + 1]), track)
-    lower = grid[1].subgridspec(1, 2)
+        _draw_template(figure.add_subplot(middle[2 * place]), track)
+        _draw_window(figure.add_subplot(middle[2 * place + 1]), track)
+    lower = grid[2].subgridspec(1, 2)
     for side, (picture, stem, colour) in enumerate(
         zip(pictures, ("template", "match"), (TEMPLATE, MATCH), strict=True)
     ):
@@ -115,6 +140,62 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
         _mark(axes, ours, stem, colour)
         _outline(axes, products, pair, side)
         axes.set_title(f"Picture {pair + side + 1}: {'templates' if side == 0 else 'tracked'}", fontsize=9)
+
+
+def _draw_rectified(
+    axes: Axes,
+    products: Mapping[str, Any],
+    picture: Float[np.ndarray, "_ _"],
+    ours: Sequence[Track],
+    place: tuple[int, int],
+) -> None:
+    """One picture of a pair as the virtual camera sees it, at one scale for both; `place` is (pair, side)."""
+    pair, side = place
+    lattice = _numbers(products.get(f"rectified_{pair}_{side}"))
+    frame, gsd = _numbers(products.get(f"rectified_frame_{pair}")), _numbers(products.get(f"gsd_{pair}"))
+    if lattice is None or lattice.ndim != 3 or lattice.shape[2] != 2 or frame is None or frame.size != 3:
+        axes.set_axis_off()
+        return
+    rectified = _rectified(picture, lattice)
+    _show(axes, rectified)
+    step = float(frame[2]) * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
+    spacing = float(gsd[0]) if gsd is not None and gsd.size == 1 else np.nan
+
+    def square(ground: Float[np.ndarray, "2"], side_px: int, colour: str, valid: bool) -> None:
+        size = side_px * spacing / step
+        middle = ((ground[0] - frame[0]) / step, (frame[1] - ground[1]) / step)
+        if np.isfinite([size, *middle]).all():
+            _square(axes, (middle[0] - size / 2, middle[1] - size / 2), (size, size), colour, valid)
+
+    for track in ours:
+        ground = np.array([track.values.get(f"ground_{axis}_m", np.nan) for axis in ("east", "north")])
+        if track.patch is None or track.window is None:
+            continue
+        if side == 0:
+            square(ground, len(track.patch), TEMPLATE, track.valid)
+        else:
+            square(ground, len(track.window), WINDOW, True)
+            square(_matched_ground(track, ground, spacing), len(track.patch), MATCH, track.valid)
+    axes.set_title(f"Picture {pair + side + 1} rectified{'' if side == 0 else ': windows'}", fontsize=9)
+
+
+def _matched_ground(track: Track, ground: Float[np.ndarray, "2"], gsd_m: float) -> Float[np.ndarray, "2"]:
+    """Where the template was found, in the later picture's ground frame: the window is centred on `ground`."""
+    if track.place is None or track.window is None:
+        return np.full(2, np.nan)
+    middle = 0.5 * (len(track.window) - 1)
+    return np.asarray(ground + gsd_m * np.array([track.place[1] - middle, middle - track.place[0]]))
+
+
+def _rectified(picture: Float[np.ndarray, "_ _"], lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
+    """The picture at the lattice's places, which are interpolated between; NaN out of the picture."""
+    places = np.linspace(0.0, lattice.shape[0] - 1.0, _RECTIFIED_PX)
+    v, u = np.meshgrid(places, places, indexing="ij")
+    pixels = [ndimage.map_coordinates(lattice[..., k], [v, u], order=1, mode="nearest") for k in (1, 0)]
+    rows, columns = picture.shape
+    seen = (pixels[0] >= -0.5) & (pixels[0] <= rows - 0.5) & (pixels[1] >= -0.5) & (pixels[1] <= columns - 0.5)
+    values = ndimage.map_coordinates(picture, np.nan_to_num(pixels, nan=-1.0), order=1, mode="nearest")
+    return np.asarray(np.where(seen, values, np.nan))
 
 
 def _draw_template(axes: Axes, track: Track | None) -> None:

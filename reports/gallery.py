@@ -110,22 +110,30 @@ def _dimes_case(run: StoredRun, case: int, products: dict[str, object]) -> Shown
     plates = [(f"case{case}pair{k}", draw_dimes_pair(products, k), f"Pair {k + 1}: {name}.") for k, name in pairs]
     of_each = tracks(products)
     quantities = list(dict.fromkeys(name for track in of_each for name in track.values))
-    quantities = [name for name in quantities if name not in ("pair", "template", "valid")]
+    quantities = [name for name in quantities if name not in ("pair", "template", "valid") and not _is_check(name)]
     return ShownCase(
         case=case,
         outcome=_outcome(run.frame, case),
         facts=_velocities(products),
         plates=_plates(plates),
-        track_head=["Pair", "Template", "Passed", *(label(name) for name in quantities)],
+        track_head=["Pair", "Template", "Failed checks", *(label(name) for name in quantities)],
         track_rows=[_track_row(track, quantities) for track in of_each],
     )
 
 
 def _track_row(track: Track, quantities: Sequence[str]) -> TrackRow:
     values = [number(track.values.get(name, float("nan"))) for name in quantities]
-    return TrackRow(
-        [str(track.pair + 1), str(track.template + 1), "yes" if track.valid else "no", *values], track.valid
-    )
+    failed = [_check_words(name) for name, value in track.values.items() if _is_check(name) and value == 1.0]
+    said = ", ".join(failed) or ("none" if track.valid else "unknown")
+    return TrackRow([str(track.pair + 1), str(track.template + 1), said, *values], track.valid)
+
+
+def _is_check(name: str) -> bool:
+    return name.startswith("failed_")
+
+
+def _check_words(name: str) -> str:
+    return name.removeprefix("failed_").replace("_", " ")
 
 
 def _outcome(frame: pd.DataFrame, case: int) -> str:

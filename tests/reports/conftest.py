@@ -86,15 +86,22 @@ def synthetic_products(seed: int = 1) -> dict[str, Any]:
         products[f"image_{number}"] = np.clip(ground, 0, 4095).astype(np.uint16)
     columns = ["pair", "template", "template_u", "template_v", "match_u", "match_v", "contrast", "peak", "peak_width"]
     columns += ["second_peak_ratio", "valid", "velocity_east_m_s", "velocity_north_m_s"]
+    columns += ["ground_east_m", "ground_north_m", "failed_contrast", "failed_second_peak"]
     rows = []
     for pair in (0, 1):
         for k in (0, 1):
             u0, v0 = rng.uniform(60, 200, 2)
             valid = float((pair, k) != (1, 1))
             rows.append([pair, k, u0, v0, u0 + 12, v0 - 9, 5e4, 0.93, 2.1, 0.45, valid, 14.2, -8.8])
+            rows[-1] += [5.0 * (u0 - 128), 5.0 * (128 - v0), 0.0, 1.0 - valid]
             products[f"window_{pair}_{k}"] = rng.normal(1500, 300, (61, 61)).astype(np.float32)
             products[f"template_{pair}_{k}"] = rng.normal(1500, 300, (17, 17)).astype(np.float32)
             products[f"match_{pair}_{k}"] = np.array([33.4, 39.2])
+        # A camera that looks straight down, 5 m a pixel, and a virtual one that takes in half as much again.
+        lattice = np.stack(np.meshgrid(*(np.linspace(-64.0, 319.0, 17),) * 2), axis=-1)
+        products |= {f"rectified_{pair}_{side}": lattice for side in (0, 1)}
+        products[f"rectified_frame_{pair}"] = np.array([-64.0 - 128.0, 128.0 + 64.0, 383.0 / 16.0]) * 5.0
+        products[f"gsd_{pair}"] = np.array([5.0])
     products |= {"tracks": np.array(rows), "tracks_columns": columns}
     return products | {
         "velocity_estimated_m_s": np.array([14.1, -8.9]),
