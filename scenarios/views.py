@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from sim.frames import rigid
-from sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture
+from sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
 from sim.sensor import CameraDesign
-from sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
+from sim.terrain import Environment, RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
 from sim.terrain.sites import SiteTexture
 
 Scale = Literal["descent", "ground"]
@@ -35,8 +35,10 @@ _COARSE_TRIANGLES = 80
 _BESIDE_HEIGHTS, _BESIDE_M = 3.0, 5.0
 #: Ratio between the sizes of neighbouring classes of rocks.
 _CLASS_RATIO = float(np.sqrt(2.0))
-#: Spacing of the mesh over the height of the eye, by how much it grows with distance, and how far it reaches.
+#: Spacing of the mesh over the height of the eye, by how much it grows with distance, and how far it reaches at least.
 _MESH_FINEST, _MESH_GROWTH, _MESH_REACH_HEIGHTS, _MESH_REACH_M = 0.0085, 0.012, 14.0, 700.0
+#: Radius of Mars, by which its horizon is as far as the mesh has to reach where an eye sees it.
+_MARS_RADIUS_M = 3.39e6
 #: Height of the eye below which a picture shows little of the mesh.
 _LOW_M = 100.0
 
@@ -75,7 +77,8 @@ class SiteGround:
     def photometry(self, sun: Sun) -> Photometry:
         """How this ground scatters the light of this sun and of the sky of the site's air."""
         law = self.site.photometry
-        sky = self.site.environment.sky_share(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
+        air = self.site.environment
+        sky = air.sky_share(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
         return Photometry(
             lunar_share=law.lunar_share,
             surge_amplitude=law.surge_amplitude,
@@ -83,7 +86,15 @@ class SiteGround:
             sky_share=sky,
             sky_radiance=sky,
             surrounding_albedo=self.terrain.albedo,
+            sky=_dusty(air),
         )
+
+
+def _dusty(air: Environment) -> DustySky | None:
+    """The sky of a site's air; None, an even one, where the air scatters none or scatters it backward."""
+    if air.optical_depth == 0.0 or air.single_scattering_albedo == 0.0 or air.asymmetry < 0.0:
+        return None
+    return DustySky(air.optical_depth, air.single_scattering_albedo, air.asymmetry)
 
 
 @dataclass(frozen=True)
@@ -140,7 +151,8 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
     """
     spacing = ground.surface.spacing_m
     finest = max(_MESH_FINEST * eye.height_m, 0.8 * spacing)
-    reach = max(_MESH_REACH_HEIGHTS * eye.height_m, _MESH_REACH_M)
+    horizon = float(np.sqrt(2.0 * _MARS_RADIUS_M * eye.height_m))
+    reach = max(_MESH_REACH_HEIGHTS * eye.height_m, _MESH_REACH_M, min(horizon, eye.reach_m))
     half = int(np.ceil(np.arcsinh(reach / finest * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
     return Scene(
         ground.surface,

@@ -24,6 +24,8 @@ LIGHT_CONTRAST = 0.25
 JUMP, STEEPER = 0.02, 3.0
 #: Where the ground is sought, as shares of the range at which a pixel beside has met it.
 AHEAD, BEYOND = 0.95, 1.05
+#: The same beside the sky, where range grows without bound from pixel to pixel.
+TO_HORIZON = 5.0
 
 
 @njit(cache=True, inline="always")
@@ -214,16 +216,18 @@ def look_closely(
             z0 = position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz
             t = math.inf
             level = 0
+            end = math.inf
             c = 0
             while c < count and t == math.inf:
-                # places met on one level, each within reach of the one before, are one stretch to be searched
+                # places met on one level are one stretch; it begins where the stretch before has ended
                 level = found[c]
-                start = AHEAD * ranges[c]
-                while c + 1 < count and found[c + 1] == level and AHEAD * ranges[c + 1] < BEYOND * ranges[c]:
+                start = min(AHEAD * ranges[c], end)
+                while c + 1 < count and found[c + 1] == level:
                     c += 1
+                end = (TO_HORIZON if sky and c + 1 == count else BEYOND) * ranges[c]
                 smooth = max(level, 0)
                 scale = inverse_spacing / (1 << smooth)
-                t = cross_ground(levels[smooth], scale, x0, y0, z0, dx, dy, dz, start, BEYOND * ranges[c])
+                t = cross_ground(levels[smooth], scale, x0, y0, z0, dx, dy, dz, start, end)
                 c += 1
             if t == math.inf and count > 0 and not sky:
                 t = ranges[count - 1]

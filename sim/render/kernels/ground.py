@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from sim.terrain.kernels import Array, Level, sample
 
 Array32 = NDArray[np.float32]
+#: Shortest step along a ray that looks for the ground, as a share of the distance.
+FINEST_STEP = 0.005
 
 
 @njit(cache=True, inline="always")
@@ -61,7 +63,7 @@ def cross_ground(
 ) -> float:
     """Distance at which a ray first dips below the ground between two distances; infinite where it does not.
 
-    The ray is followed by steps of a sample, longer where it runs high above the ground, and the crossing closed in on
+    The ray is followed by steps of a sample, longer far away and high above the ground, and the crossing closed in on
     by false position (Illinois) to a hundredth of a sample.
     """
     spacing = 1.0 / inverse_spacing
@@ -76,7 +78,7 @@ def cross_ground(
             break
         before = t
         above = clearance
-        t += max(spacing, 1.5 * clearance)
+        t += max(spacing, 1.5 * clearance, FINEST_STEP * t)
     if t >= farthest or t == before:
         return math.inf
     below = clearance
