@@ -8,8 +8,9 @@ from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import RigidTransform
 
-from sim.measurements import DescentMeasurements
+from sim.measurements import DescentMeasurements, MastCalibration, RoverMeasurements, TargetDesignation
 
 
 class VelocityOutcome(Enum):
@@ -46,4 +47,106 @@ class VelocityEstimator(Protocol):
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """The estimate; never raises for a picture, attitude or altitude that an instrument can deliver."""
+        ...
+
+
+class TrackingState(Enum):
+    """Where a target tracker stands (tracking paper, Fig. 6)."""
+
+    NO_TARGET = "no target is designated, or it was cleared"
+    NORMAL = "the target is tracked"
+    LOST = "the target is lost and may yet be found again"
+    FAILURE = "the target stayed lost; only clearing it ends this"
+
+
+class TargetLoss(Enum):
+    """Why an update lost the target. Each is an expected failure."""
+
+    LOW_MATCH_SCORE = "the template matches nowhere well enough"
+    LOW_STEREO_SCORE = "the target is not found in the right picture"
+    DISTANCE_JUMP = "the target's distance changed by more than pose and stereo errors explain"
+    POSITION_JUMP = "the target has moved too far from where it was first seen"
+    OUT_OF_VIEW = "the place where the target should be is not in the picture"
+    NO_RANGE = "the two lines of sight do not meet before the cameras"
+
+
+@dataclass(frozen=True)
+class PixelBox:
+    """A part of a full frame: its upper left pixel (column, row) and its size (columns, rows)."""
+
+    corner: tuple[int, int]
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class MastAim:
+    """Where a tracker wants the mast to look and which pixels it needs.
+
+    Attributes
+    ----------
+    azimuth_rad, elevation_rad
+        Mast angles to command (see `sim.measurements.MastGeometry`).
+    left, right
+        The parts of the full frames to deliver; their exposure is best set for them too.
+    """
+
+    azimuth_rad: float
+    elevation_rad: float
+    left: PixelBox
+    right: PixelBox
+
+
+@dataclass(frozen=True)
+class TargetUpdate:
+    """An answer to "where is the target now".
+
+    Attributes
+    ----------
+    state
+        State after the update.
+    losses
+        What failed, in the order of `TargetLoss`; empty when the target was found.
+    position_rover
+        The target in the rover frame of this stop, metres, shape (3,): triangulated when it was found, else carried
+        along by the pose estimate; None before it was seen for the first time.
+    details
+        The algorithm's intermediate products for figures and diagnosis; None where it keeps none.
+    """
+
+    state: TrackingState
+    losses: tuple[TargetLoss, ...]
+    position_rover: Float[np.ndarray, "3"] | None
+    details: object | None = None
+
+    @property
+    def found(self) -> bool:
+        """Whether this update found the target."""
+        return not self.losses
+
+
+class TargetTracker(Protocol):
+    """Follows one designated target from stop to stop of a rover.
+
+    At each stop: `aim`, point the mast, take pictures, `update`. The first update after `designate` seeds the template.
+    """
+
+    @property
+    def state(self) -> TrackingState:
+        """Where the tracker stands."""
+        ...
+
+    def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
+        """Takes a target, with the rover's estimated pose, in place of any other."""
+        ...
+
+    def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
+        """Where to look from this pose; None where the mast cannot show the target."""
+        ...
+
+    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+        """Finds the target; never raises for pictures, angles or poses that the rover can deliver."""
+        ...
+
+    def clear(self) -> None:
+        """Forgets the target."""
         ...

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt16
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from sim.camera import CameraModel
+from sim.frames import rigid
 
 
 @dataclass(frozen=True)
@@ -110,3 +111,130 @@ class DescentMeasurements:
     altitudes: tuple[AltitudeMeasurement, AltitudeMeasurement, AltitudeMeasurement]
     interval_velocities_m_s: Float[np.ndarray, "2 3"]
     sun_direction: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
+class MastGeometry:
+    """Where a mast of two axes carries its head, as surveyed before flight.
+
+    The mast turns about the rover's z axis and, above that, about the head's y axis; roll it cannot. With both angles
+    zero the head's axes are the rover's: x forward, y to the left, z up.
+
+    Attributes
+    ----------
+    base_m
+        A point of the azimuth axis in the rover (body) frame, metres, shape (3,).
+    elbow_m
+        From there to the elevation axis, in axes that turn with the azimuth, metres, shape (3,).
+    head_m
+        From there to the head frame's origin, in the head's own axes, metres, shape (3,).
+    azimuth_limits_rad
+        Least and largest azimuth, positive to the right (clockwise seen from above), radians.
+    elevation_limits_rad
+        Least and largest elevation, positive upwards, radians.
+    """
+
+    base_m: Float[np.ndarray, "3"]
+    elbow_m: Float[np.ndarray, "3"]
+    head_m: Float[np.ndarray, "3"]
+    azimuth_limits_rad: tuple[float, float] = (-np.pi, np.pi)
+    elevation_limits_rad: tuple[float, float] = (-0.5 * np.pi, 0.5 * np.pi)
+
+    def rover_from_head(self, azimuth_rad: float, elevation_rad: float) -> RigidTransform:
+        """The head's pose in the rover frame at these angles, within the limits or not."""
+        pan = Rotation.from_rotvec([0.0, 0.0, -azimuth_rad])
+        turn = pan * Rotation.from_rotvec([0.0, -elevation_rad, 0.0])
+        return rigid(turn, self.base_m + pan.apply(self.elbow_m.copy()) + turn.apply(self.head_m.copy()))
+
+
+@dataclass(frozen=True)
+class MastCalibration:
+    """A mast and the stereo pair on its head, as calibrated.
+
+    Attributes
+    ----------
+    geometry
+        The mast.
+    left, right
+        Camera models of the full frames, in the head frame.
+    """
+
+    geometry: MastGeometry
+    left: CameraModel
+    right: CameraModel
+
+
+@dataclass(frozen=True)
+class MastImage:
+    """A picture, or the part of it that was read out, of one camera on the mast.
+
+    Attributes
+    ----------
+    counts
+        Detector counts, shape (rows, columns).
+    corner
+        Column and row in the full frame of the upper left pixel.
+    """
+
+    counts: UInt16[np.ndarray, "rows columns"]
+    corner: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True)
+class RoverMeasurements:
+    """What the rover's computer holds when it has stopped, pointed its mast and taken a stereo pair.
+
+    Attributes
+    ----------
+    left, right
+        The pictures, taken together.
+    mast
+        The mast and its cameras as calibrated.
+    azimuth_rad, elevation_rad
+        The mast's angles as its encoders read them.
+    world_from_rover
+        Pose of the rover as estimated on board, in the local level world frame: right at the start by definition,
+        wrong by slip and drift later.
+    """
+
+    left: MastImage
+    right: MastImage
+    mast: MastCalibration
+    azimuth_rad: float
+    elevation_rad: float
+    world_from_rover: RigidTransform
+
+
+@dataclass(frozen=True)
+class PixelTarget:
+    """A target picked in a picture of the left camera from where the rover still stands.
+
+    Attributes
+    ----------
+    pixel
+        (u, v) in the full frame, shape (2,).
+    azimuth_rad, elevation_rad
+        The mast's angles when the picture was taken.
+    """
+
+    pixel: Float[np.ndarray, "2"]
+    azimuth_rad: float
+    elevation_rad: float
+
+
+@dataclass(frozen=True)
+class RoverTarget:
+    """A target given in the rover frame (as it lies when the target is designated), metres, shape (3,)."""
+
+    position_rover: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
+class SiteTarget:
+    """A target given in the site frame (north, east, down from the world's origin), metres, shape (3,)."""
+
+    position_site: Float[np.ndarray, "3"]
+
+
+#: The three ways in which the ground may name a target (tracking paper, section 3).
+TargetDesignation = PixelTarget | RoverTarget | SiteTarget

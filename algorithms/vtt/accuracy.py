@@ -1,0 +1,128 @@
+"""How well a target can be approached: Eqs. 1 to 5 of the tracking paper, and its Table I computed from them.
+
+Distances are in metres; 3 sigma where the disparity error is that of 3 sigma (the paper takes 1 pixel).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import ROUND_HALF_UP, Decimal
+
+import numpy as np
+
+#: Where the paper stands before and after its traverse (section 4.2), metres.
+START_M, GOAL_M = 10.0, 2.0
+#: Wheel and visual odometry together: "roughly 2% of the rover travel distance".
+NAVIGATION_ERROR = 0.02
+
+
+@dataclass(frozen=True)
+class StereoDesign:
+    """What the accuracy of a stereo pair follows from.
+
+    Attributes
+    ----------
+    name
+        For tables.
+    focal_length_m, pixel_m, baseline_m
+        Focal length, distance of the pixels and of the cameras.
+    """
+
+    name: str
+    focal_length_m: float
+    pixel_m: float
+    baseline_m: float
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in pixels, Eq. 2."""
+        return self.focal_length_m / self.pixel_m
+
+
+#: The two cameras of section 4.2, with the pixel of the manufacturer's specification: it gives the table's digits.
+PANCAM = StereoDesign("Pancam", 16e-3, 4.65e-6, 0.30)
+NAVCAM = StereoDesign("Navcam", 6e-3, 4.65e-6, 0.20)
+
+
+def stereo_range_error_m(range_m: float, focal_px: float, baseline_m: float, disparity_error_px: float = 1.0) -> float:
+    """Error of a range by stereo, Eq. 1: ``R^2 / (f_p B) * disparity error``."""
+    return range_m * range_m / (focal_px * baseline_m) * disparity_error_px
+
+
+def untracked_approach_error_m(designation_error_m: float, navigation_error_m: float) -> float:
+    """Error at the goal without a tracker, Eq. 3: designation and navigation, root sum square."""
+    return float(np.hypot(designation_error_m, navigation_error_m))
+
+
+def drift_error_m(range_m: float, focal_px: float, drift_px: float) -> float:
+    """Error across the line of sight of a point that drifted in the picture, Eq. 4."""
+    return range_m / focal_px * drift_px
+
+
+def tracked_approach_error_m(stereo_error_m: float, drift_error_m: float) -> float:
+    """Error at the goal with a tracker, Eq. 5: stereo at the goal and drift, root sum square."""
+    return float(np.hypot(stereo_error_m, drift_error_m))
+
+
+def printed(value: float, digits: int) -> float:
+    """A value as a table prints it, halves away from zero.
+
+    Float noise below 1e-9 does not decide: 38.75 cm comes out of the equations as 38.7499...
+    """
+    return float(Decimal(str(round(value, 9))).quantize(Decimal(1).scaleb(-digits), ROUND_HALF_UP))
+
+
+@dataclass(frozen=True)
+class AccuracyRow:
+    """A row of Table I as printed, centimetres, 3 sigma.
+
+    Attributes
+    ----------
+    name
+        Camera.
+    designation_cm
+        Stereo range error at 10 m.
+    untracked_cm
+        Approach error at 2 m after 8 m by visual odometry, without tracker.
+    stereo_cm
+        Stereo range error at 2 m: the first term of the last column.
+    drift_cm_px
+        Cross-range error of a pixel of drift at 2 m: what N is multiplied by in the last column.
+    """
+
+    name: str
+    designation_cm: float
+    untracked_cm: float
+    stereo_cm: float
+    drift_cm_px: float
+
+    def tracked_cm(self, drift_px: float) -> float:
+        """The last column for a drift of this many pixels."""
+        return tracked_approach_error_m(self.stereo_cm, self.drift_cm_px * drift_px)
+
+    @property
+    def tracked_formula(self) -> str:
+        """The last column as printed."""
+        return f"sqrt({self.stereo_cm:g}^2 + ({self.drift_cm_px:g} N)^2)"
+
+
+def accuracy_row(design: StereoDesign) -> AccuracyRow:
+    """A row of Table I.
+
+    Each column is rounded before the next is computed from it, as the paper did: 42.0 cm for the navcam is
+    ``sqrt(38.8^2 + 16^2)``; with 38.75 it would be 41.9.
+    """
+    designation = printed(100.0 * stereo_range_error_m(START_M, design.focal_px, design.baseline_m), 1)
+    navigation = 100.0 * NAVIGATION_ERROR * (START_M - GOAL_M)
+    return AccuracyRow(
+        name=design.name,
+        designation_cm=designation,
+        untracked_cm=printed(untracked_approach_error_m(designation, navigation), 1),
+        stereo_cm=printed(100.0 * stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m), 1),
+        drift_cm_px=printed(100.0 * drift_error_m(GOAL_M, design.focal_px, 1.0), 2),
+    )
+
+
+def table_1() -> tuple[AccuracyRow, AccuracyRow]:
+    """Table I: pancam and navcam."""
+    return accuracy_row(PANCAM), accuracy_row(NAVCAM)

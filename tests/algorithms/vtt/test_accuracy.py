@@ -1,0 +1,54 @@
+"""Table I of the tracking paper, to its printed digit."""
+
+from __future__ import annotations
+
+import pytest
+
+from algorithms.vtt.accuracy import (
+    NAVCAM,
+    PANCAM,
+    StereoDesign,
+    accuracy_row,
+    drift_error_m,
+    printed,
+    stereo_range_error_m,
+    table_1,
+    tracked_approach_error_m,
+)
+
+
+def test_table_1_to_the_printed_digit() -> None:
+    pancam, navcam = table_1()
+    assert (pancam.designation_cm, pancam.untracked_cm) == (9.7, 18.7)
+    assert (navcam.designation_cm, navcam.untracked_cm) == (38.8, 42.0)
+    assert pancam.tracked_formula == "sqrt(0.4^2 + (0.06 N)^2)"
+    assert navcam.tracked_formula == "sqrt(1.6^2 + (0.16 N)^2)"
+
+
+def test_an_extreme_drift_of_ten_pixels_as_in_the_text() -> None:
+    # "Even with an extreme 10-pixel drift, ... 0.7 cm for pancam and 2.3 cm with navcam."
+    pancam, navcam = table_1()
+    assert printed(pancam.tracked_cm(10.0), 1) == 0.7
+    assert printed(navcam.tracked_cm(10.0), 1) == 2.3
+
+
+def test_the_digits_need_the_specified_pixel() -> None:
+    # The 4.69 um that the text derives from the sensor's size gives 9.8 and 39.1 cm.
+    wide = [StereoDesign(d.name, d.focal_length_m, 4.8e-3 / 1024, d.baseline_m) for d in (PANCAM, NAVCAM)]
+    assert [accuracy_row(d).designation_cm for d in wide] == [9.8, 39.1]
+
+
+def test_laws_of_the_errors() -> None:
+    assert stereo_range_error_m(6.0, 1000.0, 0.2) == pytest.approx(9.0 * stereo_range_error_m(2.0, 1000.0, 0.2))
+    assert stereo_range_error_m(2.0, 1000.0, 0.2, 0.5) == pytest.approx(0.01)
+    # A pixel at 2 m: 0.58 mm and 1.55 mm.
+    assert drift_error_m(2.0, PANCAM.focal_px, 1.0) == pytest.approx(0.58e-3, abs=5e-6)
+    assert tracked_approach_error_m(0.03, 0.04) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "expected"),
+    [(38.75, 1, 38.8), (38.749999999999993, 1, 38.8), (1.55, 1, 1.6), (0.155, 2, 0.16), (-0.25, 1, -0.3)],
+)
+def test_halves_are_printed_away_from_zero(value: float, digits: int, expected: float) -> None:
+    assert printed(value, digits) == expected
