@@ -13,6 +13,8 @@ from algorithms.interface import VelocityEstimator
 #: Where each estimator's class is found; it is made without arguments, but for DIMES, which takes its options.
 ESTIMATORS: Mapping[str, str] = {
     "dimes": "algorithms.dimes:DimesEstimator",
+    "phase-correlation": "algorithms.baselines:PhaseCorrelationEstimator",
+    "homography": "algorithms.baselines:HomographyEstimator",
 }
 
 

@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float32, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from scenarios.descent.faults import delivered
+from scenarios.descent.faults import clouds_over, delivered
 from scenarios.descent.haze import veiled
 from scenarios.descent.heat_shield import HeatShield
 from scenarios.descent.optics import Optics
 from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.descent.world import World
 from sim.dynamics import State
-from sim.render import Frame, process_renderer
+from sim.render import Frame, Scene, process_renderer
 from sim.sensor import Detector, ImageMotion
 from sim.streams import Streams
 
@@ -30,16 +30,13 @@ def expose(
 ) -> list[UInt16[np.ndarray, "rows columns"]]:
     """The pictures of these states as they are delivered, in their order."""
     renderer = process_renderer(p.render.backend)
-    first, last = states[0].position_m, states[-1].position_m
-    lowest = float(last[2] - world.surface.height(last[0], last[1]))
-    pixel_rad = float(np.median(optics.rays.pixel_angles))
-    scene = world.scene(float(first[0]), float(first[1]), lowest, pixel_rad, p.lander.caster_diameter_m)
+    scene = _scene(p, world, states, optics, streams)
     mounting = _mounting(p, streams)
     shield = _shield(p, states[0], streams)
     noise = streams.generator("detector noise")
     pictures = []
     for state in states:
-        frame = renderer.render(scene, optics.rays, state.world_from_body * mounting)
+        frame = renderer.render(scene, optics.rays, state.world_from_body * mounting, time_s=state.time_s)
         # the camera sits at the body's origin: its mounting turns it, but moves it nowhere
         motion = ImageMotion.seen(
             optics.camera,
@@ -50,6 +47,22 @@ def expose(
         )
         pictures.append(detector.expose(_light(p, world, frame, shield, state.time_s), noise, motion))
     return delivered(p.faults, pictures)
+
+
+def _scene(
+    p: DescentScenarioParameters, world: World, states: Sequence[State], optics: Optics, streams: Streams
+) -> Scene:
+    """One scene for all pictures."""
+    first, last = states[0].position_m, states[-1].position_m
+    below_first, below_last = (float(world.surface.height(place[0], place[1])) for place in (first, last))
+    return world.scene(
+        float(first[0]),
+        float(first[1]),
+        float(last[2]) - below_last,
+        float(np.median(optics.rays.pixel_angles)),
+        caster_diameter_m=p.lander.caster_diameter_m,
+        clouds=clouds_over(p.faults, below_first, streams.generator("clouds")),
+    )
 
 
 def _light(

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from sim.measurements import AltitudeMeasurement, AttitudeMeasurement
+from sim.render.clouds import CloudLayer, CloudParameters
 from sim.sensor import DetectorParameters
 from sim.terrain import TerrainParameters
 from sim.terrain.landforms import Dunes
@@ -39,7 +40,7 @@ class Faults(BaseModel):
     heat_shield_deg: Annotated[
         Size, Field(le=90.0, description="angle that the heat shield takes in the first picture, deg; it falls ahead")
     ] = 0.0
-    cloud_cover: Annotated[Size, Field(le=1.0, description="share of the ground in moving cloud shadows")] = 0.0
+    cloud_cover: Annotated[Size, Field(le=0.9, description="share of the ground in moving cloud shadows")] = 0.0
     haze: Annotated[
         Size, Field(le=10.0, description="optical depth of the air over 2000 m, which veils the ground")
     ] = 0.0
@@ -76,6 +77,13 @@ def faulty_terrain(faults: Faults, terrain: TerrainParameters) -> TerrainParamet
         return terrain
     dunes = REPETITIVE.model_copy(update={"height_m": faults.dunes_m})
     return terrain.model_copy(update={"dunes": dunes, "rocks": None, "craters_per_km2": 0.0})
+
+
+def clouds_over(faults: Faults, ground_m: float, rng: np.random.Generator) -> CloudLayer | None:
+    """The clouds whose shadows move over ground of this height, drawn; None without the fault."""
+    if faults.cloud_cover == 0.0:
+        return None
+    return CloudLayer.drawn(CloudParameters(cover=faults.cloud_cover), rng, ground_m=ground_m)
 
 
 def faulty_detector(faults: Faults, detector: DetectorParameters) -> DetectorParameters:

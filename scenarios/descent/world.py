@@ -11,6 +11,7 @@ from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.views import Eye, SiteGround, site_scene
 from sim.frames import direction
 from sim.render import Photometry, Scene, Sun
+from sim.render.clouds import CloudLayer
 from sim.terrain import Environment, Surface, TerrainBank
 
 #: Sunlight over that at 1 AU for which the descent camera's responsivity is stated: Mars at 1.5 AU.
@@ -62,7 +63,14 @@ class World:
         return cls(surface, ground, sun, brightness)
 
     def scene(
-        self, east_m: float, north_m: float, lowest_m: float, pixel_rad: float, caster_diameter_m: float
+        self,
+        east_m: float,
+        north_m: float,
+        lowest_m: float,
+        pixel_rad: float,
+        *,
+        caster_diameter_m: float = 0.0,
+        clouds: CloudLayer | None = None,
     ) -> Scene:
         """One scene for all pictures of a descent.
 
@@ -76,9 +84,11 @@ class World:
             Angle that a pixel takes.
         caster_diameter_m
             Diameter of what casts the lander's shadow.
+        clouds
+            Clouds that drift above.
         """
         if self.ground is None:
             scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry())
         else:
             scene = site_scene(self.ground, Eye(east_m, north_m, lowest_m, pixel_rad), self.sun)
-        return replace(scene, caster_diameter_m=caster_diameter_m)
+        return replace(scene, caster_diameter_m=caster_diameter_m, clouds=clouds)

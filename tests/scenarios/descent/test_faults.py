@@ -149,6 +149,8 @@ def test_faults_show_in_pictures() -> None:
     late = changed({"late_s": 0.5})
     assert late[0] == late[2] == 0.0 < late[1]
     shield = changed({"heat_shield_deg": 5.0})
+    # the clouds' shadows, and what of the picture is brighter for their light
+    assert min(changed({"cloud_cover": 0.4})) > 0.2
     # edge on it may hide in one of them, as it tumbles
     assert max(shield) > 0.001
 
