@@ -40,32 +40,43 @@ class Sun:
 class DustySky:
     """A sky that is brighter towards the sun and the horizon, for cameras that see it; the sun's disc is drawn in it.
 
-    Light scattered once in a plane layer of air (Chandrasekhar 1960, section 7)::
+    Light scattered once in a plane layer of air (Chandrasekhar 1960, section 7), over the sun's at the ground::
 
-        I/F ~ P(g) mu0 / (mu0 - mu) (exp(-tau / mu0) - exp(-tau / mu))
+        I/F = (w tau / 4 t) P(g) mu0 / (mu0 - mu) (1 - exp(t / mu0 - t / mu))
 
-    with the Henyey-Greenstein phase function P and the sines of elevation mu of the view and mu0 of the sun. Light
-    scattered more often has about the same pattern and is brought in by the scale: the irradiance of a level ground
-    under this sky is that of `Photometry.sky_share`. Slopes are lit as by an even sky of that irradiance.
+    with the Henyey-Greenstein phase function P and the sines of elevation mu of the view and mu0 of the sun. Light is
+    weakened on its way by ``t = (1 - w g**2) tau``, as the forward peak, the share g**2 of what is scattered, is not
+    lost but counts as direct sun (Joseph et al. 1976). Light scattered more often is spread evenly, so much of it that
+    all but that peak gives a level ground the irradiance `Photometry.sky_share`; where light scattered once comes to
+    more than that, it is scaled down to it. The ground is lit as by an even sky.
 
     Attributes
     ----------
-    optical_depth
-        tau, as it weakens light on its way. Light scattered forward is hardly lost: of air of optical depth t, albedo w
-        and asymmetry g about (1 - w g) t counts (van de Hulst 1980, similarity).
-    asymmetry
-        Mean cosine of the scattering angle.
+    optical_depth, single_scattering_albedo, asymmetry
+        tau, w and g, the mean cosine of the scattering angle.
     """
 
     optical_depth: float
+    single_scattering_albedo: float
     asymmetry: float
 
     def __post_init__(self) -> None:
-        if not self.optical_depth > 0.0 or not -1.0 < self.asymmetry < 1.0:
+        if not (
+            self.optical_depth > 0.0 and 0.0 < self.single_scattering_albedo <= 1.0 and 0.0 <= self.asymmetry < 1.0
+        ):
             raise ValueError(
-                f"a dusty sky of optical depth {self.optical_depth} and asymmetry {self.asymmetry}; "
-                "more than 0, and between -1 and 1, are needed"
+                f"a dusty sky of optical depth {self.optical_depth}, single-scattering albedo "
+                f"{self.single_scattering_albedo} and asymmetry {self.asymmetry}; "
+                "allowed: above 0, above 0 and at most 1, at least 0 and below 1"
             )
+
+    def numbers(self, sun_z: float, sky_share: float) -> tuple[float, float, float, float]:
+        """Even radiance factor, factor of light scattered once, its optical depth and asymmetry, for the kernel."""
+        depth = (1.0 - self.single_scattering_albedo * self.asymmetry**2) * self.optical_depth
+        scale = self.single_scattering_albedo * self.optical_depth / (4.0 * depth)
+        beside_peak = 1.0 - self.asymmetry**2
+        once = beside_peak * scale * _scattered_irradiance(sun_z, depth, self.asymmetry)
+        return max(sky_share - once, 0.0), scale * min(sky_share / once, 1.0), depth, self.asymmetry
 
 
 @dataclass(frozen=True)
@@ -126,12 +137,10 @@ class Photometry:
         )
 
     def sky_numbers(self, sun: Sun) -> Float64[np.ndarray, "4"]:
-        """What the kernel takes for the sky: even radiance factor, or scale, optical depth and asymmetry."""
+        """What the kernel takes for the sky: even radiance factor, and the numbers of light scattered once."""
         if self.sky is None:
             return np.array([self.sky_radiance, 0.0, 0.0, 0.0])
-        depth, asymmetry = self.sky.optical_depth, self.sky.asymmetry
-        scale = self.sky_share / _scattered_irradiance(float(sun.direction[2]), depth, asymmetry)
-        return np.array([0.0, scale, depth, asymmetry])
+        return np.array(self.sky.numbers(float(sun.direction[2]), self.sky_share))
 
 
 @dataclass(frozen=True)

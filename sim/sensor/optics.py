@@ -10,11 +10,14 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.camera import CameraModel
+from sim.camera import Cahvore, CameraModel
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 #: Half size of the point spread's kernel, pixels.
 REACH_PX = 6
+#: Share of the field angle by which a fisheye's pupil is foreshortened: a MER front hazcam's, measured on the sky of
+#: Opportunity's picture 1F483288473EFFCMUFP1214L0M1 from 60 to 85 deg off axis (not flat-fielded; to 10 %).
+PUPIL_SHARE = 0.95
 
 
 class OpticsParameters(BaseModel):
@@ -84,14 +87,20 @@ def spread(
 def natural_fall_off(camera: CameraModel) -> Float32[np.ndarray, "rows columns"]:
     """Brightness of each pixel behind an unvignetted lens, 1 at the brightest.
 
-    A pixel gathers light in proportion to the solid angle it sees and to the cosine of its field angle (the pupil's
-    foreshortening). For a perspective lens that is the fourth power of the cosine; a fisheye falls off less.
+    A pixel gathers light in proportion to the solid angle it sees and to the area of the entrance pupil as seen along
+    its ray: ``dOmega cos(q theta)``, theta the angle from the lens's axis. Where the pupil stands still, q is 1: for a
+    perspective lens the product is the fourth power of the cosine. A fisheye's pupil, whose motion CAHVORE describes,
+    turns a little towards the ray (Kumler & Bauer 2000, Proc. SPIE 4093), and its picture keeps light at 90 deg. For it
+    q is `PUPIL_SHARE`.
     """
     _origins, directions = camera.rays(camera.pixel_grid())
     down = np.gradient(directions, axis=0, edge_order=2)
     right = np.gradient(directions, axis=1, edge_order=2)
     solid_angle = np.linalg.norm(np.cross(down, right), axis=-1)
-    brightness: Float64[np.ndarray, "rows columns"] = solid_angle * np.clip(directions @ camera.a, 0.0, None)
+    axis, share = (camera.o, PUPIL_SHARE) if isinstance(camera, Cahvore) else (camera.a, 1.0)
+    off_axis = np.arccos(np.clip(directions @ (axis / np.linalg.norm(axis)), -1.0, 1.0))
+    pupil = np.clip(np.cos(share * off_axis), 0.0, None)
+    brightness: Float64[np.ndarray, "rows columns"] = solid_angle * pupil
     # pixels that no ray reaches are dark
     fall_off = np.nan_to_num(brightness / np.nanmax(brightness)).astype(np.float32)
     return np.asarray(fall_off)

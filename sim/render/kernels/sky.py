@@ -14,17 +14,17 @@ HORIZON = 1e-3
 
 @njit(cache=True)
 def single_scattering(cos_zenith: float, cos_sun_zenith: float, cos_g: float, depth: float, asymmetry: float) -> float:
-    """Brightness of a plane layer of air seen from below, to a constant: light scattered once.
+    """Brightness of a plane layer of air seen from below over the sun's there, to a constant: light scattered once.
 
-    ``P(g) mu0 / (mu0 - mu) (exp(-tau / mu0) - exp(-tau / mu))`` with the Henyey-Greenstein phase function P.
+    ``P(g) mu0 / (mu0 - mu) (1 - exp(tau / mu0 - tau / mu))`` with the Henyey-Greenstein phase function P.
     """
     mu = max(cos_zenith, HORIZON)
     mu0 = max(cos_sun_zenith, HORIZON)
-    # (e^-a - e^-b) / (b - a) is e^-a (1 - e^-(b-a)) / (b - a), which stays exact where the directions are as high
+    # written so that it stays exact where both directions are as high
     apart = depth / mu - depth / mu0
     path = 1.0 - 0.5 * apart if abs(apart) < 1e-6 else -math.expm1(-apart) / apart
     phase = (1.0 - asymmetry * asymmetry) / (1.0 + asymmetry * asymmetry - 2.0 * asymmetry * cos_g) ** 1.5
-    brightness: float = phase * math.exp(-depth / mu0) * path * depth / mu
+    brightness: float = phase * path * depth / mu
     return brightness
 
 
@@ -35,7 +35,7 @@ def sky_brightness(sky: Array, sun_z: float, sun_radius: float, dz: float, cos_g
     Parameters
     ----------
     sky
-        Even radiance factor, factor of scattered light (0 for an even sky), optical depth, asymmetry.
+        Even radiance factor, factor of light scattered once (0 for an even sky), its optical depth, asymmetry.
     sun_z, sun_radius
         Sine of the sun's elevation, and its angular radius.
     dz, cos_g
@@ -46,7 +46,7 @@ def sky_brightness(sky: Array, sun_z: float, sun_radius: float, dz: float, cos_g
     brightness: float = sky[0]
     if sky[1] <= 0.0:
         return brightness
-    brightness = sky[1] * single_scattering(dz, sun_z, cos_g, sky[2], sky[3])
+    brightness += sky[1] * single_scattering(dz, sun_z, cos_g, sky[2], sky[3])
     if cos_g > 0.9:
         inside = (sun_radius - math.acos(min(cos_g, 1.0))) / pixel + 0.5
         # the ramp across the edge adds pixel**2 / 12 to the squared radius, on average
