@@ -13,9 +13,9 @@ from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, meet_triangles
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import cameras, descent_view, ground_view, renderer, rock_view
-from sim.camera import Cahv
+from sim.camera import Cahv, CameraModel
 from sim.frames import direction, rigid
-from sim.render import Photometry, Scene, Sun, Texture
+from sim.render import CloudLayer, CloudParameters, DustySky, Photometry, PixelRays, Scene, Sun, Texture
 from sim.terrain import Surface
 
 #: Brightness is then albedo times the cosine of incidence in the sun, and 0 in shadow.
@@ -194,8 +194,71 @@ def _spherical_albedo(law: Photometry, log2_points: int) -> float:
     return float(np.mean(_law(law, cos_i, cos_e, cos_g) / cos_i))
 
 
+def run_clouds(quick: bool) -> Iterator[Measure]:
+    """Cover of the ground, and the motion of the shadows, in the pictures alone."""
+    camera, law = cameras()["MER descent camera, CAHVOR, 45 deg"], LAMBERT
+    sun = Sun(direction(np.radians(150.0), np.radians(45.0)))
+    given = CloudParameters(cover=0.3, size_m=400.0, optical_depth=50.0)
+    lit = FLAT_ALBEDO * float(sun.direction[2])
+    covers, moved = [], []
+    for seed in range(2 if quick else 8):
+        layer = CloudLayer.drawn(given, np.random.default_rng(seed))
+        scene = Scene(_flat(), (0.0, 0.0), sun, law, clouds=layer, edge_rays=1)
+        rng = np.random.default_rng(100 + seed)
+        more = FLAT_ALBEDO * given.sky_light(sun)
+        for place in rng.uniform(0.0, 12800.0, (4, 2)):
+            picture = _from_above(scene, camera, place, 0.0)
+            covers.append(1.0 - float(np.mean((picture - more) / lit)))
+            later = _from_above(
+                scene, camera, place + 3.75 * np.array([given.wind_east_m_s, given.wind_north_m_s]), 3.75
+            )
+            steep = np.hypot(*np.gradient(picture))
+            clear = steep > 0.2 * steep.max()
+            moved.append(float(np.max(np.abs(later - picture)[clear] / steep[clear])))
+    how = (
+        f"{len(covers)} pictures from 2 km over flat ground, {2 if quick else 8} layers; {given.cover:g} was asked for"
+    )
+    yield Measure(
+        "share of the ground in clouds' shadows, from the stated one", abs(np.mean(covers) - 0.3), "", 0.1, how
+    )
+    how = "two pictures 3.75 s apart, the later from a place that drifted with the wind; change over slope at the edges"
+    yield Measure("motion of clouds' shadows from the wind's", max(moved), "px", 0.01, how)
+
+
+def _from_above(scene: Scene, camera: CameraModel, place: np.ndarray, time_s: float) -> np.ndarray:
+    pose = rigid(Rotation.identity(), np.array([*place, 2000.0]))
+    return renderer().render(scene, PixelRays.of(camera), pose, time_s).radiance.astype(np.float64)
+
+
+def run_sun(quick: bool) -> Iterator[Measure]:
+    """Place and light of the sun's disc in the sky."""
+    camera = cameras()["MER navcam, CAHVOR, 45 deg"]
+    off, flux = [], []
+    for azimuth_deg, elevation_deg in (
+        ((90.0, 12.0), (97.0, 16.0)) if quick else ((90.0, 12.0), (97.0, 16.0), (80.0, 5.0))
+    ):
+        sun = Sun(direction(np.radians(azimuth_deg), np.radians(elevation_deg)))
+        law = Photometry(sky_share=0.3, sky=DustySky(0.5, 0.95, 0.65))
+        pose = rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5]))
+        scene = Scene(_flat(), (0.0, 0.0), sun, law, mesh_finest_m=0.5, mesh_reach_m=2000.0)
+        rays = PixelRays.of(camera)
+        radiance = renderer().render(scene, rays, pose).radiance.astype(np.float64)
+        light = np.where(radiance > 1000.0, radiance, 0.0)
+        rows, columns = np.indices(radiance.shape)
+        centre = np.array([(light * columns).sum(), (light * rows).sum()]) / light.sum()
+        off.append(float(np.linalg.norm(centre - camera.project(1e9 * sun.direction)[0])))
+        angle = np.square(rays.pixel_angles.astype(np.float64)).reshape(radiance.shape)
+        flux.append(abs(float((light * angle).sum()) / np.pi - 1.0))
+    yield Measure(
+        "the sun's disc from the sun's direction", max(off), "px", 0.1, f"{len(off)} suns in the navcam's sky"
+    )
+    yield Measure("light of the sun's disc from the direct sun", max(flux), "", 0.01, "the same pictures")
+
+
 CHECKS = (
     Check("opposition", "Light", run_opposition),
     Check("shadows", "Light", run_shadows),
     Check("reflectance", "Light", run_reflectance),
+    Check("clouds", "Light", run_clouds),
+    Check("sun", "Light", run_sun),
 )
