@@ -13,6 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from reports import gallery, sections
 from reports.answers import answers_section
+from reports.carried import carried_section
 from reports.columns import primary_metric
 from reports.conditions import conditions_section
 from reports.faults import faults_section
@@ -30,6 +31,7 @@ SCHEMA = 1
 FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
     answers_section,
     faults_section,
+    carried_section,
     landing_section,
     sensitivity_section,
     conditions_section,

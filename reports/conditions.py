@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
+from scipy import stats
 
 from reports.answers import CONFIDENCE, Share, share_of
-from reports.columns import axis_columns, label, numbers
+from reports.columns import axis_columns, label, numbers, split_unit
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics import quantile_bounds
-from reports.verdicts import is_flag, members
+from reports.verdicts import is_flag, members, terrain_groups
 from reports.wording import number, percent, stated
 
 #: Beginnings of the columns by which errors are sorted, in the order of the page; the first column of each counts.
@@ -28,12 +30,12 @@ CONDITIONS = (
     "terrain_kind",
     "relief",
     "rms_slope",
-    "terrain",
     "sun_elevation",
     "horizontal_speed",
 )
-#: Kinds up to this many are told one by one; numbers of more values are cut into bins.
-MOST_KINDS = 12
+#: Kinds up to this many are told one by one if each has so many cases on average; numbers of more values are cut into
+#: bins.
+MOST_KINDS, CASES_PER_KIND = 12, 10
 #: Cases in a bin, at least where there are enough for two; and most bins of a condition.
 CASES_PER_BIN, MOST_BINS = 40, 5
 QUANTILE = 0.99
@@ -71,16 +73,21 @@ def conditions_section(subject: Subject) -> Section | None:
     if metric is None or not is_flag(frame, "answered"):
         return None
     tables = {column: [_bin(frame[chosen], metric, name) for name, chosen in bins] for column, bins in cuts(frame)}
-    if not tables:
+    spread = [terrain_spread(frame, part) for part in _parts(frame, metric)]
+    known = [one for one in spread if one is not None]
+    if not tables and not known:
         return None
     blocks = [Block(heading=f"By {label(column)}", grid=_grid(frame, metric, bins)) for column, bins in tables.items()]
+    if known:
+        blocks.append(Block(heading="By terrain", grid=_spread_grid(known), note=_SPREAD_NOTE))
     note = (
         "Bins hold as many cases each. Answered: with its two-sided Clopper-Pearson interval at "
         f"{stated(CONFIDENCE)} confidence, as for independent cases. Mean and standard deviation of the errors of the "
         f"answers. Bound: what the {stated(QUANTILE)} quantile of the magnitude does not exceed, at "
         f"{stated(CONFIDENCE)} confidence (order statistics); it takes 230 answers."
     )
-    data = {column: [asdict(one) for one in bins] for column, bins in tables.items()}
+    data: dict[str, Any] = {column: [asdict(one) for one in bins] for column, bins in tables.items()}
+    data["between_terrains"] = [asdict(one) for one in known]
     title = "Errors and answers by condition"
     return Section("conditions", "Conditions", title, [*blocks, Block(note=note)], data)
 
@@ -89,14 +96,87 @@ def cuts(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.nda
     """Every condition that varies: its column, and its bins with their names and members."""
     for start in CONDITIONS:
         columns = [str(name) for name in frame.columns if name == start or str(name).startswith(f"{start}_")]
-        if start == "terrain":
-            columns = [name for name in columns if name == "terrain"]
         for column in columns[:1]:
             kinds = frame[column].dropna().nunique()
-            if 2 <= kinds <= MOST_KINDS:
+            if 2 <= kinds <= MOST_KINDS and len(frame) >= CASES_PER_KIND * kinds:
                 yield column, _kinds(frame[column])
-            elif kinds > MOST_KINDS and column != "terrain" and pd.api.types.is_numeric_dtype(frame[column].dtype):
+            elif kinds > 2 and pd.api.types.is_numeric_dtype(frame[column].dtype):
                 yield column, _bins(numbers(frame, column))
+
+
+@dataclass(frozen=True)
+class TerrainSpread:
+    """One part of the error between and within terrains: analysis of variance with terrains as random effects.
+
+    Attributes
+    ----------
+    part
+        The error's column.
+    terrains
+        Terrains with an answer.
+    within_sd, between_sd
+        Standard deviations of single errors about their terrain's mean, and of the terrains' means in the long run.
+    share
+        Part of the variance that lies between terrains, 0 to 1 (intraclass correlation; 0 where none shows).
+    p_value
+        Probability of means so different were terrains all alike (F-test).
+    """
+
+    part: str
+    terrains: int
+    within_sd: float
+    between_sd: float
+    share: float
+    p_value: float
+
+
+_SPREAD_NOTE = (
+    "Analysis of variance over the answers: how much errors on one terrain differ, and how much more terrains do. A "
+    "small p says that terrains matter."
+)
+
+
+def terrain_spread(frame: pd.DataFrame, part: str) -> TerrainSpread | None:
+    """The spread of errors between terrains; None where no terrain has two answers, or one alone has any."""
+    groups = terrain_groups(frame)
+    values = numbers(frame, part)
+    known = np.isfinite(values) & members(frame, "valid")
+    if groups is None or not known.any():
+        return None
+    _, index = np.unique(groups[known], return_inverse=True)
+    errors, sizes = values[known], np.bincount(index).astype(np.float64)
+    n, k = errors.size, sizes.size
+    if k < 2 or n == k:
+        return None
+    means = np.bincount(index, weights=errors) / sizes
+    within = float(((errors - means[index]) ** 2).sum()) / (n - k)
+    between = float((sizes * (means - errors.mean()) ** 2).sum()) / (k - 1)
+    size = (n - float((sizes**2).sum()) / n) / (k - 1)
+    variance = max(between - within, 0.0) / size
+    return TerrainSpread(
+        part=part,
+        terrains=k,
+        within_sd=float(np.sqrt(within)),
+        between_sd=float(np.sqrt(variance)),
+        share=variance / (variance + within) if variance + within > 0.0 else 0.0,
+        p_value=float(stats.f.sf(between / within, k - 1, n - k)) if within > 0.0 else float("nan"),
+    )
+
+
+def _spread_grid(spread: Sequence[TerrainSpread]) -> Grid:
+    head = ["", "Terrains", "SD within", "SD between", "Share of variance between", "p"]
+    rows = [
+        [
+            label(one.part),
+            f"{one.terrains:,}",
+            number(one.within_sd),
+            number(one.between_sd),
+            percent(one.share),
+            number(one.p_value),
+        ]
+        for one in spread
+    ]
+    return Grid(head, rows)
 
 
 def _kinds(values: pd.Series) -> list[tuple[str, Bool[np.ndarray, " n"]]]:
@@ -135,9 +215,11 @@ def _bin(chosen: pd.DataFrame, metric: str, name: str) -> Bin:
 
 
 def _grid(frame: pd.DataFrame, metric: str, bins: Sequence[Bin]) -> Grid:
-    parts = [label(part) for part in _parts(frame, metric)]
+    columns = _parts(frame, metric)
+    axes = [""] if columns == [metric] else [f" {split_unit(part)[0].rsplit('_', 1)[-1]}" for part in columns]
+    unit = split_unit(metric)[1]
     head = ["", "Cases", "Answered", "Interval"]
-    head += [f"{what}, {part}" for part in parts for what in ("Mean", "SD")]
+    head += [f"{what}{axis} ({unit})" for axis in axes for what in ("Mean", "SD")]
     head += [f"{stated(QUANTILE)} bound", "Largest"]
     rows = []
     for one in bins:

@@ -20,6 +20,8 @@ from reports.wording import NOTHING, number, percent, stated
 
 #: Columns that name what is wrong in a case and how large it is.
 FAULT, SIZE = "fault", "fault_size"
+#: The fault of a case without one.
+NO_FAULT = "none"
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,12 @@ class FaultRow:
 
 
 def faults_section(subject: Subject) -> Section | None:
-    """One table over faults and sizes; None where rows name no fault, or errors have no bound."""
+    """One table over faults and sizes; None where no row has a fault, or errors have no bound."""
     frame = subject.frame
     if FAULT not in frame or subject.metric is None or subject.bound is None or not is_flag(frame, "answered"):
         return None
     rows = fault_rows(frame, subject.metric, subject.bound)
-    if not rows:
+    if all(row.fault == NO_FAULT for row in rows):
         return None
     unit = split_unit(subject.metric)[1]
     caption = "Full: answers within the bound. Hatched: no answer. Crossed: wrong answers."

@@ -15,7 +15,7 @@ from reports.sections import Grid
 from reports.statistics import quantile_bounds
 from reports.svg import SERIES, in_page_style, new_axes, svg_markup
 from reports.verdicts import is_flag, members
-from reports.wording import NOTHING, number, percent, stated
+from reports.wording import number, percent, stated
 
 WITH, WITHOUT = "touchdown_speed_with_m_s", "touchdown_speed_without_m_s"
 #: Column of true and false: whether the answer was there when thrusters fired.
@@ -95,12 +95,12 @@ def _speeds_grid(with_it: Float[np.ndarray, " n"], without: Float[np.ndarray, " 
     columns = (with_it, without)
     rows = [["mean (m/s)", *(number(float(values.mean())) for values in columns)]]
     for probability in (0.5, 0.95, 0.99):
-        bounds = [quantile_bounds(values, probability, CONFIDENCE)[1] for values in columns]
-        texts = [
-            f"{number(float(np.quantile(values, probability)))} (≤ {number(bound) if np.isfinite(bound) else NOTHING})"
-            for values, bound in zip(columns, bounds, strict=True)
-        ]
-        rows.append([f"{stated(probability)} quantile (bound)", *texts])
+        texts = []
+        for values in columns:
+            bound = quantile_bounds(values, probability, CONFIDENCE)[1]
+            known = f" (≤ {number(bound)})" if np.isfinite(bound) else ""
+            texts.append(f"{number(float(np.quantile(values, probability)))}{known}")
+        rows.append([f"{stated(probability)} quantile (its bound)", *texts])
     rows += [
         [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
         for speed in SPEEDS_M_S

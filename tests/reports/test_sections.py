@@ -13,7 +13,8 @@ import pytest
 
 from reports.answers import answer_shares
 from reports.campaign import write_report
-from reports.conditions import conditions_section, cuts
+from reports.carried import carried_section
+from reports.conditions import conditions_section, cuts, terrain_spread
 from reports.faults import fault_rows, faults_section
 from reports.landing import landing_section
 from reports.section import Section, Subject
@@ -94,6 +95,34 @@ def test_conditions_that_do_not_vary_are_left_out(make_rows: Rows) -> None:
     frame = make_rows(60).assign(sun_elevation_deg=40.0)
     assert "sun_elevation_deg" not in dict(cuts(frame))
     assert conditions_section(subject(frame[["answered", METRIC]])) is None
+    # Few cases of many kinds say nothing, kind by kind.
+    assert "site" not in dict(cuts(frame.assign(site=[f"site {k % 10}" for k in range(60)])))
+
+
+def test_spread_between_terrains_is_found() -> None:
+    rng = np.random.default_rng(6)
+    terrain = np.repeat(np.arange(200), 5)
+    # Deviations of 3 within and 2 between terrains: 4 of 13 of the variance. Standard error of the share: about 0.035.
+    error = 2.0 * rng.standard_normal(200)[terrain] + 3.0 * rng.standard_normal(1000)
+    frame = pd.DataFrame({"answered": True, "terrain": terrain, METRIC: error})
+    spread = terrain_spread(frame, METRIC)
+    assert spread is not None
+    assert spread.share == pytest.approx(4.0 / 13.0, abs=0.1)
+    assert (spread.within_sd, spread.between_sd) == (pytest.approx(3.0, rel=0.08), pytest.approx(2.0, rel=0.2))
+    assert spread.p_value < 1e-6
+    alike = terrain_spread(frame.assign(**{METRIC: rng.standard_normal(1000)}), METRIC)
+    assert alike is not None
+    assert alike.p_value > 0.01
+    assert terrain_spread(frame.assign(terrain=np.arange(1000)), METRIC) is None
+    assert terrain_spread(frame.drop(columns="terrain"), METRIC) is None
+
+
+def test_firing_section_wants_its_error(make_rows: Rows) -> None:
+    frame = make_rows(30)
+    assert carried_section(subject(frame)) is None
+    carried = carried_section(subject(frame.assign(firing_velocity_error_m_s=0.5, firing_after_s=18.0)))
+    assert cells(carried, "mean")[1] == "0.500"
+    assert cells(carried, "firing after (s)")[1:] == ["18.00"] * 3
 
 
 def test_faults_by_size() -> None:
