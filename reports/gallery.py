@@ -27,6 +27,8 @@ from reports.wording import NOTHING, count, number
 
 #: Kept cases whose pictures go into the page; each takes about half a megabyte.
 _MOST_SHOWN = 2
+#: Columns of the tracks that the page has no room for, or says otherwise.
+_NOT_SHOWN = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ def _dimes_case(run: StoredRun, case: int, products: dict[str, object]) -> Shown
     plates = [(f"case{case}pair{k}", draw_dimes_pair(products, k), f"Pair {k + 1}: {name}.") for k, name in pairs]
     of_each = tracks(products)
     quantities = list(dict.fromkeys(name for track in of_each for name in track.values))
-    quantities = [name for name in quantities if name not in ("pair", "template", "valid") and not _is_check(name)]
+    quantities = [name for name in quantities if name not in _NOT_SHOWN and not _is_check(name)]
     return ShownCase(
         case=case,
         outcome=_outcome(run.frame, case),
