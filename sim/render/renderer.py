@@ -59,7 +59,7 @@ class Scene:
     caster_diameter_m
         Diameter of what casts a shadow from the camera's place: the lander seen against the sun. 0 for none.
     ground_shadows
-        Whether the ground hides the sun from itself.
+        Whether the ground hides the sun from itself, as softly as the sun's disc is wide; shadows of objects are hard.
     clouds
         Clouds that dim the sun as they drift; None for none.
     mesh_finest_m, mesh_reach_m, mesh_lines
