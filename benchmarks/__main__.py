@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks import descent, pictures
+from benchmarks import descent, estimators, pictures
 from benchmarks.timing import Figure
 from sim.processor import processor_features
 from sim.render import process_renderer
@@ -26,9 +26,10 @@ def main() -> None:
     cv2.setNumThreads(1)
     figures = [
         # first, while nothing else has grown the process
-        *pictures.memory(120),
+        *pictures.memory(500),
         *descent.frame(15),
         *descent.case(7),
+        *estimators.side_by_side(8),
         *pictures.wall_seconds_of_a_frame(9),
         *pictures.beside_pyrender(5),
         *pictures.rover_pictures(3),

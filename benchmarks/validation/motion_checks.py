@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.validation.estimators import PATCH
-from benchmarks.validation.motion import STEPS_PX, Motion, View, measure
+from benchmarks.validation.motion import STEPS_PX, Motion, View, measure, render, supersampled
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import descent_view, renderer, rock_view
+from sim.render.edges import edge_pixels
 from sim.terrain.sites import sites
 
 BAR_PX, CONTROL_BAR_PX = 0.02, 0.005
@@ -109,7 +110,39 @@ def run_control(quick: bool) -> Iterator[Measure]:
         yield _row(claim, [motion.error for motion in motions], CONTROL_BAR_PX, CONTROL_STEPS_PX)
 
 
+def _edge_error(view: View) -> tuple[float, float, int]:
+    """Rms error of radiance at pixels that hold an edge, over the mean, by one ray and as rendered; and their number.
+
+    Against 256 rays a pixel, each of which sees ground and texture as smooth as the pixel.
+    """
+    single = replace(view, scene=replace(view.scene, edge_rays=1))
+    one, several = render(renderer(), single), render(renderer(), view)
+    edges = edge_pixels(one.radiance, one.range_m, one.body)
+    true = supersampled(renderer(), replace(single, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
+    before, after = (
+        float(np.sqrt(np.mean((frame.radiance - true).ravel()[edges] ** 2)) / true.mean()) for frame in (one, several)
+    )
+    return before, after, edges.size
+
+
+def run_edges(quick: bool) -> Iterator[Measure]:
+    size = (192, 160) if quick else (384, 320)
+    for distance in DISTANCES_M:
+        whole = rock_view(ROCK_SITE, distance)
+        # the upper left of the picture holds an outline before the ground far behind
+        view = replace(whole, camera=whole.camera.cropped(0, 0, size))
+        before, after, count = _edge_error(view)
+        yield Measure(
+            f"radiance at outlines, rms, {distance:g} m from a rock",
+            after,
+            "of the mean",
+            None,
+            f"{count} pixels that hold an edge, against 256 rays a pixel; by one ray a pixel {before:.2g}",
+        )
+
+
 CHECKS = (
+    Check("edges", "Motion of the picture", run_edges),
     Check("motion", "Motion of the picture", run),
     Check("motion-control", "Motion of the picture", run_control),
 )

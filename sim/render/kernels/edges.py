@@ -229,8 +229,6 @@ def look_closely(
                 scale = inverse_spacing / (1 << smooth)
                 t = cross_ground(levels[smooth], scale, x0, y0, z0, dx, dy, dz, start, end)
                 c += 1
-            if t == math.inf and count > 0 and not sky:
-                t = ranges[count - 1]
             triangle = -1
             second = 0.0
             third = 0.0
@@ -238,7 +236,10 @@ def look_closely(
                 t_thing, triangle, second, third = nearest_hit(tree, x0, y0, z0, dx, dy, dz, t)
                 if triangle >= 0:
                     t = t_thing
-            if t == math.inf and not sky:
+            if t == math.inf and count > 0 and not sky:
+                # grazes the ground without dipping below it
+                t = ranges[count - 1]
+            elif t == math.inf and not sky:
                 # a sliver of ground that no pixel around sees
                 t = distance[pixel]
                 triangle = triangle_of_pixel[pixel]
