@@ -10,7 +10,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
-from sim.measurements import DescentMeasurements, MastCalibration, RoverMeasurements, TargetDesignation
+from sim.measurements import (
+    DescentMeasurements,
+    LandingMeasurements,
+    MastCalibration,
+    RoverMeasurements,
+    TargetDesignation,
+)
 
 
 class VelocityOutcome(Enum):
@@ -54,7 +60,7 @@ class TrackingState(Enum):
     """Where a target tracker stands (tracking paper, Fig. 6)."""
 
     NO_TARGET = "no target is designated, or it was cleared"
-    NORMAL = "the target is tracked"
+    NORMAL = "a target is designated and, since it was first seen, tracked"
     LOST = "the target is lost and may yet be found again"
     FAILURE = "the target stayed lost; only clearing it ends this"
 
@@ -105,7 +111,8 @@ class TargetUpdate:
     state
         State after the update.
     losses
-        What failed, in the order of `TargetLoss`; empty when the target was found.
+        Why the target was not found, in the order of `TargetLoss`; empty when it was, or was not looked for (no target,
+        failure).
     position_rover
         The target in the rover frame of this stop, metres, shape (3,): triangulated when it was found, else carried
         along by the pose estimate; None before it was seen for the first time.
@@ -121,7 +128,7 @@ class TargetUpdate:
     @property
     def found(self) -> bool:
         """Whether this update found the target."""
-        return not self.losses
+        return self.state is TrackingState.NORMAL
 
 
 class TargetTracker(Protocol):
@@ -149,4 +156,55 @@ class TargetTracker(Protocol):
 
     def clear(self) -> None:
         """Forgets the target."""
+        ...
+
+
+class SiteOutcome(Enum):
+    """How the search for a place to land ended.
+
+    With SAFE_SITE a site is reported, with NO_SAFE_SITE none: the ground was mapped and no part of it is safe. Every
+    other member means that the algorithm did not converge: the a-priori site is what is left, and nothing is known of
+    it.
+    """
+
+    SAFE_SITE = "a safe site is reported"
+    NO_SAFE_SITE = "the mapped ground has no safe site"
+    NO_RANGE = "the altimeter gave no range"
+    NO_FEATURES = "the first picture has too few features"
+    NO_TRACKS = "too few features were found again in the second picture"
+    NO_MOTION = "no rigid motion explains the tracks"
+    NO_BASELINE = "the camera has not moved enough for depths"
+    NO_STRUCTURE = "too few points were matched for an elevation map"
+
+    @property
+    def converged(self) -> bool:
+        """Whether the ground was mapped."""
+        return self in (SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE)
+
+
+@dataclass(frozen=True)
+class SiteEstimate:
+    """An answer to "where can one land".
+
+    Attributes
+    ----------
+    outcome
+        How the search ended.
+    site_world
+        Where to land, in the world frame of the on-board poses, metres; the a-priori site where the algorithm did not
+        converge, None where the ground has no safe site.
+    details
+        The algorithm's intermediate products for figures and diagnosis; None where it keeps none.
+    """
+
+    outcome: SiteOutcome
+    site_world: Float[np.ndarray, "3"] | None
+    details: object | None = None
+
+
+class SiteEstimator(Protocol):
+    """Finds a safe place to land from two pictures and the measurements taken with them."""
+
+    def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
+        """The estimate; never raises for pictures, poses or a range that instruments can deliver."""
         ...

@@ -238,3 +238,45 @@ class SiteTarget:
 
 #: The three ways in which the ground may name a target (tracking paper, section 3).
 TargetDesignation = PixelTarget | RoverTarget | SiteTarget
+
+
+@dataclass(frozen=True)
+class PoseMeasurement:
+    """Position and attitude as the on-board filter has them.
+
+    Attributes
+    ----------
+    world_from_body
+        The body's pose in the local level world frame, metres.
+    time_s
+        Its time tag, seconds.
+    """
+
+    world_from_body: RigidTransform
+    time_s: float
+
+
+@dataclass(frozen=True)
+class LandingMeasurements:
+    """What the helicopter's computer holds when it looks for a place to land.
+
+    Attributes
+    ----------
+    images
+        Two pictures of overlapping ground, the first and the second, each with its camera in the body frame.
+    poses
+        The on-board filter's pose at each picture.
+    slant_range_m
+        The laser altimeter's range at the first picture, metres: from its camera's centre along the camera's optical
+        axis to the ground. NaN where nothing was returned.
+    up_body
+        Upwards at the first picture as the inclinometers have it, unit vector in body axes.
+    apriori_site_world
+        Where to land if no better place is known: a point in the world frame, metres.
+    """
+
+    images: tuple[DetectorImage, DetectorImage]
+    poses: tuple[PoseMeasurement, PoseMeasurement]
+    slant_range_m: float
+    up_body: Float[np.ndarray, "3"]
+    apriori_site_world: Float[np.ndarray, "3"]
