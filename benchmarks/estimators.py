@@ -1,0 +1,98 @@
+"""Velocity estimators side by side on the same rendered descents: DIMES, and what a user would take instead."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
+from algorithms.dimes import DimesEstimator, DimesOptions
+from algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
+from benchmarks.timing import Figure
+from campaigns.loading import load_campaign
+from sim.measurements import DescentMeasurements
+
+#: By name: what is compared.
+ESTIMATORS: Mapping[str, VelocityEstimator] = {
+    "DIMES": DimesEstimator(),
+    "DIMES, peaks by a quadric alone": DimesEstimator(DimesOptions(align=False)),
+    "DIMES, whole pixels": DimesEstimator(DimesOptions(subpixel=False)),
+    "OpenCV's phase correlation": PhaseCorrelationEstimator(),
+    "OpenCV's ORB and homography": HomographyEstimator(),
+}
+#: Runs of each estimate, of which the fastest counts: others on the machine make it slower, never faster.
+REPEATS = 3
+
+
+class Recorder:
+    """An estimator that keeps what it is given, so that others can be tried on it."""
+
+    given: ClassVar[list[DescentMeasurements]] = []
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """Keeps the measurements and gives no answer."""
+        self.given.append(measurements)
+        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Measurements of a descent, the true mean velocity over its second pair, and whether DIMES has room there."""
+
+    measurements: DescentMeasurements
+    velocity_m_s: np.ndarray
+    room: bool
+
+
+def recorded(campaign_name: str, cases: int) -> list[Descent]:
+    """The first cases of a campaign of descents."""
+    campaign = load_campaign(campaign_name, ["parameters.algorithm=benchmarks.estimators:Recorder"])
+    found = []
+    for case in range(cases):
+        Recorder.given.clear()
+        row = campaign.scenario.run(campaign.parameters(case), campaign.streams(case)).row
+        velocity = np.array([row["velocity_true_x_m_s"], row["velocity_true_y_m_s"]])
+        found.append(Descent(Recorder.given[0], velocity, bool(row["room"])))
+    return found
+
+
+@dataclass(frozen=True)
+class Tried:
+    """An estimator's answers to some descents: errors in m/s (NaN where none was given), and core-seconds of each."""
+
+    errors_m_s: np.ndarray
+    seconds: np.ndarray
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Errors of the answers that were given."""
+        return self.errors_m_s[np.isfinite(self.errors_m_s)]
+
+
+def tried(estimator: VelocityEstimator, descents: list[Descent]) -> Tried:
+    """What an estimator makes of descents."""
+    errors, seconds = [], []
+    for descent in descents:
+        times = []
+        for _ in range(REPEATS):
+            start = time.process_time()
+            answer = estimator.estimate(descent.measurements)
+            times.append(time.process_time() - start)
+        given = np.full(2, np.nan) if answer.velocity_m_s is None else answer.velocity_m_s
+        errors.append(float(np.hypot(*(given - descent.velocity_m_s))))
+        seconds.append(min(times))
+    return Tried(np.array(errors), np.array(seconds))
+
+
+def side_by_side(cases: int) -> list[Figure]:
+    """Core-seconds of each estimator on the same triples, binned to 256 x 256."""
+    descents = recorded("dimes-smoke", cases)
+    bars = {"DIMES": 0.030}
+    return [
+        Figure(f"a triple: {name}", tried(estimator, descents).seconds.tolist(), bar=bars.get(name))
+        for name, estimator in ESTIMATORS.items()
+    ]
