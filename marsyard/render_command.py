@@ -212,7 +212,8 @@ def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Pictur
     cameras = of_camera.cameras()
     place = (shot.east_m, shot.north_m, shot.altitude_m)
     pose = camera_pose(ground.surface, of_camera.design, *place, shot.azimuth_deg, shot.elevation_deg)
-    sun = Sun(direction(np.radians(shot.sun_azimuth_deg), np.radians(shot.sun_elevation_deg)))
+    towards_sun = direction(np.radians(shot.sun_azimuth_deg), np.radians(shot.sun_elevation_deg))
+    sun = Sun(towards_sun, ground.site.environment.sun_radius_rad)
     taken = cameras if both else cameras[:1]
     rays = [PixelRays.of(camera) for camera in taken]
     # The cameras of a pair are so close together that one scene serves both.

@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 #: Lowest sun for which a plane-parallel atmosphere is used.
 LOWEST_SUN_SINE = 0.05
+#: Angular radius of the sun at 1 AU, radians.
+SUN_RADIUS_AT_1_AU_RAD = 0.00465
 
 
 class Environment(BaseModel):
@@ -27,6 +29,11 @@ class Environment(BaseModel):
         float, Field(ge=0.0, lt=1.0, description="share of the extinction that is scattering")
     ] = 0.94
     asymmetry: Annotated[float, Field(gt=-1.0, lt=1.0, description="mean cosine of the scattering angle")] = 0.65
+
+    @property
+    def sun_radius_rad(self) -> float:
+        """Angular radius of the sun's disc: like the square root of its irradiance, it falls with the distance."""
+        return float(SUN_RADIUS_AT_1_AU_RAD * np.sqrt(self.solar_irradiance))
 
     def direct_share(self, sun_elevation_rad: float) -> float:
         """Share of sunlight that reaches a plane facing the sun, with the aureole scattered forward around it.

@@ -9,6 +9,9 @@ from numba import njit
 
 from sim.terrain.kernels import Array
 
+#: Mean square of `gradient_noise` over space.
+NOISE_VARIANCE = 0.0732
+
 
 @njit(cache=True, inline="always")
 def _mixed(i: int, j: int, k: int, seed: int) -> np.uint32:
@@ -71,7 +74,7 @@ def texture(x: float, y: float, z: float, footprint: float, coarsest: float, amp
     """Natural logarithm of the albedo's relative change at a place, averaged over a pixel's footprint.
 
     Octave n has lattice cells of ``coarsest / 2**n``. It fades out between four and two footprints a cell: finer, it
-    would alias, and its mean over the pixel is zero.
+    would alias. Half of each octave's variance is taken off, so that albedo keeps its mean whatever octaves are seen.
     """
     total = 0.0
     cell = coarsest
@@ -82,6 +85,7 @@ def texture(x: float, y: float, z: float, footprint: float, coarsest: float, amp
         if amplitudes[n] != 0.0:
             share = min(share, 1.0)
             weight = share * share * (3.0 - 2.0 * share)
-            total += amplitudes[n] * weight * gradient_noise(x / cell, y / cell, z / cell, n)
+            amplitude = amplitudes[n] * weight
+            total += amplitude * gradient_noise(x / cell, y / cell, z / cell, n) - 0.5 * NOISE_VARIANCE * amplitude**2
         cell *= 0.5
     return total

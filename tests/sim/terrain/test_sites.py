@@ -189,3 +189,9 @@ def test_real_terrain_lies_in_a_sites_surround(shared_data: Path) -> None:
     assert surface.levels[0][..., 1].mean() == pytest.approx(0.22, rel=0.01)
     assert parameters.rocks is not None
     assert len(RockField.on(surface, parameters.rocks, np.random.default_rng(1))) > 0
+
+
+def test_the_suns_disc_shrinks_with_distance() -> None:
+    # 0.0093 rad across at 1 AU, 0.35 deg at Mars' mean distance
+    assert site("kelso").environment.sun_radius_rad == pytest.approx(0.00465)
+    assert np.degrees(2.0 * site("gusev").environment.sun_radius_rad) == pytest.approx(0.35, abs=0.01)
