@@ -10,13 +10,13 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from reports.answers import CONFIDENCE, Share, share_of
-from reports.columns import numbers, split_unit
+from reports.columns import label, numbers, split_unit
 from reports.gallery import Plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes, svg_markup
 from reports.verdicts import is_flag, members, succeeded
-from reports.wording import NOTHING, number, percent, stated
+from reports.wording import NOTHING, percent, stated
 
 #: Columns that name what is wrong in a case and how large it is.
 FAULT, SIZE = "fault", "fault_size"
@@ -72,10 +72,10 @@ def faults_section(subject: Subject) -> Section | None:
 
 
 def fault_rows(frame: pd.DataFrame, metric: str, bound: float) -> list[FaultRow]:
-    """Cases by fault and size, in the order in which faults first appear, sizes ascending."""
+    """Cases by fault and size: those without a fault first, then by name and size."""
     sizes = pd.Series(numbers(frame, SIZE), index=frame.index)
     found = []
-    for fault in frame[FAULT].dropna().unique():
+    for fault in sorted(frame[FAULT].dropna().unique(), key=lambda name: (name != NO_FAULT, str(name))):
         of_fault = frame[FAULT].eq(fault).fillna(False)
         for size in np.unique(sizes[of_fault]):
             same = sizes.isna() if np.isnan(size) else sizes.eq(size)
@@ -123,8 +123,8 @@ def fault_bars(rows: list[FaultRow]) -> Figure:
 
 
 def _name(row: FaultRow) -> str:
-    name = row.fault.replace("_", " ")
-    return name if np.isnan(row.size) else f"{name}, {row.size:g}"
+    name = label(row.fault)
+    return name if np.isnan(row.size) or row.fault == NO_FAULT else f"{name} {row.size:g}"
 
 
 def _grid(rows: list[FaultRow]) -> Grid:
@@ -133,7 +133,7 @@ def _grid(rows: list[FaultRow]) -> Grid:
     for row in rows:
         counts = [f"{count:,} ({percent(count / row.n)})" for count in (row.valid, row.invalid, row.wrong)]
         interval = f"{percent(row.wrong_share.lower)} to {percent(row.wrong_share.upper)}"
-        size = NOTHING if np.isnan(row.size) else number(row.size)
+        size = NOTHING if np.isnan(row.size) or row.fault == NO_FAULT else f"{row.size:g}"
         refusal = row.commonest_refusal or NOTHING
-        texts.append([row.fault.replace("_", " "), size, f"{row.n:,}", *counts, interval, refusal])
+        texts.append([label(row.fault), size, f"{row.n:,}", *counts, interval, refusal])
     return Grid(head, texts)

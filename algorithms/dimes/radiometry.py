@@ -14,9 +14,9 @@ the sum over all rows: within the delivered row the packets pass (n-1)/2 of its 
 Given T this is a linear recursion in P; T itself follows because P_M = T is linear in T.
 
 Dark current is left in, as the paper does. It is a ramp along the columns: for the MER camera over the 31 rows of a
-template 0.05 counts at -34 deg C (flight) and 2.5 counts at 0 deg C (field test), less than a pixel's noise of 6 counts,
-without effect on velocities even over terrain of 2 % contrast. At +23 deg C it is 36 counts: over such terrain no track
-stays valid, over terrain of 15 % errors double to 0.07 m/s.
+template 0.05 counts at -34 deg C (flight) and 2.5 counts at 0 deg C (field test), less than a pixel's noise of 6, and
+without effect on velocities even over terrain of 2 % contrast. At +23 deg C it is 36 counts: over such terrain few
+tracks stay valid and no velocity is reported, over terrain of 15 % contrast errors double to 0.07 m/s.
 """
 
 from __future__ import annotations
