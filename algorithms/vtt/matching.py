@@ -1,0 +1,159 @@
+"""Cutting templates and finding them again (sections 4.3.2 and 4.3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt16
+from scipy.spatial.transform import RigidTransform
+
+from algorithms.image.alignment import SURROUND, Alignment, aligned
+from algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
+from algorithms.image.peak import Peak, biquadratic_offset
+from algorithms.image.resampling import similarity_patch
+from algorithms.vtt.options import VttOptions
+from sim.camera import CameraModel
+from sim.measurements import MastImage
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A stop at which the target was found: what the next update starts from.
+
+    The template is not stored: it is resampled from the picture once its magnification and roll are known, so that it
+    is interpolated once only, at the target's sub-pixel position.
+
+    Attributes
+    ----------
+    image
+        The left picture.
+    pixel
+        The target in it, full-frame (u, v), shape (2,).
+    position_rover
+        The target in the rover frame of that stop, metres, shape (3,).
+    camera
+        The left camera in that rover frame.
+    world_from_rover
+        The rover's pose as estimated then.
+    """
+
+    image: MastImage
+    pixel: Float[np.ndarray, "2"]
+    position_rover: Float[np.ndarray, "3"]
+    camera: CameraModel
+    world_from_rover: RigidTransform
+
+
+@dataclass(frozen=True)
+class Change:
+    """How the target's picture changed since it was last found: magnification, and roll in radians, clockwise."""
+
+    magnification: float = 1.0
+    roll_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class Match:
+    """The target in the new left picture.
+
+    Attributes
+    ----------
+    pixel
+        Full-frame (u, v), shape (2,).
+    score
+        Normalised correlation (Eq. 11) of the template with the picture there.
+    template
+        What was searched for: the old picture about the target, magnified and rolled.
+    """
+
+    pixel: Float[np.ndarray, "2"]
+    score: float
+    template: Float[np.ndarray, "n n"]
+
+
+#: Finds what was seen at a sighting in a new picture near a full-frame pixel; None where there is no room for it.
+Matcher = Callable[[Sighting, MastImage, Float[np.ndarray, "2"], Change, VttOptions], Match | None]
+
+
+def cut_patch(
+    image: MastImage, pixel: Float[np.ndarray, "2"], side: int, change: Change | None = None
+) -> Float[np.ndarray, "side side"]:
+    """A square about a full-frame pixel, cut at its sub-pixel position, magnified and rolled by `change`."""
+    drawn = Change() if change is None else change
+    # Only what the patch is made of becomes floating point: its diagonal, and the spline's surroundings.
+    reach = int(np.ceil(0.75 * side / min(drawn.magnification, 1.0))) + SURROUND + 1
+    centre = pixel - np.array(image.corner, dtype=np.float64)
+    near = np.maximum(np.floor(centre).astype(int) - reach, 0)
+    region = image.counts[near[1] : max(int(centre[1]) + reach, 1), near[0] : max(int(centre[0]) + reach, 1)]
+    return similarity_patch(region.astype(np.float64), centre - near, side, drawn.magnification, drawn.roll_rad)
+
+
+def search_window(
+    image: MastImage, pixel: Float[np.ndarray, "2"], side: int
+) -> tuple[UInt16[np.ndarray, "rows columns"], tuple[int, int]]:
+    """The square of `side` pixels about a full-frame pixel, as far as the picture goes, and its corner in the frame."""
+    near = np.rint(pixel - 0.5 * (side - 1)).astype(int) - np.array(image.corner)
+    far = np.maximum(near + side, 0)
+    near = np.maximum(near, 0)
+    window = image.counts[near[1] : far[1], near[0] : far[0]]
+    return window, (int(near[0]) + image.corner[0], int(near[1]) + image.corner[1])
+
+
+def has_room(image: MastImage, pixel: Float[np.ndarray, "2"], side: int) -> bool:
+    """Whether a square of `side` pixels about a full-frame pixel lies in the picture."""
+    local = pixel - np.array(image.corner, dtype=np.float64)
+    rows, columns = image.counts.shape
+    reach = 0.5 * (side - 1)
+    return bool(np.all(local >= reach) and np.all(local <= np.array([columns, rows]) - 1.0 - reach))
+
+
+def refined(
+    template: Float[np.ndarray, "n n"],
+    image: MastImage,
+    corner: Float[np.ndarray, "2"],
+    offset: Float[np.ndarray, "2"],
+    score: float,
+) -> Alignment:
+    """The match's upper left corner (row, column of `image.counts`) below a pixel, and the correlation there.
+
+    `corner` and `score` are those of the best whole pixel and `offset` where the fit to the correlation peak has its
+    top: the answer where aligning the pictures themselves fails.
+    """
+    near = np.maximum(corner.astype(int) - SURROUND - 2, 0)
+    far = corner.astype(int) + len(template) + SURROUND + 2
+    region = image.counts[near[0] : far[0], near[1] : far[1]].astype(np.float64)
+    found = aligned(template, region, corner + offset - near)
+    if found is None:
+        return Alignment(corner + offset, score)
+    return Alignment(found.corner + near, found.score)
+
+
+def match_by_correlation(
+    sighting: Sighting, image: MastImage, predicted: Float[np.ndarray, "2"], change: Change, options: VttOptions
+) -> Match | None:
+    """The paper's matcher: normalised correlation of the magnified, rolled template in a window, coarse to fine."""
+    template = cut_patch(sighting.image, sighting.pixel, options.template_px, change)
+    counts, window_corner = search_window(image, predicted, options.search_px)
+    if min(counts.shape) < options.template_px:
+        return None
+    window = counts.astype(np.float64)
+    peak = coarse_to_fine_peak(template, window, options.coarse_levels, options.coarse_candidates)
+    half = 0.5 * (options.template_px - 1)
+    corner = np.array([peak.row, peak.column]) + np.array(window_corner[::-1], dtype=np.float64) - image.corner[::-1]
+    best = Alignment(corner, peak.value)
+    if options.subpixel:
+        best = refined(template, image, corner, _top(template, window, peak), peak.value)
+    return Match(best.corner[::-1] + half + image.corner, best.score, template)
+
+
+def _top(
+    template: Float[np.ndarray, "n n"], window: Float[np.ndarray, "rows columns"], peak: Peak
+) -> Float[np.ndarray, "2"]:
+    """Offset (row, column) of the fit to the correlation about its peak; zero on the window's border."""
+    if peak.on_border:
+        return np.zeros(2)
+    side = len(template)
+    about = window[peak.row - 1 : peak.row + side + 1, peak.column - 1 : peak.column + side + 1]
+    return biquadratic_offset(normalized_correlation(template, about), Peak(1, 1, peak.value, False))

@@ -1,0 +1,122 @@
+"""Pointing the mast so that the target comes to lie where it is wanted (section 4.1, action 2).
+
+The mast turns in azimuth and elevation only. Both angles follow from the calibrated camera models and the mast's
+geometry, lens distortion included, by Newton's method on the target's pixel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from algorithms.image.alignment import SURROUND
+from algorithms.interface import MastAim, PixelBox
+from algorithms.vtt.options import VttOptions
+from algorithms.vtt.stereo import epipolar_pixels
+from algorithms.vtt.target import rover_cameras
+from sim.camera import CameraModel
+from sim.measurements import MastCalibration, MastGeometry, PixelTarget
+
+#: Newton's steps, each of which about squares the error of the one before, and the error that ends them.
+STEPS, TOLERANCE_PX = 12, 1e-6
+
+
+def mast_angles(
+    position_rover: Float[np.ndarray, "3"], mast: MastCalibration, pair: bool = False
+) -> tuple[float, float] | None:
+    """Azimuth and elevation that bring a point to the middle of the left frame.
+
+    With `pair`, to where its pixels in both frames lie equally far, in opposite directions, from the middles: a near
+    target stays in both. None where no angles within the mast's limits do it.
+    """
+    cameras = (mast.left, mast.right) if pair else (mast.left,)
+    angles = _towards(position_rover, mast.geometry)
+    for _ in range(STEPS):
+        offset, slope = _offset(position_rover, mast.geometry, cameras, angles)
+        if not np.all(np.isfinite(slope)) or abs(np.linalg.det(slope)) < 1e-9:
+            return None
+        angles = angles - np.linalg.solve(slope, offset)
+        if np.hypot(*offset) < TOLERANCE_PX:
+            azimuth = float(np.arctan2(np.sin(angles[0]), np.cos(angles[0])))
+            return (azimuth, float(angles[1])) if _allowed(azimuth, float(angles[1]), mast.geometry) else None
+    return None
+
+
+def _towards(position_rover: Float[np.ndarray, "3"], mast: MastGeometry) -> Float[np.ndarray, "2"]:
+    """Angles of the direction from the elevation axis to the point, the axis' own turn neglected."""
+    x, y, z = position_rover - mast.base_m - np.array([0.0, 0.0, mast.elbow_m[2]])
+    return np.array([np.arctan2(-y, x), np.arctan2(z, np.hypot(x, y))])
+
+
+def _offset(
+    position_rover: Float[np.ndarray, "3"],
+    mast: MastGeometry,
+    cameras: tuple[CameraModel, ...],
+    angles: Float[np.ndarray, "2"],
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
+    """Mean distance of the point's pixels from the frames' middles, and its derivative by azimuth and elevation.
+
+    When the head turns about an axis w through a, a point p fixed in the rover moves by -w x (p - a) in the head.
+    """
+    rover_from_head = mast.rover_from_head(float(angles[0]), float(angles[1]))
+    to_head = rover_from_head.rotation.inv()
+    sine, cosine = np.sin(angles[0]), np.cos(angles[0])
+    left = np.array([sine, cosine, 0.0])
+    elbow = mast.base_m + np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ mast.elbow_m
+    axes = ((np.array([0.0, 0.0, -1.0]), mast.base_m), (-left, elbow))
+    motion = np.stack([-to_head.apply(np.cross(axis, position_rover - point)) for axis, point in axes], axis=-1)
+    point = rover_from_head.inv().apply(position_rover.copy())
+    offsets = [camera.project(point)[0] - middle(camera) for camera in cameras]
+    slopes = [camera.projection_jacobian(point) @ motion for camera in cameras]
+    return np.mean(offsets, axis=0), np.mean(slopes, axis=0)
+
+
+def _allowed(azimuth_rad: float, elevation_rad: float, mast: MastGeometry) -> bool:
+    least, most = zip(mast.azimuth_limits_rad, mast.elevation_limits_rad, strict=True)
+    return least[0] <= azimuth_rad <= most[0] and least[1] <= elevation_rad <= most[1]
+
+
+def middle(camera: CameraModel) -> Float[np.ndarray, "2"]:
+    """The middle of the frame, pixels."""
+    return 0.5 * (np.array(camera.size, dtype=np.float64) - 1.0)
+
+
+def box_around(pixels: Float[np.ndarray, "n 2"], margin_px: float, camera: CameraModel) -> PixelBox | None:
+    """The part of the frame within the margin of any of the pixels; None if one of them is outside the frame."""
+    if not bool(np.all(camera.in_frame(pixels))):
+        return None
+    near = np.maximum(np.floor(pixels.min(axis=0) - margin_px).astype(int), 0)
+    far = np.minimum(np.ceil(pixels.max(axis=0) + margin_px).astype(int) + 1, camera.size)
+    return PixelBox((int(near[0]), int(near[1])), (int(far[0] - near[0]), int(far[1] - near[1])))
+
+
+def aim_at_position(
+    position_rover: Float[np.ndarray, "3"], mast: MastCalibration, options: VttOptions
+) -> MastAim | None:
+    """Mast angles for a target at this position, and what to read out; None where the mast cannot show it.
+
+    The right picture's part covers the disparities searched wherever in the left search window the target is found.
+    """
+    angles = mast_angles(position_rover, mast, options.aim_pair)
+    if angles is None:
+        return None
+    left, right = rover_cameras(mast, *angles)
+    margin = 0.5 * options.search_px + SURROUND
+    boxes = (
+        box_around(left.project(position_rover[None])[0], margin, mast.left),
+        box_around(right.project(position_rover[None])[0], margin + options.disparity_search_px, mast.right),
+    )
+    return None if boxes[0] is None or boxes[1] is None else MastAim(*angles, boxes[0], boxes[1])
+
+
+def aim_at_pixel(target: PixelTarget, mast: MastCalibration, options: VttOptions) -> MastAim | None:
+    """The angles at which the target was picked, and what to read out: in the right picture all ranges allowed."""
+    left, right = rover_cameras(mast, target.azimuth_rad, target.elevation_rad)
+    margin = 0.5 * options.search_px + SURROUND
+    box = box_around(target.pixel[None], margin, mast.left)
+    curve = epipolar_pixels(left, right, target.pixel, options.seed_range_m)
+    seen = curve[mast.right.in_frame(curve)]
+    if box is None or len(seen) == 0:
+        return None
+    right_box = box_around(seen, 0.5 * options.template_px + options.epipolar_tolerance_px + SURROUND, mast.right)
+    return None if right_box is None else MastAim(target.azimuth_rad, target.elevation_rad, box, right_box)

@@ -1,0 +1,137 @@
+"""Point stereo along the epipolar curve, and triangulation (section 4.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from algorithms.image.alignment import Alignment
+from algorithms.image.normalized import normalized_correlation
+from algorithms.image.peak import biquadratic_offset, highest_peak
+from algorithms.vtt.matching import refined
+from algorithms.vtt.options import VttOptions
+from sim.camera import CameraModel
+from sim.measurements import MastImage
+
+
+@dataclass(frozen=True)
+class StereoMatch:
+    """The target in the right picture.
+
+    Attributes
+    ----------
+    pixel
+        (u, v) in the right full frame, shape (2,).
+    score
+        Normalised correlation there.
+    band
+        The part of the right picture that was searched, counts, shape (rows, columns).
+    band_corner
+        (u, v) of the band's upper left pixel in the full frame.
+    """
+
+    pixel: Float[np.ndarray, "2"]
+    score: float
+    band: Float[np.ndarray, "rows columns"]
+    band_corner: tuple[int, int]
+
+
+def epipolar_pixels(
+    left: CameraModel, right: CameraModel, pixel: Float[np.ndarray, "2"], ranges_m: tuple[float, float]
+) -> Float[np.ndarray, "n 2"]:
+    """Where the right camera sees the points along the left pixel's line of sight, from the far range to the near.
+
+    Both cameras are in one frame. Points are about half a pixel of disparity apart; what the right camera does not see
+    is left out. Lens distortion bends the curve.
+    """
+    origin, direction = left.rays(pixel)
+    baseline = float(np.linalg.norm(right.c - left.c))
+    near, far = (1.0 / ranges_m[0], 1.0 / ranges_m[1])
+    count = max(int(np.ceil(2.0 * right.focal_lengths[0] * baseline * (near - far))) + 1, 2)
+    points = origin + direction / np.linspace(far, near, count)[:, None]
+    pixels, visible = right.project(points)
+    return np.asarray(pixels[visible])
+
+
+def searched_ranges(left: CameraModel, right: CameraModel, range_m: float, disparity_px: float) -> tuple[float, float]:
+    """Least and largest range whose disparity differs by `disparity_px` at most from that of `range_m`."""
+    step = disparity_px / (right.focal_lengths[0] * float(np.linalg.norm(right.c - left.c)))
+    inverse = 1.0 / range_m
+    return 1.0 / (inverse + step), 1.0 / max(inverse - step, 1e-6)
+
+
+def point_stereo(
+    template: Float[np.ndarray, "n n"],
+    image: MastImage,
+    curve: Float[np.ndarray, "points 2"],
+    options: VttOptions,
+) -> StereoMatch | None:
+    """The place near the epipolar curve of the right picture at which the left template matches best.
+
+    Parameters
+    ----------
+    template
+        What the left picture shows about the target.
+    image
+        The right picture.
+    curve
+        From `epipolar_pixels`, full-frame pixels.
+    options
+        Tolerance and sub-pixel refinement.
+
+    Returns
+    -------
+    None where the picture has no room for the template anywhere along the curve.
+    """
+    half, tolerance = (len(template) - 1) // 2, options.epipolar_tolerance_px
+    local = curve - np.array(image.corner, dtype=np.float64)
+    rows, columns = image.counts.shape
+    local = local[(local[:, 0] > half - 1.0) & (local[:, 0] < columns - half)]
+    if len(local) == 0:
+        return None
+    reach = half + int(np.ceil(tolerance))
+    near = np.maximum(np.ceil(local.min(axis=0)).astype(int) - np.array([half, reach]), 0)
+    far = np.minimum(np.floor(local.max(axis=0)).astype(int) + np.array([half, reach]) + 1, [columns, rows])
+    if np.any(far - near < len(template)):
+        return None
+    band = image.counts[near[1] : far[1], near[0] : far[0]].astype(np.float64)
+    surface = normalized_correlation(template, band)
+    peak = highest_peak(np.where(_off_curve(local - near - half, surface.shape, tolerance), -1.0, surface))
+    corner = near[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
+    best = Alignment(corner, peak.value)
+    if options.subpixel:
+        best = refined(template, image, corner, biquadratic_offset(surface, peak), peak.value)
+    return StereoMatch(
+        pixel=best.corner[::-1] + half + image.corner,
+        score=best.score,
+        band=band,
+        band_corner=(int(near[0]) + image.corner[0], int(near[1]) + image.corner[1]),
+    )
+
+
+def _off_curve(curve: Float[np.ndarray, "n 2"], shape: tuple[int, ...], tolerance: float) -> Bool[np.ndarray, "_ _"]:
+    """Which places of the surface lie further than the tolerance above or below the curve."""
+    order = np.argsort(curve[:, 0])
+    along = np.interp(np.arange(shape[1]), curve[order, 0], curve[order, 1])
+    return np.asarray(np.abs(np.arange(shape[0])[:, None] - along) > tolerance)
+
+
+def triangulated(
+    left: CameraModel, right: CameraModel, left_pixel: Float[np.ndarray, "2"], right_pixel: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "3"] | None:
+    """The point half-way between the two lines of sight where they are nearest to each other.
+
+    In the frame of the cameras, metres. None where they are parallel or meet behind a camera.
+    """
+    (a, d), (b, e) = left.rays(left_pixel), right.rays(right_pixel)
+    between, cosine = b - a, float(d @ e)
+    across = 1.0 - cosine * cosine
+    if not across > 1e-14:
+        return None
+    along_left = float(between @ (d - cosine * e)) / across
+    along_right = float(between @ (cosine * d - e)) / across
+    if not (along_left > 0.0 and along_right > 0.0):
+        return None
+    return np.asarray(0.5 * (a + along_left * d + b + along_right * e))

@@ -1,0 +1,324 @@
+"""The visual target tracker: the loop of section 4.1 and its states.
+
+The steps are functions of their own (`target`, `pointing`, `appearance`, `matching`, `stereo`, `loss`, `handoff`); here
+they are put in order. What is known of a target is an immutable `Track`; the tracker only holds the latest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import RigidTransform
+
+from algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
+from algorithms.vtt.appearance import magnification, roll_angle
+from algorithms.vtt.details import VttDetails
+from algorithms.vtt.loss import Evidence, Journey, Tolerances, losses, next_state, tolerances
+from algorithms.vtt.matching import (
+    Change,
+    Match,
+    Matcher,
+    Sighting,
+    cut_patch,
+    has_room,
+    match_by_correlation,
+    search_window,
+)
+from algorithms.vtt.options import VttOptions
+from algorithms.vtt.pointing import aim_at_pixel, aim_at_position
+from algorithms.vtt.stereo import epipolar_pixels, point_stereo, searched_ranges, triangulated
+from algorithms.vtt.target import (
+    bearing_rad,
+    designated_position_world,
+    pose_change,
+    predicted_position,
+    rover_cameras,
+)
+from sim.camera import CameraModel
+from sim.measurements import MastCalibration, PixelTarget, RoverMeasurements, TargetDesignation
+
+
+@dataclass(frozen=True)
+class Track:
+    """What the tracker knows of its target.
+
+    Attributes
+    ----------
+    target
+        As it was designated.
+    designated_world
+        Where that is in the world, metres, shape (3,); None for a pixel.
+    state, lost_updates
+        Where it stands in Fig. 6, and for how many updates the target has been looked for.
+    sighting
+        The last time it was found; None before the seed.
+    seed_world
+        Where it was first seen, in the world as estimated, metres, shape (3,); None before.
+    seed_distance_m
+        From the camera, then.
+    driven_m
+        Length of the rover's path since, by its pose estimates at the updates.
+    world_from_rover
+        The pose at the last update, found or not.
+    """
+
+    target: TargetDesignation
+    designated_world: Float[np.ndarray, "3"] | None
+    world_from_rover: RigidTransform
+    state: TrackingState = TrackingState.NORMAL
+    lost_updates: int = 0
+    sighting: Sighting | None = None
+    seed_world: Float[np.ndarray, "3"] | None = None
+    seed_distance_m: float = float("nan")
+    driven_m: float = 0.0
+
+
+@final
+class VisualTargetTracker:
+    """Follows a target by its template, scaled and rolled as the rover's motion says; see `TargetTracker`.
+
+    `PURE_NCC` as options is the paper's baseline; another `matcher` replaces the search in the left picture (see
+    `algorithms.vtt.lucas_kanade`), all else remaining the same.
+    """
+
+    def __init__(self, options: VttOptions | None = None, matcher: Matcher = match_by_correlation) -> None:
+        self.options = VttOptions() if options is None else options
+        self.matcher = matcher
+        self.track: Track | None = None
+
+    @property
+    def state(self) -> TrackingState:
+        """Where the tracker stands."""
+        return TrackingState.NO_TARGET if self.track is None else self.track.state
+
+    def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
+        """Takes a target, with the rover's estimated pose, in place of any other."""
+        given = None if isinstance(target, PixelTarget) else designated_position_world(target, world_from_rover)
+        self.track = Track(target, given, world_from_rover)
+
+    def clear(self) -> None:
+        """Forgets the target."""
+        self.track = None
+
+    def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
+        """Where to look from this pose; None without a target, or where the mast cannot show it."""
+        if self.track is None:
+            return None
+        if self.track.sighting is None and isinstance(self.track.target, PixelTarget):
+            return aim_at_pixel(self.track.target, mast, self.options)
+        expected = expected_position(self.track, world_from_rover)
+        return None if expected is None else aim_at_position(expected, mast, self.options)
+
+    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+        """Finds the target in a new stereo pair; its details are `VttDetails`. After a failure it looks no more."""
+        if self.track is None:
+            return TargetUpdate(TrackingState.NO_TARGET, (), None)
+        if self.track.state is TrackingState.FAILURE:
+            carried = expected_position(self.track, measurements.world_from_rover)
+            return TargetUpdate(TrackingState.FAILURE, (), carried)
+        if self.track.sighting is None:
+            found = seeded(self.track, measurements, self.options)
+        else:
+            found = followed(self.track, self.track.sighting, measurements, self.options, self.matcher)
+        self.track = advanced(self.track, found, measurements, self.options)
+        position = found.position_rover
+        if position is None:
+            position = expected_position(self.track, measurements.world_from_rover)
+        return TargetUpdate(self.track.state, found.losses, position, found.details)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one update found: why it did not, or the target in the rover frame and the sighting to go on from."""
+
+    losses: tuple[TargetLoss, ...]
+    details: VttDetails
+    position_rover: Float[np.ndarray, "3"] | None = None
+    sighting: Sighting | None = None
+
+
+def expected_position(track: Track, world_from_rover: RigidTransform) -> Float[np.ndarray, "3"] | None:
+    """The target in the rover frame of this pose; None for a pixel that was not yet seen in stereo."""
+    if track.sighting is not None:
+        last = track.sighting
+        return predicted_position(last.position_rover, last.world_from_rover, world_from_rover)
+    if track.designated_world is None:
+        return None
+    return np.asarray(world_from_rover.inv().apply(track.designated_world.copy()))
+
+
+def seeded(track: Track, measurements: RoverMeasurements, options: VttOptions) -> Finding:
+    """Takes the first template where the target was designated, and its position by point stereo."""
+    cameras = rover_cameras(measurements.mast, measurements.azimuth_rad, measurements.elevation_rad)
+    expected = expected_position(track, measurements.world_from_rover)
+    if expected is None and isinstance(track.target, PixelTarget):
+        pixel, ranges = track.target.pixel, options.seed_range_m
+    elif expected is not None:
+        pixel = cameras[0].project(expected)[0]
+        distance = float(np.linalg.norm(expected - cameras[0].c))
+        ranges = searched_ranges(*cameras, distance, options.disparity_search_px)
+    if not np.all(np.isfinite(pixel)) or not has_room(measurements.left, pixel, options.template_px):
+        return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
+    template = cut_patch(measurements.left, pixel, options.template_px)
+    window, window_corner = search_window(measurements.left, pixel, options.search_px)
+    details = VttDetails(True, pixel, window, window_corner, match=Match(pixel, 1.0, template), template=template)
+    placed = ranged(measurements, cameras, pixel, template, ranges, details, options)
+    if placed.sighting is None or placed.details.stereo is None:
+        return placed
+    if placed.details.stereo.score < options.min_stereo_score:
+        return Finding((TargetLoss.LOW_STEREO_SCORE,), placed.details)
+    return placed
+
+
+def followed(
+    track: Track, last: Sighting, measurements: RoverMeasurements, options: VttOptions, matcher: Matcher
+) -> Finding:
+    """Actions 1 to 6 of section 4.1 but the pointing, which came before the pictures; and the criteria of loss."""
+    cameras = rover_cameras(measurements.mast, measurements.azimuth_rad, measurements.elevation_rad)
+    expected = predicted_position(last.position_rover, last.world_from_rover, measurements.world_from_rover)
+    predicted = cameras[0].project(expected)[0]
+    change = appearance_change(last, expected, cameras[0], measurements.world_from_rover, options)
+    if not np.all(np.isfinite(predicted)) or change is None:
+        return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
+    window, window_corner = search_window(measurements.left, predicted, options.search_px)
+    details = VttDetails(False, predicted, window, window_corner, change)
+    applied = Change(
+        change.magnification if options.scale else 1.0,
+        change.roll_rad if options.roll else 0.0,
+    )
+    match = matcher(last, measurements.left, predicted, applied, options)
+    if match is None:
+        return Finding((TargetLoss.OUT_OF_VIEW,), details)
+    template = cut_patch(measurements.left, match.pixel, options.template_px)
+    details = replace(details, match=match, template=template)
+    distance = float(np.linalg.norm(expected - cameras[0].c))
+    ranges = searched_ranges(*cameras, distance, options.disparity_search_px)
+    placed = ranged(measurements, cameras, match.pixel, template, ranges, details, options)
+    if placed.sighting is None:
+        return placed
+    return judged(track, last, placed, placed.sighting, distance, cameras, options)
+
+
+def appearance_change(
+    last: Sighting,
+    expected: Float[np.ndarray, "3"],
+    camera: CameraModel,
+    world_from_rover: RigidTransform,
+    options: VttOptions,
+) -> Change | None:
+    """Magnification and roll since the last sighting; None where the new camera does not see the target."""
+    roll = roll_angle(
+        last.position_rover,
+        last.camera,
+        camera,
+        pose_change(last.world_from_rover, world_from_rover),
+        options.roll_lever_m,
+    )
+    if roll is None:
+        return None
+    return Change(magnification(last.position_rover, last.camera.c, expected, camera.c), roll)
+
+
+def ranged(
+    measurements: RoverMeasurements,
+    cameras: tuple[CameraModel, CameraModel],
+    pixel: Float[np.ndarray, "2"],
+    template: Float[np.ndarray, "n n"],
+    ranges_m: tuple[float, float],
+    details: VttDetails,
+    options: VttOptions,
+) -> Finding:
+    """The target's position by point stereo from its left pixel; the right picture is searched over these ranges."""
+    left, right = cameras
+    curve = epipolar_pixels(left, right, pixel, ranges_m)
+    stereo = point_stereo(template, measurements.right, curve, options)
+    if stereo is None:
+        return Finding((TargetLoss.OUT_OF_VIEW,), details)
+    position = triangulated(left, right, pixel, stereo.pixel)
+    if position is None:
+        return Finding((TargetLoss.NO_RANGE,), replace(details, stereo=stereo))
+    sight = position - left.c
+    details = replace(
+        details,
+        stereo=stereo,
+        distance_m=float(np.linalg.norm(sight)),
+        azimuth_rad=float(np.arctan2(-sight[1], sight[0])),
+        position_world=np.asarray(measurements.world_from_rover.apply(position.copy())),
+    )
+    sighting = Sighting(measurements.left, pixel, position, left, measurements.world_from_rover)
+    return Finding((), details, position, sighting)
+
+
+def judged(
+    track: Track,
+    last: Sighting,
+    placed: Finding,
+    sighting: Sighting,
+    expected_m: float,
+    cameras: tuple[CameraModel, CameraModel],
+    options: VttOptions,
+) -> Finding:
+    """What was found, or nothing where one of the four criteria says that it is not the target."""
+    details = placed.details
+    moved = sighting.world_from_rover.translation - last.world_from_rover.translation
+    since_update = sighting.world_from_rover.translation - track.world_from_rover.translation
+    journey = Journey(
+        seed_m=track.seed_distance_m,
+        last_m=float(np.linalg.norm(last.position_rover - last.camera.c)),
+        now_m=details.distance_m,
+        step_m=float(np.linalg.norm(moved)),
+        driven_m=track.driven_m + float(np.linalg.norm(since_update)),
+    )
+    evidence = _evidence(track, details, expected_m)
+    allowed: Tolerances = tolerances(journey, *cameras, options)
+    details = replace(
+        details,
+        step_m=journey.step_m,
+        azimuth_change_rad=_turned(last, sighting),
+        evidence=evidence,
+        allowed=allowed,
+    )
+    failed = losses(evidence, allowed, options)
+    return Finding(failed, details) if failed else replace(placed, details=details)
+
+
+def _evidence(track: Track, details: VttDetails, expected_m: float) -> Evidence:
+    match, stereo, position = details.match, details.stereo, details.position_world
+    if match is None or stereo is None or position is None or track.seed_world is None:
+        raise ValueError("only a target that was matched, ranged and seeded can be judged")
+    return Evidence(
+        match_score=match.score,
+        stereo_score=stereo.score,
+        distance_correction_m=details.distance_m - expected_m,
+        position_correction_m=float(np.linalg.norm(position - track.seed_world)),
+    )
+
+
+def _turned(last: Sighting, now: Sighting) -> float:
+    """By how much the line of sight turned in the world, clockwise seen from above, radians."""
+    before, after = (
+        bearing_rad(np.asarray(s.world_from_rover.rotation.apply(s.position_rover - s.camera.c))) for s in (last, now)
+    )
+    return float(np.arctan2(np.sin(after - before), np.cos(after - before)))
+
+
+def advanced(track: Track, finding: Finding, measurements: RoverMeasurements, options: VttOptions) -> Track:
+    """The track after an update: the template is replaced by what was found, and kept where nothing was."""
+    pose, sighting = measurements.world_from_rover, finding.sighting
+    state, lost_updates = next_state(track.state, track.lost_updates, sighting is not None, options.max_lost_updates)
+    moved = float(np.linalg.norm(pose.translation - track.world_from_rover.translation))
+    after = replace(
+        track,
+        state=state,
+        lost_updates=lost_updates,
+        world_from_rover=pose,
+        driven_m=track.driven_m + moved if track.sighting is not None else 0.0,
+    )
+    if sighting is None:
+        return after
+    if track.sighting is None:
+        after = replace(after, seed_world=finding.details.position_world, seed_distance_m=finding.details.distance_m)
+    return replace(after, sighting=sighting)

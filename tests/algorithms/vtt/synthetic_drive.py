@@ -1,0 +1,203 @@
+"""A rover among textured bodies, its pictures exact: each pixel's ray is cast to a plane or a sphere, no renderer.
+
+The texture fills space: a sum of plane waves with amplitudes falling as 1/frequency, as on natural surfaces. What a
+pixel's extent averages away is taken out wave by wave in closed form, so that far pictures do not alias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from algorithms.interface import PixelBox, TargetTracker, TargetUpdate
+from sim.camera import Cahv, Cahvor, CameraModel
+from sim.frames import rigid
+from sim.measurements import MastCalibration, MastGeometry, MastImage, RoverMeasurements
+
+#: The mast of a MER: axes 1.4 m above the ground the rover's frame stands on; elbow and head are off their axes.
+MAST = MastGeometry(
+    base_m=np.array([0.35, 0.05, 1.1]), elbow_m=np.array([0.02, 0.01, 0.3]), head_m=np.array([0.06, 0.0, 0.08])
+)
+
+
+def stereo_pair(
+    focal_px: float, size: tuple[int, int], baseline_m: float, toe_in_rad: float = 0.0
+) -> tuple[CameraModel, CameraModel]:
+    """Cameras on the head, with the lens distortion of Opportunity's navcam, its axis off the middle."""
+    cameras = []
+    for side in (1.0, -1.0):
+        turn = Rotation.from_rotvec([0.0, 0.0, -side * toe_in_rad])
+        linear = Cahv.from_axes(
+            (focal_px, focal_px),
+            size,
+            axis=turn.apply([1.0, 0.0, 0.0]),
+            right=turn.apply([0.0, -1.0, 0.0]),
+            centre=np.array([0.0, 0.5 * side * baseline_m, 0.0]),
+            image_centre=(0.5 * size[0] + 3.0, 0.5 * size[1] - 4.0),
+        )
+        cameras.append(Cahvor.from_cahv(linear, r=np.array([0.00096, -0.002183, 0.018547])))
+    return cameras[0], cameras[1]
+
+
+@cache
+def navcam() -> MastCalibration:
+    """MER's: 0.82 mrad pixels, 20 cm."""
+    return MastCalibration(MAST, *stereo_pair(1222.5, (1024, 1024), 0.20))
+
+
+@cache
+def pancam() -> MastCalibration:
+    """The research rover's: 0.29 mrad pixels, 30 cm, looking straight ahead: 516 px of disparity at 2 m."""
+    return MastCalibration(MAST, *stereo_pair(3440.9, (1024, 768), 0.30))
+
+
+@dataclass(frozen=True)
+class Waves:
+    """A texture that fills space: wave vectors (n, 3) in rad/m, amplitudes of a total variance of 1, phases."""
+
+    vectors: np.ndarray
+    amplitudes: np.ndarray
+    phases: np.ndarray
+
+
+def waves(seed: int, longest_m: float = 0.6, shortest_m: float = 0.003, count: int = 160) -> Waves:
+    """Waves of all directions, their lengths spread evenly over octaves: the variance of each octave is the same."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    lengths = np.exp(np.linspace(np.log(longest_m), np.log(shortest_m), count))
+    return Waves(
+        2.0 * np.pi / lengths[:, None] * directions,
+        np.full(count, np.sqrt(2.0 / count)),
+        rng.uniform(0.0, 2.0 * np.pi, count),
+    )
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane through a point with a normal, in the world."""
+
+    point: np.ndarray
+    normal: np.ndarray
+
+    def ranges(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Distance along each ray; NaN where it does not meet the front."""
+        slope = directions @ self.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = ((self.point - origins) @ self.normal) / slope
+        return np.where((slope < 0.0) & (t > 0.0), t, np.nan)
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere in the world."""
+
+    centre: np.ndarray
+    radius: float
+
+    def ranges(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Distance along each ray; NaN where it passes by."""
+        offset = origins - self.centre
+        b = np.sum(offset * directions, axis=-1)
+        gap = b * b - np.sum(offset * offset, axis=-1) + self.radius**2
+        with np.errstate(invalid="ignore"):
+            return -b - np.sqrt(gap)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Bodies with one texture; the nearest hides the others. Waves' phases count from `origin`."""
+
+    bodies: tuple[Plane | Sphere, ...]
+    texture: Waves
+    origin: np.ndarray
+    contrast: float = 0.15
+    level_dn: float = 1500.0
+
+    def hit(self, camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
+        """World points that pixels of a camera in the world see; NaN for the sky."""
+        origins, directions = camera.rays(pixels)
+        ranges = np.stack([body.ranges(origins, directions) for body in self.bodies])
+        nearest = np.where(np.isnan(ranges), np.inf, ranges).min(axis=0)
+        return origins + np.where(np.isinf(nearest), np.nan, nearest)[..., None] * directions
+
+    def picture(
+        self, camera: CameraModel, box: PixelBox, noise: np.random.Generator | None = None, noise_dn: float = 8.0
+    ) -> MastImage:
+        """Counts of a part of the frame, the pixels' extent taken from the middle of the part."""
+        u = box.corner[0] + np.arange(box.size[0], dtype=np.float64)
+        v = box.corner[1] + np.arange(box.size[1], dtype=np.float64)
+        points = self.hit(camera, np.stack(np.meshgrid(u, v), axis=-1))
+        middle = points[box.size[1] // 2, box.size[0] // 2]
+        by_u = points[box.size[1] // 2, box.size[0] // 2 + 1] - middle
+        by_v = points[box.size[1] // 2 + 1, box.size[0] // 2] - middle
+        kept = self.texture.amplitudes.copy()
+        for extent in (by_u, by_v):
+            kept *= np.sinc(self.texture.vectors @ extent / (2.0 * np.pi))
+        used = np.abs(kept) > 1e-4
+        vectors, phases, amplitudes = (
+            x.astype(np.float32) for x in (self.texture.vectors[used].T, self.texture.phases[used], kept[used])
+        )
+        value = np.empty(points.shape[:2])
+        for row, seen in zip(value, (points - self.origin).astype(np.float32), strict=True):
+            row[:] = np.cos(seen @ vectors + phases) @ amplitudes
+        counts = self.level_dn * (1.0 + self.contrast * value)
+        counts = np.where(np.isnan(counts), 0.3 * self.level_dn, counts)
+        if noise is not None:
+            counts = counts + noise_dn * noise.standard_normal(counts.shape)
+        return MastImage(np.clip(np.rint(counts), 0, 4095).astype(np.uint16), box.corner)
+
+
+def pose(x: float, y: float, heading_rad: float = 0.0, tilt: Rotation | None = None) -> RigidTransform:
+    """The rover at a place on level ground, heading counted to the left from +x, tilted in its own axes."""
+    turn = Rotation.from_rotvec([0.0, 0.0, heading_rad])
+    return rigid(turn if tilt is None else turn * tilt, np.array([x, y, 0.0]))
+
+
+@dataclass
+class Drive:
+    """A rover that looks with a tracker at what a scene shows, stop by stop.
+
+    `estimated` turns the true pose into what the rover believes; `mast` is the true one too, `calibrated` what the
+    rover believes of it.
+    """
+
+    scene: Scene
+    mast: MastCalibration
+    tracker: TargetTracker
+    calibrated: MastCalibration | None = None
+    noise: np.random.Generator | None = None
+    measurements: list[RoverMeasurements] = field(default_factory=list)
+
+    def camera(self, world_from_rover: RigidTransform, angles: tuple[float, float], right: bool = False) -> CameraModel:
+        """A camera in the world at mast angles."""
+        chosen = self.mast.right if right else self.mast.left
+        return chosen.moved(world_from_rover * self.mast.geometry.rover_from_head(*angles))
+
+    def stop(self, true: RigidTransform, estimated: RigidTransform | None = None) -> TargetUpdate | None:
+        """Aims, takes pictures and updates; None where the tracker finds no aim."""
+        believed = true if estimated is None else estimated
+        known = self.mast if self.calibrated is None else self.calibrated
+        aim = self.tracker.aim(believed, known)
+        if aim is None:
+            return None
+        angles = (aim.azimuth_rad, aim.elevation_rad)
+        self.measurements.append(
+            RoverMeasurements(
+                left=self.scene.picture(self.camera(true, angles), aim.left, self.noise),
+                right=self.scene.picture(self.camera(true, angles, right=True), aim.right, self.noise),
+                mast=known,
+                azimuth_rad=angles[0],
+                elevation_rad=angles[1],
+                world_from_rover=believed,
+            )
+        )
+        return self.tracker.update(self.measurements[-1])
+
+    def true_pixel(self, true: RigidTransform, point_world: np.ndarray) -> np.ndarray:
+        """Where the left picture of the last stop truly shows a point of the world."""
+        last = self.measurements[-1]
+        return self.camera(true, (last.azimuth_rad, last.elevation_rad)).project(point_world)[0]
