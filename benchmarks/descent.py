@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from benchmarks.pictures import descent_scene
 from benchmarks.timing import Figure, core_seconds
+from campaigns.loading import load_campaign
 from scenarios.descent import (
     CameraParameters,
-    DescentScenario,
     DescentScenarioParameters,
     camera_optics,
     flown_descent,
@@ -36,15 +38,17 @@ def frame(repeats: int) -> list[Figure]:
 
 
 def case(repeats: int) -> list[Figure]:
-    """A whole case as the smoke campaign runs it, terrain built."""
-    scenario, parameters = DescentScenario(), DescentScenarioParameters()
-    streams = Streams(1, "bench", 0)
+    """Whole cases as the campaign `dimes-gusev` runs them, one after the other, all over one terrain that is built."""
+    campaign = load_campaign("dimes-gusev")
+    numbers = itertools.count()
+
+    def run_next() -> None:
+        number = next(numbers)
+        parameters = campaign.with_values({**campaign.draws(number), "place.terrain": 0})
+        campaign.scenario.run(parameters, campaign.streams(number))
+
     return [
-        Figure(
-            "smoke case: 3 frames, detector, instruments, DIMES",
-            core_seconds(lambda: scenario.run(parameters, streams), repeats),
-            bar=2.0,
-        )
+        Figure("dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), bar=1.0)
     ]
 
 
