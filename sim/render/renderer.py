@@ -21,13 +21,14 @@ from sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingErr
 from sim.render.clouds import CloudLayer, no_cover
 from sim.render.edges import Sight, edge_pixels, look_within, rays_within
 from sim.render.kernels.ground import height_range
-from sim.render.kernels.shading import Clouds, shade
+from sim.render.kernels.shading import Clouds, Reach, shade
 from sim.render.kernels.sight import look
 from sim.render.kernels.sun import Shadow, sweep_shadow
 from sim.render.mesh import graded_offsets, ground_mesh, lines_in_view
 from sim.render.objects import Objects
 from sim.render.photometry import Photometry, Sun, Texture
 from sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
+from sim.render.reach import EVERYWHERE, shade_reach
 from sim.terrain import Surface
 
 NO_TEXTURE = Texture()
@@ -104,6 +105,14 @@ class Scene:
         if not self.ground_shadows or self.sun.direction[2] <= 0.0:
             return NO_SHADOW
         return _ground_shadow(self.surface, self.sun, self.height_range_m)
+
+    @cached_property
+    def reach(self) -> Reach:
+        """Where objects may shade the ground; near the ground, among rocks, that is nearly everywhere."""
+        if self.mesh_in_view:
+            return EVERYWHERE
+        towards = np.asarray(self.sun.direction, dtype=np.float64)
+        return shade_reach(self.objects.spheres, towards, self.height_range_m[0])
 
     def light(self, time_s: float) -> Light:
         """What the kernel takes: direction of the sun, the law's numbers, the sky's, and the clouds at a time."""
@@ -345,6 +354,7 @@ def _shaded(
         scene.objects.body_of_triangle,
         scene.objects.albedo,
         scene.objects.hierarchy,
+        scene.reach,
         radiance,
         body,
         normal,

@@ -188,22 +188,20 @@ def anything_hit(tree: Hierarchy, x: float, y: float, z: float, direction: Array
     iy = 1.0 / (dy if abs(dy) > 1e-12 else 1e-12)
     iz = 1.0 / (dz if abs(dz) > 1e-12 else 1e-12)
     first_leaf = boxes.shape[0] // 2
-    stack = np.empty(_STACK, dtype=np.int64)
-    stack[0] = 0
-    waiting = 1
-    while waiting > 0:
-        waiting -= 1
-        node = stack[waiting]
-        if not _passes(boxes, node, x, y, z, ix, iy, iz):
-            continue
-        if node < first_leaf:
-            stack[waiting] = 2 * node + 1
-            stack[waiting + 1] = 2 * node + 2
-            waiting += 2
-            continue
-        start = (node - first_leaf) * LEAF
-        for k in range(start, min(start + LEAF, order.size)):
-            t, second, third = hit_triangle(triangles, order[k], x, y, z, dx, dy, dz)
-            if clearance < t < math.inf and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
-                return True
-    return False
+    # depth first without a stack, which would cost more than the walk: after a subtree comes its right neighbour
+    node = 0
+    while True:
+        if _passes(boxes, node, x, y, z, ix, iy, iz):
+            if node < first_leaf:
+                node = 2 * node + 1
+                continue
+            start = (node - first_leaf) * LEAF
+            for k in range(start, min(start + LEAF, order.size)):
+                t, second, third = hit_triangle(triangles, order[k], x, y, z, dx, dy, dz)
+                if clearance < t < math.inf and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
+                    return True
+        while node > 0 and node % 2 == 0:
+            node = (node - 1) // 2
+        if node == 0:
+            return False
+        node += 1

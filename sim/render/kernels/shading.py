@@ -26,6 +26,8 @@ from sim.terrain.kernels import Array, Level, sample
 
 #: Cover of a layer of clouds, and its numbers.
 Clouds = tuple[Array32, Array]
+#: Places on the ground that things may shade: a grid, its west and south border, and cells a metre; 0: everywhere.
+Reach = tuple[NDArray[np.bool_], float, float, float]
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
 #: Footprint, in samples, up to which the finest level is taken: the B-spline itself holds nothing finer than this.
@@ -39,6 +41,17 @@ def _brightness(law: Array, cos_i: float, cos_e: float, cos_g: float) -> float:
     surge = 1.0 + law[1] / (1.0 + tan_half / law[2])
     brightness: float = law[3] * surge * (2.0 * law[0] * cos_i / (cos_i + cos_e) + (1.0 - law[0]) * cos_i)
     return brightness
+
+
+@njit(cache=True, inline="always")
+def _in_reach(reach: Reach, x: float, y: float) -> bool:
+    """Whether a thing may hide the sun from the ground at this place."""
+    cells, west, south, per_metre = reach
+    if per_metre == 0.0:
+        return True
+    column = math.floor((x - west) * per_metre)
+    row = math.floor((y - south) * per_metre)
+    return bool(0 <= row < cells.shape[0] and 0 <= column < cells.shape[1] and cells[row, column])
 
 
 # Fused multiplications round differently, but the same way every time on the same processor.
@@ -69,6 +82,7 @@ def shade(
     body_of_triangle: Ints,
     albedos: Array,
     tree: Hierarchy,
+    reach: Reach,
     radiance: Array32,
     body: Ints,
     normal: Array32,
@@ -106,6 +120,8 @@ def shade(
     normals, body_of_triangle, albedos, tree
         Triangles that stand on the ground: normals at their corners, the body of each, the bodies' albedos, and the
         triangles themselves with the tree in which shadows look for them.
+    reach
+        Where the ground may lie in those shadows: a grid, its west and south border, and cells a metre; 0: everywhere.
     radiance, body, normal
         Outputs: radiance factor; number of the thing seen (GROUND, SKY); unit normal in world axes.
     """
@@ -210,7 +226,7 @@ def shade(
                     lit = sun_over_ground(
                         finest, inverse_spacing, shadow, shadow_spacing, row_m, x, y, z, sun, sun_radius, highest
                     )
-            if lit > 0.0 and things:
+            if lit > 0.0 and things and (triangle >= 0 or _in_reach(reach, x, y)):
                 # lifted off its own facet, so that this and those beside do not shade it by rounding
                 lift = 1e-4 + (0.05 * t * pixel_angles[n] if triangle >= 0 else 0.0)
                 if anything_hit(tree, x + lift * nx, y + lift * ny, z + lift * nz, sun, 0.0):

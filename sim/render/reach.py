@@ -1,0 +1,48 @@
+"""Where things may shade the ground: what spares most of a wide picture's pixels the search for what hides the sun."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.ndimage import binary_dilation
+
+from sim.render.kernels.shading import Reach
+
+#: Most cells along a side.
+SIDE = 512
+#: No place is spared the search.
+EVERYWHERE: Reach = (np.ones((1, 1), dtype=np.bool_), 0.0, 0.0, 0.0)
+
+
+def shade_reach(spheres: Float64[np.ndarray, "bodies 4"], sun: Float64[np.ndarray, "3"], lowest_m: float) -> Reach:
+    """A grid of places, true where a body may hide the sun from ground that is nowhere lower than `lowest_m`.
+
+    The shadow of a sphere falls along the sun's azimuth between the point below its middle and the place where the ray
+    past its top has fallen to the lowest ground.
+
+    Parameters
+    ----------
+    spheres
+        Centre and radius of a sphere about each body, metres.
+    sun
+        Unit vector towards the sun, above the horizon.
+    lowest_m
+        Bound of the ground's height.
+    """
+    if len(spheres) == 0 or sun[2] <= 0.0:
+        return EVERYWHERE
+    starts = spheres[:, :2]
+    falls = np.maximum(spheres[:, 2] + spheres[:, 3] - lowest_m, 0.0) / sun[2]
+    ends = starts - falls[:, None] * sun[:2]
+    low, high = np.minimum(starts, ends).min(axis=0), np.maximum(starts, ends).max(axis=0)
+    # a body and half a step lie within a cell to each side
+    cell = float(max((high - low).max() / SIDE, 2.0 * spheres[:, 3].max(), 1e-3))
+    steps = int(np.ceil(2.0 * float(np.linalg.norm(ends - starts, axis=1).max()) / cell)) + 2
+    along = np.linspace(0.0, 1.0, steps)[:, None, None]
+    places = (starts + along * (ends - starts)).reshape(-1, 2)
+    corner = low - 2.0 * cell
+    columns, rows = (np.floor((high - corner) / cell).astype(int) + 3).tolist()
+    touched = np.zeros((rows, columns), dtype=np.bool_)
+    column, row = np.floor((places - corner) / cell).astype(int).T
+    touched[row, column] = True
+    return binary_dilation(touched, np.ones((3, 3), dtype=np.bool_)), float(corner[0]), float(corner[1]), 1.0 / cell

@@ -1,0 +1,69 @@
+"""Places where things may shade the ground: none that they do shade is left out, and most others are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenarios.views import Eye, SiteGround, nadir_pose, site_scene
+from sim.frames import direction
+from sim.render import PixelRays, Sun, process_renderer
+from sim.render.backend import default_backend
+from sim.render.reach import EVERYWHERE, shade_reach
+from sim.sensor import preset
+from sim.terrain import RockParameters, TerrainParameters, site
+
+ROCKY = TerrainParameters(samples=512, spacing_m=3.0, rocks=RockParameters(abundance=0.15, smallest_m=1.0))
+
+
+def _told(reach, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    cells, west, south, per_metre = reach
+    column = np.floor((x - west) * per_metre).astype(int)
+    row = np.floor((y - south) * per_metre).astype(int)
+    inside = (column >= 0) & (column < cells.shape[1]) & (row >= 0) & (row < cells.shape[0])
+    told = np.zeros(x.shape, dtype=bool)
+    told[inside] = cells[row[inside], column[inside]]
+    return told
+
+
+@pytest.mark.parametrize("elevation", [0.2, 0.7, 1.5])
+def test_every_place_in_a_shadow_is_in_reach(elevation) -> None:
+    """Rays to the sun that pass through a sphere, from ground of any height above the lowest; and few others."""
+    rng = np.random.default_rng(0)
+    spheres = np.column_stack(
+        [rng.uniform(-900.0, 900.0, (40, 2)), rng.uniform(-30.0, 30.0, 40), rng.uniform(0.5, 3.0, 40)]
+    )
+    sun = direction(rng.uniform(0.0, 6.0), elevation)
+    reach = shade_reach(spheres, sun, -40.0)
+    # from points within the spheres back along the sun's rays, down to any height
+    inside = np.repeat(spheres, 500, axis=0)
+    away = rng.standard_normal((len(inside), 3))
+    away *= (rng.random(len(inside)) ** (1.0 / 3.0) / np.linalg.norm(away, axis=1))[:, None]
+    points = inside[:, :3] + inside[:, 3:] * away
+    fall = rng.random(len(points)) * (points[:, 2] + 40.0)
+    ground = points - (fall / sun[2])[:, None] * sun
+    assert _told(reach, ground[:, 0], ground[:, 1]).all()
+    anywhere = rng.uniform(-1000.0, 1000.0, (20000, 2))
+    # shadows of 70 m / tan(elevation), some cells wide, of 40 things on 4 km2
+    assert _told(reach, *anywhere.T).mean() < 0.15 + 0.1 / np.tan(elevation)
+
+
+def test_without_things_or_sun_nothing_is_said() -> None:
+    one = np.array([[0.0, 0.0, 0.0, 1.0]])
+    assert shade_reach(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is EVERYWHERE
+    assert shade_reach(one, direction(0.0, -0.1), 0.0) is EVERYWHERE
+
+
+def test_pictures_are_the_same_with_and_without() -> None:
+    """Bit for bit, over ground with many rocks under a low sun."""
+    ground = SiteGround.of(site("gusev").model_copy(update={"descent": ROCKY}))
+    rays = PixelRays.of(preset("mer-descent-flown").cameras()[0].binned(4, 4))
+    pose = nadir_pose(ground.surface, 300.0, 200.0, 400.0)
+    scene = site_scene(ground, Eye.of(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
+    assert len(scene.objects) > 50
+    limited = process_renderer(default_backend()).render(scene, rays, pose)
+    unlimited = replace(scene)
+    unlimited.__dict__["reach"] = EVERYWHERE
+    whole = process_renderer(default_backend()).render(unlimited, rays, pose)
+    np.testing.assert_array_equal(limited.radiance, whole.radiance)
+    assert not scene.reach[0].all()
