@@ -6,7 +6,6 @@ the pictures themselves, with the window interpolated by a spline of high order,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -57,14 +56,6 @@ def shifted_patch(
     )
 
 
-@dataclass(frozen=True)
-class Alignment:
-    """Where a template matches best: corner (row, column) in the window, and normalised correlation there."""
-
-    corner: Float[np.ndarray, "2"]
-    score: float
-
-
 def refine_shift(
     template: Float[np.ndarray, "n m"],
     window: Float[np.ndarray, "rows columns"],
@@ -72,21 +63,7 @@ def refine_shift(
     iterations: int = 6,
     reach: float = 1.5,
 ) -> Float[np.ndarray, "2"] | None:
-    """The corner of `aligned`, or None."""
-    found = aligned(template, window, corner, iterations, reach)
-    return None if found is None else found.corner
-
-
-def aligned(
-    template: Float[np.ndarray, "n m"],
-    window: Float[np.ndarray, "rows columns"],
-    corner: Float[np.ndarray, "2"],
-    iterations: int = 6,
-    reach: float = 1.5,
-) -> Alignment | None:
     """Corner (row, column) in the window at which the template matches best, to hundredths of a pixel.
-
-    The score is that of the last place but one, less than 1e-3 px away unless the iterations ran out.
 
     Minimises ``sum (A - gain B)^2`` over shift and gain, A and B less their means, from `corner` by Gauss-Newton. None
     when it leaves the circle of `reach` pixels about the start, when the patch comes within three pixels of the
@@ -99,18 +76,17 @@ def aligned(
     room = np.array(region.shape) - np.array(template.shape) - 4.0
     a = template - template.mean()
     start = corner - near
-    place, score = start, 0.0
+    place = start
     for _ in range(iterations):
         if np.hypot(*(place - start)) > reach or np.any(place < 3.0) or np.any(place > room):
             return None
-        found = _step(a, *shifted_patch(coefficients, place, (template.shape[0], template.shape[1])))
-        if found is None:
+        step = _step(a, *shifted_patch(coefficients, place, (template.shape[0], template.shape[1])))
+        if step is None:
             return None
-        step, score = found
         place = place + step
         if np.hypot(*step) < TOLERANCE:
             break
-    return Alignment(place + near, score) if np.hypot(*(place - start)) <= reach else None
+    return place + near if np.hypot(*(place - start)) <= reach else None
 
 
 def _step(
@@ -118,17 +94,15 @@ def _step(
     patch: Float[np.ndarray, "n m"],
     by_row: Float[np.ndarray, "n m"],
     by_column: Float[np.ndarray, "n m"],
-) -> tuple[Float[np.ndarray, "2"], float] | None:
-    """One Gauss-Newton step of the shift (row, column), the gain solved for at once; and the correlation before it."""
+) -> Float[np.ndarray, "2"] | None:
+    """One Gauss-Newton step of the shift (row, column), the gain solved for at once."""
     b = patch - patch.mean()
     energy = float(np.sum(b * b))
-    cross = float(np.sum(a * b))
-    gain = cross / energy if energy > 0.0 else 0.0
+    gain = float(np.sum(a * b)) / energy if energy > 0.0 else 0.0
     if gain <= 0.0:
         return None
-    score = cross / float(np.sqrt(energy * np.sum(a * a)))
     jacobian = gain * np.stack([(by_row - by_row.mean()).ravel(), (by_column - by_column.mean()).ravel()])
     normal = jacobian @ jacobian.T
     if np.linalg.det(normal) <= 1e-10 * np.trace(normal) ** 2:
         return None
-    return np.asarray(np.linalg.solve(normal, jacobian @ (a - gain * b).ravel())), score
+    return np.asarray(np.linalg.solve(normal, jacobian @ (a - gain * b).ravel()))

@@ -16,11 +16,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from algorithms.interface import TargetLoss, TrackingState
 from algorithms.vtt.accuracy import stereo_range_error_m
 from algorithms.vtt.options import VttOptions
+from algorithms.vtt.stereo import disparity_px_m
 from sim.camera import CameraModel
 
 
@@ -53,11 +52,11 @@ class Tolerances:
 
 def tolerances(journey: Journey, left: CameraModel, right: CameraModel, options: VttOptions) -> Tolerances:
     """The tolerances of Fig. 5 for this update, by the formula above."""
-    focal, baseline = left.focal_lengths[0], float(np.linalg.norm(right.c - left.c))
+    scale = disparity_px_m(left, right)
 
     def tolerance(before_m: float, moved_m: float) -> float:
         before, now = (
-            stereo_range_error_m(range_m, focal, baseline, options.stereo_disparity_error_px)
+            stereo_range_error_m(range_m, scale, 1.0, options.stereo_disparity_error_px)
             for range_m in (before_m, journey.now_m)
         )
         return options.tolerance_floor_m + math.hypot(before, now, options.pose_error * moved_m)

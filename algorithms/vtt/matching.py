@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.image.alignment import SURROUND, Alignment, aligned
+from algorithms.image.alignment import SURROUND
 from algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
 from algorithms.image.peak import Peak, biquadratic_offset
+from algorithms.image.registration import Registration, registered
 from algorithms.image.resampling import similarity_patch
 from algorithms.vtt.options import VttOptions
 from sim.camera import CameraModel
@@ -31,19 +32,25 @@ class Sighting:
         The left picture.
     pixel
         The target in it, full-frame (u, v), shape (2,).
-    position_rover
-        The target in the rover frame of that stop, metres, shape (3,).
+    position_head
+        The target in the frame of the mast's head as it was, metres, shape (3,).
     camera
-        The left camera in that rover frame.
-    world_from_rover
-        The rover's pose as estimated then.
+        The left camera in that frame.
+    world_from_head, world_from_rover
+        The head's and the rover's pose as estimated then.
     """
 
     image: MastImage
     pixel: Float[np.ndarray, "2"]
-    position_rover: Float[np.ndarray, "3"]
+    position_head: Float[np.ndarray, "3"]
     camera: CameraModel
+    world_from_head: RigidTransform
     world_from_rover: RigidTransform
+
+    @property
+    def distance_m(self) -> float:
+        """From the camera's centre to the target."""
+        return float(np.linalg.norm(self.position_head - self.camera.c))
 
 
 @dataclass(frozen=True)
@@ -114,20 +121,22 @@ def refined(
     image: MastImage,
     corner: Float[np.ndarray, "2"],
     offset: Float[np.ndarray, "2"],
-    score: float,
-) -> Alignment:
+    whole: Peak,
+    options: VttOptions,
+) -> Registration:
     """The match's upper left corner (row, column of `image.counts`) below a pixel, and the correlation there.
 
-    `corner` and `score` are those of the best whole pixel and `offset` where the fit to the correlation peak has its
-    top: the answer where aligning the pictures themselves fails.
+    `corner` is that of the best whole pixel, with the correlation of `whole`, and `offset` where the fit to the
+    correlation has its top: the answer where registration of the pictures themselves fails.
     """
     near = np.maximum(corner.astype(int) - SURROUND - 2, 0)
     far = corner.astype(int) + len(template) + SURROUND + 2
     region = image.counts[near[0] : far[0], near[1] : far[1]].astype(np.float64)
-    found = aligned(template, region, corner + offset - near)
-    if found is None:
-        return Alignment(corner + offset, score)
-    return Alignment(found.corner + near, found.score)
+    for stretch in (True, False) if options.affine else (False,):
+        found = registered(template, region, corner + offset - near, stretch)
+        if found is not None:
+            return Registration(found.corner + near, found.score)
+    return Registration(corner + offset, whole.value)
 
 
 def match_by_correlation(
@@ -142,9 +151,9 @@ def match_by_correlation(
     peak = coarse_to_fine_peak(template, window, options.coarse_levels, options.coarse_candidates)
     half = 0.5 * (options.template_px - 1)
     corner = np.array([peak.row, peak.column]) + np.array(window_corner[::-1], dtype=np.float64) - image.corner[::-1]
-    best = Alignment(corner, peak.value)
+    best = Registration(corner, peak.value)
     if options.subpixel:
-        best = refined(template, image, corner, _top(template, window, peak), peak.value)
+        best = refined(template, image, corner, _top(template, window, peak), peak, options)
     return Match(best.corner[::-1] + half + image.corner, best.score, template)
 
 

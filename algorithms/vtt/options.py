@@ -61,6 +61,7 @@ class VttOptions:
     coarse_levels: int = 1
     coarse_candidates: int = 6
     subpixel: bool = True
+    affine: bool = True
     epipolar_tolerance_px: float = 2.0
     stereo_search_share: float = 0.5
     seed_range_m: tuple[float, float] = (1.0, 100.0)

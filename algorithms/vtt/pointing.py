@@ -13,7 +13,6 @@ from algorithms.image.alignment import SURROUND
 from algorithms.interface import MastAim, PixelBox
 from algorithms.vtt.options import VttOptions
 from algorithms.vtt.stereo import epipolar_pixels
-from algorithms.vtt.target import rover_cameras
 from sim.camera import CameraModel
 from sim.measurements import MastCalibration, MastGeometry, PixelTarget
 
@@ -100,21 +99,20 @@ def aim_at_position(
     angles = mast_angles(position_rover, mast, options.aim_pair)
     if angles is None:
         return None
-    left, right = rover_cameras(mast, *angles)
+    point = mast.geometry.rover_from_head(*angles).inv().apply(position_rover[None])
     margin = 0.5 * options.search_px + SURROUND
     boxes = (
-        box_around(left.project(position_rover[None])[0], margin, mast.left),
-        box_around(right.project(position_rover[None])[0], margin + options.disparity_search_px, mast.right),
+        box_around(mast.left.project(point)[0], margin, mast.left),
+        box_around(mast.right.project(point)[0], margin + options.disparity_search_px, mast.right),
     )
     return None if boxes[0] is None or boxes[1] is None else MastAim(*angles, boxes[0], boxes[1])
 
 
 def aim_at_pixel(target: PixelTarget, mast: MastCalibration, options: VttOptions) -> MastAim | None:
     """The angles at which the target was picked, and what to read out: in the right picture all ranges allowed."""
-    left, right = rover_cameras(mast, target.azimuth_rad, target.elevation_rad)
     margin = 0.5 * options.search_px + SURROUND
     box = box_around(target.pixel[None], margin, mast.left)
-    curve = epipolar_pixels(left, right, target.pixel, options.seed_range_m)
+    curve = epipolar_pixels(mast.left, mast.right, target.pixel, options.seed_range_m)
     seen = curve[mast.right.in_frame(curve)]
     if box is None or len(seen) == 0:
         return None

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from algorithms.image.alignment import Alignment
 from algorithms.image.normalized import normalized_correlation
 from algorithms.image.peak import biquadratic_offset, highest_peak
+from algorithms.image.registration import Registration
 from algorithms.vtt.matching import refined
 from algorithms.vtt.options import VttOptions
 from sim.camera import CameraModel
@@ -47,17 +48,22 @@ def epipolar_pixels(
     is left out. Lens distortion bends the curve.
     """
     origin, direction = left.rays(pixel)
-    baseline = float(np.linalg.norm(right.c - left.c))
     near, far = (1.0 / ranges_m[0], 1.0 / ranges_m[1])
-    count = max(int(np.ceil(2.0 * right.focal_lengths[0] * baseline * (near - far))) + 1, 2)
+    count = max(int(np.ceil(2.0 * disparity_px_m(left, right) * (near - far))) + 1, 2)
     points = origin + direction / np.linspace(far, near, count)[:, None]
     pixels, visible = right.project(points)
     return np.asarray(pixels[visible])
 
 
+@lru_cache(maxsize=32)
+def disparity_px_m(left: CameraModel, right: CameraModel) -> float:
+    """Focal length times baseline: disparity times range, pixels metres. Kept, as every update asks for it thrice."""
+    return right.focal_lengths[0] * float(np.linalg.norm(right.c - left.c))
+
+
 def searched_ranges(left: CameraModel, right: CameraModel, range_m: float, disparity_px: float) -> tuple[float, float]:
     """Least and largest range whose disparity differs by `disparity_px` at most from that of `range_m`."""
-    step = disparity_px / (right.focal_lengths[0] * float(np.linalg.norm(right.c - left.c)))
+    step = disparity_px / disparity_px_m(left, right)
     inverse = 1.0 / range_m
     return 1.0 / (inverse + step), 1.0 / max(inverse - step, 1e-6)
 
@@ -100,9 +106,9 @@ def point_stereo(
     surface = normalized_correlation(template, band)
     peak = highest_peak(np.where(_off_curve(local - near - half, surface.shape, tolerance), -1.0, surface))
     corner = near[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
-    best = Alignment(corner, peak.value)
+    best = Registration(corner, peak.value)
     if options.subpixel:
-        best = refined(template, image, corner, biquadratic_offset(surface, peak), peak.value)
+        best = refined(template, image, corner, biquadratic_offset(surface, peak), peak, options)
     return StereoMatch(
         pixel=best.corner[::-1] + half + image.corner,
         score=best.score,

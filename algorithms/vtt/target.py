@@ -6,9 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
-from sim.camera import CameraModel
 from sim.frames import SITE_FROM_WORLD
-from sim.measurements import MastCalibration, RoverTarget, SiteTarget
+from sim.measurements import RoverTarget, SiteTarget
 
 
 def designated_position_world(
@@ -20,24 +19,16 @@ def designated_position_world(
     return np.asarray(SITE_FROM_WORLD.inv().apply(target.position_site.copy()))
 
 
-def pose_change(old_world_from_rover: RigidTransform, new_world_from_rover: RigidTransform) -> RigidTransform:
-    """The transform from the old rover frame into the new one."""
-    return new_world_from_rover.inv() * old_world_from_rover
+def pose_change(old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform) -> RigidTransform:
+    """The transform from the frame as it lay into the frame as it lies."""
+    return new_world_from_frame.inv() * old_world_from_frame
 
 
 def predicted_position(
-    position_rover: Float[np.ndarray, "3"],
-    old_world_from_rover: RigidTransform,
-    new_world_from_rover: RigidTransform,
+    position: Float[np.ndarray, "3"], old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform
 ) -> Float[np.ndarray, "3"]:
-    """The target in the rover frame after a move, from where it was and the estimated poses before and after."""
-    return np.asarray(pose_change(old_world_from_rover, new_world_from_rover).apply(position_rover.copy()))
-
-
-def rover_cameras(mast: MastCalibration, azimuth_rad: float, elevation_rad: float) -> tuple[CameraModel, CameraModel]:
-    """The left and right camera in the rover frame at these mast angles."""
-    rover_from_head = mast.geometry.rover_from_head(azimuth_rad, elevation_rad)
-    return mast.left.moved(rover_from_head), mast.right.moved(rover_from_head)
+    """A point fixed in the world, in a frame that moved (the rover's, or the mast head's), from where it was there."""
+    return np.asarray(pose_change(old_world_from_frame, new_world_from_frame).apply(position.copy()))
 
 
 def bearing_rad(direction_world: Float[np.ndarray, "3"]) -> float:

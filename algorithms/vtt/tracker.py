@@ -35,7 +35,6 @@ from algorithms.vtt.target import (
     designated_position_world,
     pose_change,
     predicted_position,
-    rover_cameras,
 )
 from sim.camera import CameraModel
 from sim.measurements import MastCalibration, PixelTarget, RoverMeasurements, TargetDesignation
@@ -140,32 +139,61 @@ class Finding:
     sighting: Sighting | None = None
 
 
-def expected_position(track: Track, world_from_rover: RigidTransform) -> Float[np.ndarray, "3"] | None:
-    """The target in the rover frame of this pose; None for a pixel that was not yet seen in stereo."""
+@dataclass(frozen=True)
+class Stop:
+    """What was measured at a stop, and the mast's head as it stands there; cameras are in the head's frame."""
+
+    measurements: RoverMeasurements
+    rover_from_head: RigidTransform
+    world_from_head: RigidTransform
+
+    @classmethod
+    def of(cls, measurements: RoverMeasurements) -> Stop:
+        """The stop at which this was measured."""
+        angles = (measurements.azimuth_rad, measurements.elevation_rad)
+        rover_from_head = measurements.mast.geometry.rover_from_head(*angles)
+        return cls(measurements, rover_from_head, measurements.world_from_rover * rover_from_head)
+
+    @property
+    def left(self) -> CameraModel:
+        """The left camera."""
+        return self.measurements.mast.left
+
+    @property
+    def right(self) -> CameraModel:
+        """The right camera."""
+        return self.measurements.mast.right
+
+    def distance_m(self, position_head: Float[np.ndarray, "3"]) -> float:
+        """From the left camera's centre."""
+        return float(np.linalg.norm(position_head - self.left.c))
+
+
+def expected_position(track: Track, world_from_frame: RigidTransform) -> Float[np.ndarray, "3"] | None:
+    """The target in a frame of this pose (the rover's, the head's); None for a pixel not yet seen in stereo."""
     if track.sighting is not None:
         last = track.sighting
-        return predicted_position(last.position_rover, last.world_from_rover, world_from_rover)
+        return predicted_position(last.position_head, last.world_from_head, world_from_frame)
     if track.designated_world is None:
         return None
-    return np.asarray(world_from_rover.inv().apply(track.designated_world.copy()))
+    return np.asarray(world_from_frame.inv().apply(track.designated_world.copy()))
 
 
 def seeded(track: Track, measurements: RoverMeasurements, options: VttOptions) -> Finding:
     """Takes the first template where the target was designated, and its position by point stereo."""
-    cameras = rover_cameras(measurements.mast, measurements.azimuth_rad, measurements.elevation_rad)
-    expected = expected_position(track, measurements.world_from_rover)
+    stop = Stop.of(measurements)
+    expected = expected_position(track, stop.world_from_head)
     if expected is None and isinstance(track.target, PixelTarget):
         pixel, ranges = track.target.pixel, options.seed_range_m
     elif expected is not None:
-        pixel = cameras[0].project(expected)[0]
-        distance = float(np.linalg.norm(expected - cameras[0].c))
-        ranges = searched_ranges(*cameras, distance, options.disparity_search_px)
+        pixel = stop.left.project(expected)[0]
+        ranges = searched_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
     if not np.all(np.isfinite(pixel)) or not has_room(measurements.left, pixel, options.template_px):
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
     template = cut_patch(measurements.left, pixel, options.template_px)
     window, window_corner = search_window(measurements.left, pixel, options.search_px)
     details = VttDetails(True, pixel, window, window_corner, match=Match(pixel, 1.0, template), template=template)
-    placed = ranged(measurements, cameras, pixel, template, ranges, details, options)
+    placed = ranged(stop, pixel, template, ranges, details, options)
     if placed.sighting is None or placed.details.stereo is None:
         return placed
     if placed.details.stereo.score < options.min_stereo_score:
@@ -177,10 +205,11 @@ def followed(
     track: Track, last: Sighting, measurements: RoverMeasurements, options: VttOptions, matcher: Matcher
 ) -> Finding:
     """Actions 1 to 6 of section 4.1 but the pointing, which came before the pictures; and the criteria of loss."""
-    cameras = rover_cameras(measurements.mast, measurements.azimuth_rad, measurements.elevation_rad)
-    expected = predicted_position(last.position_rover, last.world_from_rover, measurements.world_from_rover)
-    predicted = cameras[0].project(expected)[0]
-    change = appearance_change(last, expected, cameras[0], measurements.world_from_rover, options)
+    stop = Stop.of(measurements)
+    new_from_old = pose_change(last.world_from_head, stop.world_from_head)
+    expected = np.asarray(new_from_old.apply(last.position_head.copy()))
+    predicted = stop.left.project(expected)[0]
+    change = appearance_change(last, expected, stop.left, new_from_old, options)
     if not np.all(np.isfinite(predicted)) or change is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
     window, window_corner = search_window(measurements.left, predicted, options.search_px)
@@ -194,37 +223,32 @@ def followed(
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
     template = cut_patch(measurements.left, match.pixel, options.template_px)
     details = replace(details, match=match, template=template)
-    distance = float(np.linalg.norm(expected - cameras[0].c))
-    ranges = searched_ranges(*cameras, distance, options.disparity_search_px)
-    placed = ranged(measurements, cameras, match.pixel, template, ranges, details, options)
+    ranges = searched_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
+    placed = ranged(stop, match.pixel, template, ranges, details, options)
     if placed.sighting is None:
         return placed
-    return judged(track, last, placed, placed.sighting, distance, cameras, options)
+    return judged(track, last, placed, placed.sighting, stop, stop.distance_m(expected), options)
 
 
 def appearance_change(
     last: Sighting,
     expected: Float[np.ndarray, "3"],
     camera: CameraModel,
-    world_from_rover: RigidTransform,
+    new_from_old: RigidTransform,
     options: VttOptions,
 ) -> Change | None:
-    """Magnification and roll since the last sighting; None where the new camera does not see the target."""
-    roll = roll_angle(
-        last.position_rover,
-        last.camera,
-        camera,
-        pose_change(last.world_from_rover, world_from_rover),
-        options.roll_lever_m,
-    )
+    """Magnification and roll since the last sighting; None where the new camera does not see the target.
+
+    The target where it is expected and the new camera are in the head's frame now, into which `new_from_old` takes.
+    """
+    roll = roll_angle(last.position_head, last.camera, camera, new_from_old, options.roll_lever_m)
     if roll is None:
         return None
-    return Change(magnification(last.position_rover, last.camera.c, expected, camera.c), roll)
+    return Change(magnification(last.position_head, last.camera.c, expected, camera.c), roll)
 
 
 def ranged(
-    measurements: RoverMeasurements,
-    cameras: tuple[CameraModel, CameraModel],
+    stop: Stop,
     pixel: Float[np.ndarray, "2"],
     template: Float[np.ndarray, "n n"],
     ranges_m: tuple[float, float],
@@ -232,24 +256,25 @@ def ranged(
     options: VttOptions,
 ) -> Finding:
     """The target's position by point stereo from its left pixel; the right picture is searched over these ranges."""
-    left, right = cameras
-    curve = epipolar_pixels(left, right, pixel, ranges_m)
-    stereo = point_stereo(template, measurements.right, curve, options)
+    curve = epipolar_pixels(stop.left, stop.right, pixel, ranges_m)
+    stereo = point_stereo(template, stop.measurements.right, curve, options)
     if stereo is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
-    position = triangulated(left, right, pixel, stereo.pixel)
+    position = triangulated(stop.left, stop.right, pixel, stereo.pixel)
     if position is None:
         return Finding((TargetLoss.NO_RANGE,), replace(details, stereo=stereo))
-    sight = position - left.c
+    in_rover = np.asarray(stop.rover_from_head.apply(np.stack([position, stop.left.c])))
+    sight = in_rover[0] - in_rover[1]
+    world_from_rover = stop.measurements.world_from_rover
     details = replace(
         details,
         stereo=stereo,
-        distance_m=float(np.linalg.norm(sight)),
+        distance_m=stop.distance_m(position),
         azimuth_rad=float(np.arctan2(-sight[1], sight[0])),
-        position_world=np.asarray(measurements.world_from_rover.apply(position.copy())),
+        position_world=np.asarray(stop.world_from_head.apply(position)),
     )
-    sighting = Sighting(measurements.left, pixel, position, left, measurements.world_from_rover)
-    return Finding((), details, position, sighting)
+    sighting = Sighting(stop.measurements.left, pixel, position, stop.left, stop.world_from_head, world_from_rover)
+    return Finding((), details, in_rover[0], sighting)
 
 
 def judged(
@@ -257,8 +282,8 @@ def judged(
     last: Sighting,
     placed: Finding,
     sighting: Sighting,
+    stop: Stop,
     expected_m: float,
-    cameras: tuple[CameraModel, CameraModel],
     options: VttOptions,
 ) -> Finding:
     """What was found, or nothing where one of the four criteria says that it is not the target."""
@@ -267,13 +292,13 @@ def judged(
     since_update = sighting.world_from_rover.translation - track.world_from_rover.translation
     journey = Journey(
         seed_m=track.seed_distance_m,
-        last_m=float(np.linalg.norm(last.position_rover - last.camera.c)),
+        last_m=last.distance_m,
         now_m=details.distance_m,
         step_m=float(np.linalg.norm(moved)),
         driven_m=track.driven_m + float(np.linalg.norm(since_update)),
     )
     evidence = _evidence(track, details, expected_m)
-    allowed: Tolerances = tolerances(journey, *cameras, options)
+    allowed: Tolerances = tolerances(journey, stop.left, stop.right, options)
     details = replace(
         details,
         step_m=journey.step_m,
@@ -300,7 +325,7 @@ def _evidence(track: Track, details: VttDetails, expected_m: float) -> Evidence:
 def _turned(last: Sighting, now: Sighting) -> float:
     """By how much the line of sight turned in the world, clockwise seen from above, radians."""
     before, after = (
-        bearing_rad(np.asarray(s.world_from_rover.rotation.apply(s.position_rover - s.camera.c))) for s in (last, now)
+        bearing_rad(np.asarray(s.world_from_head.rotation.apply(s.position_head - s.camera.c))) for s in (last, now)
     )
     return float(np.arctan2(np.sin(after - before), np.cos(after - before)))
 

@@ -1,0 +1,84 @@
+"""Registration of a template that may have been stretched as well as shifted: Gauss-Newton on quintic splines.
+
+Shifting alone leans: where the picture is longer one way than the template, texture that is denser on one side pulls
+the match to that side, by up to tenths of a pixel. Solving for the stretch as well takes that out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from algorithms.image import kernels
+from algorithms.image.alignment import SURROUND, TOLERANCE, spline_coefficients
+
+#: A pivot of the normal equations, their diagonal made 1, below which texture does not tell one unknown from another.
+SINGULAR = 1e-4
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How far a registration may go before it is not believed.
+
+    Attributes
+    ----------
+    shift_px
+        Largest distance of the middle from where it started.
+    stretch
+        Largest entry of the affine map's difference from the identity.
+    steps
+        Steps allowed; four to six are the rule.
+    """
+
+    shift_px: float = 1.5
+    stretch: float = 0.35
+    steps: int = 12
+
+
+#: What is believed where nothing else is said.
+LIMITS = Limits()
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Where a template matches best.
+
+    Attributes
+    ----------
+    corner
+        Row and column of its upper left pixel in the window, as if it were only shifted, shape (2,).
+    score
+        Normalised correlation of the template with what it was registered to.
+    """
+
+    corner: Float[np.ndarray, "2"]
+    score: float
+
+
+def registered(
+    template: Float[np.ndarray, "n n"],
+    window: Float[np.ndarray, "rows columns"],
+    corner: Float[np.ndarray, "2"],
+    stretch: bool,
+    limits: Limits = LIMITS,
+) -> Registration | None:
+    """The place in the window, by its middle, at which the template matches best, to hundredths of a pixel.
+
+    Minimises ``sum (B(c + M d) - gain A(d) - offset)^2`` over the middle c, gain, offset and, with `stretch`, the
+    matrix M, which else is 1; A is the template over offsets d from its middle, B the window by quintic splines. It
+    goes from `corner` (row, column) by the inverse compositional method (Baker & Matthews 2004): derivatives are those
+    of the template, taken once. None when it leaves the limits or the window, does not converge, or when the texture
+    does not determine the unknowns.
+    """
+    half = 0.5 * (len(template) - 1)
+    near = np.maximum(np.floor(corner).astype(int) - SURROUND, 0)
+    far = np.ceil(corner).astype(int) + len(template) + SURROUND
+    coefficients = spline_coefficients(window[near[0] : far[0], near[1] : far[1]])
+    start = corner - near + half
+    bounds = (limits.shift_px, limits.stretch, limits.steps)
+    done, row, column, score = kernels.register(
+        template, coefficients, start[0], start[1], stretch, bounds, TOLERANCE, SINGULAR
+    )
+    return Registration(np.array([row, column]) - half + near, score) if done else None
