@@ -20,7 +20,7 @@ from tests.scenarios.descent.settings import FLAT, NOISELESS, PERFECT, parameter
 
 #: Swell of 200 m from trough to crest under ground that is rough on all scales.
 RELIEF = {"samples": 1024, "spacing_m": 4.0, "rms_slope_deg": 1.0, "swell": {"relief_m": 200.0}}
-CASES = 8
+CASES = 5
 
 
 def _tracked(case: int, **parts: Any) -> tuple[list[Track], list[State], DescentMeasurements, Surface]:
