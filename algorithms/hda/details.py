@@ -1,0 +1,141 @@
+"""What the hazard detection did, for figures and diagnosis: all that the paper's Figs. 1-5 and 7 show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from algorithms.hda.elevation import ElevationMap
+from algorithms.hda.hazards import HazardMaps
+from algorithms.hda.motion import Motion
+from algorithms.hda.structure import Matches
+from algorithms.hda.tracking import Tracks
+from algorithms.hda.view import View, points_at, undistorted
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The ground as mapped.
+
+    Attributes
+    ----------
+    surface_from_camera
+        From the first camera's frame to the surface frame; both have their origin in that camera.
+    world_from_surface
+        The rotation about the vertical that is left, by the on-board pose.
+    points
+        The point cloud in the surface frame, metres.
+    elevation, hazards
+        The maps.
+    apriori_cell
+        Row and column of the a-priori site, whole or not, perhaps outside the map.
+    site_cell
+        Row and column of the chosen site; None if nothing is safe.
+    """
+
+    surface_from_camera: Rotation
+    world_from_surface: Rotation
+    points: Float[np.ndarray, "n 3"]
+    elevation: ElevationMap
+    hazards: HazardMaps
+    apriori_cell: Float[np.ndarray, "2"]
+    site_cell: tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class HdaDetails:
+    """Everything found on the way to the answer, as far as it went: None for what was not reached.
+
+    Attributes
+    ----------
+    views
+        The two pictures with their cameras, each in its camera's frame, and the on-board poses.
+    tracks
+        All features and their tracks.
+    motion
+        Motion, and depths of the tracks that were accepted, in that order; its scale is the altimeter's if there are
+        matches.
+    matches
+        The dense matches.
+    ground
+        Maps and site.
+    """
+
+    views: tuple[View, View]
+    tracks: Tracks | None = None
+    motion: Motion | None = None
+    matches: Matches | None = None
+    ground: Ground | None = None
+
+
+def hda_products(details: HdaDetails) -> dict[str, Any]:
+    """The details as plain arrays, for storage and figures; stages that were not reached are left out.
+
+    Keys, pixels (u, v), lengths in metres, angles in radians:
+
+    - Fig. 1: `features`, `tracked`, `correlations`, `tracks_accepted`;
+    - Fig. 2: `rotation` and `translation` (second from first camera), `sparse_points` (of the accepted tracks, first
+      camera's frame), `residuals_px`, `inliers`, `frustum_0` and `frustum_1` (rays of each picture's corners in its
+      camera's frame, of depth one);
+    - Fig. 3: `grid`, `segment_starts`, `segment_ends`, `matched`, `matches_accepted`;
+    - Fig. 4: `points`, `elevation`, `corner`, `cell` (surface frame);
+    - Figs. 5 and 7: `smooth`, `roughness`, `slope`, `safety` (values of `Safety`), `site` and `apriori` (row, column;
+      the site empty for none), `map_pixels` (of the first picture, for every cell's middle at its elevation),
+      `surface_from_camera` and `world_from_surface` (matrices).
+    """
+    products: dict[str, Any] = {}
+    if details.tracks is not None:
+        tracks = details.tracks
+        products |= {"features": tracks.first, "tracked": tracks.second, "correlations": tracks.correlations}
+        products["tracks_accepted"] = tracks.accepted
+    if details.tracks is not None and details.motion is not None:
+        products |= _motion_products(details.views, details.tracks, details.motion)
+    if details.matches is not None:
+        matches = details.matches
+        products |= {"grid": matches.first, "segment_starts": matches.starts, "segment_ends": matches.ends}
+        products |= {"matched": matches.second, "matches_accepted": matches.accepted}
+    if details.ground is not None:
+        products |= _ground_products(details.views[0], details.ground)
+    return products
+
+
+def _motion_products(views: tuple[View, View], tracks: Tracks, motion: Motion) -> dict[str, Any]:
+    places = undistorted(views[0].camera, tracks.first[tracks.accepted])
+    products: dict[str, Any] = {
+        "rotation": motion.second_from_first.rotation.as_matrix(),
+        "translation": motion.second_from_first.translation,
+        "sparse_points": points_at(places, motion.depths),
+        "residuals_px": motion.residuals_px,
+        "inliers": motion.inliers,
+    }
+    for number, one in enumerate(views):
+        rays = one.camera.corner_rays()[1]
+        products[f"frustum_{number}"] = rays / rays[:, 2:]
+    return products
+
+
+def _ground_products(first: View, ground: Ground) -> dict[str, Any]:
+    elevation = ground.elevation
+    shape = elevation.elevation_m.shape
+    places = elevation.places(np.moveaxis(np.indices(shape).astype(np.float64), 0, -1))
+    middles = np.concatenate([places, elevation.elevation_m[..., None]], axis=-1).reshape(-1, 3)
+    pixels, _ = first.camera.project(ground.surface_from_camera.inv().apply(middles))
+    return {
+        "points": ground.points,
+        "elevation": elevation.elevation_m,
+        "corner": elevation.corner_m,
+        "cell": np.array([elevation.cell_m]),
+        "smooth": ground.hazards.smooth_m,
+        "roughness": ground.hazards.roughness_m,
+        "slope": ground.hazards.slope_rad,
+        "safety": ground.hazards.safety,
+        "site": np.array(() if ground.site_cell is None else ground.site_cell, dtype=np.float64),
+        "apriori": ground.apriori_cell,
+        "map_pixels": pixels.reshape(*shape, 2),
+        "surface_from_camera": ground.surface_from_camera.as_matrix(),
+        "world_from_surface": ground.world_from_surface.as_matrix(),
+    }

@@ -1,0 +1,151 @@
+"""Points spread over a grid, and least-median-of-squares planes of its parts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: An upper quantile of a normal distribution, and what makes the median of absolute values its standard deviation.
+INLIER_DEVIATIONS = 2.5
+DEVIATION_OF_MEDIAN = 1.4826
+
+
+@njit(cache=True)
+def spread(rows: Array, columns: Array, values: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """Sums of weighted values and of weights: each value goes to the four cells about it by bilinear weights."""
+    sums = np.zeros(shape)
+    weights = np.zeros(shape)
+    for k in range(values.size):
+        row, column = math.floor(rows[k]), math.floor(columns[k])
+        fr, fc = rows[k] - row, columns[k] - column
+        for i in range(2):
+            for j in range(2):
+                r, c = int(row) + i, int(column) + j
+                if 0 <= r < shape[0] and 0 <= c < shape[1]:
+                    weight = (fr if i else 1.0 - fr) * (fc if j else 1.0 - fc)
+                    sums[r, c] += weight * values[k]
+                    weights[r, c] += weight
+    return sums, weights
+
+
+@njit(cache=True)
+def _plane_through(x: Array, y: Array, z: Array, i: int, j: int, k: int) -> tuple[float, float, float]:
+    """Value at (0, 0) and slopes of the plane through three points; NaN where they are in line."""
+    ux, uy, uz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
+    vx, vy, vz = x[k] - x[i], y[k] - y[i], z[k] - z[i]
+    determinant = ux * vy - uy * vx
+    if abs(determinant) < 0.5:
+        return math.nan, math.nan, math.nan
+    by_x = (uz * vy - uy * vz) / determinant
+    by_y = (ux * vz - uz * vx) / determinant
+    return z[i] - by_x * x[i] - by_y * y[i], by_x, by_y
+
+
+@njit(cache=True)
+def _least_squares(x: Array, y: Array, z: Array, used: NDArray[np.bool_]) -> tuple[float, float, float]:
+    """Value at (0, 0) and slopes of the least-squares plane of the points used; NaN where they are in line."""
+    n, mx, my, mz = 0, 0.0, 0.0, 0.0
+    for i in range(x.size):
+        if used[i]:
+            n += 1
+            mx += x[i]
+            my += y[i]
+            mz += z[i]
+    if n < 3:
+        return math.nan, math.nan, math.nan
+    mx /= n
+    my /= n
+    mz /= n
+    xx, yy, xy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(x.size):
+        if used[i]:
+            dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
+            xx += dx * dx
+            yy += dy * dy
+            xy += dx * dy
+            xz += dx * dz
+            yz += dy * dz
+    determinant = xx * yy - xy * xy
+    if determinant < 1e-9 * (xx + yy) ** 2 or determinant <= 0.0:
+        return math.nan, math.nan, math.nan
+    by_x = (xz * yy - yz * xy) / determinant
+    by_y = (yz * xx - xz * xy) / determinant
+    return mz - by_x * mx - by_y * my, by_x, by_y
+
+
+@njit(cache=True)
+def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> tuple[float, float, float]:
+    """Value at (0, 0) and slopes of the least-median-of-squares plane over planes through random triples.
+
+    `triples` are uniform numbers in [0, 1), one row a trial. x and y are whole numbers of cells. The median is that of
+    Rousseeuw & Leroy (1987): the (n / 2 + 2)-th smallest for a plane's three unknowns.
+    """
+    n = x.size
+    order = min(n // 2 + 2, n) - 1
+    best = math.inf
+    plane = (math.nan, math.nan, math.nan)
+    distances = np.empty(n)
+    for trial in range(triples.shape[0]):
+        i = int(triples[trial, 0] * n)
+        j = int(triples[trial, 1] * (n - 1))
+        j += j >= i
+        k = int(triples[trial, 2] * (n - 2))
+        low, high = min(i, j), max(i, j)
+        k += k >= low
+        k += k >= high
+        value, by_x, by_y = _plane_through(x, y, z, i, j, k)
+        if math.isnan(value):
+            continue
+        nearer = 0
+        for m in range(n):
+            distance = abs(z[m] - value - by_x * x[m] - by_y * y[m])
+            distances[m] = distance
+            nearer += distance < best
+        # The median is below the best so far only if enough of the distances are.
+        if nearer > order:
+            best = np.partition(distances, order)[order]
+            plane = (value, by_x, by_y)
+    if not refine or math.isinf(best):
+        return plane
+    limit = INLIER_DEVIATIONS * DEVIATION_OF_MEDIAN * (1.0 + 5.0 / max(n - 3, 1)) * best
+    used = np.empty(n, dtype=np.bool_)
+    for m in range(n):
+        used[m] = abs(z[m] - plane[0] - plane[1] * x[m] - plane[2] * y[m]) <= limit
+    refined = _least_squares(x, y, z, used)
+    return plane if math.isnan(refined[0]) else refined
+
+
+@njit(cache=True)
+def footprint_planes(
+    elevation: Array, first_rows: NDArray[np.int64], first_columns: NDArray[np.int64], side: int, least: int,
+    triples: Array, refine: bool,
+) -> Array:  # fmt: skip
+    """Planes of the squares of `side` cells at first rows and columns, shape (rows, columns, 3).
+
+    Value at the square's middle, slopes per column and per row; NaN where fewer than `least` cells are known.
+    """
+    planes = np.full((first_rows.size, first_columns.size, 3), np.nan)
+    x, y, z = np.empty(side * side), np.empty(side * side), np.empty(side * side)
+    middle = (side - 1) // 2
+    for a in range(first_rows.size):
+        for b in range(first_columns.size):
+            n = 0
+            for i in range(side):
+                for j in range(side):
+                    value = elevation[first_rows[a] + i, first_columns[b] + j]
+                    if not math.isnan(value):
+                        x[n], y[n], z[n] = j - middle, i - middle, value
+                        n += 1
+            if n < least:
+                continue
+            value, by_x, by_y = robust_plane(x[:n], y[:n], z[:n], triples, refine)
+            shift = 0.5 * (side - 1) - middle
+            planes[a, b, 0] = value + shift * (by_x + by_y)
+            planes[a, b, 1] = by_x
+            planes[a, b, 2] = by_y
+    return planes

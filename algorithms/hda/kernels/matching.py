@@ -1,0 +1,178 @@
+"""Correlation at whole pixels, its sub-pixel peak, and the searches: in a window, and along an epipolar segment."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+Array = NDArray[np.float64]
+
+#: Energy of a patch per pixel, squared counts, at or below which it is flat: rounding alone leaves less.
+FLAT_ENERGY = 1e-6
+
+
+@njit(cache=True)
+def correlation(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int) -> float:
+    """Eq. 3 of the patches about two pixels, each less its mean; both lie in their pictures."""
+    sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0
+    # Less one value of each, so that the sums of squares are small and lose nothing when the means are taken off.
+    base_a = np.float64(first[r1, c1])
+    base_b = np.float64(second[r2, c2])
+    for i in range(-half, half + 1):
+        for j in range(-half, half + 1):
+            a = first[r1 + i, c1 + j] - base_a
+            b = second[r2 + i, c2 + j] - base_b
+            sa += a
+            sb += b
+            saa += a * a
+            sbb += b * b
+            sab += a * b
+    n = (2 * half + 1) ** 2
+    energy = saa - sa * sa / n + sbb - sb * sb / n
+    if energy <= FLAT_ENERGY * n:
+        return 0.0
+    return 2.0 * (sab - sa * sb / n) / energy
+
+
+@njit(cache=True)
+def biquadratic_top(z: Array) -> tuple[float, float, float]:
+    """Row, column and value of the top of the quadric through 3 x 3 values, by least squares.
+
+    The place is held to [-1, 1]; the middle and its value where the quadric has no top.
+    """
+    gr, gc, rr, cc, rc, mean = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(3):
+        for j in range(3):
+            r, c, v = i - 1.0, j - 1.0, z[i, j]
+            mean += v / 9.0
+            gr += v * r / 6.0
+            gc += v * c / 6.0
+            rr += v * (r * r - 2.0 / 3.0)
+            cc += v * (c * c - 2.0 / 3.0)
+            rc += v * r * c / 4.0
+    determinant = rr * cc - rc * rc
+    if rr >= 0.0 or determinant <= 0.0:
+        return 0.0, 0.0, z[1, 1]
+    row = min(max(-(cc * gr - rc * gc) / determinant, -1.0), 1.0)
+    column = min(max(-(rr * gc - rc * gr) / determinant, -1.0), 1.0)
+    middle = mean - (rr + cc) / 3.0
+    value = middle + gr * row + gc * column + 0.5 * (rr * row * row + cc * column * column) + rc * row * column
+    return row, column, value
+
+
+@njit(cache=True)
+def inside(image: Image, row: int, column: int, reach: int) -> bool:
+    """Whether the square of this reach about a pixel lies in the picture."""
+    return bool(reach <= row < image.shape[0] - reach and reach <= column < image.shape[1] - reach)
+
+
+@njit(cache=True)
+def search(
+    first: Image, second: Image, r1: int, c1: int, row: int, column: int, half: int, reach: int
+) -> tuple[int, int, float]:
+    """The place of highest correlation within `reach` pixels of (row, column); -2 for its value where none has room."""
+    best_row, best_column, best = row, column, -2.0
+    for i in range(row - reach, row + reach + 1):
+        for j in range(column - reach, column + reach + 1):
+            if inside(second, i, j, half):
+                value = correlation(first, second, r1, c1, i, j, half)
+                if value > best:
+                    best_row, best_column, best = i, j, value
+    return best_row, best_column, best
+
+
+@njit(cache=True)
+def search_level(
+    first: Image, second: Image, places: NDArray[np.int64], shifts: NDArray[np.int64], half: int, reach: int
+) -> tuple[NDArray[np.int64], Array]:
+    """The best shift of every place (row, column) within `reach` of the one given, and Eq. 3 there.
+
+    -2 where a template has no room.
+    """
+    found = shifts.copy()
+    values = np.full(places.shape[0], -2.0)
+    for k in range(places.shape[0]):
+        r, c = places[k, 0], places[k, 1]
+        if not inside(first, r, c, half):
+            continue
+        i, j, values[k] = search(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half, reach)
+        found[k, 0], found[k, 1] = i - r, j - c
+    return found, values
+
+
+@njit(cache=True)
+def refine(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int) -> tuple[float, float, float]:
+    """Row, column and correlation of the biquadratic's top over the 3 x 3 places about (r2, c2); NaN without room."""
+    if not inside(second, r2, c2, half + 1):
+        return math.nan, math.nan, math.nan
+    z = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            z[i, j] = correlation(first, second, r1, c1, r2 + i - 1, c2 + j - 1, half)
+    row, column, value = biquadratic_top(z)
+    return r2 + row, c2 + column, value
+
+
+@njit(cache=True)
+def refine_shifts(
+    first: Image, second: Image, places: NDArray[np.int64], shifts: NDArray[np.int64], half: int
+) -> tuple[Array, Array]:
+    """Sub-pixel places (u, v) in the second picture and the correlation there; NaN without room."""
+    pixels = np.empty((places.shape[0], 2))
+    values = np.empty(places.shape[0])
+    for k in range(places.shape[0]):
+        r, c = places[k, 0], places[k, 1]
+        row, column, values[k] = refine(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half)
+        pixels[k, 0], pixels[k, 1] = column, row
+    return pixels, values
+
+
+@njit(cache=True)
+def absolute_differences(
+    first: NDArray[np.uint16], second: NDArray[np.uint16], r1: int, c1: int, r2: int, c2: int, half: int, most: int
+) -> int:
+    """Eq. 9 of the windows about two pixels; left off, at some value above, once it exceeds `most`."""
+    width = 2 * half + 1
+    total = 0
+    for i in range(-half, half + 1):
+        a = first[r1 + i, c1 - half : c1 - half + width]
+        b = second[r2 + i, c2 - half : c2 - half + width]
+        row = 0
+        for j in range(width):
+            row += int(abs(np.int32(a[j]) - np.int32(b[j])))
+        total += row
+        if total > most:
+            break
+    return total
+
+
+@njit(cache=True)
+def search_segments(
+    first: NDArray[np.uint16],
+    second: NDArray[np.uint16],
+    pixels: NDArray[np.int64],
+    starts: Array,
+    ends: Array,
+    half: int,
+) -> NDArray[np.int64]:
+    """For every pixel (u, v) of the first picture the one on its segment in the second with the least Eq. 9.
+
+    A segment is walked in steps of one pixel along its longer axis, at whole pixels nearest to it. Windows have room.
+    """
+    found = np.empty_like(pixels)
+    for k in range(pixels.shape[0]):
+        du, dv = ends[k, 0] - starts[k, 0], ends[k, 1] - starts[k, 1]
+        steps = max(math.ceil(max(abs(du), abs(dv))), 1)
+        best = 2**62
+        for n in range(steps + 1):
+            u = round(starts[k, 0] + du * n / steps)
+            v = round(starts[k, 1] + dv * n / steps)
+            value = absolute_differences(first, second, pixels[k, 1], pixels[k, 0], v, u, half, best)
+            if value < best:
+                best = value
+                found[k, 0], found[k, 1] = u, v
+    return found

@@ -1,0 +1,191 @@
+"""Motion of a camera and depths of features by robust least squares: Levenberg-Marquardt with the depths eliminated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+LARGEST_DAMPING = 1e12
+#: Curvature added to each depth's, of the squared focal length: depths stay where they are when the camera stood still.
+DEPTH_FLOOR = 1e-14
+
+
+@njit(cache=True)
+def rotation_matrix(q: Array) -> Array:
+    """The matrix of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+
+
+@njit(cache=True)
+def turned(q: Array, step: Array) -> Array:
+    """The quaternion turned further by a small rotation vector, and of unit length again."""
+    p = np.array([1.0, 0.5 * step[0], 0.5 * step[1], 0.5 * step[2]])
+    result = np.array(
+        [
+            p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+            p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+            p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+            p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+        ]
+    )
+    return result / math.sqrt(np.sum(result * result))
+
+
+@njit(cache=True)
+def residuals(first: Array, second: Array, focal: float, q: Array, t: Array, inverse_depths: Array) -> Array:
+    """Pixels from where the features were found to where motion and depths put them, shape (n, 2); inf behind."""
+    R = rotation_matrix(q)
+    result = np.empty_like(second)
+    for i in range(first.shape[0]):
+        x, y, rho = first[i, 0], first[i, 1], inverse_depths[i]
+        px = R[0, 0] * x + R[0, 1] * y + R[0, 2] + rho * t[0]
+        py = R[1, 0] * x + R[1, 1] * y + R[1, 2] + rho * t[1]
+        pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] + rho * t[2]
+        if pz <= 1e-6:
+            result[i, 0] = result[i, 1] = math.inf
+            continue
+        result[i, 0] = focal * (px / pz - second[i, 0])
+        result[i, 1] = focal * (py / pz - second[i, 1])
+    return result
+
+
+@njit(cache=True)
+def cauchy_cost(r: Array, scale: float) -> float:
+    """Sum of scale^2 / 2 log(1 + (r / scale)^2) over features."""
+    total = 0.0
+    for i in range(r.shape[0]):
+        total += math.log1p((r[i, 0] ** 2 + r[i, 1] ** 2) / scale**2)
+    return 0.5 * scale**2 * total
+
+
+@njit(cache=True)
+def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, Jm: Array, Jd: Array) -> None:
+    """Derivatives of one residual by rotation (turned from the left) and translation, and by inverse depth."""
+    ax = R[0, 0] * x + R[0, 1] * y + R[0, 2]
+    ay = R[1, 0] * x + R[1, 1] * y + R[1, 2]
+    az = R[2, 0] * x + R[2, 1] * y + R[2, 2]
+    pz = az + rho * t[2]
+    gain = focal / pz
+    place = ((ax + rho * t[0]) / pz, (ay + rho * t[1]) / pz)
+    # d(step x a) = (sy az - sz ay, sz ax - sx az, sx ay - sy ax)
+    Jm[0, 0] = -gain * place[0] * ay
+    Jm[0, 1] = gain * (az + place[0] * ax)
+    Jm[0, 2] = -gain * ay
+    Jm[1, 0] = -gain * (az + place[1] * ay)
+    Jm[1, 1] = gain * place[1] * ax
+    Jm[1, 2] = gain * ax
+    for k in range(2):
+        Jm[k, 3] = Jm[k, 4] = 0.0
+        Jm[k, 3 + k] = gain * rho
+        Jm[k, 5] = -gain * place[k] * rho
+        Jd[k] = gain * (t[k] - place[k] * t[2])
+
+
+@njit(cache=True)
+def _solved(S: Array, g: Array) -> Array:
+    """Solves S x = g by Cholesky, S given by its lower half; NaN where S is not positive."""
+    n = g.size
+    L = np.zeros((n, n))
+    x = np.empty(n)
+    for a in range(n):
+        for b in range(a + 1):
+            total = S[a, b]
+            for c in range(b):
+                total -= L[a, c] * L[b, c]
+            if a == b:
+                L[a, a] = math.sqrt(total) if total > 0.0 else math.nan
+            else:
+                L[a, b] = total / L[b, b]
+    for a in range(n):
+        total = g[a]
+        for c in range(a):
+            total -= L[a, c] * x[c]
+        x[a] = total / L[a, a]
+    for a in range(n - 1, -1, -1):
+        total = x[a]
+        for c in range(a + 1, n):
+            total -= L[c, a] * x[c]
+        x[a] = total / L[a, a]
+    return x
+
+
+@njit(cache=True)
+def _step(
+    first: Array, r: Array, focal: float, q: Array, t: Array, inverse_depths: Array, scale: float, damping: float,
+    with_depths: bool,
+) -> tuple[Array, Array]:  # fmt: skip
+    """A damped Gauss-Newton step of rotation and translation (6,) and of inverse depths, by Schur's complement."""
+    n = first.shape[0]
+    R = rotation_matrix(q)
+    Jm, Jd = np.empty((2, 6)), np.empty(2)
+    S, g, diagonal = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    mixed, curvature, slope = np.empty((n, 6)), np.empty(n), np.empty(n)
+    for i in range(n):
+        weight = 1.0 / (1.0 + (r[i, 0] ** 2 + r[i, 1] ** 2) / scale**2)
+        _jacobian(first[i, 0], first[i, 1], inverse_depths[i], focal, R, t, Jm, Jd)
+        curvature[i] = weight * (Jd[0] ** 2 + Jd[1] ** 2) * (1.0 + damping) + DEPTH_FLOOR * focal**2
+        slope[i] = weight * (Jd[0] * r[i, 0] + Jd[1] * r[i, 1])
+        for a in range(6):
+            mixed[i, a] = weight * (Jm[0, a] * Jd[0] + Jm[1, a] * Jd[1])
+        eliminated = 1.0 / curvature[i] if with_depths else 0.0
+        for a in range(6):
+            g[a] += weight * (Jm[0, a] * r[i, 0] + Jm[1, a] * r[i, 1]) - mixed[i, a] * slope[i] * eliminated
+            diagonal[a] += weight * (Jm[0, a] ** 2 + Jm[1, a] ** 2)
+            for b in range(a + 1):
+                S[a, b] += weight * (Jm[0, a] * Jm[0, b] + Jm[1, a] * Jm[1, b])
+                S[a, b] -= mixed[i, a] * mixed[i, b] * eliminated
+    for a in range(6):
+        S[a, a] += damping * diagonal[a] + 1e-15 * focal**2
+    step = -_solved(S, g)
+    depth_steps = np.zeros(n)
+    if with_depths:
+        for i in range(n):
+            depth_steps[i] = -(slope[i] + np.sum(mixed[i] * step)) / curvature[i]
+    return step, depth_steps
+
+
+@njit(cache=True)
+def solve(
+    first: Array, second: Array, focal: float, q: Array, t: Array, inverse_depths: Array, scale: float,
+    with_depths: bool, iterations: int, tolerance: float,
+) -> tuple[Array, Array, Array, float, bool, int]:  # fmt: skip
+    """Minimises Cauchy's cost from a start; the translation is in the unit that inverse depths are in.
+
+    Returns the quaternion, translation, inverse depths, cost, whether it converged (a step below the tolerance, or none
+    that lowers the cost) and how many steps were tried.
+    """
+    r = residuals(first, second, focal, q, t, inverse_depths)
+    cost = cauchy_cost(r, scale)
+    damping = 1e-3
+    for iteration in range(iterations):
+        step, depth_steps = _step(first, r, focal, q, t, inverse_depths, scale, damping, with_depths)
+        new_q = turned(q, step[:3])
+        new_t = t + step[3:]
+        new_depths = inverse_depths + depth_steps
+        new_r = residuals(first, second, focal, new_q, new_t, new_depths)
+        new_cost = cauchy_cost(new_r, scale)
+        size = math.sqrt(np.sum(step * step))
+        if new_cost <= cost:
+            q, t, inverse_depths, r, cost = new_q, new_t, new_depths, new_r, new_cost
+            damping = max(damping * 0.1, 1e-12)
+            if size < tolerance:
+                return q, t, inverse_depths, cost, True, iteration + 1
+        elif size < tolerance:
+            return q, t, inverse_depths, cost, True, iteration + 1
+        else:
+            damping *= 10.0
+            if damping > LARGEST_DAMPING:
+                return q, t, inverse_depths, cost, False, iteration + 1
+    return q, t, inverse_depths, cost, False, iterations
