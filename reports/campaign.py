@@ -17,6 +17,7 @@ from reports.carried import carried_section
 from reports.columns import primary_metric
 from reports.conditions import conditions_section
 from reports.faults import faults_section
+from reports.fieldtest import field_test_section
 from reports.landing import landing_section
 from reports.section import Section, SectionMaker, Subject
 from reports.sensitivity import sensitivity_section
@@ -29,6 +30,7 @@ SCHEMA = 1
 
 #: Sections that a page has where the rows hold their columns, in the page's order.
 FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
+    field_test_section,
     answers_section,
     faults_section,
     carried_section,

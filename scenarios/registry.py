@@ -10,7 +10,10 @@ from typing import cast
 from scenarios.interface import Scenario
 
 #: Where each scenario's class is found; imported only when asked for.
-SCENARIOS: Mapping[str, str] = {"descent": "scenarios.descent:DescentScenario"}
+SCENARIOS: Mapping[str, str] = {
+    "descent": "scenarios.descent:DescentScenario",
+    "fieldtest": "scenarios.fieldtest:FieldTestScenario",
+}
 
 
 class UnknownScenarioError(LookupError):

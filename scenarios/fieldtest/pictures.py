@@ -1,0 +1,105 @@
+"""The pictures of a triple, rendered from the flight at their places and times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt16
+
+from scenarios.fieldtest.run import Run, RunKey, field_camera, worked_out
+from scenarios.views import Eye, SiteGround, site_scene
+from sim.camera import CameraModel
+from sim.dynamics import State
+from sim.render import PixelRays, Scene, Sun, process_renderer
+from sim.sensor import Detector, ImageMotion, natural_fall_off
+from sim.terrain import TerrainBank, site
+
+#: Half the angle that the sun takes, radians.
+SUN_RADIUS_RAD = 0.00465
+#: Distance of the pixels whose ground points are kept.
+GRID_PX = 32
+
+
+@dataclass(frozen=True)
+class FieldOptics:
+    """The camera with its pixels' rays and the fall-off of its lens."""
+
+    camera: CameraModel
+    rays: PixelRays
+    fall_off: Float32[np.ndarray, "rows columns"]
+
+
+@cache
+def field_optics() -> FieldOptics:
+    """The field test's camera; shared by all cases of a process."""
+    camera = field_camera()
+    return FieldOptics(camera, PixelRays.of(camera), natural_fall_off(camera))
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture taken.
+
+    Attributes
+    ----------
+    counts
+        As the detector delivers them.
+    ground_m
+        Points of the ground that it shows, on a coarse grid of its pixels, world axes.
+    """
+
+    counts: UInt16[np.ndarray, "rows columns"]
+    ground_m: Float64[np.ndarray, "m n 3"]
+
+
+def take_picture(run: Run, state: State, detector: Detector, rng: np.random.Generator) -> Picture:
+    """The picture taken in a state of the flight."""
+    optics = field_optics()
+    p = run.key.field_test
+    scene = _scene(run.key, round(state.time_s / p.sun_step_s))
+    frame = process_renderer(p.backend).render(scene, optics.rays, state.world_from_body, state.time_s)
+    motion = ImageMotion.seen(
+        optics.camera,
+        frame.range_m,
+        frame.world_from_body,
+        state.velocity_m_s,
+        state.attitude.apply(state.body_rate_rad_s),
+    )
+    air = site(run.parameters.site).environment
+    brightness = air.direct_share(float(np.arcsin(scene.sun.direction[2]))) * air.solar_irradiance
+    counts = detector.expose(frame.radiance * np.float32(brightness), rng, motion)
+    return Picture(counts, frame.points_world()[::GRID_PX, ::GRID_PX])
+
+
+def cloud_transmittances(
+    run: Run, ground_m: Float64[np.ndarray, "m n 3"], times_s: Sequence[float]
+) -> Float64[np.ndarray, "times m n"]:
+    """Share of the direct sun that clouds let through to points of the ground, at each of these times."""
+    if run.clouds is None:
+        return np.ones((len(times_s), *ground_m.shape[:2]))
+    layer = run.clouds
+    return np.stack([layer.transmittance(ground_m, Sun(run.sun(time), SUN_RADIUS_RAD), time) for time in times_s])
+
+
+@lru_cache(maxsize=2)
+def site_ground(site_name: str, samples: int, bank_seed: int) -> SiteGround:
+    """The ground of a site."""
+    preset = site(site_name)
+    terrain = preset.terrain("descent").model_copy(update={"samples": samples})
+    bank = TerrainBank(terrain, bank_seed)
+    return SiteGround(preset, terrain, bank.terrain(0), bank.rocks(0))
+
+
+@lru_cache(maxsize=3)
+def _scene(key: RunKey, step: int) -> Scene:
+    """The site around the middle of the line under the sun of a time; as many are kept as a triple has pictures."""
+    run, p = worked_out(key), key.field_test
+    ground = site_ground(run.parameters.site, p.samples, p.bank_seed)
+    pixel_rad = float(np.median(field_optics().rays.pixel_angles))
+    east, north, _ = run.flight.origin_m.tolist()
+    eye = Eye(east, north, p.helicopter.lowest_m, pixel_rad)
+    scene = site_scene(ground, eye, Sun(run.sun(step * p.sun_step_s), SUN_RADIUS_RAD))
+    return replace(scene, clouds=run.clouds)

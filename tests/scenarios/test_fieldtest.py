@@ -1,0 +1,154 @@
+"""The field test's flight processing and triples; one case is rendered."""
+
+from __future__ import annotations
+
+import tomllib
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scenarios
+from scenarios.fieldtest import FieldTestParameters, FieldTestScenario
+from scenarios.fieldtest.elevation import ElevationModel
+from scenarios.fieldtest.ephemeris import sun_direction
+from scenarios.fieldtest.parameters import ElevationParameters
+from scenarios.fieldtest.run import Run, RunKey, worked_out
+from scenarios.fieldtest.scenario import case_order
+from scenarios.fieldtest.triples import Category
+from sim.streams import Streams
+from sim.terrain import Surface
+
+CATALOGUE = Path(scenarios.__file__).parent / "catalogue" / "dimes-fieldtest.toml"
+#: Fig. 11 of the paper: sum of its column TOTAL.
+TRIPLES = 1913
+
+
+def stated(**changes: Any) -> FieldTestParameters:
+    """The campaign's parameters over a small terrain."""
+    parameters = tomllib.loads(CATALOGUE.read_text(encoding="utf-8"))["parameters"]
+    return FieldTestParameters.model_validate({**parameters, "samples": 512, **changes})
+
+
+def ivanpah(**changes: Any) -> Run:
+    return worked_out(RunKey(stated(**changes), 4, 5, "test"))
+
+
+def attitude_errors_deg(run: Run) -> np.ndarray:
+    errors: np.ndarray = np.degrees((run.attitudes * run.truth.attitudes.inv()).as_rotvec())
+    return errors
+
+
+def test_sun_is_where_the_almanac_has_it() -> None:
+    """Reda & Andreas (2004), their example: zenith 50.11162 deg with 0.0165 deg of refraction, azimuth 194.34024 deg."""
+    time = datetime(2003, 10, 17, 12, 30, 30, tzinfo=timezone(timedelta(hours=-7)))
+    sun = sun_direction(time, 39.742476, -105.1786)
+    assert np.degrees(np.arccos(sun[2])) == pytest.approx(50.1281, abs=0.01)
+    assert np.degrees(np.arctan2(sun[0], sun[1])) % 360.0 == pytest.approx(194.34024, abs=0.01)
+
+
+def test_sun_at_the_equinox_stands_over_the_equator() -> None:
+    """Equinox of 23 September 2002, 04:55 UT (United States Naval Observatory)."""
+    sun = sun_direction(datetime(2002, 9, 23, 4, 55, tzinfo=UTC), 90.0, 0.0)
+    assert np.degrees(np.arcsin(sun[2])) == pytest.approx(0.0, abs=0.01)
+    with pytest.raises(ValueError, match="time zone"):
+        sun_direction(datetime(2002, 9, 23), 0.0, 0.0)
+
+
+def test_attitude_is_good_to_hundredths_of_a_degree_without_drift() -> None:
+    """Random walk of 0.07 deg/sqrt(h) over 40 min pinned at both ends: 0.03 deg in the middle; 0.15 deg is 5 of these."""
+    run = ivanpah(drift={"change_k": 0.0})
+    assert np.abs(attitude_errors_deg(run)).max() < 0.15
+    assert run.attitude_solution.residual_rad < 5e-4
+
+
+def test_fit_takes_a_constant_bias_off() -> None:
+    run = ivanpah(drift={"change_k": 0.0}, imu={"rate_hz": 100.0, "gyro_bias_deg_h": 5.0, "gyro_bias_deg_h_k": 0.0})
+    assert np.abs(attitude_errors_deg(run)).max() < 0.15
+    assert np.degrees(np.linalg.norm(run.attitude_solution.bias_rad_s)) * 3600.0 > 2.0
+
+
+def test_drift_tilts_across_the_line_and_the_fit_does_not_see_it() -> None:
+    """The bias is about the line's direction; its tilt changes by tenths of a degree over the run, the others' do not."""
+    run = ivanpah()
+    azimuth = run.flight.azimuth_rad
+    along = np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
+    tilt = attitude_errors_deg(run) @ along
+    assert np.ptp(tilt) > 0.6
+    assert np.ptp(attitude_errors_deg(run) @ np.array([-along[1], along[0], 0.0])) < 0.2
+
+
+def test_turning_about_with_the_flight_cancels_the_drift() -> None:
+    """A platform that follows the flight turns the gyros about at each pass: the drift takes off what it had added."""
+    held, turned = ivanpah(), ivanpah(helicopter={"turns_with_flight": True})
+    assert (
+        np.ptp(attitude_errors_deg(turned)[:, :2], axis=0).max()
+        < 0.6 * np.ptp(attitude_errors_deg(held)[:, :2], axis=0).max()
+    )
+
+
+def test_elevation_model_has_the_error_of_its_class() -> None:
+    """Over flat ground the error is that of the posts, smoothed a little by interpolation, with what that adds."""
+    flat = Surface.from_samples(np.zeros((64, 64, 2), dtype=np.float32), 500.0)
+    places = np.random.default_rng(1).uniform(0.0, 30000.0, (4000, 2))
+    model = ElevationModel.surveyed(ElevationParameters(), flat, places, np.random.default_rng(2))
+    assert model.heights(places, np.random.default_rng(3)).std() == pytest.approx(np.hypot(6.0, 1.0), rel=0.06)
+
+
+def test_triples_are_what_their_category_says() -> None:
+    run = ivanpah()
+    counts = {category: 0 for category in Category}
+    for triple in run.triples:
+        counts[triple.category] += 1
+        numbers = list(triple.pictures)
+        heights = run.pictures.position_m[numbers, 2]
+        moved = np.linalg.norm(np.diff(run.pictures.position_m[numbers, :2], axis=0), axis=1)
+        assert np.all(moved <= 30.0 * 3.75)
+        turned = len(set(run.pictures.direction[numbers].tolist())) > 1
+        if triple.category is Category.SHORT_TIME:
+            assert np.array_equal(np.diff(numbers), [1, 1])
+            assert len(set(run.pictures.flown[numbers].tolist())) == 1
+        else:
+            assert np.all((-np.diff(heights) >= 150.0) & (-np.diff(heights) <= 390.0))
+            assert turned is (triple.category is Category.OPPOSITE_DIRECTION)
+    assert counts == {Category.SHORT_TIME: 139, Category.SAME_DIRECTION: 66, Category.OPPOSITE_DIRECTION: 24}
+
+
+def test_cases_are_the_papers_triples_spread_evenly() -> None:
+    parameters = stated()
+    order = case_order(parameters)
+    assert len(order) == len(set(order)) == TRIPLES
+    largest = parameters.runs[3].triples / TRIPLES
+    assert sum(number == 3 for number, _ in order[:200]) / 200 == pytest.approx(largest, abs=0.03)
+
+
+def test_a_run_is_worked_out_the_same_again() -> None:
+    key = RunKey(stated(), 4, 5, "test")
+    kept = worked_out(key)
+    worked_out.cache_clear()
+    again = worked_out(key)
+    assert again is not kept
+    assert np.array_equal(again.attitudes.as_quat(), kept.attitudes.as_quat())
+    assert again.triples == kept.triples
+
+
+def test_too_many_triples_are_refused() -> None:
+    runs = [run.model_dump() for run in stated().runs[4:]]
+    with pytest.raises(ValueError, match="5000 triples 'short time' are asked for"):
+        worked_out(RunKey(stated(runs=[{**runs[0], "short_time": 5000}]), 0, 5, "test"))
+
+
+def test_case_is_answered_and_repeats() -> None:
+    """A short-time triple over the lake bed: attitude and altitude errors leave under 2 m/s."""
+    parameters = stated(runs=[stated().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}])
+    found = FieldTestScenario().run(parameters, Streams(5, "test", 0))
+    assert found.row["run"] == "Ivanpah Run 3"
+    assert found.row["category"] == "short time"
+    assert found.answered
+    assert float(found.row["velocity_error_m_s"]) < 2.0
+    again = FieldTestScenario().run(parameters, Streams(5, "test", 0))
+    assert again.row == found.row
+    with pytest.raises(ValueError, match="allowed: 0 to 138"):
+        FieldTestScenario().run(parameters, Streams(5, "test", 139))
