@@ -180,7 +180,8 @@ def _note(found: Sequence[Cell]) -> str:
     apart = f"More than {LARGE_POINTS:g} points apart: {'; '.join(large)}." if large else ""
     return (
         f"{said} Misprints of the paper's table: the rows {'; '.join(odd)}; its totals sum to {totals:,}, its counts "
-        f"to {counts:,}. Its totals are taken. Of Pisgah Run 3's same direction it prints 99 %, its counts give 97 %. {apart or f'No cell is more than {LARGE_POINTS:g} points apart.'}"
+        f"to {counts:,}. Its totals are taken. Of Pisgah Run 3's same direction it prints 99 %, its counts give 97 %. "
+        f"{apart or f'No cell is more than {LARGE_POINTS:g} points apart.'}"
     )
 
 

@@ -42,7 +42,7 @@ def attitude_errors_deg(run: Run) -> np.ndarray:
 
 
 def test_sun_is_where_the_almanac_has_it() -> None:
-    """Reda & Andreas (2004), their example: zenith 50.11162 deg with 0.0165 deg of refraction, azimuth 194.34024 deg."""
+    """Reda & Andreas (2004), their example: zenith 50.11162 deg, of which refraction takes 0.0165 deg."""
     time = datetime(2003, 10, 17, 12, 30, 30, tzinfo=timezone(timedelta(hours=-7)))
     sun = sun_direction(time, 39.742476, -105.1786)
     assert np.degrees(np.arccos(sun[2])) == pytest.approx(50.1281, abs=0.01)
