@@ -8,8 +8,10 @@ from enum import Enum
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.interface import TrackingState
+from algorithms.interface import TargetUpdate
 from algorithms.vtt.accuracy import drift_error_m, stereo_range_error_m, tracked_approach_error_m
+from algorithms.vtt.stereo import disparity_px_m
+from sim.measurements import MastCalibration
 
 
 class HandOffOutcome(Enum):
@@ -56,24 +58,21 @@ class GoalReached:
         return abs(float(np.hypot(position_rover[0], position_rover[1])) - self.distance_m) <= self.tolerance_m
 
 
-def hand_off(
-    state: TrackingState,
-    position_rover: Float[np.ndarray, "3"] | None,
-    goal: GoalReached,
-    optics: tuple[float, float, float],
-    drift_px: float,
-) -> HandOff:
+def hand_off(update: TargetUpdate, goal: GoalReached, mast: MastCalibration, drift_px: float = 2.5) -> HandOff:
     """The target for the arm, if it is tracked and the rover at its goal.
 
-    `optics` are the target's distance from the camera (m), the focal length (px) and the baseline (m); `drift_px` the
-    drift to allow for (paper: 2.5 px from 10 m to 2 m).
+    `drift_px` is the drift to allow for (paper: 2.5 px from 10 m to 2 m). The distance from the camera, on which the
+    error depends, is taken as that from the mast's elevation axis.
     """
-    if state is not TrackingState.NORMAL or position_rover is None:
+    position = update.position_rover
+    if not update.found or position is None:
         return HandOff(HandOffOutcome.NOT_TRACKED, None)
-    if not goal.holds(position_rover):
+    if not goal.holds(position):
         return HandOff(HandOffOutcome.NOT_AT_GOAL, None)
-    range_m, focal_px, baseline_m = optics
+    axis = mast.geometry.base_m + np.array([0.0, 0.0, mast.geometry.elbow_m[2]])
+    range_m = float(np.linalg.norm(position - axis))
     error = tracked_approach_error_m(
-        stereo_range_error_m(range_m, focal_px, baseline_m), drift_error_m(range_m, focal_px, drift_px)
+        stereo_range_error_m(range_m, disparity_px_m(mast.left, mast.right), 1.0),
+        drift_error_m(range_m, mast.left.focal_lengths[0], drift_px),
     )
-    return HandOff(HandOffOutcome.HANDED_OVER, ArmTarget(position_rover, error))
+    return HandOff(HandOffOutcome.HANDED_OVER, ArmTarget(position, error))

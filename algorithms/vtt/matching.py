@@ -127,16 +127,17 @@ def refined(
     """The match's upper left corner (row, column of `image.counts`) below a pixel, and the correlation there.
 
     `corner` is that of the best whole pixel, with the correlation of `whole`, and `offset` where the fit to the
-    correlation has its top: the answer where registration of the pictures themselves fails.
+    correlation has its top: the answer where registration of the pictures themselves fails. The stretch, where the
+    options allow it, decides the place only; the correlation stays that of the template as it was searched for.
     """
     near = np.maximum(corner.astype(int) - SURROUND - 2, 0)
     far = corner.astype(int) + len(template) + SURROUND + 2
     region = image.counts[near[0] : far[0], near[1] : far[1]].astype(np.float64)
-    for stretch in (True, False) if options.affine else (False,):
-        found = registered(template, region, corner + offset - near, stretch)
-        if found is not None:
-            return Registration(found.corner + near, found.score)
-    return Registration(corner + offset, whole.value)
+    shifted = registered(template, region, corner + offset - near, stretch=False)
+    if shifted is None:
+        return Registration(corner + offset, whole.value)
+    stretched = registered(template, region, shifted.corner, stretch=True) if options.affine else None
+    return Registration((shifted if stretched is None else stretched).corner + near, shifted.score)
 
 
 def match_by_correlation(
