@@ -47,8 +47,9 @@ def near_match(word: str, allowed: Iterable[str]) -> str:
     return f" (did you mean '{matches[0]}'?)" if matches else ""
 
 
-def not_allowed(what: str, word: str, allowed: Iterable[str]) -> str:
-    """States that a word is unknown, which one is near, and which are allowed."""
+def not_allowed(what: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
+    """States that a word is unknown, which one is near, and which are allowed; of very many, those worth listing."""
     known = sorted(allowed)
-    listed = ", ".join(known) if known else "none"
+    shown = known if listed_only is None else sorted(listed_only)
+    listed = ", ".join(shown) if shown else "none"
     return f"unknown {what} '{word}'{near_match(word, known)}; allowed: {listed}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -222,7 +222,7 @@ def _dispersion_problems(document: _Document, campaign: Campaign) -> list[Proble
         if path not in known:
             table = any(leaf.startswith(f"{path}.") for leaf in known)
             if not (table and isinstance(dispersion, Choice)):
-                unknown = not_allowed("parameter", path, known)
+                unknown = not_allowed("parameter", path, known, _beside(path, known))
                 message = "is a table; disperse one of its values, or choose between tables" if table else unknown
                 problems.append(document.problem(("dispersions", path), message))
                 continue
@@ -232,6 +232,19 @@ def _dispersion_problems(document: _Document, campaign: Campaign) -> list[Proble
                 message = f"{dispersion.describe()} reaches {value!r}, which the parameter does not take: {refused}"
                 problems.append(document.problem(("dispersions", path), message))
     return problems
+
+
+def _beside(path: str, known: Iterable[str]) -> list[str]:
+    """The parameters in the innermost table on a path that there is, further tables in it by their names alone."""
+    names = list(known)
+    table = path
+    while table:
+        table = table.rpartition(".")[0]
+        prefix = f"{table}." if table else ""
+        inside = [name.removeprefix(prefix).partition(".") for name in names if name.startswith(prefix)]
+        if inside:
+            return list(dict.fromkeys(f"{prefix}{head}{'.*' if rest else ''}" for head, rest, _ in inside))
+    return names
 
 
 def _draw_problems(document: _Document, campaign: Campaign) -> list[Problem]:

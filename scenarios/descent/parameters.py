@@ -137,6 +137,9 @@ class DescentScenarioParameters(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     site: Annotated[str | None, Field(description="preset of terrain, light and gravity; none: a plain terrain")] = None
+    terrain_site: Annotated[
+        str | None, Field(description="whose terrain is below; filled in with `site`, and not to be set otherwise")
+    ] = None
     place: Place = Place()
     terrain: TerrainParameters = TerrainParameters()
     sun: SunParameters = SunParameters()
@@ -181,7 +184,14 @@ class DescentScenarioParameters(BaseModel):
         if not isinstance(changes, Mapping):
             return stated
         of_site = site(stated["site"]).terrain("descent").model_dump()
-        return {**stated, "terrain": _merged(of_site, changes)}
+        return {"terrain_site": stated["site"], **stated, "terrain": _merged(of_site, changes)}
+
+    @model_validator(mode="after")
+    def _terrain_is_the_sites(self) -> DescentScenarioParameters:
+        """A terrain that was completed for one site must not be lit as another's."""
+        if self.terrain_site != self.site:
+            raise ValueError(f"site is {self.site}, but the terrain is of {self.terrain_site}; a site is not dispersed")
+        return self
 
     @property
     def preset(self) -> Site | None:

@@ -289,3 +289,19 @@ def test_a_choice_between_tables_draws_whole_tables(campaign_file: CampaignFile)
     # a value set within the table is not drawn over
     fixed = load_campaign(path, ["wind.east_m_s=7"])
     assert fixed.configuration.dispersions == {}
+
+
+@pytest.mark.parametrize(
+    ("path", "allowed"),
+    [
+        ("wnd.est_m_s", "aborting_cases, altitude_m, "),
+        ("wind.est_m_s", "wind.east_m_s, wind.north_m_s"),
+        ("wind.east_m_s.x", "wind.east_m_s, wind.north_m_s"),
+    ],
+)
+def test_unknown_parameters_are_told_their_neighbours(campaign_file: CampaignFile, path: str, allowed: str) -> None:
+    """Of a scenario's hundreds only those of the innermost table that there is."""
+    dispersion = f'[dispersions]\n"{path}" = {{distribution="uniform", low=1, high=2}}'
+    text = refusal(campaign_file(dispersions=dispersion))
+    assert f"allowed: {allowed}" in text
+    assert ("wind.*" in text) == path.startswith("wnd")

@@ -41,6 +41,13 @@ def test_a_site_brings_its_terrain_with_what_is_set_over_it() -> None:
     assert p.terrain == of_site.model_copy(update=changed)
 
 
+def test_a_site_is_not_dispersed() -> None:
+    """The terrain was completed when the campaign was read: another site's name would only change its light."""
+    complete = DescentScenarioParameters.model_validate({"site": "gusev"}).model_dump(mode="json", round_trip=True)
+    with pytest.raises(ValidationError, match="the terrain is of gusev"):
+        DescentScenarioParameters.model_validate(complete | {"site": "kelso"})
+
+
 @pytest.mark.parametrize("stated", [{}, {"site": "kelso"}, {"dimes": {"subpixel": False}, "faults": {"haze": 2.0}}])
 def test_complete_parameters_are_read_back_as_they_were(stated) -> None:
     """As a campaign's workers do."""
