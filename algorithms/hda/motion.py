@@ -106,20 +106,35 @@ def estimate_motion(
     unit = float(np.median(depths))
     candidates = [_solved(first, second, focal_px, unit / depths, start, unit, options) for start in starts]
     quaternion, translation, inverse, _, converged = min(candidates, key=lambda found: found[3])
-    r = np.hypot(*kernels.residuals(first, second, focal_px, quaternion, translation, inverse).T)
-    fitting = r <= options.max_residual_px
-    inliers = fitting & _plausible(first, inverse, fitting)
-    still, moved = (_shown(first, quaternion, t, inverse, focal_px) for t in (np.zeros(3), translation))
-    parallax = np.hypot(*(moved - still).T)
+    moved = rigid(Rotation.from_quat(quaternion, scalar_first=True), unit * translation)
     with np.errstate(divide="ignore"):
-        found_depths = unit / inverse
-    rotation = Rotation.from_quat(quaternion, scalar_first=True)
+        return assessed(first, second, focal_px, moved, unit / inverse, converged, options)
+
+
+def assessed(
+    first: Float[np.ndarray, "n 2"],
+    second: Float[np.ndarray, "n 2"],
+    focal_px: float,
+    second_from_first: RigidTransform,
+    depths: Float[np.ndarray, "n"],
+    converged: bool,
+    options: HdaOptions,
+) -> Motion:
+    """A motion with depths, and what its tracks say of it; the arguments are those of `estimate_motion`."""
+    quaternion = second_from_first.rotation.as_quat(scalar_first=True)
+    inverse = 1.0 / depths
+    still, moved = (
+        kernels.residuals(first, np.zeros_like(first), focal_px, quaternion, translation, inverse)
+        for translation in (np.zeros(3), np.array(second_from_first.translation))
+    )
+    residuals = np.hypot(*(moved - focal_px * second).T)
+    fitting = residuals <= options.max_residual_px
     return Motion(
-        second_from_first=rigid(rotation, unit * translation),
-        depths=found_depths,
-        residuals_px=r,
-        inliers=inliers,
-        parallax_px=float(np.median(parallax[fitting])) if np.any(fitting) else 0.0,
+        second_from_first=second_from_first,
+        depths=depths,
+        residuals_px=residuals,
+        inliers=fitting & _plausible(first, inverse, fitting),
+        parallax_px=float(np.median(np.hypot(*(moved - still)[fitting].T))) if np.any(fitting) else 0.0,
         converged=converged,
     )
 
@@ -147,17 +162,6 @@ def _solved(
             first, second, focal_px, q, t, inverse, scale_px, with_depths, ITERATIONS, tolerance
         )
     return q, t, inverse, cost, converged
-
-
-def _shown(
-    first: Float[np.ndarray, "n 2"],
-    quaternion: Float[np.ndarray, "4"],
-    translation: Float[np.ndarray, "3"],
-    inverse: Float[np.ndarray, "n"],
-    focal_px: float,
-) -> Float[np.ndarray, "n 2"]:
-    """Where motion and depths put the features in the second picture, pixels from its optical axis."""
-    return np.asarray(kernels.residuals(first, np.zeros_like(first), focal_px, quaternion, translation, inverse))
 
 
 def _plausible(

@@ -106,7 +106,10 @@ def search_level(
 
 @njit(cache=True)
 def refine(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int) -> tuple[float, float, float]:
-    """Row, column and correlation of the biquadratic's top over the 3 x 3 places about (r2, c2); NaN without room."""
+    """Row and column of the biquadratic's top over the 3 x 3 places about (r2, c2), and the correlation there.
+
+    NaN without room.
+    """
     if not inside(second, r2, c2, half + 1):
         return math.nan, math.nan, math.nan
     z = np.empty((3, 3))
@@ -114,7 +117,8 @@ def refine(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half
         for j in range(3):
             z[i, j] = correlation(first, second, r1, c1, r2 + i - 1, c2 + j - 1, half)
     row, column, value = biquadratic_top(z)
-    return r2 + row, c2 + column, value
+    # The quadric of least squares lies below a peak as sharp as a pixel.
+    return r2 + row, c2 + column, max(value, z[1, 1])
 
 
 @njit(cache=True)

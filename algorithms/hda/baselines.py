@@ -1,0 +1,224 @@
+"""What a user would take instead: OpenCV's essential matrix for motion, its semi-global matching for structure.
+
+Features, tracks, scale and all that follows the point cloud are shared with the algorithm under test, so that what
+differs is how motion and structure are found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from algorithms.hda.estimator import find_site, matched_structure
+from algorithms.hda.motion import Motion, assessed
+from algorithms.hda.options import HdaOptions
+from algorithms.hda.sighting import Sighting, sighting
+from algorithms.hda.structure import Matches, depth_bounds, epipolar_segments, pixel_lattice, triangulated
+from algorithms.hda.tracking import Tracks
+from algorithms.hda.view import View, pixels_of, points_at, undistorted
+from algorithms.interface import SiteEstimate
+from sim.camera import Cahv
+from sim.frames import rigid
+from sim.measurements import LandingMeasurements
+
+#: Distance from the epipolar line up to which a track supports a matrix, pixels, and the confidence of the search.
+ESSENTIAL_PX = 0.5
+CONFIDENCE = 0.9999
+#: Windows of the semi-global matching, pixels, and its penalties of small and large steps as OpenCV recommends them.
+BLOCK_PX = 5
+SMALL_STEP, LARGE_STEP = 8 * BLOCK_PX**2, 32 * BLOCK_PX**2
+#: Steps of the compared disparities: OpenCV wants their number to be a multiple.
+DISPARITY_STEP = 16
+#: OpenCV gives disparities in sixteenths of a pixel.
+DISPARITY_UNIT = 1.0 / 16.0
+#: Largest cosine between the baseline and the mean optical axis at which pictures are rectified.
+LARGEST_COSINE = 0.8
+#: Largest side of a rectified picture, in diagonals of the pictures.
+LARGEST_SIDE = 2.0
+
+
+@final
+class EssentialMatrixEstimator:
+    """The motion from OpenCV's essential matrix (MAGSAC++), structure as the algorithm under test has it."""
+
+    def __init__(self, options: HdaOptions | None = None) -> None:
+        self.options = HdaOptions() if options is None else options
+
+    def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
+        """The estimate; details and errors are those of `HdaEstimator.estimate`."""
+        return find_site(sighting(measurements), essential_motion, matched_structure, self.options)
+
+
+@final
+class SemiGlobalEstimator:
+    """The motion from OpenCV's essential matrix, structure from its semi-global matching of the rectified pictures."""
+
+    def __init__(self, options: HdaOptions | None = None) -> None:
+        self.options = HdaOptions() if options is None else options
+
+    def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
+        """The estimate; details and errors are those of `HdaEstimator.estimate`."""
+        return find_site(sighting(measurements), essential_motion, semi_global_structure, self.options)
+
+
+def essential_motion(seen: Sighting, tracks: Tracks, options: HdaOptions) -> Motion | None:
+    """The motion of the essential matrix that most tracks agree with; None if there is none.
+
+    Its scale is such that the median depth is the range.
+    """
+    focal = seen.views[1].focal_px
+    first, second = (
+        undistorted(one.camera, pixels[tracks.accepted])
+        for one, pixels in zip(seen.views, (tracks.first, tracks.second), strict=True)
+    )
+    intrinsics = np.diag([focal, focal, 1.0])
+    matrix, agreeing = cv2.findEssentialMat(
+        focal * first, focal * second, intrinsics, cv2.USAC_MAGSAC, CONFIDENCE, ESSENTIAL_PX
+    )
+    if matrix is None or matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
+        return None
+    _, rotation, translation, _ = cv2.recoverPose(matrix, focal * first, focal * second, intrinsics, mask=agreeing)
+    moved = rigid(Rotation.from_matrix(rotation), translation.ravel())
+    depths = triangulated(first, second, moved)
+    depths[~(np.abs(depths) > 0.0)] = np.inf
+    ahead = depths[np.isfinite(depths) & (depths > 0.0)]
+    if len(ahead) == 0:
+        return None
+    motion = assessed(first, second, focal, moved, depths, True, options)
+    return motion.scaled(seen.range_m / float(np.median(ahead)))
+
+
+@dataclass(frozen=True)
+class Rectification:
+    """A pair of linear cameras with parallel axes and their columns along the baseline, the second ahead along it.
+
+    Attributes
+    ----------
+    rectified_from_first
+        From the first camera's frame to the rectified one, both with the first camera as origin.
+    baseline_m
+        Distance of the two.
+    camera
+        The camera of both rectified pictures.
+    """
+
+    rectified_from_first: Rotation
+    baseline_m: float
+    camera: Cahv
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length, pixels."""
+        return self.camera.focal_lengths[0]
+
+
+def rectification(views: tuple[View, View], second_from_first: RigidTransform) -> Rectification | None:
+    """The rectification of a pair; None where the camera moved along its axis."""
+    first_from_second = second_from_first.inv()
+    baseline = float(np.linalg.norm(first_from_second.translation))
+    along = first_from_second.translation / baseline
+    axis = np.array([0.0, 0.0, 1.0]) + first_from_second.rotation.apply(np.array([0.0, 0.0, 1.0]))
+    axis /= np.linalg.norm(axis)
+    if abs(float(along @ axis)) > LARGEST_COSINE:
+        return None
+    axis -= (along @ axis) * along
+    axis /= np.linalg.norm(axis)
+    turn = Rotation.from_matrix(np.stack([along, np.cross(axis, along), axis]))
+    focal = views[0].focal_px
+    borders = [
+        turn.apply(rotation.apply(one.camera.rays(one.camera.border(16))[1]))
+        for one, rotation in zip(views, (Rotation.identity(), first_from_second.rotation), strict=True)
+    ]
+    edges = np.concatenate(borders)
+    if np.any(edges[:, 2] <= 0.0):
+        return None
+    edges = focal * edges[:, :2] / edges[:, 2:]
+    low, high = np.floor(edges.min(axis=0)), np.ceil(edges.max(axis=0))
+    if float((high - low).max()) > LARGEST_SIDE * float(np.hypot(*views[0].camera.size)):
+        return None
+    camera = Cahv.from_axes(
+        (focal, focal),
+        (int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1),
+        axis=(0.0, 0.0, 1.0),
+        right=(1.0, 0.0, 0.0),
+        image_centre=(-float(low[0]), -float(low[1])),
+    )
+    return Rectification(turn, baseline, camera)
+
+
+def rectified_picture(
+    one: View, camera_from_rectified: Rotation, camera: Cahv, full_scale: float
+) -> UInt8[np.ndarray, "rows columns"]:
+    """A picture as the rectified camera would take it, in 8 bits; black where it was not seen."""
+    rays = camera_from_rectified.apply(camera.rays(camera.pixel_grid())[1].reshape(-1, 3))
+    pixels, _ = one.camera.project(rays)
+    pixels = np.nan_to_num(pixels, nan=-10.0).astype(np.float32).reshape(camera.size[1], camera.size[0], 2)
+    grey = np.clip(one.counts * (255.0 / full_scale), 0.0, 255.0).astype(np.float32)
+    return np.asarray(np.rint(cv2.remap(grey, pixels, None, cv2.INTER_LINEAR)).astype(np.uint8))
+
+
+def disparities(
+    views: tuple[View, View], pair: Rectification, second_from_first: RigidTransform, bounds_m: tuple[float, float]
+) -> Float[np.ndarray, "rows columns"]:
+    """Disparities of the first rectified picture by semi-global matching, pixels; NaN where none was found."""
+    first_from_rectified = pair.rectified_from_first.inv()
+    full_scale = max(float(np.quantile(views[0].counts, 0.995)), 1.0)
+    pictures = [
+        rectified_picture(one, turn, pair.camera, full_scale)
+        for one, turn in zip(
+            views, (first_from_rectified, second_from_first.rotation * first_from_rectified), strict=True
+        )
+    ]
+    reach = pair.focal_px * pair.baseline_m
+    least = int(reach / bounds_m[1])
+    count = DISPARITY_STEP * (int(reach / bounds_m[0] - least) // DISPARITY_STEP + 1)
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=least,
+        numDisparities=count,
+        blockSize=BLOCK_PX,
+        P1=SMALL_STEP,
+        P2=LARGE_STEP,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    found = matcher.compute(*pictures).astype(np.float64) * DISPARITY_UNIT
+    return np.where(found >= max(least, 1), found, np.nan)
+
+
+def semi_global_structure(seen: Sighting, motion: Motion, options: HdaOptions) -> Matches:
+    """Structure of the same grid of pixels from the disparities of the rectified pictures; no match where none is."""
+    first, second = seen.views
+    bounds = depth_bounds(motion.depth_range_m, options.depth_margin)
+    border = options.search_half_px + 1
+    pixels = pixel_lattice(first.camera.size, options.grid_px, border)
+    places = undistorted(first.camera, pixels)
+    starts, ends, room = epipolar_segments(second, motion.second_from_first, places, bounds, border)
+    pixels, places, starts, ends = pixels[room], places[room], starts[room], ends[room]
+    depths = np.full(len(pixels), np.nan)
+    pair = rectification(seen.views, motion.second_from_first)
+    if pair is not None:
+        found = disparities(seen.views, pair, motion.second_from_first, bounds)
+        depths = _depths(pair, found, places)
+    accepted: Bool[np.ndarray, "n"] = (depths > bounds[0]) & (depths < bounds[1])
+    points = points_at(places, depths)
+    matched, _ = pixels_of(second.camera, motion.second_from_first.apply(points))
+    return Matches(pixels, starts, ends, matched, np.full(len(pixels), np.nan), depths, accepted, points[accepted])
+
+
+def _depths(
+    pair: Rectification, found: Float[np.ndarray, "rows columns"], places: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n"]:
+    """Depths in the first camera's frame of undistorted coordinates, by the disparity of the nearest pixel."""
+    rays = pair.rectified_from_first.apply(np.column_stack([places, np.ones(len(places))]))
+    pixels, _ = pair.camera.project(rays)
+    column, row = np.rint(pixels).astype(np.int64).T
+    # Rectified depth over that of the ray of depth one is how long the ray is.
+    return np.asarray(pair.focal_px * pair.baseline_m / found[row, column] / rays[:, 2])

@@ -1,0 +1,236 @@
+"""Slope, roughness and safe landing maps of grounds whose answers are known by formula."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from algorithms.hda import ElevationMap, HdaOptions, Safety, hazard_maps, safe_site
+from algorithms.hda.hazards import grassfire, safe_landing_map, smooth_surface
+from algorithms.hda.kernels.elevation import robust_plane
+
+CELL_M = 0.1
+OPTIONS = HdaOptions(lander_diameter_m=1.0, max_roughness_m=0.2, max_slope_rad=float(np.deg2rad(15.0)))
+
+
+def ground(rows: int = 80, columns: int = 100, by_x: float = 0.0, by_y: float = 0.0) -> ElevationMap:
+    empty = ElevationMap(np.zeros((rows, columns)), np.array([-2.0, 5.0]), CELL_M)
+    x, y = np.moveaxis(empty.places(np.moveaxis(np.indices((rows, columns)).astype(np.float64), 0, -1)), -1, 0)
+    return replace(empty, elevation_m=by_x * x + by_y * y)
+
+
+def with_bump(flat: ElevationMap, row: int, column: int, radius: float, height: float) -> ElevationMap:
+    """A cylinder of this height, radius in cells."""
+    rows, columns = np.indices(flat.elevation_m.shape)
+    inside = np.hypot(rows - row, columns - column) <= radius
+    return replace(flat, elevation_m=flat.elevation_m + height * inside)
+
+
+@pytest.mark.parametrize("refine", [False, True])
+@pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.2, 0.0), (0.1, -0.25)])
+def test_a_plane_has_its_slope_and_no_roughness(slopes: tuple[float, float], refine: bool) -> None:
+    maps = hazard_maps(ground(by_x=slopes[0], by_y=slopes[1]), replace(OPTIONS, refine_planes=refine))
+    np.testing.assert_allclose(maps.roughness_m, 0.0, atol=1e-10)
+    np.testing.assert_allclose(maps.slope_rad, np.arctan(np.hypot(*slopes)), atol=1e-10)
+
+
+@pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.15, -0.1)])
+@pytest.mark.parametrize("height", [0.3, -0.3])
+def test_a_boulder_on_a_slope_is_as_rough_as_it_is_high(slopes: tuple[float, float], height: float) -> None:
+    # Radius 2.5 cells: 21 of a footprint's 100 cells, wherever it lies; the median does not see them.
+    flat = ground(by_x=slopes[0], by_y=slopes[1])
+    for row, column in ((40, 50), (45, 55), (12, 33)):
+        maps = hazard_maps(with_bump(flat, row, column, 2.5, height), OPTIONS)
+        assert maps.roughness_m[row, column] == pytest.approx(abs(height), abs=1e-9)
+        np.testing.assert_allclose(maps.slope_rad, np.arctan(np.hypot(*slopes)), atol=1e-9)
+        assert maps.safety[row, column] == Safety.HAZARD
+
+
+def test_half_of_the_points_may_be_anything() -> None:
+    # The breakdown point: 45 of 100 points far above, in a heap. 300 trials find a good triple but for 1 in 1e24.
+    rng = np.random.default_rng(1)
+    x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(10), np.arange(10)))
+    z = 3.0 + 0.2 * x - 0.1 * y + rng.normal(0.0, 0.01, 100)
+    z[rng.permutation(100)[:45]] += rng.uniform(1.0, 5.0, 45)
+    triples = rng.uniform(size=(300, 3))
+    value, by_x, by_y = robust_plane(x, y, z, triples, True)
+    # 55 points of 0.01 noise: slopes to 0.01 / (sqrt(55) 2.9) = 5e-4; four times that.
+    assert by_x == pytest.approx(0.2, abs=2e-3)
+    assert by_y == pytest.approx(-0.1, abs=2e-3)
+    assert value == pytest.approx(3.0, abs=0.02)
+    # Least squares is off by tenths.
+    plain = np.linalg.lstsq(np.column_stack([np.ones(100), x, y]), z, rcond=None)[0]
+    assert abs(plain[0] - 3.0) > 0.3
+
+
+def test_the_plane_is_that_of_the_least_median_over_all_triples_tried() -> None:
+    rng = np.random.default_rng(2)
+    x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(5), np.arange(5)))
+    z = rng.normal(size=25)
+    triples = rng.uniform(size=(40, 3))
+    found = robust_plane(x, y, z, triples, False)
+    best = np.inf
+    expected = None
+    for u in triples:
+        # Without repetition: the second of the 24 left, the third of the 23 left.
+        left = list(range(25))
+        i, j, k = left.pop(int(u[0] * 25)), left.pop(int(u[1] * 24)), left.pop(int(u[2] * 23))
+        design = np.array([[1.0, x[n], y[n]] for n in (i, j, k)])
+        if abs(np.linalg.det(design)) < 0.5:
+            continue
+        plane = np.linalg.solve(design, z[[i, j, k]])
+        median = np.sort(np.abs(z - plane[0] - plane[1] * x - plane[2] * y))[25 // 2 + 1]
+        if median < best:
+            best, expected = median, plane
+    assert expected is not None
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_refined_planes_are_less_noisy() -> None:
+    rng = np.random.default_rng(3)
+    x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(10), np.arange(10)))
+    errors = []
+    for _ in range(200):
+        z = rng.normal(0.0, 1.0, 100)
+        triples = rng.uniform(size=(30, 3))
+        errors.append([robust_plane(x, y, z, triples, refine)[1] for refine in (False, True)])
+    raw, refined = np.std(errors, axis=0)
+    # Least squares over all 100 points: 1 / (sqrt(100) 2.87) = 0.035; the inliers are nearly all.
+    assert refined < 0.045 < raw
+
+
+def test_the_smooth_surface_is_bilinear_between_footprints() -> None:
+    # Elevation x y / 10 is bilinear itself: between the middles nothing is lost, however coarse the footprints.
+    flat = ground(60, 60)
+    rows, columns = np.indices((60, 60))
+    saddle = replace(flat, elevation_m=1e-4 * (rows - 29.5) * (columns - 29.5))
+    planes, smooth, _ = smooth_surface(saddle, replace(OPTIONS, refine_planes=True, plane_trials=200))
+    assert planes.shape == (6, 6, 3)
+    # Each footprint's robust plane is off the saddle's middle by less than the saddle's departure from a plane.
+    assert np.max(np.abs(smooth - saddle.elevation_m)) < 1e-4 * 5.0 * 5.0
+
+
+@pytest.mark.parametrize("shape", [(80, 14), (14, 80), (12, 13)])
+def test_a_strip_with_a_single_footprint_across_is_still_a_plane(shape: tuple[int, int]) -> None:
+    maps = hazard_maps(ground(*shape, by_x=0.1, by_y=0.2), OPTIONS)
+    np.testing.assert_allclose(maps.roughness_m, 0.0, atol=1e-10)
+
+
+def test_a_map_smaller_than_the_lander_is_unknown() -> None:
+    maps = hazard_maps(ground(8, 40), OPTIONS)
+    assert np.all(maps.safety == Safety.UNKNOWN)
+    assert safe_site(maps.safety, np.zeros(2)) is None
+
+
+def test_steep_ground_is_a_hazard_beside_level_ground() -> None:
+    flat = ground(80, 100)
+    ramp = np.maximum(np.arange(100) - 50, 0) * CELL_M * np.tan(np.deg2rad(20.0))
+    maps = hazard_maps(replace(flat, elevation_m=flat.elevation_m + ramp), OPTIONS)
+    assert np.rad2deg(maps.slope_rad[40, 85]) == pytest.approx(20.0, abs=0.01)
+    assert np.rad2deg(maps.slope_rad[40, 15]) == pytest.approx(0.0, abs=0.01)
+    assert maps.safety[40, 75] == Safety.HAZARD
+    assert maps.safety[40, 20] == Safety.SAFE
+    site = safe_site(maps.safety, np.array([40.0, 50.0]))
+    assert site is not None
+    assert site[1] < 40
+
+
+@given(st.integers(5, 74), st.integers(5, 94), st.floats(0.5, 2.0))
+def test_hazards_grow_by_discs_of_the_landers_diameter(row: int, column: int, growth: float) -> None:
+    rough = np.zeros((80, 100))
+    rough[row, column] = 1.0
+    options = replace(OPTIONS, hazard_growth=growth, unknown_growth=0.0)
+    safety = safe_landing_map(np.zeros((80, 100)), rough, CELL_M, options)
+    rows, columns = np.indices((80, 100))
+    distance = CELL_M * np.hypot(rows - row, columns - column)
+    expected = distance <= growth * OPTIONS.lander_diameter_m
+    sure = np.abs(distance - growth * OPTIONS.lander_diameter_m) > 1e-5
+    np.testing.assert_array_equal((safety == Safety.HAZARD)[sure], expected[sure])
+
+
+def test_near_borders_and_holes_nothing_is_known() -> None:
+    slope = np.zeros((80, 100))
+    slope[40, 50] = np.nan
+    safety = safe_landing_map(slope, np.zeros((80, 100)), CELL_M, OPTIONS)
+    rows, columns = np.indices((80, 100))
+    # Half a diameter, 5 cells; the cells around the map are the first that are not known.
+    from_border = np.minimum.reduce([rows + 1, columns + 1, 80 - rows, 100 - columns])
+    unknown = (from_border <= 5) | (np.hypot(rows - 40, columns - 50) <= 5.0)
+    np.testing.assert_array_equal(safety, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
+
+
+def test_what_is_hazard_and_unknown_is_hazard() -> None:
+    slope = np.zeros((80, 100))
+    slope[:, 0] = 1.0
+    safety = safe_landing_map(slope, np.zeros((80, 100)), CELL_M, OPTIONS)
+    assert np.all(safety[:, :11] == Safety.HAZARD)
+    assert np.all(safety[10:70, 11:90] == Safety.SAFE)
+
+
+def test_hazards_of_either_map_count() -> None:
+    nothing = np.zeros((80, 100))
+    rough, steep = nothing.copy(), nothing.copy()
+    rough[40, 30], steep[40, 70] = 1.0, 1.0
+    safety = safe_landing_map(steep, rough, CELL_M, OPTIONS)
+    assert safety[40, 30] == safety[40, 70] == Safety.HAZARD
+    assert safety[40, 50] == Safety.SAFE
+
+
+def test_grassfire_is_the_distance_to_the_nearest_fire() -> None:
+    rng = np.random.default_rng(4)
+    burning = rng.random((40, 50)) < 0.01
+    fires = np.argwhere(burning)
+    cells = np.moveaxis(np.indices(burning.shape), 0, -1).reshape(-1, 1, 2)
+    expected = np.linalg.norm(cells - fires, axis=-1).min(axis=1).reshape(burning.shape)
+    np.testing.assert_allclose(grassfire(burning), expected, rtol=1e-5)
+    assert np.all(np.isinf(grassfire(np.zeros((3, 3), dtype=bool))))
+
+
+def test_the_site_is_farthest_from_all_that_is_not_safe() -> None:
+    safety = np.full((60, 60), Safety.SAFE, dtype=np.uint8)
+    safety[10, 10] = Safety.HAZARD
+    safety[50, 20] = Safety.UNKNOWN
+    site = safe_site(safety, np.array([0.0, 0.0]))
+    others = np.pad(safety != Safety.SAFE, 1, constant_values=True)
+    fires = np.argwhere(others) - 1
+    cells = np.moveaxis(np.indices(safety.shape), 0, -1).reshape(-1, 1, 2)
+    distances = np.linalg.norm(cells - fires, axis=-1).min(axis=1).reshape(safety.shape)
+    assert site is not None
+    assert distances[site] == pytest.approx(distances.max())
+
+
+@pytest.mark.parametrize("apriori", [(0.0, 0.0), (29.0, 8.0), (5.0, 90.0)])
+def test_of_equal_sites_the_nearest_to_the_a_priori_one_is_taken(apriori: tuple[float, float]) -> None:
+    # A strip of 11 rows: its middle row is 6 cells from both sides all along.
+    safety = np.full((11, 60), Safety.SAFE, dtype=np.uint8)
+    site = safe_site(safety, np.array(apriori))
+    assert site == (5, int(np.clip(apriori[1], 5, 54)))
+
+
+def test_no_safe_cell_is_no_site() -> None:
+    assert safe_site(np.full((20, 20), Safety.HAZARD, dtype=np.uint8), np.zeros(2)) is None
+    rough = ground()
+    noise = np.random.default_rng(5).normal(0.0, 1.0, rough.elevation_m.shape)
+    assert safe_site(hazard_maps(replace(rough, elevation_m=noise), OPTIONS).safety, np.zeros(2)) is None
+
+
+def test_holes_in_the_map_are_not_bridged() -> None:
+    flat = ground(100, 100)
+    elevation = flat.elevation_m.copy()
+    elevation[30:70, 30:70] = np.nan
+    maps = hazard_maps(replace(flat, elevation_m=elevation), OPTIONS)
+    assert np.all(maps.safety[30:70, 30:70] == Safety.UNKNOWN)
+    assert np.any(maps.safety == Safety.SAFE)
+
+
+def test_options_out_of_range_are_named() -> None:
+    with pytest.raises(ValueError, match="template_half_px is 1; it must be at least 2"):
+        HdaOptions(template_half_px=1)
+    with pytest.raises(ValueError, match="lander_diameter_m is 0"):
+        HdaOptions(lander_diameter_m=0.0)
+    with pytest.raises(ValueError, match="max_slope_rad"):
+        HdaOptions(max_slope_rad=2.0)

@@ -1,0 +1,168 @@
+"""Features and tracks: Eqs. 1-5 against plain arithmetic, tracks against the exact scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from relief_scene import Pass, bumps, camera, picture, plane, pose
+
+from algorithms.hda import HdaOptions
+from algorithms.hda.features import eigenvalue_test, select_features
+from algorithms.hda.kernels import matching
+from algorithms.hda.pyramid import LevelSize, level_sizes, pyramid, reach_px
+from algorithms.hda.tracking import track_features
+from algorithms.image.correlation import pseudo_normalized_correlation
+from algorithms.image.peak import biquadratic_offset, highest_peak
+
+OPTIONS = HdaOptions(block_px=32)
+
+
+@pytest.fixture(scope="module")
+def noise() -> np.ndarray:
+    return np.random.default_rng(1).integers(0, 256, (120, 160)).astype(np.uint16)
+
+
+def test_interest_is_the_product_of_what_the_eigenvalues_exceed_the_least_by(noise: np.ndarray) -> None:
+    image = noise.astype(np.float32)
+    p = eigenvalue_test(image, 11, 300.0)
+    # Independent: gradients and sums by loops over one template.
+    for row, column in ((20, 30), (60, 81), (100, 140)):
+        part = image[row - 6 : row + 7, column - 6 : column + 7].astype(np.float64)
+        smooth_rows = part[:-2] + 2.0 * part[1:-1] + part[2:]
+        g_u = (smooth_rows[:, 2:] - smooth_rows[:, :-2]) / 8.0
+        smooth_columns = part[:, :-2] + 2.0 * part[:, 1:-1] + part[:, 2:]
+        g_v = (smooth_columns[2:] - smooth_columns[:-2]) / 8.0
+        tensor = np.array([[np.mean(g_u * g_u), np.mean(g_u * g_v)], [np.mean(g_u * g_v), np.mean(g_v * g_v)]])
+        excess = np.linalg.eigvalsh(tensor) - 300.0
+        expected = excess.prod() if excess.min() > 0.0 else -np.inf
+        assert p[row, column] == pytest.approx(expected, rel=1e-3)
+
+
+def test_both_eigenvalues_below_the_least_are_no_feature() -> None:
+    # The product of two negative excesses is positive: only a > l tells them from two large eigenvalues.
+    faint = np.random.default_rng(2).integers(0, 3, (60, 60)).astype(np.float32)
+    assert not np.any(np.isfinite(eigenvalue_test(faint, 11, 50.0)))
+
+
+def test_straight_edges_and_flat_pictures_have_no_features() -> None:
+    edge = np.tile((np.arange(160) // 20 % 2 * 200).astype(np.uint16), (120, 1))
+    assert len(select_features(edge, OPTIONS)) == 0
+    assert len(select_features(np.full((120, 160), 77, dtype=np.uint16), OPTIONS)) == 0
+
+
+def test_one_feature_a_block_its_best_within_the_border() -> None:
+    counts = np.random.default_rng(3).integers(0, 256, (150, 200)).astype(np.uint16)
+    options = HdaOptions(block_px=40, window_half_px=8)
+    features = select_features(counts, options)
+    border = reach_px(options)
+    interest = eigenvalue_test(counts.astype(np.float32), 11, options.min_eigenvalue)
+    expected = []
+    for top in range(0, 150, 40):
+        for left in range(0, 200, 40):
+            rows = slice(max(top, border), min(top + 40, 150 - border))
+            columns = slice(max(left, border), min(left + 40, 200 - border))
+            part = interest[rows, columns]
+            if part.size:
+                row, column = np.unravel_index(int(part.argmax()), part.shape)
+                expected.append((columns.start + column, rows.start + row))
+    np.testing.assert_array_equal(features, expected)
+
+
+def test_levels_of_the_papers_window() -> None:
+    # Table I: t = 5, w = 40. Eq. 4: log2(40) - 2 = 3.3; Eq. 5: 5 / 8 + 0.5 < 2, 40 / 8 + 0.5 = 5.5.
+    assert level_sizes(5, 40) == (LevelSize(5, 2), LevelSize(3, 2), LevelSize(2, 2), LevelSize(2, 5))
+    # A window that one level holds is searched at the full resolution.
+    assert level_sizes(5, 6) == (LevelSize(5, 6),)
+
+
+def test_pyramid_levels_are_block_means(noise: np.ndarray) -> None:
+    levels = pyramid(noise, 3)
+    np.testing.assert_allclose(levels[2], noise.reshape(30, 4, 40, 4).mean(axis=(1, 3)), rtol=1e-6)
+
+
+def test_correlation_and_its_top_are_those_of_the_shared_operators(noise: np.ndarray) -> None:
+    first = noise.astype(np.float32)
+    second = 0.8 * np.roll(first, (2, -3), axis=(0, 1)) + 31.0
+    template, window = first[40:51, 60:71], second[32:63, 50:77]
+    surface = pseudo_normalized_correlation(template, window)
+    ours = [
+        [matching.correlation(first, second, 45, 65, 37 + i, 55 + j, 5) for j in range(surface.shape[1])]
+        for i in range(surface.shape[0])
+    ]
+    np.testing.assert_allclose(ours, surface, atol=1e-6)
+    peak = highest_peak(surface)
+    z = surface[peak.row - 1 : peak.row + 2, peak.column - 1 : peak.column + 2]
+    np.testing.assert_allclose(matching.biquadratic_top(z)[:2], biquadratic_offset(surface, peak), atol=1e-12)
+
+
+def test_the_biquadratics_top_is_exact_for_a_quadric() -> None:
+    r, c = np.mgrid[-1.0:2.0, -1.0:2.0]
+    z = 0.9 - 0.3 * (r - 0.2) ** 2 - 0.2 * (c + 0.35) ** 2 - 0.1 * (r - 0.2) * (c + 0.35)
+    np.testing.assert_allclose(matching.biquadratic_top(z), (0.2, -0.35, 0.9), atol=1e-12)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (7, -4), (-38, 33), (40, 40)])
+def test_whole_shifts_up_to_the_window_are_found(shift: tuple[int, int]) -> None:
+    # Detail at all scales, or the coarse levels have nothing to find.
+    rng = np.random.default_rng(4)
+    spectrum = np.fft.rfft2(rng.standard_normal((240, 320)))
+    frequency = np.hypot(np.fft.fftfreq(240)[:, None], np.fft.rfftfreq(320)[None])
+    frequency[0, 0] = np.inf
+    values = np.fft.irfft2(spectrum / frequency, (240, 320))
+    first = np.rint(500.0 + 100.0 * values / values.std()).clip(0, 4095).astype(np.uint16)
+    second = np.roll(first, shift[::-1], axis=(0, 1))
+    features = select_features(first, OPTIONS)
+    # Those that the wrap-around does not touch.
+    features = features[np.all((features > 60) & (features < np.array([260, 180])), axis=1)]
+    tracks = track_features(first, second, features, features, replace(OPTIONS, align=False))
+    assert len(features) > 10
+    # The biquadratic leans on texture as fine as pixels.
+    right = np.all(np.abs(tracks.second - features - shift) < 0.3, axis=1)
+    assert right.mean() > 0.9
+    assert np.all(tracks.correlations[right] > 0.98)
+
+
+def flown(second: tuple[float, ...] = (0.2, -0.6, 10.05, 21.5, 0.5, -0.8)) -> Pass:
+    return Pass(bumps((1.2, 0.8, 0.4, 0.3), base=plane(0.05, 0.02)), (pose(0.0, 0.0, 10.0, 20.0), pose(*second)))
+
+
+def test_tracks_over_relief_end_where_the_exact_scene_has_them() -> None:
+    scene = flown()
+    first, second = (picture(scene, i).counts for i in (0, 1))
+    features = select_features(first, OPTIONS)
+    true = scene.camera(1).project(scene.ground(0, features))[0]
+    plain, fine = (
+        track_features(first, second, features, features, replace(OPTIONS, align=align)) for align in (False, True)
+    )
+    assert fine.accepted.sum() >= 40
+    right = fine.accepted & (np.hypot(*(plain.second - true).T) < 1.0)
+    assert right.sum() >= 0.95 * fine.accepted.sum()
+    # The biquadratic's lean to whole pixels is up to 0.09 px; aligned, what is left is rounding to counts and relief.
+    assert np.sqrt(np.mean((plain.second - true)[right] ** 2)) < 0.1
+    assert np.sqrt(np.mean((fine.second - true)[right] ** 2)) < 0.015
+
+
+def test_features_that_leave_the_picture_are_no_tracks() -> None:
+    scene = flown((0.0, -1.0, 10.0, 20.0))
+    first, second = (picture(scene, i).counts for i in (0, 1))
+    features = select_features(first, replace(OPTIONS, window_half_px=60))
+    true = scene.camera(1).project(scene.ground(0, features))[0]
+    tracks = track_features(first, second, features, features, replace(OPTIONS, window_half_px=60))
+    outside = ~camera().in_frame(true)
+    assert outside.sum() >= 3
+    assert not np.any(tracks.accepted & outside)
+
+
+def test_the_search_begins_where_it_is_told() -> None:
+    scene = flown((0.0, -1.8, 10.0, 20.0))
+    first, second = (picture(scene, i).counts for i in (0, 1))
+    features = select_features(first, OPTIONS)
+    true = scene.camera(1).project(scene.ground(0, features))[0]
+    inside = np.all((true > 30) & (true < np.array([290, 210])), axis=1)
+    # 70 px and more: beyond the window, unless the search is told where to begin.
+    lost = track_features(first, second, features, features, OPTIONS)
+    found = track_features(first, second, features, true + 9.0, OPTIONS)
+    assert np.mean(np.hypot(*(lost.second - true).T)[inside] < 1.0) < 0.1
+    assert np.mean(np.hypot(*(found.second - true).T)[inside] < 1.0) > 0.9
