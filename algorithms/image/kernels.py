@@ -183,6 +183,37 @@ def sample(coefficients: Array, side: int, row: float, column: float, matrix: Ar
 
 
 @njit(cache=True)
+def sample_shifted(coefficients: Array, side: int, row: float, column: float, values: Array) -> bool:
+    """`sample` without stretch: all pixels share the fraction of the shift, so that rows and columns separate."""
+    half = 0.5 * (side - 1)
+    v, u = row - half, column - half
+    if not (v >= 2.0 and u >= 2.0 and v + side <= coefficients.shape[0] - 3):
+        return False
+    if not u + side <= coefficients.shape[1] - 3:
+        return False
+    r, c = int(v), int(u)
+    down, across = np.empty(6), np.empty(6)
+    quintic_weights(v - r, down)
+    quintic_weights(u - c, across)
+    lines = np.empty((side + 5, side))
+    for i in range(side + 5):
+        line = coefficients[r + i - 2]
+        out = lines[i]
+        for j in range(side):
+            total = 0.0
+            for b in range(6):
+                total += across[b] * line[c + j + b - 2]
+            out[j] = total
+    for i in range(side):
+        for j in range(side):
+            total = 0.0
+            for a in range(6):
+                total += down[a] * lines[i + a, j]
+            values[i * side + j] = total
+    return True
+
+
+@njit(cache=True)
 def design_rows(template: Array, unknowns: int) -> Array:
     """What a patch is explained by, one row each: the template and a constant; shift (2); stretch (4, if asked for)."""
     side = template.shape[0]
@@ -270,8 +301,12 @@ def register(
     found = np.empty(unknowns)
     matrix = np.eye(2)
     v, u, score = row, column, 0.0
-    for _ in range(limits[2]):
-        if not sample(coefficients, side, v, u, matrix, values):
+    for step in range(limits[2]):
+        if stretch and step > 0:
+            inside = sample(coefficients, side, v, u, matrix, values)
+        else:
+            inside = sample_shifted(coefficients, side, v, u, values)
+        if not inside:
             return failed
         values -= values.mean()
         for p in range(unknowns):

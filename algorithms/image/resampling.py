@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage
 
-from algorithms.image.alignment import ORDER, SURROUND, spline_coefficients
+from algorithms.image import kernels
+from algorithms.image.alignment import SURROUND, spline_coefficients
 
 
 def similarity_patch(
@@ -33,15 +33,22 @@ def similarity_patch(
         How much larger things become; below 1 they shrink (unfiltered: meant for steps down to about 0.7).
     roll_rad
         How far they turn, clockwise as seen.
+
+    Raises
+    ------
+    ValueError
+        If the centre is not in the picture.
     """
-    reach = 0.5 * (side - 1)
-    across, down = np.meshgrid(np.arange(side) - reach, np.arange(side) - reach)
-    cosine, sine = np.cos(roll_rad) / magnification, np.sin(roll_rad) / magnification
-    u = centre[0] + cosine * across + sine * down
-    v = centre[1] - sine * across + cosine * down
-    near = [max(int(np.floor(x.min())) - SURROUND, 0) for x in (v, u)]
-    far = [min(int(np.ceil(x.max())) + SURROUND + 1, n) for x, n in zip((v, u), image.shape, strict=True)]
-    coefficients = spline_coefficients(image[near[0] : far[0], near[1] : far[1]])
-    return np.asarray(
-        ndimage.map_coordinates(coefficients, [v - near[0], u - near[1]], order=ORDER, prefilter=False, mode="mirror")
-    )
+    turned = np.array([[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]) / magnification
+    reach = int(np.ceil(0.5 * (side - 1) * np.abs(turned).sum(axis=1).max())) + SURROUND
+    place = centre[::-1]
+    near = np.floor(place).astype(int) - reach
+    far = near + 2 * reach + 2
+    inside = image[max(near[0], 0) : max(far[0], 0), max(near[1], 0) : max(far[1], 0)]
+    beyond = [(max(-a, 0), max(b - n, 0)) for a, b, n in zip(near, far, image.shape, strict=True)]
+    region = np.pad(inside, beyond, mode="reflect") if np.any(beyond) else inside
+    values = np.empty(side * side)
+    row, column = place - near
+    if not kernels.sample(spline_coefficients(region), side, row, column, turned, values):
+        raise ValueError(f"the middle of a patch, {centre}, is not in the picture of {image.shape[::-1]} pixels")
+    return values.reshape(side, side)

@@ -21,6 +21,8 @@ from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, Sphere, na
 #: A smaller window than the paper's keeps the pictures that must be computed small.
 SMALL = VttOptions(search_px=101)
 
+Body = Callable[[int, np.ndarray], Plane | Sphere]
+
 
 def slanted(seed: int, target: np.ndarray) -> Plane:
     """A face through the target, turned and tilted at random, towards a rover at the origin."""
@@ -77,9 +79,7 @@ def approach(
 @pytest.mark.parametrize(
     ("share", "body", "seeds"), [(0.1, slanted, range(3)), (0.1, boulder, range(3)), (0.05, slanted, range(10, 11))]
 )
-def test_the_tracked_point_does_not_drift_from_10_m_to_2_m(
-    share: float, body: Callable[[int, np.ndarray], Plane | Sphere], seeds: range
-) -> None:
+def test_the_tracked_point_does_not_drift_from_10_m_to_2_m(share: float, body: Body, seeds: range) -> None:
     # The requirement: 1 px rms, 2.5 px worst (the paper's own: a pixel at 10 m is 5 px at 2 m), noise-free.
     drifts = []
     for seed in seeds:

@@ -1,0 +1,84 @@
+"""How long an update of the target tracker takes, and its search beside the full search and OpenCV's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
+from algorithms.vtt.lucas_kanade import lucas_kanade_tracker
+from algorithms.vtt.matching import cut_patch, search_window
+from algorithms.vtt.options import VttOptions
+from algorithms.vtt.tracker import VisualTargetTracker
+from benchmarks.timing import Figure, core_seconds
+from sim.measurements import RoverMeasurements, RoverTarget
+from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, navcam, pose, waves
+
+TARGET = np.array([10.0, 0.1, 0.2])
+#: Runs averaged into one measurement: a single one is near the clock's resolution on a busy machine.
+BATCH = 20
+
+
+def _stops(options: VttOptions) -> tuple[RoverMeasurements, RoverMeasurements]:
+    """Two stops, 10 % of the distance apart, before a slanted face."""
+    face = Plane(TARGET, np.array([-0.8, 0.0, 0.6]))
+    drive = Drive(Scene((face,), waves(1), TARGET), navcam(), VisualTargetTracker(options))
+    drive.tracker.designate(RoverTarget(TARGET), pose(0.0, 0.0))
+    for x in (0.0, 0.97):
+        drive.stop(pose(x, 0.0))
+    return drive.measurements[0], drive.measurements[1]
+
+
+def _update_ms(tracker: VisualTargetTracker, repeats: int, options: VttOptions) -> list[float]:
+    first, second = _stops(options)
+    tracker.designate(RoverTarget(TARGET), pose(0.0, 0.0))
+    tracker.update(first)
+    seeded = tracker.track
+
+    def run() -> None:
+        for _ in range(BATCH):
+            tracker.track = seeded
+            tracker.update(second)
+
+    return [1e3 * seconds / BATCH for seconds in core_seconds(run, repeats)]
+
+
+def updates(repeats: int) -> list[Figure]:
+    """One update: scale, roll, 21 x 21 in 161 x 161, refinement, point stereo, criteria."""
+    options = VttOptions()
+    brute = replace(options, coarse_levels=0)
+    return [
+        Figure("target tracking update, ms", _update_ms(VisualTargetTracker(options), repeats, options), bar=4.0),
+        Figure("the same by the full search, ms", _update_ms(VisualTargetTracker(brute), repeats, options)),
+        Figure("the same by OpenCV's Lucas-Kanade, ms", _update_ms(lucas_kanade_tracker(), repeats, options)),
+    ]
+
+
+def searches(repeats: int) -> list[Figure]:
+    """The search alone, in turn: coarse to fine, everywhere, and OpenCV's matchTemplate."""
+    figures = []
+    for side in (161, 600):
+        options = VttOptions(search_px=side)
+        first, second = _stops(options)
+        place = navcam().left.project(
+            navcam().geometry.rover_from_head(first.azimuth_rad, first.elevation_rad).inv().apply(TARGET)
+        )[0]
+        template = cut_patch(first.left, place, 21)
+        window = search_window(second.left, place, side)[0].astype(np.float64)
+        a, b = template.astype(np.float32), window.astype(np.float32)
+        timed = {
+            "coarse to fine": lambda t=template, w=window: coarse_to_fine_peak(t, w, 1, 6),
+            "at every place": lambda t=template, w=window: normalized_correlation(t, w),
+            "by cv2.matchTemplate": lambda t=a, w=b: cv2.matchTemplate(w, t, cv2.TM_CCOEFF_NORMED),
+        }
+        for name, search in timed.items():
+            batch = [1e3 * s / BATCH for s in core_seconds(lambda f=search: [f() for _ in range(BATCH)], repeats)]
+            figures.append(Figure(f"21 x 21 in {side} x {side} {name}, ms", batch))
+    return figures
+
+
+def figures(repeats: int) -> list[Figure]:
+    """All of target tracking."""
+    return [*updates(repeats), *searches(repeats)]
