@@ -19,13 +19,14 @@ FLAT_ENERGY = 1e-12
 
 
 @njit(cache=True)
-def centred(image: Image) -> Image:
-    """The image less its mean."""
-    total = 0.0
+def centred(image: Image) -> tuple[Image, float]:
+    """The image less its mean; and its largest absolute value before."""
+    total, largest = 0.0, 0.0
     for i in range(image.shape[0]):
         row = image[i]
         for j in range(image.shape[1]):
             total += row[j]
+            largest = max(largest, abs(row[j]))
     mean = total / image.size
     result = np.empty_like(image)
     for i in range(image.shape[0]):
@@ -33,7 +34,7 @@ def centred(image: Image) -> Image:
         out = result[i]
         for j in range(image.shape[1]):
             out[j] = row[j] - mean
-    return result
+    return result, largest
 
 
 @njit(cache=True)
@@ -109,7 +110,8 @@ def best_near(
 ) -> tuple[NDArray[np.int64], Array]:
     """For each place (row, column) the best one within `reach` rows and columns of it, and Eq. 11 there.
 
-    Places outside the window are moved to its border. Both images are given less their means.
+    Places outside the window are moved to its border. The template is given less its mean, the window as it is: all
+    sums are float64 here.
     """
     n, m = template.shape
     last_row, last_column = window.shape[0] - n, window.shape[1] - m

@@ -27,7 +27,10 @@ def normalized_correlation(
     ValueError
         If the template is larger than the window.
     """
-    return np.asarray(kernels.surface(*_prepared(template, window)))
+    _check_fit(template, window)
+    a, bright_a = kernels.centred(np.ascontiguousarray(template, dtype=np.float32))
+    b, bright_b = kernels.centred(np.ascontiguousarray(window, dtype=np.float32))
+    return np.asarray(kernels.surface(a, b, _flat(template, max(bright_a, bright_b))))
 
 
 def coarse_to_fine_peak(
@@ -46,13 +49,15 @@ def coarse_to_fine_peak(
     """
     if min(template.shape) >> levels < 2:
         raise ValueError(f"a template of {template.shape} pixels cannot be halved {levels} times: 2 must be left")
+    _check_fit(template, window)
     pyramid = [(template, window)]
     for _ in range(levels):
         pyramid.append((halved(pyramid[-1][0]), halved(pyramid[-1][1])))
     places, values = _local_maxima(normalized_correlation(*pyramid[-1]), candidates if levels else 1)
-    for level in reversed(pyramid[:-1]):
-        a, b, floor = _prepared(*level)
-        places, values = kernels.best_near(a, b, 2 * places, REACH_PX, floor)
+    for small, large in reversed(pyramid[:-1]):
+        a, bright = kernels.centred(np.ascontiguousarray(small, dtype=np.float32))
+        b = np.ascontiguousarray(large, dtype=np.float32)
+        places, values = kernels.best_near(a, b, 2 * places, REACH_PX, _flat(small, bright))
     best = int(np.argmax(values))
     row, column = (int(i) for i in places[best])
     last = (window.shape[0] - template.shape[0], window.shape[1] - template.shape[1])
@@ -66,15 +71,14 @@ def halved(image: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "_ _"]
     return np.asarray(cv2.resize(even, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
-def _prepared(
-    template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ _"]
-) -> tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"], float]:
-    """Both as float32 less their means, and the energy below which a patch counts as flat."""
+def _check_fit(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ _"]) -> None:
     if template.shape[0] > window.shape[0] or template.shape[1] > window.shape[1]:
         raise ValueError(f"a template of {template.shape} pixels does not fit into a window of {window.shape}")
-    a, b = (kernels.centred(np.ascontiguousarray(image, dtype=np.float32)) for image in (template, window))
-    scale = max(float(np.abs(template).max()), float(np.abs(window).max()))
-    return a, b, kernels.FLAT_ENERGY * template.size * scale * scale
+
+
+def _flat(template: Float[np.ndarray, "_ _"], largest: float) -> float:
+    """The energy below which a patch counts as flat, for values up to `largest`."""
+    return kernels.FLAT_ENERGY * template.size * largest * largest
 
 
 def _local_maxima(
