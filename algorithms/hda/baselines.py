@@ -26,9 +26,11 @@ from sim.camera import Cahv
 from sim.frames import rigid
 from sim.measurements import LandingMeasurements
 
-#: Distance from the epipolar line up to which a track supports a matrix, pixels, and the confidence of the search.
-ESSENTIAL_PX = 0.5
+#: Confidence with which the search for an essential matrix meets five right tracks.
 CONFIDENCE = 0.9999
+#: Methods and inlier distances, pixels. Two motions explain a plane, and each method takes the wrong one now and then;
+#: it puts most tracks behind a camera.
+ATTEMPTS = ((cv2.LMEDS, 1.0), (cv2.RANSAC, 0.1), (cv2.RANSAC, 0.3), (cv2.RANSAC, 1.0), (cv2.USAC_PROSAC, 0.1))
 #: Windows of the semi-global matching, pixels, and its penalties of small and large steps as OpenCV recommends them.
 BLOCK_PX = 5
 SMALL_STEP, LARGE_STEP = 8 * BLOCK_PX**2, 32 * BLOCK_PX**2
@@ -44,7 +46,7 @@ LARGEST_SIDE = 2.0
 
 @final
 class EssentialMatrixEstimator:
-    """The motion from OpenCV's essential matrix (MAGSAC++), structure as the algorithm under test has it."""
+    """The motion from OpenCV's essential matrix, structure as the algorithm under test has it."""
 
     def __init__(self, options: HdaOptions | None = None) -> None:
         self.options = HdaOptions() if options is None else options
@@ -67,7 +69,7 @@ class SemiGlobalEstimator:
 
 
 def essential_motion(seen: Sighting, tracks: Tracks, options: HdaOptions) -> Motion | None:
-    """The motion of the essential matrix that most tracks agree with; None if there is none.
+    """Of several essential matrices the motion with most tracks before both cameras; None if there is none.
 
     Its scale is such that the median depth is the range.
     """
@@ -76,14 +78,12 @@ def essential_motion(seen: Sighting, tracks: Tracks, options: HdaOptions) -> Mot
         undistorted(one.camera, pixels[tracks.accepted])
         for one, pixels in zip(seen.views, (tracks.first, tracks.second), strict=True)
     )
-    intrinsics = np.diag([focal, focal, 1.0])
-    matrix, agreeing = cv2.findEssentialMat(
-        focal * first, focal * second, intrinsics, cv2.USAC_MAGSAC, CONFIDENCE, ESSENTIAL_PX
-    )
-    if matrix is None or matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
+    found = [_essential_pose(focal * first, focal * second, focal, *attempt) for attempt in ATTEMPTS]
+    poses = [pose for pose in found if pose is not None]
+    if not poses:
         return None
-    _, rotation, translation, _ = cv2.recoverPose(matrix, focal * first, focal * second, intrinsics, mask=agreeing)
-    moved = rigid(Rotation.from_matrix(rotation), translation.ravel())
+    _, rotation, translation = max(poses, key=lambda pose: pose[0])
+    moved = rigid(Rotation.from_matrix(rotation), translation)
     depths = triangulated(first, second, moved)
     depths[~(np.abs(depths) > 0.0)] = np.inf
     ahead = depths[np.isfinite(depths) & (depths > 0.0)]
@@ -91,6 +91,18 @@ def essential_motion(seen: Sighting, tracks: Tracks, options: HdaOptions) -> Mot
         return None
     motion = assessed(first, second, focal, moved, depths, True, options)
     return motion.scaled(seen.range_m / float(np.median(ahead)))
+
+
+def _essential_pose(
+    first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"], focal_px: float, method: int, inlier_px: float
+) -> tuple[int, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
+    """How many tracks lie before both cameras, rotation and direction of translation; None without a matrix."""
+    intrinsics = np.diag([focal_px, focal_px, 1.0])
+    matrix, agreeing = cv2.findEssentialMat(first, second, intrinsics, method, CONFIDENCE, inlier_px)
+    if matrix is None or matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
+        return None
+    count, rotation, translation, _ = cv2.recoverPose(matrix, first, second, intrinsics, mask=agreeing)
+    return count, rotation, translation.ravel()
 
 
 @dataclass(frozen=True)

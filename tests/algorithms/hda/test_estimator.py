@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from relief_scene import Pass, bumps, measured, picture, plane, pose
@@ -43,7 +42,7 @@ def scene() -> Pass:
 
 @pytest.fixture(scope="module")
 def exact(scene: Pass) -> LandingMeasurements:
-    return measured(scene, np.random.default_rng(1))
+    return measured(scene)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +114,11 @@ def test_gravity_from_a_plane_through_the_points_sees_no_mean_slope() -> None:
     frame = replace(OPTIONS, surface_frame=SurfaceFrame.PLANE)
     found = HdaEstimator(frame).estimate(steep)
     assert found.outcome is SiteOutcome.SAFE_SITE
-    assert np.rad2deg(np.nanmedian(found.details.ground.hazards.slope_rad)) < 0.5
+    ground = found.details.ground
+    first = found.details.views[0]
+    normal = (first.world_from_camera.rotation * ground.surface_from_camera.inv()).apply(np.array([0.0, 0.0, 1.0]))
+    # 3,000 points of 2 cm noise over 7 m would leave 0.01 deg; matches are not independent of their neighbours.
+    assert np.rad2deg(np.arccos(normal @ np.array([-0.3, 0.0, 1.0]) / np.hypot(0.3, 1.0))) < 0.2
 
 
 def test_gravity_is_the_inclinometers_unless_it_is_the_states(exact: LandingMeasurements) -> None:
@@ -148,11 +151,12 @@ def test_a_position_error_moves_the_site_by_as_much(exact: LandingMeasurements, 
     np.testing.assert_allclose(found.site_world, answer.site_world + shift, atol=1e-6)
 
 
-def test_the_answer_is_a_function_of_the_measurements(exact: LandingMeasurements, answer: SiteEstimate) -> None:
-    again = HdaEstimator(OPTIONS).estimate(exact)
-    np.testing.assert_array_equal(again.site_world, answer.site_world)
-    for name, value in hda_products(answer.details).items():
-        np.testing.assert_array_equal(hda_products(again.details)[name], value)
+@each
+def test_the_answer_is_a_function_of_the_measurements(name: str, exact: LandingMeasurements) -> None:
+    first, second = (ESTIMATORS[name](OPTIONS).estimate(exact) for _ in range(2))
+    np.testing.assert_array_equal(first.site_world, second.site_world)
+    for key, value in hda_products(first.details).items():
+        np.testing.assert_array_equal(hda_products(second.details)[key], value)
 
 
 def apriori(found: SiteEstimate, given: LandingMeasurements) -> bool:
@@ -217,14 +221,16 @@ def test_a_pure_rotation_is_told() -> None:
 
 
 def test_parts_that_move_on_their_own_are_no_motion(exact: LandingMeasurements) -> None:
-    # Strips of the first picture shifted to and fro: every track is sharp, but no rigid motion has them all.
+    # Blocks of the first picture shifted each its own way: tracks are sharp, but no rigid motion has them all.
     rng = np.random.default_rng(4)
     source = exact.images[0].counts
-    second = np.concatenate(
-        [np.roll(source[i : i + 24], int(rng.integers(-35, 36)), axis=1) for i in range(0, 240, 24)]
-    )
-    found = HdaEstimator(OPTIONS).estimate(repainted(exact, 1, np.ascontiguousarray(second)))
-    assert found.outcome in (SiteOutcome.NO_MOTION, SiteOutcome.NO_TRACKS, SiteOutcome.NO_BASELINE)
+    second = source.copy()
+    for row in range(0, 240, 60):
+        for column in range(0, 320, 64):
+            part = np.roll(source, rng.integers(-15, 16, 2), axis=(0, 1))
+            second[row : row + 60, column : column + 64] = part[row : row + 60, column : column + 64]
+    found = HdaEstimator(OPTIONS).estimate(repainted(exact, 1, second))
+    assert found.outcome is SiteOutcome.NO_MOTION
     assert apriori(found, exact)
 
 
@@ -294,7 +300,6 @@ def test_a_dropped_frame_is_a_repeated_one(exact: LandingMeasurements) -> None:
     repeated = repainted(exact, 1, exact.images[0].counts)
     found = HdaEstimator(OPTIONS).estimate(repeated)
     assert found.outcome is SiteOutcome.NO_BASELINE
-    cv2.setRNGSeed(0)
 
 
 def test_noise_of_the_detector_leaves_the_map_usable(scene: Pass) -> None:
