@@ -147,7 +147,10 @@ class TargetTracker(Protocol):
         ...
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
-        """Where to look from this pose; None where the mast cannot show the target."""
+        """Where to look from this pose; None where the mast cannot show the target.
+
+        Pictures taken at any other angles then make an update that loses it.
+        """
         ...
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:

@@ -46,10 +46,10 @@ class Track:
 
     Attributes
     ----------
-    target
-        As it was designated.
-    designated_world
-        Where that is in the world, metres, shape (3,); None for a pixel.
+    designated
+        The target as it was picked in a picture, or else where it lies in the world, metres, shape (3,).
+    world_from_rover
+        The pose at the last update, found or not.
     state, lost_updates
         Where it stands in Fig. 6, and for how many updates the target has been looked for.
     sighting
@@ -60,12 +60,9 @@ class Track:
         From the camera, then.
     driven_m
         Length of the rover's path since, by its pose estimates at the updates.
-    world_from_rover
-        The pose at the last update, found or not.
     """
 
-    target: TargetDesignation
-    designated_world: Float[np.ndarray, "3"] | None
+    designated: PixelTarget | Float[np.ndarray, "3"]
     world_from_rover: RigidTransform
     state: TrackingState = TrackingState.NORMAL
     lost_updates: int = 0
@@ -95,8 +92,10 @@ class VisualTargetTracker:
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
         """Takes a target, with the rover's estimated pose, in place of any other."""
-        given = None if isinstance(target, PixelTarget) else designated_position_world(target, world_from_rover)
-        self.track = Track(target, given, world_from_rover)
+        if isinstance(target, PixelTarget):
+            self.track = Track(target, world_from_rover)
+        else:
+            self.track = Track(designated_position_world(target, world_from_rover), world_from_rover)
 
     def clear(self) -> None:
         """Forgets the target."""
@@ -106,8 +105,8 @@ class VisualTargetTracker:
         """Where to look from this pose; None without a target, or where the mast cannot show it."""
         if self.track is None:
             return None
-        if self.track.sighting is None and isinstance(self.track.target, PixelTarget):
-            return aim_at_pixel(self.track.target, mast, self.options)
+        if self.track.sighting is None and isinstance(self.track.designated, PixelTarget):
+            return aim_at_pixel(self.track.designated, mast, self.options)
         expected = expected_position(self.track, world_from_rover)
         return None if expected is None else aim_at_position(expected, mast, self.options)
 
@@ -174,18 +173,18 @@ def expected_position(track: Track, world_from_frame: RigidTransform) -> Float[n
     if track.sighting is not None:
         last = track.sighting
         return predicted_position(last.position_head, last.world_from_head, world_from_frame)
-    if track.designated_world is None:
+    if isinstance(track.designated, PixelTarget):
         return None
-    return np.asarray(world_from_frame.inv().apply(track.designated_world.copy()))
+    return np.asarray(world_from_frame.inv().apply(track.designated.copy()))
 
 
 def seeded(track: Track, measurements: RoverMeasurements, options: VttOptions) -> Finding:
     """Takes the first template where the target was designated, and its position by point stereo."""
     stop = Stop.of(measurements)
-    expected = expected_position(track, stop.world_from_head)
-    if expected is None and isinstance(track.target, PixelTarget):
-        pixel, ranges = track.target.pixel, options.seed_range_m
-    elif expected is not None:
+    if isinstance(track.designated, PixelTarget):
+        pixel, ranges = track.designated.pixel, options.seed_range_m
+    else:
+        expected = np.asarray(stop.world_from_head.inv().apply(track.designated.copy()))
         pixel = stop.left.project(expected)[0]
         ranges = searched_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
     if not np.all(np.isfinite(pixel)) or not has_room(measurements.left, pixel, options.template_px):
@@ -214,10 +213,7 @@ def followed(
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
     window, window_corner = search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
-    applied = Change(
-        change.magnification if options.scale else 1.0,
-        change.roll_rad if options.roll else 0.0,
-    )
+    applied = Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
     match = matcher(last, measurements.left, predicted, applied, options)
     if match is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
