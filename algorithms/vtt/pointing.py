@@ -16,8 +16,8 @@ from algorithms.vtt.stereo import epipolar_pixels
 from sim.camera import CameraModel
 from sim.measurements import MastCalibration, MastGeometry, PixelTarget
 
-#: Newton's steps, each of which about squares the error of the one before, and the error that ends them.
-STEPS, TOLERANCE_PX = 12, 1e-6
+#: Newton's steps, and the error before a step that makes it the last: each about squares the error of the one before.
+STEPS, TOLERANCE_PX = 12, 1e-2
 
 
 def mast_angles(

@@ -161,8 +161,8 @@ def pose(x: float, y: float, heading_rad: float = 0.0, tilt: Rotation | None = N
 class Drive:
     """A rover that looks with a tracker at what a scene shows, stop by stop.
 
-    `estimated` turns the true pose into what the rover believes; `mast` is the true one too, `calibrated` what the
-    rover believes of it.
+    `mast` is the true one, `calibrated` what the rover believes of it; `pointing_error_rad` is how far the mast's true
+    angles are from those commanded and read.
     """
 
     scene: Scene
@@ -170,6 +170,7 @@ class Drive:
     tracker: TargetTracker
     calibrated: MastCalibration | None = None
     noise: np.random.Generator | None = None
+    pointing_error_rad: tuple[float, float] = (0.0, 0.0)
     measurements: list[RoverMeasurements] = field(default_factory=list)
 
     def camera(self, world_from_rover: RigidTransform, angles: tuple[float, float], right: bool = False) -> CameraModel:
@@ -185,10 +186,11 @@ class Drive:
         if aim is None:
             return None
         angles = (aim.azimuth_rad, aim.elevation_rad)
+        actual = (angles[0] + self.pointing_error_rad[0], angles[1] + self.pointing_error_rad[1])
         self.measurements.append(
             RoverMeasurements(
-                left=self.scene.picture(self.camera(true, angles), aim.left, self.noise),
-                right=self.scene.picture(self.camera(true, angles, right=True), aim.right, self.noise),
+                left=self.scene.picture(self.camera(true, actual), aim.left, self.noise),
+                right=self.scene.picture(self.camera(true, actual, right=True), aim.right, self.noise),
                 mast=known,
                 azimuth_rad=angles[0],
                 elevation_rad=angles[1],
@@ -199,5 +201,5 @@ class Drive:
 
     def true_pixel(self, true: RigidTransform, point_world: np.ndarray) -> np.ndarray:
         """Where the left picture of the last stop truly shows a point of the world."""
-        last = self.measurements[-1]
-        return self.camera(true, (last.azimuth_rad, last.elevation_rad)).project(point_world)[0]
+        last, error = self.measurements[-1], self.pointing_error_rad
+        return self.camera(true, (last.azimuth_rad + error[0], last.elevation_rad + error[1])).project(point_world)[0]

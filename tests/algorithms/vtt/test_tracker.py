@@ -15,6 +15,7 @@ from algorithms.vtt.details import VttDetails
 from algorithms.vtt.lucas_kanade import lucas_kanade_tracker
 from algorithms.vtt.options import PURE_NCC, VttOptions
 from algorithms.vtt.tracker import VisualTargetTracker
+from sim.camera import Cahvor
 from sim.measurements import MastImage, PixelTarget, RoverTarget, SiteTarget, TargetDesignation
 from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, Sphere, navcam, pancam, pose, waves
 
@@ -221,6 +222,41 @@ def test_slip_shows_as_a_correction_and_not_as_an_error() -> None:
     assert evidence is not None
     # It has driven 6 m: the target moved by 4 % of that in the world that it believes in.
     assert evidence.position_correction_m == pytest.approx(0.24, abs=0.05)
+
+
+def test_a_mast_that_points_wrong_moves_the_picture_and_not_the_match() -> None:
+    target = np.array([6.0, 0.1, 0.2])
+    drive = Drive(scene_of(slanted(5, target), target, 5), navcam(), VisualTargetTracker(SMALL))
+    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
+    drive.stop(pose(0.0, 0.0))
+    drive.pointing_error_rad = (np.deg2rad(0.5), np.deg2rad(-0.3))
+    update = drive.stop(pose(0.5, 0.0))
+    assert update is not None
+    assert update.found
+    found = details(update)
+    assert found.predicted_pixel is not None
+    # 0.82 mrad a pixel: looking too far to the right and down moves the target to the left and up.
+    correction = pixel_of(update) - found.predicted_pixel
+    np.testing.assert_allclose(correction, [-1222.5 * np.deg2rad(0.5), -1222.5 * np.deg2rad(0.3)], atol=0.5)
+    np.testing.assert_allclose(pixel_of(update), drive.true_pixel(pose(0.5, 0.0), target), atol=0.1)
+
+
+@pytest.mark.parametrize(("rows", "found"), [(1.4, True), (5.0, False)])
+def test_point_stereo_tolerates_two_pixels_of_misalignment(rows: float, found: bool) -> None:
+    target = np.array([6.0, 0.1, 0.2])
+    true = navcam()
+    assert isinstance(true.right, Cahvor)
+    believed = replace(true, right=replace(true.right, v=true.right.v + rows * true.right.a))
+    drive = Drive(scene_of(slanted(5, target), target, 5), true, VisualTargetTracker(SMALL), calibrated=believed)
+    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
+    update = drive.stop(pose(0.0, 0.0))
+    assert update is not None
+    assert update.found == found
+    if found:
+        # Rows hardly enter the range: a tenth of a pixel of disparity is 1.5 cm here.
+        assert np.linalg.norm(update.position_rover - target) < 0.03
+    else:
+        assert update.losses == (TargetLoss.LOW_STEREO_SCORE,)
 
 
 def test_wheels_that_spin_in_place_are_noticed() -> None:
