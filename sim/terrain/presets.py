@@ -106,9 +106,9 @@ KELSO = Site(
         albedo=0.5,
         albedo_contrast=0.03,
         swell=Swell(relief_m=207.0),
-        # Crests that wind and branch, with smaller dunes upon them, as pictures of Kelso show. How irregular they are is a
-        # calibration: over straighter crests (1.8 and 0.9 wavelengths) DIMES refuses a third of the triples close in
-        # time, which in the field test were all valid.
+        # Crests that wind and branch, with smaller dunes upon them. How irregular they are is a calibration: over
+        # straighter crests (1.8 and 0.9 wavelengths) DIMES refuses a third of the triples close in time, which in the
+        # field test were all valid.
         dunes=Dunes(
             wavelength_m=115.0, height_m=3.6, wind_from_deg=290.0, repose_deg=33.0, crest_length=0.8, regularity=0.5
         ),
