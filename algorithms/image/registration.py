@@ -12,8 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from algorithms.image import kernels
-from algorithms.image.alignment import SURROUND, TOLERANCE, spline_coefficients
+from algorithms.image.alignment import SURROUND, spline_coefficients
 
+#: A step below this, pixels, ends the iteration; what is left is less than 1e-3 px.
+TOLERANCE = 3e-3
 #: A pivot of the normal equations, their diagonal made 1, below which texture does not tell one unknown from another.
 SINGULAR = 1e-4
 
