@@ -89,7 +89,7 @@ class HdaOptions:
     window_half_px: int = 40
     block_px: int = 64
     min_eigenvalue: float = 1.0
-    min_track_correlation: float = 0.8
+    min_track_correlation: float = 0.7
     track_seed: TrackSeed = TrackSeed.NOTHING
     align: bool = True
     min_tracks: int = 12

@@ -62,8 +62,8 @@ def test_semi_global_depths_are_those_of_the_exact_scene(seen: Sighting) -> None
     one = true.camera(0)
     depths = (true.ground(0, matches.first) - one.c) @ one.a
     assert matches.accepted.mean() > 0.9
-    # 33 px of disparity at 10 m: a quarter of a pixel is 0.08 m.
-    assert np.sqrt(np.mean((matches.depths - depths)[matches.accepted] ** 2)) < 0.08
+    # 33 px of disparity at 10 m: a third of a pixel is 0.1 m; a grid pixel takes the nearest rectified one's disparity.
+    assert np.sqrt(np.mean((matches.depths - depths)[matches.accepted] ** 2)) < 0.1
 
 
 def test_the_essential_matrix_gives_the_motion_that_least_squares_gives(seen: Sighting) -> None:

@@ -275,7 +275,10 @@ def test_products_hold_what_the_figures_show(scene: Pass, exact: LandingMeasurem
     # Fig. 2's points are where the tracks' pixels see the ground.
     truth = scene.ground(0, products["features"][accepted])
     one = scene.camera(0)
-    np.testing.assert_allclose(products["sparse_points"][:, 2], (truth - one.c) @ one.a, atol=0.1)
+    misses = products["sparse_points"][:, 2] - (truth - one.c) @ one.a
+    assert products["inliers"].mean() > 0.9
+    # Aligned tracks with a parallax of 33 px at 10 m: 0.1 m is a third of a pixel.
+    assert np.max(np.abs(misses[products["inliers"]])) < 0.1
     assert products["grid"].shape == products["segment_ends"].shape == products["matched"].shape
     # Fig. 7: cells fall on the pixels that see them.
     row, column = products["site"].astype(int)
