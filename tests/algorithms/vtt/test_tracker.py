@@ -169,6 +169,45 @@ def test_turning_in_place_changes_the_mast_and_nothing_else() -> None:
     assert np.degrees(found.azimuth_rad) == pytest.approx(45.0, abs=5.0)
 
 
+def test_circling_the_target_lowers_the_score_and_leaves_the_match() -> None:
+    # As in Table III, where 6 to 9 deg gave 0.85 to 0.88 and 15 deg 0.79; a flat face has no relief to show.
+    target = np.array([4.0, 0.0, 0.3])
+    scene = scene_of(Plane(target, np.array([-0.96, 0.0, 0.28])), target, 5)
+    scores = {}
+    for step in (2.0, 8.0, 15.0):
+        drive = Drive(scene, navcam(), VisualTargetTracker(SMALL))
+        first, second = (
+            pose(4.0 - 4.0 * np.cos(a), -4.0 * np.sin(a), a) for a in (np.deg2rad(-0.5 * step), np.deg2rad(0.5 * step))
+        )
+        drive.tracker.designate(RoverTarget(first.inv().apply(target)), first)
+        drive.stop(first)
+        update = drive.stop(second)
+        assert update is not None
+        assert update.found
+        # The mast stands ahead of the rover's origin and to its left; the angle is that of the camera's line of sight.
+        assert abs(np.degrees(details(update).azimuth_change_rad)) == pytest.approx(step, rel=0.02)
+        np.testing.assert_allclose(pixel_of(update), drive.true_pixel(second, target), atol=0.2)
+        match = details(update).match
+        assert match is not None
+        scores[step] = match.score
+    assert 0.79 < scores[15.0] < scores[8.0] < scores[2.0]
+
+
+def test_backing_off_shrinks_the_template() -> None:
+    target = np.array([4.0, 0.1, 0.2])
+    drive = Drive(scene_of(slanted(2, target), target, 2), navcam(), VisualTargetTracker(SMALL))
+    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
+    drive.stop(pose(0.0, 0.0))
+    for x in (-0.4, -0.8, -1.2):
+        update = drive.stop(pose(x, 0.0))
+        change = details(update).change
+        assert update is not None
+        assert update.found
+        assert change is not None
+        assert 0.88 < change.magnification < 0.93
+        np.testing.assert_allclose(pixel_of(update), drive.true_pixel(pose(x, 0.0), target), atol=0.15)
+
+
 # ----- designation, stereo, poses -----
 
 
