@@ -5,10 +5,11 @@ be read from the figure. Here they are what the errors that the paper names expl
 of the last sighting, D_0 that at the seed, s the length of the last move and S that of all moves since the seed:
 
     distance tolerance = floor + sqrt(dR(D_old)^2 + dR(D)^2 + (e s)^2)
-    position tolerance = floor + sqrt(dR(D_0)^2   + dR(D)^2 + (e S)^2)
+    position tolerance = floor + sqrt(dR(D_0)^2   + dR(D)^2 + (e S)^2 + (w D)^2)
 
-dR is the stereo range error of Eq. 1 for the disparity error of 3 sigma, e the pose estimate's error as a share of the
-distance driven; both tolerances shrink as the rover comes nearer.
+dR is the stereo range error of Eq. 1 for the disparity error of 3 sigma, e the error of the estimated position as a
+share of the distance driven, w that of the direction to the target. The first tolerance shrinks as the rover comes
+nearer; the second is never less than what the first designation and the drive may have been wrong by.
 """
 
 from __future__ import annotations
@@ -54,14 +55,17 @@ def tolerances(journey: Journey, left: CameraModel, right: CameraModel, options:
     """The tolerances of Fig. 5 for this update, by the formula above."""
     scale = disparity_px_m(left, right)
 
-    def tolerance(before_m: float, moved_m: float) -> float:
+    def tolerance(before_m: float, moved_m: float, across_m: float) -> float:
         before, now = (
             stereo_range_error_m(range_m, scale, 1.0, options.stereo_disparity_error_px)
             for range_m in (before_m, journey.now_m)
         )
-        return options.tolerance_floor_m + math.hypot(before, now, options.pose_error * moved_m)
+        return options.tolerance_floor_m + math.hypot(before, now, options.pose_error * moved_m, across_m)
 
-    return Tolerances(tolerance(journey.last_m, journey.step_m), tolerance(journey.seed_m, journey.driven_m))
+    return Tolerances(
+        distance_m=tolerance(journey.last_m, journey.step_m, 0.0),
+        position_m=tolerance(journey.seed_m, journey.driven_m, options.direction_error_rad * journey.now_m),
+    )
 
 
 @dataclass(frozen=True)

@@ -49,9 +49,11 @@ class VttOptions:
     stereo_disparity_error_px
         Disparity error of 3 sigma in the tolerances (paper: 1 pixel).
     pose_error
-        Error of the pose estimate in the tolerances, as a share of the distance driven, 3 sigma. 0.02 would be visual
-        odometry (paper: "roughly 2%"); 0.1 allows for wheel slip on firm ground. Steeper ground without visual
-        odometry needs more, up to 1.
+        Error of the estimated position in the tolerances, as a share of the distance driven. 0.2 lets wheels slip by
+        as much, as on gentle slopes: a right match is not given up for what the wheels lost. Visual odometry needs less
+        (paper: "roughly 2%"), steep ground without it more, up to 1.
+    direction_error_rad
+        Error of the direction to the target, from attitude and mast, in the tolerance of the position: 1.7 deg.
     tolerance_floor_m
         Part of both tolerances that does not depend on distance: relief under a drifting match, mast pointing.
     max_lost_updates
@@ -74,7 +76,8 @@ class VttOptions:
     min_match_score: float = 0.7
     min_stereo_score: float = 0.7
     stereo_disparity_error_px: float = 1.0
-    pose_error: float = 0.1
+    pose_error: float = 0.2
+    direction_error_rad: float = 0.03
     tolerance_floor_m: float = 0.05
     max_lost_updates: int = 2
 

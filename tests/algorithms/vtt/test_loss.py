@@ -48,10 +48,10 @@ def test_all_criteria_are_reported() -> None:
 
 
 def test_tolerances_are_those_of_the_formula() -> None:
-    # Navcam of MER: dR = R^2 / 244.5 for 1 px: 0.409 m at 10 m, 0.331 at 9 m; a step of 1 m adds 0.1.
+    # Navcam of MER: dR = R^2 / 244.5 for 1 px: 0.409 m at 10 m, 0.331 at 9 m; a step of 1 m adds 0.2, direction 0.27.
     found = tolerances(Journey(10.0, 10.0, 9.0, 1.0, 1.0), navcam().left, navcam().right, OPTIONS)
-    assert found.distance_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.1**2), abs=1e-3)
-    assert found.position_m == pytest.approx(found.distance_m)
+    assert found.distance_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2), abs=1e-3)
+    assert found.position_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2 + 0.27**2), abs=1e-3)
 
 
 def test_tolerances_shrink_as_the_rover_comes_nearer() -> None:
@@ -61,19 +61,19 @@ def test_tolerances_shrink_as_the_rover_comes_nearer() -> None:
         for before, now in pairwise(distances)
     ]
     assert np.all(np.diff([a.distance_m for a in allowed]) < 0.0)
-    assert allowed[-1].distance_m < 0.1
+    assert allowed[-1].distance_m < 0.11
     # The first designation was that uncertain, and the rover may have drifted: never below either.
     assert min(a.position_m for a in allowed) > 0.409
 
 
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
 def test_stereo_noise_rarely_loses_a_target(mast: MastCalibration) -> None:
-    # 1 px of 3 sigma in two disparities, and 10 % of 3 sigma in a step of 1 m: of the 3 sigma that the root sum square
+    # 1 px of 3 sigma in two disparities, and 20 % of 3 sigma in a step of 1 m: of the 3 sigma that the root sum square
     # stands for, before the floor is added, less than 0.3 % are beyond it.
     rng = np.random.default_rng(1)
     scale = mast.left.focal_lengths[0] * np.linalg.norm(mast.left.c - mast.right.c)
     old, new = (scale / (scale / r + rng.normal(0.0, 1.0 / 3.0, 100_000)) for r in (10.0, 9.0))
-    correction = new - (old - 1.0 + rng.normal(0.0, 0.1 / 3.0, 100_000))
+    correction = new - (old - 1.0 + rng.normal(0.0, 0.2 / 3.0, 100_000))
     allowed = tolerances(Journey(10.0, 10.0, 9.0, 1.0, 1.0), mast.left, mast.right, OPTIONS)
     assert np.mean(np.abs(correction) > allowed.distance_m) < 0.003
     assert np.quantile(np.abs(correction), 0.99) > allowed.distance_m * 0.45  # and it is not loose by much
