@@ -14,6 +14,9 @@ from pathlib import Path
 
 from sim.cache import cache_directory
 
+#: The folders that hold kernels, side by side in the tree and where they are installed.
+_FOLDERS = ("sim", "algorithms")
+
 
 def use_own_folder() -> None:
     """Points numba, without importing it, at the folder of the kernels as they are, unless the user has chosen one."""
@@ -33,5 +36,9 @@ def use_own_folder() -> None:
 
 
 def _kernel_sources() -> list[Path]:
-    here = Path(__file__).parent
-    return sorted([*here.rglob("kernels.py"), *here.rglob("kernels/*.py")])
+    root = Path(__file__).parents[1]
+    return sorted(path for folder in _FOLDERS for path in (root / folder).rglob("*.py") if _is_kernel(path))
+
+
+def _is_kernel(path: Path) -> bool:
+    return path.name == "kernels.py" or path.parent.name == "kernels"

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -21,13 +23,15 @@ def _folder(sources: Path, cache: Path, **environment: str) -> str:
     return done.stdout.strip()
 
 
-def test_a_changed_kernel_is_compiled_anew_with_all_that_call_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kernels", ["sim/terrain/kernels.py", "algorithms/hda/kernels/motion.py"])
+def test_a_changed_kernel_is_compiled_anew_with_all_that_call_it(kernels: str, tmp_path: Path) -> None:
     sources = tmp_path / "sources"
-    shutil.copytree(ROOT / "sim", sources / "sim", ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in ("sim", "algorithms"):
+        shutil.copytree(ROOT / folder, sources / folder, ignore=shutil.ignore_patterns("__pycache__"))
     before = _folder(sources, tmp_path / "cache")
     assert _folder(sources, tmp_path / "cache") == before
-    kernels = sources / "sim" / "terrain" / "kernels.py"
-    kernels.write_text(kernels.read_text() + "\n# changed\n")
+    changed = sources / kernels
+    changed.write_text(changed.read_text() + "\n# changed\n")
     assert _folder(sources, tmp_path / "cache") != before
 
 
