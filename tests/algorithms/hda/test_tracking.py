@@ -166,3 +166,20 @@ def test_the_search_begins_where_it_is_told() -> None:
     found = track_features(first, second, features, true + 9.0, OPTIONS)
     assert np.mean(np.hypot(*(lost.second - true).T)[inside] < 1.0) < 0.1
     assert np.mean(np.hypot(*(found.second - true).T)[inside] < 1.0) > 0.9
+
+
+def test_tracks_among_boulders_are_right_or_none() -> None:
+    rng = np.random.default_rng(5)
+    boulders = [(*rng.uniform(-3.0, 3.0, 2), rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.3)) for _ in range(20)]
+    scene = Pass(bumps(*boulders), (pose(0.0, 0.0, 10.0, 20.0), pose(0.1, -0.7, 10.1, 21.0, 1.0, 1.0)))
+    first, second = (picture(scene, i).counts for i in (0, 1))
+    features = select_features(first, OPTIONS)
+    true = scene.camera(1).project(scene.ground(0, features))[0]
+    plain, fine = (
+        track_features(first, second, features, features, replace(OPTIONS, align=align)) for align in (False, True)
+    )
+    wrong = np.hypot(*(fine.second - true).T) > 0.5
+    # What correlation alone would have accepted: features that left the picture, and edges that hide ground.
+    assert np.sum(plain.accepted & wrong) >= 3
+    assert np.sum(fine.accepted & wrong) <= 1
+    assert np.sum(fine.accepted) > 40
