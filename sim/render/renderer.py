@@ -86,7 +86,7 @@ class Scene:
     mesh_reach_m: float = 20000.0
     mesh_lines: int = 513
     mesh_in_view: bool = False
-    edge_rays: int = 3
+    edge_rays: int = 2
 
     @cached_property
     def mesh_offsets(self) -> Float64[np.ndarray, "lines"]:
@@ -340,6 +340,7 @@ def _shaded(
         sight.triangle,
         sight.weights,
         sight.level,
+        sight.lit,
         rotation,
         position,
         rays.origins,

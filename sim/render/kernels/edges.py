@@ -9,7 +9,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sim.render.kernels.ground import Array32, cross_ground
-from sim.render.kernels.hierarchy import Hierarchy, nearest_hit
+from sim.render.kernels.hierarchy import Hierarchy, in_beam, nearest_hit
+from sim.render.kernels.intersection import hit_triangle
 from sim.render.kernels.sight import Ints
 from sim.terrain.kernels import Array, Level
 
@@ -26,6 +27,14 @@ JUMP, STEEPER = 0.02, 3.0
 AHEAD, BEYOND = 0.95, 1.05
 #: The same beside the sky, where range grows without bound from pixel to pixel.
 TO_HORIZON = 5.0
+#: Triangles that a pixel's beam may list; where there are more, every ray walks through the hierarchy by itself.
+MOST_LISTED = 96
+#: Half a pixel's diagonal, in pixels, and a little more, for pixels are not quite square.
+BEAM_PX = 0.8
+#: Pixels that must agree on whether the sun reaches a surface for its rays to be taken at their word.
+WITNESSES = 3
+#: The sun's visible share where it is not known.
+UNKNOWN = -1.0
 
 
 @njit(cache=True, inline="always")
@@ -128,6 +137,50 @@ def split_rays(rays: Array32, rows: int, columns: int, pixels: Longs, side: int,
                 number += 1
 
 
+@njit(cache=True)
+def _nearest_listed(
+    tree: Hierarchy,
+    listed: Longs,
+    count: int,
+    x: float,
+    y: float,
+    z: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    farthest: float,
+) -> tuple[float, int, float, float]:
+    """As `nearest_hit`, among some triangles."""
+    best = farthest
+    best_triangle = -1
+    best_second = 0.0
+    best_third = 0.0
+    for k in range(count):
+        t, second, third = hit_triangle(tree[0], listed[k], x, y, z, dx, dy, dz)
+        if 0.0 < t < best and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
+            best = t
+            best_triangle = listed[k]
+            best_second = second
+            best_third = third
+    return best, best_triangle, best_second, best_third
+
+
+@njit(cache=True, inline="always")
+def _agreed(bodies: Ints, lit: Array32, count: int, body: int) -> float:
+    """Share of the sun that pixels around see from a body, where enough of them agree on all or none of it."""
+    witnesses = 0
+    share = UNKNOWN
+    for k in range(count):
+        if bodies[k] == body:
+            if lit[k] != 0.0 and lit[k] != 1.0:
+                return UNKNOWN
+            if witnesses > 0 and lit[k] != share:
+                return UNKNOWN
+            share = lit[k]
+            witnesses += 1
+    return share if witnesses >= WITNESSES else UNKNOWN
+
+
 # Fused multiplications round differently, but the same way every time on the same processor.
 @njit(cache=True, fastmath={"contract"})
 def look_closely(
@@ -141,19 +194,23 @@ def look_closely(
     share: int,
     origins: Array32,
     directions: Array32,
+    pixel_angles: Array32,
+    body_of_triangle: Ints,
     distance: Array,
     triangle_of_pixel: Ints,
     level_of_pixel: NDArray[np.int8],
     weights: Array32,
+    lit_of_pixel: Array32,
     near: Array,
     triangle_of_ray: Ints,
     weights_of_ray: Array32,
     level_of_ray: NDArray[np.int8],
+    lit_of_ray: Array32,
 ) -> None:
     """What every ray within some pixels meets, among what these pixels and the eight around each see.
 
-    Triangles are sought in the hierarchy and the ground where a pixel around has met it, on the level on which it did,
-    so that neighbouring pixels show one ground.
+    Triangles are sought among those that a beam around the pixel may meet, and the ground where a pixel around has met
+    it, on the level on which it did, so that neighbouring pixels show one ground.
 
     Parameters
     ----------
@@ -165,28 +222,41 @@ def look_closely(
         Columns of the picture.
     pixels, share
         Numbers of the pixels, and how many rays each has.
-    origins, directions
-        The rays in body axes, shape (pixels * share, 3).
-    distance, triangle_of_pixel, level_of_pixel, weights
-        What the picture's pixels meet, from `look`.
-    near, triangle_of_ray, weights_of_ray, level_of_ray
-        The same of the rays: outputs.
+    origins, directions, pixel_angles
+        The rays in body axes, shape (pixels * share, 3), and the angle that the pixel of each takes.
+    body_of_triangle
+        The body of each triangle.
+    distance, triangle_of_pixel, level_of_pixel, weights, lit_of_pixel
+        What the picture's pixels meet, from `look`, and the share of the sun that reaches it, from `shade`.
+    near, triangle_of_ray, weights_of_ray, level_of_ray, lit_of_ray
+        The same of the rays: outputs. The sun's share is `UNKNOWN` where the pixels around do not agree.
     """
     inverse_spacing = 1.0 / spacing
     w = world_from_body
     rows = distance.size // columns
     ranges = np.empty(9)
     found = np.empty(9, dtype=np.int8)
+    bodies = np.empty(9, dtype=np.int32)
+    lit = np.empty(9, dtype=np.float32)
+    listed = np.empty(MOST_LISTED, dtype=np.int64)
     for k in range(pixels.size):
         pixel = pixels[k]
         row = pixel // columns
         column = pixel - row * columns
         count = 0
+        witnesses = 0
         sky = False
         things = False
+        last = 0.0
         for i in range(max(row - 1, 0), min(row + 2, rows)):
             for j in range(max(column - 1, 0), min(column + 2, columns)):
                 n = i * columns + j
+                if distance[n] < math.inf:
+                    triangle = triangle_of_pixel[n]
+                    bodies[witnesses] = body_of_triangle[triangle] if triangle >= 0 else -1
+                    lit[witnesses] = lit_of_pixel[n]
+                    witnesses += 1
+                    last = max(last, distance[n])
                 if distance[n] == math.inf:
                     sky = True
                 elif triangle_of_pixel[n] >= 0:
@@ -201,6 +271,29 @@ def look_closely(
                     ranges[place] = distance[n]
                     found[place] = level_of_pixel[n]
                     count += 1
+        in_list = -1
+        if things:
+            # the pixel's middle lies between its first ray and its last
+            a = k * share
+            b = a + share - 1
+            bx = 0.5 * (directions[a, 0] + directions[b, 0])
+            by = 0.5 * (directions[a, 1] + directions[b, 1])
+            bz = 0.5 * (directions[a, 2] + directions[b, 2])
+            ox = 0.5 * (origins[a, 0] + origins[b, 0])
+            oy = 0.5 * (origins[a, 1] + origins[b, 1])
+            oz = 0.5 * (origins[a, 2] + origins[b, 2])
+            in_list = in_beam(
+                tree,
+                position[0] + w[0, 0] * ox + w[0, 1] * oy + w[0, 2] * oz,
+                position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz,
+                position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz,
+                w[0, 0] * bx + w[0, 1] * by + w[0, 2] * bz,
+                w[1, 0] * bx + w[1, 1] * by + w[1, 2] * bz,
+                w[2, 0] * bx + w[2, 1] * by + w[2, 2] * bz,
+                BEAM_PX * pixel_angles[a],
+                math.inf if sky else BEYOND * last,
+                listed,
+            )
         for n in range(k * share, (k + 1) * share):
             bx = directions[n, 0]
             by = directions[n, 1]
@@ -233,7 +326,10 @@ def look_closely(
             second = 0.0
             third = 0.0
             if things:
-                t_thing, triangle, second, third = nearest_hit(tree, x0, y0, z0, dx, dy, dz, t)
+                if in_list < 0:
+                    t_thing, triangle, second, third = nearest_hit(tree, x0, y0, z0, dx, dy, dz, t)
+                else:
+                    t_thing, triangle, second, third = _nearest_listed(tree, listed, in_list, x0, y0, z0, dx, dy, dz, t)
                 if triangle >= 0:
                     t = t_thing
             if t == math.inf and count > 0 and not sky:
@@ -250,6 +346,8 @@ def look_closely(
             near[n] = t
             triangle_of_ray[n] = triangle
             level_of_ray[n] = level
+            body = body_of_triangle[triangle] if triangle >= 0 else -1
+            lit_of_ray[n] = _agreed(bodies, lit, witnesses, body)
             if triangle >= 0:
                 weights_of_ray[n, 0] = second
                 weights_of_ray[n, 1] = third

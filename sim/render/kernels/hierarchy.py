@@ -67,6 +67,11 @@ def node_boxes(triangles: Array, order: Longs) -> Boxes:
     boxes = np.empty((2 * leaves - 1, 6), dtype=np.float32)
     for leaf in range(leaves):
         node = leaves - 1 + leaf
+        if leaf > 0 and leaf * LEAF >= order.size:
+            # holds nothing: a point of the leaf before, which makes no box above it larger
+            boxes[node, :3] = boxes[node - 1, :3]
+            boxes[node, 3:] = boxes[node - 1, :3]
+            continue
         for axis in range(3):
             low = math.inf
             high = -math.inf
@@ -173,6 +178,67 @@ def nearest_hit(
                 best_second = second
                 best_third = third
     return best, best_triangle, best_second, best_third
+
+
+@njit(cache=True)
+def in_beam(
+    tree: Hierarchy,
+    x: float,
+    y: float,
+    z: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    spread: float,
+    farthest: float,
+    found: Longs,
+) -> int:
+    """Lists the triangles that rays of one origin may meet whose directions differ from this one by up to `spread`.
+
+    Returns how many there are, -1 where they are more than `found` holds.
+    """
+    _triangles, order, boxes = tree
+    if order.size == 0:
+        return 0
+    ix = 1.0 / (dx if abs(dx) > 1e-12 else 1e-12)
+    iy = 1.0 / (dy if abs(dy) > 1e-12 else 1e-12)
+    iz = 1.0 / (dz if abs(dz) > 1e-12 else 1e-12)
+    first_leaf = boxes.shape[0] // 2
+    count = 0
+    node = 0
+    while True:
+        # the box, wider by as much as the beam is at its farthest corner
+        wider = max(abs(boxes[node, 0] - x), abs(boxes[node, 3] - x))
+        wider += max(abs(boxes[node, 1] - y), abs(boxes[node, 4] - y))
+        wider += max(abs(boxes[node, 2] - z), abs(boxes[node, 5] - z))
+        wider *= spread
+        a = (boxes[node, 0] - wider - x) * ix
+        b = (boxes[node, 3] + wider - x) * ix
+        near = min(a, b)
+        far = max(a, b)
+        a = (boxes[node, 1] - wider - y) * iy
+        b = (boxes[node, 4] + wider - y) * iy
+        near = max(near, min(a, b))
+        far = min(far, max(a, b))
+        a = (boxes[node, 2] - wider - z) * iz
+        b = (boxes[node, 5] + wider - z) * iz
+        near = max(max(near, min(a, b)), 0.0)
+        far = min(far, max(a, b))
+        if far >= near and near <= farthest:
+            if node < first_leaf:
+                node = 2 * node + 1
+                continue
+            start = (node - first_leaf) * LEAF
+            for k in range(start, min(start + LEAF, order.size)):
+                if count == found.size:
+                    return -1
+                found[count] = order[k]
+                count += 1
+        while node > 0 and node % 2 == 0:
+            node = (node - 1) // 2
+        if node == 0:
+            return count
+        node += 1
 
 
 @njit(cache=True)
