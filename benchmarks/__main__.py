@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks import descent, estimators, pictures, vtt
+from benchmarks import descent, estimators, hda, pictures, vtt
 from benchmarks.timing import Figure
 from sim.processor import processor_features
 from sim.render import process_renderer
@@ -35,6 +35,7 @@ def main() -> None:
         *pictures.rover_pictures(3),
         *descent.new_terrains(2),
         *vtt.figures(9),
+        *hda.figures(9),
     ]
     print(f"{'core-seconds, unless said otherwise':<52}{'median':>8}{'least':>8}{'most':>8}  {'bar':<8}")
     for figure in figures:

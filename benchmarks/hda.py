@@ -1,0 +1,127 @@
+"""Hazard detection beside the run times of its paper (Table I, on a 400 MHz R12000), and dense maps."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy import ndimage
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, hazard_maps
+from algorithms.hda.baselines import SemiGlobalEstimator
+from algorithms.hda.estimator import expected_pixels, matched_structure, motion_from_tracks
+from algorithms.hda.features import select_features
+from algorithms.hda.landing import map_ground
+from algorithms.hda.scale import scale_factor
+from algorithms.hda.sighting import sighting
+from algorithms.hda.tracking import track_features
+from algorithms.hda.view import undistorted
+from benchmarks.timing import Figure, core_seconds
+from sim.camera import Cahv
+from sim.frames import rigid
+from sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
+
+#: The XC-55's picture. A block of 73 px gives about the paper's 59 tracks, a grid of 20 px its 600 structure pixels.
+CAMERA = Cahv.from_focal_length(0.006, 7.4e-6, (640, 480), axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0))
+PAPER = HdaOptions(block_px=73, grid_px=20)
+#: 160 x 120 structure pixels.
+DENSE = HdaOptions(grid_px=4)
+TEXEL_M = 0.005
+
+
+def measurements() -> LandingMeasurements:
+    """Two pictures of textured level ground from 10 m, 0.36 m apart."""
+    values = np.random.default_rng(1).standard_normal((2400, 2400)).astype(np.float32)
+    texture = sum(
+        sigma * ndimage.gaussian_filter(values, sigma, mode="wrap", truncate=3.0) * sigma**0.5 for sigma in (4, 12, 36)
+    )
+    texture = np.asarray(128.0 + 40.0 * texture / np.std(texture), dtype=np.float32)
+    known = DetectorCalibration(np.ones((480, 640)), 0.001, 0.0, 0.0, 1, 0.0, 255)
+    poses = (
+        rigid(Rotation.identity(), np.array([0.0, 0.0, 10.0])),
+        rigid(Rotation.from_euler("zyx", [0.3, 0.2, -0.2], degrees=True), np.array([0.1, -0.35, 10.02])),
+    )
+    images = [DetectorImage(_picture(texture, pose), float(k), CAMERA, known) for k, pose in enumerate(poses)]
+    return LandingMeasurements(
+        (images[0], images[1]),
+        (PoseMeasurement(poses[0], 0.0), PoseMeasurement(poses[1], 1.0)),
+        10.0,
+        np.array([0.0, 0.0, 1.0]),
+        np.zeros(3),
+    )
+
+
+def _picture(texture: np.ndarray, pose: RigidTransform) -> np.ndarray:
+    camera = CAMERA.moved(pose)
+    rays = camera.rays(camera.pixel_grid())[1]
+    ground = camera.c[:2] - camera.c[2] * rays[..., :2] / rays[..., 2:]
+    places = (ground / TEXEL_M + 1200.0).astype(np.float32)
+    return np.rint(np.clip(cv2.remap(texture, places, None, cv2.INTER_LINEAR), 0, 255)).astype(np.uint16)
+
+
+def figures(repeats: int) -> list[Figure]:
+    """Stages with the paper's parameters, the whole with them and dense, the hazard maps of a large map."""
+    given = measurements()
+    return [*table_one(given, repeats), *_whole(given, repeats), _large_map(repeats)]
+
+
+def table_one(given: LandingMeasurements, repeats: int) -> list[Figure]:
+    """The four stages of Table I; the scale belongs to structure from motion."""
+    seen = sighting(given)
+    details = HdaEstimator(PAPER).estimate(given).details
+    assert isinstance(details, HdaDetails)
+    tracks, motion, matches, ground = details.tracks, details.motion, details.matches, details.ground
+    assert tracks is not None
+    assert motion is not None
+    assert matches is not None
+    assert ground is not None
+    first, second = (view.counts for view in seen.views)
+    places = undistorted(seen.views[0].camera, tracks.first[tracks.accepted])
+
+    def track() -> None:
+        features = select_features(first, PAPER)
+        track_features(first, second, features, expected_pixels(seen, features, PAPER), PAPER)
+
+    def move() -> None:
+        scale_factor(seen.views, motion_from_tracks(seen, tracks, PAPER), places, seen.range_m, PAPER)
+
+    rows, columns = ground.elevation.elevation_m.shape
+    return [
+        Figure("HDA features, 11 x 11 in 81 x 81 (paper: 0.21 s)", core_seconds(track, repeats)),
+        Figure(f"HDA motion, {tracks.accepted.sum()} tracks (paper: 59, 0.10 s)", core_seconds(move, repeats)),
+        Figure(
+            f"HDA structure, {len(matches.points)} points (paper: 600, 0.41 s)",
+            core_seconds(lambda: matched_structure(seen, motion, PAPER), repeats),
+        ),
+        Figure(
+            f"HDA map and hazards, {rows} x {columns} (paper: 0.05 s)",
+            core_seconds(lambda: map_ground(seen, matches.points, PAPER), repeats),
+        ),
+    ]
+
+
+def _whole(given: LandingMeasurements, repeats: int) -> list[Figure]:
+    return [
+        Figure(
+            "HDA, the paper's parameters (paper: 0.77 s)",
+            core_seconds(lambda: HdaEstimator(PAPER).estimate(given), repeats),
+            bar=0.06,
+        ),
+        Figure(
+            "HDA, 160 x 120 points of 640 x 480",
+            core_seconds(lambda: HdaEstimator(DENSE).estimate(given), repeats),
+            bar=0.4,
+        ),
+        Figure(
+            "the same by semi-global matching",
+            core_seconds(lambda: SemiGlobalEstimator(DENSE).estimate(given), repeats),
+        ),
+    ]
+
+
+def _large_map(repeats: int) -> Figure:
+    rough = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
+    ground = ElevationMap(rough, np.zeros(2), 0.1)
+    return Figure(
+        "HDA hazard maps of 256 x 256", core_seconds(lambda: hazard_maps(ground, HdaOptions()), repeats), bar=0.05
+    )
