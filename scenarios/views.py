@@ -20,15 +20,18 @@ from sim.frames import rigid
 from sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
 from sim.sensor import CameraDesign
 from sim.terrain import Environment, RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
+from sim.terrain.rocks.shapes import FINEST, pixels_held, rock_shapes
 from sim.terrain.sites import SiteTexture
 
 Scale = Literal["descent", "ground"]
 
 #: Rocks smaller than this many pixels are left out.
 SMALLEST_ROCK_PX = 1.5
-#: Triangles of coarsely drawn rocks that a scene may have: beyond, smaller rocks are left out. Near ones, drawn finely,
-#: come to about half as many again.
+#: Triangles of coarsely drawn rocks that a scene may have: beyond, smaller rocks are left out.
 ROCK_TRIANGLES = 600_000
+#: Triangles that finely drawn, near rocks may have besides: beyond, all are drawn more coarsely than a camera sees.
+#: Those that are close beside the eye, out of its sight, come on top.
+DETAIL_TRIANGLES = 1_200_000
 #: Triangles of a rock drawn coarsely, as nearly all are.
 _COARSE_TRIANGLES = 80
 #: Rocks out of sight whose shadows may fall into the picture are kept within this many heights of the eye, and metres.
@@ -172,12 +175,14 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
 def rocks_in_sight(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Objects:
     """The rocks that the eye can tell apart, and those near it whose shadows it may see; bodies carry rocks' numbers.
 
-    Where rocks of `SMALLEST_ROCK_PX` would come to more than about `ROCK_TRIANGLES`, only larger ones are taken.
+    Where rocks of `SMALLEST_ROCK_PX` would come to more than about `ROCK_TRIANGLES`, only larger ones are taken. Rocks
+    are drawn so finely that they cannot be told from their finest shape (`sim.terrain.rocks.shapes.DEVIATION_PX`),
+    except where that takes more than `DETAIL_TRIANGLES`, as fine pixels over fields of clinker do.
     """
     field = ground.rocks
     if field is None or len(field) == 0:
         return Objects.none()
-    smallest_rad = smallest_rock_rad(field, eye)
+    smallest_rad, pixel_rad = smallest_rock_rad(field, eye), _pixel_of_detail_rad(field, eye)
     reach = min(farthest_m, eye.reach_m)
     parts = []
     for low, members in _size_classes(field):
@@ -185,7 +190,9 @@ def rocks_in_sight(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> 
         horizontal = np.sqrt(max((low * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - eye.height_m**2, 0.0))
         radius = float(min(horizontal, reach))
         if radius > 0.0:
-            mesh = _subset(field, members).near(eye.east_m, eye.north_m, radius, above_m=eye.height_m)
+            mesh = _subset(field, members).near(
+                eye.east_m, eye.north_m, radius, above_m=eye.height_m, pixel_rad=pixel_rad
+            )
             seen = _in_sector(mesh, eye)
             names = members[mesh.rock_of_face[seen]].astype(np.int32)
             albedo = ground.site.photometry.rock_albedo
@@ -205,6 +212,18 @@ def smallest_rock_rad(field: RockField, eye: Eye) -> float:
     squares = float(np.sum(field.diameter_m**2)) / field.period_m**2
     affordable = np.sqrt(_COARSE_TRIANGLES * eye.half_width_rad * squares / ROCK_TRIANGLES)
     return float(max(SMALLEST_ROCK_PX * eye.pixel_rad, affordable))
+
+
+def _pixel_of_detail_rad(field: RockField, eye: Eye) -> float:
+    """The pixel for which rocks are drawn: the eye's, or the smallest that `DETAIL_TRIANGLES` allow.
+
+    A rock of diameter D that is held by its level k up to p_k pixels needs the next level's additional triangles up to
+    the distance ``D / (p_k pixel)``.
+    """
+    triangles = np.array([rock_shapes(detail).faces.shape[0] for detail in range(FINEST + 1)])
+    added = (np.diff(triangles) / pixels_held() ** 2).sum(axis=1)
+    per_m2 = float(np.sum(field.diameter_m**2 * added[field.shape])) / field.period_m**2
+    return float(max(eye.pixel_rad, np.sqrt(eye.half_width_rad * per_m2 / DETAIL_TRIANGLES)))
 
 
 @dataclass(frozen=True)

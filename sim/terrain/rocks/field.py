@@ -11,13 +11,19 @@ from jaxtyping import Float64, Int32, Int64
 
 from sim.terrain.rocks.kernels import assemble, place_discs
 from sim.terrain.rocks.population import PlacedRock, RockParameters, draw_diameters
-from sim.terrain.rocks.shapes import COARSE, FINEST, FORMS, SHAPES, SHAPES_OF_FORM, UNIT_HEIGHT, rock_shapes
+from sim.terrain.rocks.shapes import (
+    COARSE,
+    FINEST,
+    FORMS,
+    SHAPES,
+    SHAPES_OF_FORM,
+    UNIT_HEIGHT,
+    pixels_held,
+    rock_shapes,
+)
 from sim.terrain.substreams import substream
 from sim.terrain.surface import Surface
 
-#: Diameter over distance from which a rock is drawn medium, fine and finest: its triangles' edges then take no more
-#: than about 10 pixels of 1 mrad.
-DETAIL_FROM_SIZE = (0.015, 0.04, 0.09)
 #: Side of the cells in which placement looks for neighbours, over the mean diameter.
 CELL_OVER_DIAMETER = 3.0
 #: Random places tried for a rock. Even at k = 0.4 a handful suffice.
@@ -143,6 +149,7 @@ class RockField:
         smallest_m: float = 0.0,
         *,
         above_m: float = 0.0,
+        pixel_rad: float = 1e-3,
         detail: int | None = None,
     ) -> RockMesh:
         """Triangles of the rocks whose centres lie within a radius of a place.
@@ -157,9 +164,11 @@ class RockField:
             Smallest diameter of interest.
         above_m
             Height of the eye above the ground there, for the choice of detail.
+        pixel_rad
+            Angle that a pixel takes.
         detail
-            Level of detail of all rocks, 0 (80 triangles) to 3 (5120); by default chosen for each rock from its size
-            over its distance from the eye.
+            Level of detail of all rocks, 0 (80 triangles) to 3 (5120); by default each rock's is the coarsest that
+            cannot be told from the finest (`DEVIATION_PX`).
         """
         number, offset = self._images(x, y, radius_m, smallest_m)
         position = self.position_m[number]
@@ -168,7 +177,8 @@ class RockField:
             distance = np.sqrt((position[:, 0] - x) ** 2 + (position[:, 1] - y) ** 2 + above_m**2)
             # as near as the eye can be to any of it
             nearest = np.maximum(distance - 0.5 * self.diameter_m[number], 0.1 * self.diameter_m[number])
-            wanted = np.digitize(self.diameter_m[number] / nearest, DETAIL_FROM_SIZE)
+            across_px = self.diameter_m[number] / (nearest * pixel_rad)
+            wanted = np.sum(across_px[:, None] > pixels_held()[self.shape[number]], axis=1)
         else:
             wanted = np.full(number.size, detail)
         return self._assembled(number, position, wanted)

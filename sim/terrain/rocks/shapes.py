@@ -8,6 +8,8 @@ from functools import cache, cached_property
 import numpy as np
 import trimesh
 from jaxtyping import Float64, Int32
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import splu
 
 #: Number of different shapes of each form. Of the blocks the first are angular, the last rounded.
 SHAPES_OF_FORM = 16
@@ -17,6 +19,8 @@ SHAPES = SHAPES_OF_FORM * len(FORMS)
 #: Subdivisions of the icosahedron at each level of detail: 80, 320, 1280 and 5120 triangles.
 SUBDIVISIONS = (1, 2, 3, 4)
 COARSE, MEDIUM, FINE, FINEST = range(4)
+#: How far a rock may be seen to deviate from its finest shape, rms, in pixels.
+DEVIATION_PX = 0.25
 #: Height above the ground over diameter of the unit shapes. Each rock is stretched to its own.
 UNIT_HEIGHT = 0.5
 #: Exponents of the cuts' union, which rounds their edges, from the most angular to the most rounded.
@@ -57,17 +61,60 @@ class ShapeSet:
 
 @cache
 def rock_shapes(detail: int) -> ShapeSet:
-    """The shapes at a level of detail, 0 (`COARSE`) to 3 (`FINEST`); finer levels keep the coarser ones' vertices."""
+    """The shapes at a level of detail, 0 (`COARSE`) to 3 (`FINEST`); coarser ones deviate least from the finest."""
+    directions, faces = _icosphere(detail)
+    vertices = _vertices(detail)
+    normals = np.stack([block.normals(directions) for block in _blocks()])
+    normals.setflags(write=False)
+    return ShapeSet(vertices, normals, faces, _reach())
+
+
+@cache
+def pixels_held(bound_px: float = DEVIATION_PX) -> Float64[np.ndarray, "shapes levels"]:
+    """Up to how many pixels across each shape may be at each level but the finest: larger, it is seen to deviate.
+
+    Deviation is the distance from the finest shape along its normals, rms over what is above the ground.
+    """
+    shapes = rock_shapes(FINEST)
+    held = np.empty((SHAPES, FINEST))
+    for number, block in enumerate(_blocks()):
+        finest, normals = shapes.vertices[number], shapes.normals[number]
+        for detail in range(FINEST):
+            flat = block.flat(_parts_of_corners(detail) @ _fitted(number, detail))
+            away = np.sum((flat - finest) * normals, axis=1)[finest[:, 2] > 0.0]
+            held[number, detail] = bound_px / np.sqrt(np.mean(away**2))
+    held.setflags(write=False)
+    return held
+
+
+@cache
+def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarray, "faces 3"]]:
+    """Unit vectors and triangles of the subdivided icosahedron."""
     sphere = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS[detail])
-    directions = np.array(sphere.vertices, dtype=np.float64)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    blocks = _blocks()
-    vertices = np.stack([block.surface(directions) for block in blocks])
-    normals = np.stack([block.normals(directions) for block in blocks])
-    for array in (vertices, normals):
-        array.setflags(write=False)
-    reach = np.array([block.reach() for block in blocks])
-    return ShapeSet(vertices, normals, np.ascontiguousarray(sphere.faces, dtype=np.int32), reach)
+    vertices = np.array(sphere.vertices, dtype=np.float64)
+    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), np.ascontiguousarray(sphere.faces, np.int32)
+
+
+@cache
+def _vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
+    directions, _ = _icosphere(detail)
+    if detail == FINEST:
+        vertices = np.stack([block.surface(directions) for block in _blocks()])
+    else:
+        vertices = np.stack(
+            [block.placed(directions / _fitted(number, detail)[:, None]) for number, block in enumerate(_blocks())]
+        )
+    vertices.setflags(write=False)
+    return vertices
+
+
+@cache
+def _reach() -> Float64[np.ndarray, "shapes"]:
+    """Largest horizontal distance from the origin, over all levels of detail: fitted corners may stick out."""
+    levels = [np.hypot(_vertices(k)[..., 0], _vertices(k)[..., 1]).max(axis=1) for k in range(len(SUBDIVISIONS))]
+    reach: Float64[np.ndarray, "shapes"] = np.max(levels, axis=0)
+    reach.setflags(write=False)
+    return reach
 
 
 @dataclass(frozen=True)
@@ -118,6 +165,27 @@ class _Block:
         points: Float64[np.ndarray, "n 3"] = (self._raw(directions) - shift) * stretch
         return points
 
+    def fitted(self, detail: int) -> Float64[np.ndarray, "corners"]:
+        """Inverse distances of a level's corners whose flat triangles deviate least, in mean square, from the finest.
+
+        Along a direction that is a sum of three corners' directions with weights c, a triangle lies at the distance
+        1 / sum(c / r): its inverse is linear in the inverse distances of its corners.
+        """
+        parts, radius = _parts_of_corners(detail), self.finest_radius
+        weighed = parts.multiply(radius[:, None] ** 4).tocsc()
+        inverse: Float64[np.ndarray, "corners"] = splu((parts.T @ weighed).tocsc()).solve(weighed.T @ (1.0 / radius))
+        return inverse
+
+    def flat(self, inverse: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+        """Points at these inverse distances along the finest shape's directions."""
+        return self.placed(_icosphere(FINEST)[0] / inverse[:, None])
+
+    def placed(self, own: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """Points of the unit shape, given before the block is stretched."""
+        shift, stretch = self.frame
+        points: Float64[np.ndarray, "n 3"] = (own * self.axes - shift) * stretch
+        return points
+
     def normals(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """Outward unit normals there, by differences of the implicit surface ``|x| - r(x / |x|)``."""
         points = self._raw(directions)
@@ -130,10 +198,6 @@ class _Block:
         gradient /= self.axes * self.frame[1]
         unit: Float64[np.ndarray, "n 3"] = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
         return unit
-
-    def reach(self) -> float:
-        """Largest horizontal distance from the origin, over the finest mesh."""
-        return float(np.hypot(*self.surface(_finest_directions())[:, :2].T).max())
 
     def _beyond(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
         length = np.linalg.norm(points, axis=1)
@@ -157,9 +221,14 @@ class _Block:
         return raw
 
     @cached_property
+    def finest_radius(self) -> Float64[np.ndarray, "n"]:
+        """Distance of the surface along the finest shapes' directions, in the block's own axes."""
+        return self._radius(_icosphere(FINEST)[0])
+
+    @cached_property
     def frame(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Origin on the ground plane and scale that make the block a unit shape."""
-        points = self._raw(_finest_directions())
+        points = _icosphere(FINEST)[0] * self.finest_radius[:, None] * self.axes
         lowest, highest = points[:, 2].min(), points[:, 2].max()
         ground = lowest + self.buried_share * (highest - lowest)
         seen = points[points[:, 2] >= ground, :2]
@@ -177,7 +246,22 @@ def _blocks() -> tuple[_Block, ...]:
 
 
 @cache
-def _finest_directions() -> Float64[np.ndarray, "n 3"]:
-    vertices = np.array(trimesh.creation.icosphere(subdivisions=SUBDIVISIONS[FINEST]).vertices, dtype=np.float64)
-    directions: Float64[np.ndarray, "n 3"] = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    return directions
+def _fitted(number: int, detail: int) -> Float64[np.ndarray, "corners"]:
+    return _blocks()[number].fitted(detail)
+
+
+@cache
+def _parts_of_corners(detail: int) -> csc_matrix:
+    """Each direction of the finest shapes as a sum of the directions of the corners of a level's triangle there."""
+    directions, faces = _icosphere(detail)
+    finest = _icosphere(FINEST)[0]
+    middles = directions[faces].sum(axis=1)
+    # the triangle that holds a direction is among those whose middles are nearest
+    near = np.argsort(-(finest @ middles.T), axis=1, kind="stable")[:, :4]
+    solved = np.linalg.inv(directions[faces].transpose(0, 2, 1))
+    weights = np.einsum("nkij,nj->nki", solved[near], finest)
+    every = np.arange(len(finest))
+    best = np.argmax(weights.min(axis=2), axis=1)
+    corners = faces[near[every, best]]
+    places = (np.repeat(every, 3), corners.ravel())
+    return csc_matrix((weights[every, best].ravel(), places), (len(finest), len(directions)))

@@ -6,7 +6,17 @@ from scipy.spatial import cKDTree
 
 from sim.terrain import PlacedRock, RockField, RockParameters, Surface
 from sim.terrain.rocks.population import covered_share, draw_diameters, rocks_per_m2
-from sim.terrain.rocks.shapes import COARSE, FINE, FINEST, MEDIUM, SHAPES, SHAPES_OF_FORM, UNIT_HEIGHT, rock_shapes
+from sim.terrain.rocks.shapes import (
+    COARSE,
+    FINE,
+    FINEST,
+    MEDIUM,
+    SHAPES,
+    SHAPES_OF_FORM,
+    UNIT_HEIGHT,
+    pixels_held,
+    rock_shapes,
+)
 
 TARGET = PlacedRock(name="target", east_m=3.0, north_m=60.0, diameter_m=1.5, shape=4, yaw_deg=30.0)
 
@@ -213,3 +223,28 @@ def test_refuses_more_rocks_than_fit_in_memory_and_unknown_shapes(ground: Surfac
     strange = PlacedRock(name="strange", east_m=0.0, north_m=0.0, diameter_m=1.0, shape=99)
     with pytest.raises(ValueError, match="'strange' has shape 99"):
         make(ground, placed=(strange,))
+
+
+@pytest.mark.parametrize("number", [0, 9, 15, 16, 27])
+@pytest.mark.parametrize("detail", [COARSE, MEDIUM, FINE])
+def test_a_coarse_rock_cannot_be_told_from_the_finest(number: int, detail: int) -> None:
+    """Bar: 0.25 px rms above the ground, from the plane of the coarse triangle that is nearest."""
+    coarse = rock_shapes(detail).mesh(number)
+    samples, triangles = trimesh.sample.sample_surface(coarse, 200_000, seed=1)
+    finest = trimesh.sample.sample_surface(rock_shapes(FINEST).mesh(number), 4_000, seed=2)[0]
+    finest = finest[finest[:, 2] > 0.0]
+    nearest = cKDTree(samples).query(finest)[1]
+    away = np.sum((finest - samples[nearest]) * coarse.face_normals[triangles[nearest]], axis=1)
+    assert 0.15 < np.sqrt(np.mean(away**2)) * pixels_held()[number, detail] < 0.28
+
+
+def test_rocks_are_drawn_as_finely_as_the_camera_sees(field: RockField) -> None:
+    faces = [rock_shapes(detail).faces.shape[0] for detail in (COARSE, MEDIUM, FINE, FINEST)]
+    for pixel_rad in (3e-4, 1e-3, 1e-2):
+        mesh = field.near(32.0, 32.0, 25.0, smallest_m=0.3, above_m=1.5, pixel_rad=pixel_rad)
+        for rock, count in zip(*np.unique(mesh.rock_of_face, return_counts=True), strict=True):
+            detail = faces.index(int(count))
+            away = np.hypot(np.hypot(*(field.position_m[rock, :2] - 32.0)), 1.5)
+            across_px = field.diameter_m[rock] / (away - 0.5 * field.diameter_m[rock]) / pixel_rad
+            held = np.concatenate([[0.0], pixels_held()[field.shape[rock]], [np.inf]])
+            assert held[detail] < across_px <= held[detail + 1]
