@@ -32,15 +32,12 @@ class Sight:
         Weights of the triangle's second and third corner at the place met; empty where there are no triangles.
     level
         Level of the terrain on which the ground was met; -1 where the mesh's own distance stands.
-    lit
-        Share of the sun that the ground and things leave to the place met; negative where it is yet to be found.
     """
 
     distance: Float64[np.ndarray, "rays"]
     triangle: Int32[np.ndarray, "rays"]
     weights: Float32[np.ndarray, "weighed 2"]
     level: Int8[np.ndarray, "rays"]
-    lit: Float32[np.ndarray, "rays"]
 
     @classmethod
     def unseen(cls, count: int, objects: Objects) -> Sight:
@@ -50,7 +47,6 @@ class Sight:
             np.empty(count, dtype=np.int32),
             np.empty((count if len(objects) > 0 else 0, 2), dtype=np.float32),
             np.empty(count, dtype=np.int8),
-            np.full(count, -1.0, dtype=np.float32),
         )
 
 
@@ -113,16 +109,13 @@ def look_within(
         within.origins,
         within.directions,
         within.pixel_angles,
-        objects.body_of_triangle,
         seen.distance,
         seen.triangle,
         seen.level,
         seen.weights,
-        seen.lit,
         found.distance,
         found.triangle,
         found.weights,
         found.level,
-        found.lit,
     )
     return found

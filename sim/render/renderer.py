@@ -340,7 +340,6 @@ def _shaded(
         sight.triangle,
         sight.weights,
         sight.level,
-        sight.lit,
         rotation,
         position,
         rays.origins,

@@ -31,10 +31,6 @@ TO_HORIZON = 5.0
 MOST_LISTED = 96
 #: Half a pixel's diagonal, in pixels, and a little more, for pixels are not quite square.
 BEAM_PX = 0.8
-#: Pixels that must agree on whether the sun reaches a surface for its rays to be taken at their word.
-WITNESSES = 3
-#: The sun's visible share where it is not known.
-UNKNOWN = -1.0
 
 
 @njit(cache=True, inline="always")
@@ -165,22 +161,6 @@ def _nearest_listed(
     return best, best_triangle, best_second, best_third
 
 
-@njit(cache=True, inline="always")
-def _agreed(bodies: Ints, lit: Array32, count: int, body: int) -> float:
-    """Share of the sun that pixels around see from a body, where enough of them agree on all or none of it."""
-    witnesses = 0
-    share = UNKNOWN
-    for k in range(count):
-        if bodies[k] == body:
-            if lit[k] != 0.0 and lit[k] != 1.0:
-                return UNKNOWN
-            if witnesses > 0 and lit[k] != share:
-                return UNKNOWN
-            share = lit[k]
-            witnesses += 1
-    return share if witnesses >= WITNESSES else UNKNOWN
-
-
 # Fused multiplications round differently, but the same way every time on the same processor.
 @njit(cache=True, fastmath={"contract"})
 def look_closely(
@@ -195,17 +175,14 @@ def look_closely(
     origins: Array32,
     directions: Array32,
     pixel_angles: Array32,
-    body_of_triangle: Ints,
     distance: Array,
     triangle_of_pixel: Ints,
     level_of_pixel: NDArray[np.int8],
     weights: Array32,
-    lit_of_pixel: Array32,
     near: Array,
     triangle_of_ray: Ints,
     weights_of_ray: Array32,
     level_of_ray: NDArray[np.int8],
-    lit_of_ray: Array32,
 ) -> None:
     """What every ray within some pixels meets, among what these pixels and the eight around each see.
 
@@ -224,27 +201,22 @@ def look_closely(
         Numbers of the pixels, and how many rays each has.
     origins, directions, pixel_angles
         The rays in body axes, shape (pixels * share, 3), and the angle that the pixel of each takes.
-    body_of_triangle
-        The body of each triangle.
-    distance, triangle_of_pixel, level_of_pixel, weights, lit_of_pixel
-        What the picture's pixels meet, from `look`, and the share of the sun that reaches it, from `shade`.
-    near, triangle_of_ray, weights_of_ray, level_of_ray, lit_of_ray
-        The same of the rays: outputs. The sun's share is `UNKNOWN` where the pixels around do not agree.
+    distance, triangle_of_pixel, level_of_pixel, weights
+        What the picture's pixels meet, from `look`.
+    near, triangle_of_ray, weights_of_ray, level_of_ray
+        The same of the rays: outputs.
     """
     inverse_spacing = 1.0 / spacing
     w = world_from_body
     rows = distance.size // columns
     ranges = np.empty(9)
     found = np.empty(9, dtype=np.int8)
-    bodies = np.empty(9, dtype=np.int32)
-    lit = np.empty(9, dtype=np.float32)
     listed = np.empty(MOST_LISTED, dtype=np.int64)
     for k in range(pixels.size):
         pixel = pixels[k]
         row = pixel // columns
         column = pixel - row * columns
         count = 0
-        witnesses = 0
         sky = False
         things = False
         last = 0.0
@@ -252,10 +224,6 @@ def look_closely(
             for j in range(max(column - 1, 0), min(column + 2, columns)):
                 n = i * columns + j
                 if distance[n] < math.inf:
-                    triangle = triangle_of_pixel[n]
-                    bodies[witnesses] = body_of_triangle[triangle] if triangle >= 0 else -1
-                    lit[witnesses] = lit_of_pixel[n]
-                    witnesses += 1
                     last = max(last, distance[n])
                 if distance[n] == math.inf:
                     sky = True
@@ -346,8 +314,6 @@ def look_closely(
             near[n] = t
             triangle_of_ray[n] = triangle
             level_of_ray[n] = level
-            body = body_of_triangle[triangle] if triangle >= 0 else -1
-            lit_of_ray[n] = _agreed(bodies, lit, witnesses, body)
             if triangle >= 0:
                 weights_of_ray[n, 0] = second
                 weights_of_ray[n, 1] = third

@@ -63,7 +63,6 @@ def shade(
     triangle_of_pixel: Ints,
     weights: Array32,
     level_of_pixel: NDArray[np.int8],
-    lit_of_pixel: Array32,
     world_from_body: Array,
     position: Array,
     origins: Array32,
@@ -96,9 +95,6 @@ def shade(
         The surface's pyramid and the spacing of its level 0.
     distance, triangle_of_pixel, weights, level_of_pixel
         What each ray meets, as `look` finds it.
-    lit_of_pixel
-        Share of the sun that ground and things leave to each place; written where it is negative and the sun is not
-        behind the surface.
     world_from_body, position
         Rotation matrix of the body, and world position of the centre of projection.
     origins, directions
@@ -212,11 +208,8 @@ def shade(
         value = sky_share * 0.5 * (1.0 + nz) + bounced * 0.5 * (1.0 - nz)
         cos_i = sun[0] * nx + sun[1] * ny + sun[2] * nz
         if cos_i > 0.0:
-            lit = lit_of_pixel[n]
-            known = lit >= 0.0
-            if not known:
-                lit = 1.0
-            if shadowed and not known:
+            lit = 1.0
+            if shadowed:
                 if triangle < 0 and not met:
                     # the terrain itself, where the pixel saw it smoothed: its own bumps must not shade a smooth ground
                     height, _slope_x, _slope_y, _albedo = sample(levels[shadow_level], 1.0 / shadow_spacing, x, y)
@@ -233,12 +226,11 @@ def shade(
                     lit = sun_over_ground(
                         finest, inverse_spacing, shadow, shadow_spacing, row_m, x, y, z, sun, sun_radius, highest
                     )
-            if lit > 0.0 and not known and things and (triangle >= 0 or _in_reach(reach, x, y)):
+            if lit > 0.0 and things and (triangle >= 0 or _in_reach(reach, x, y)):
                 # lifted off its own facet, so that this and those beside do not shade it by rounding
                 lift = 1e-4 + (0.05 * t * pixel_angles[n] if triangle >= 0 else 0.0)
                 if anything_hit(tree, x + lift * nx, y + lift * ny, z + lift * nz, sun, 0.0):
                     lit = 0.0
-            lit_of_pixel[n] = lit
             cos_g = min(max(-(dx * sun[0] + dy * sun[1] + dz * sun[2]), -1.0), 1.0)
             if caster > 0.0 and cos_g > 0.9:
                 lit *= 1.0 - disc_overlap(0.5 * caster / t, sun_radius, math.acos(cos_g))

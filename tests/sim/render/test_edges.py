@@ -82,7 +82,7 @@ def test_the_nearest_triangle_is_that_of_an_exhaustive_search(rocky) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("side", "share"), [(2, 0.55), (3, 0.42)])
+@pytest.mark.parametrize(("side", "share"), [(2, 0.5), (3, 0.4)])
 def test_outlines_are_those_of_256_rays_a_pixel(renderer, rocky, side: int, share: float) -> None:
     """Each of the 256 sees ground and texture as smooth as the pixel: what differs is the edges."""
     single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))

@@ -46,7 +46,7 @@ def test_shadows_of_rough_ground_under_a_low_sun(renderer, rough, descent_camera
     pose = rigid(Rotation.from_euler("zxy", [30.0, 12.0, 5.0], degrees=True), np.array([380.0, 200.0, 1500.0]))
     frame = renderer.render(scene, PixelRays.of(descent_camera(512)), pose)
     agree, in_shadow = _agreement(frame, scene, 4000, 0.3)
-    assert in_shadow > 0.03
+    assert in_shadow > 0.02
     assert agree >= BAR
 
 
@@ -70,7 +70,7 @@ def test_shadows_of_rocks(renderer) -> None:
     eye = np.array([10.0, 10.0, float(surface.height(10.0, 10.0)) + 8.0])
     frame = renderer.render(scene, PixelRays.of(camera), rigid(Rotation.from_euler("x", 15.0, degrees=True), eye))
     agree, in_shadow = _agreement(frame, scene, 3000, 0.02)
-    assert in_shadow > 0.03
+    assert in_shadow > 0.02
     assert agree >= BAR
 
 
