@@ -17,6 +17,8 @@ from sim.terrain.sites import sites
 BAR_PX, CONTROL_BAR_PX = 0.02, 0.005
 DESCENT_HEIGHT_M = 2000.0
 DISTANCES_M = (10.0, 5.0, 2.0)
+#: Those from which the picture holds the rock's outline; nearer, the rock fills it.
+OUTLINE_DISTANCES_M = (10.0, 5.0)
 ROCK_SITE = "gusev"
 #: 256 patches of 31 x 31 from the air.
 DESCENT_SIZE = (512, 512)
@@ -127,7 +129,7 @@ def _edge_error(view: View) -> tuple[float, float, int]:
 
 def run_edges(quick: bool) -> Iterator[Measure]:
     size = (192, 160) if quick else (384, 320)
-    for distance in DISTANCES_M:
+    for distance in OUTLINE_DISTANCES_M:
         whole = rock_view(ROCK_SITE, distance)
         # the upper left of the picture holds an outline before the ground far behind
         view = replace(whole, camera=whole.camera.cropped(0, 0, size))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt32
@@ -51,13 +53,16 @@ def _levels_of_lines(surface: Surface, lines: Float[np.ndarray, "count"]) -> Int
     return level
 
 
+@lru_cache(maxsize=4)
 def grid_faces(rows: int, columns: int) -> UInt32[np.ndarray, "faces 3"]:
     """Triangles of a grid of vertices stored row by row, counter-clockwise seen from above."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)[None, :]).ravel()
     right, above = corner + 1, corner + columns
     lower = np.column_stack([corner, right, above + 1])
     upper = np.column_stack([corner, above + 1, above])
-    return np.concatenate([lower, upper]).astype(np.uint32)
+    faces = np.concatenate([lower, upper]).astype(np.uint32)
+    faces.setflags(write=False)
+    return faces
 
 
 def lines_in_view(lines: Float[np.ndarray, "count"], low: float, high: float) -> Float[np.ndarray, "kept"]:

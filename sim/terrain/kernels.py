@@ -66,6 +66,39 @@ def sample(field: Level, inverse_spacing: float, x: float, y: float) -> tuple[fl
     return height, slope_x * inverse_spacing, slope_y * inverse_spacing, albedo
 
 
+@njit(cache=True, inline="always")
+def collapse(field: Level, gy: float, out: Array) -> None:
+    """The control values of a level along the line y = gy, counted in samples: both fields as splines of x alone."""
+    mask = field.shape[0] - 1
+    fy = math.floor(gy)
+    i = int(fy)
+    wy = bspline_weights(gy - fy)
+    for j in range(field.shape[1]):
+        for part in range(2):
+            out[j, part] = (
+                wy[0] * field[(i - 1) & mask, j, part]
+                + wy[1] * field[i & mask, j, part]
+                + wy[2] * field[(i + 1) & mask, j, part]
+                + wy[3] * field[(i + 2) & mask, j, part]
+            )
+
+
+@njit(cache=True, inline="always")
+def sample_collapsed(line: Array, gx: float) -> tuple[float, float]:
+    """Both fields of a collapsed level at x = gx, counted in samples."""
+    mask = line.shape[0] - 1
+    fx = math.floor(gx)
+    j = int(fx)
+    w0, w1, w2, w3, _d0, _d1, _d2, _d3 = bspline_weights(gx - fx)
+    j0 = (j - 1) & mask
+    j1 = j & mask
+    j2 = (j + 1) & mask
+    j3 = (j + 2) & mask
+    first = w0 * line[j0, 0] + w1 * line[j1, 0] + w2 * line[j2, 0] + w3 * line[j3, 0]
+    second = w0 * line[j0, 1] + w1 * line[j1, 1] + w2 * line[j2, 1] + w3 * line[j3, 1]
+    return first, second
+
+
 @njit(cache=True)
 def evaluate_field(field: Level, spacing: float, x: Array, y: Array) -> Array:
     """Height, slopes and albedo at many places; shape (n, 4)."""

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.terrain.kernels import Array, Level, sample
+from sim.terrain.kernels import Array, Level, collapse, sample_collapsed
 
 Grid = NDArray[np.float32]
 
@@ -119,11 +119,14 @@ def add_dunes(
     side = height.shape[0]
     inverse = 1.0 / modulation_spacing
     wave = math.sqrt(wave_x * wave_x + wave_y * wave_y)
+    along = np.empty((modulation.shape[0], 2))
     for i in range(side):
         y = i * spacing
+        # on one row the modulation is a spline of x alone
+        collapse(modulation, inverse * y, along)
         for j in range(side):
             x = j * spacing
-            real, _a, _b, imaginary = sample(modulation, inverse, x, y)
+            real, imaginary = sample_collapsed(along, inverse * x)
             strength = math.sqrt(real * real + imaginary * imaginary)
             high = crest * min(strength, 1.6)
             turns = (wave_x * x + wave_y * y + math.atan2(imaginary, real)) / (2.0 * math.pi)
