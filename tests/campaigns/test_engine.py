@@ -224,7 +224,12 @@ def test_replay_says_what_differs(troubled: Path, tmp_path: Path) -> None:
 
 def _started(path: Path, directory: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "marsyard", "run", str(path), "--jobs", "2", "--out", str(directory)]
-    process = subprocess.Popen([*command, "--set", "sleep_s=0.2", "-n", "500"], stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        [*command, "--set", "sleep_s=0.2", "-n", "500"],
+        stderr=subprocess.PIPE,
+        # what a script starts in the background ignores Ctrl-C, and so would its children
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     deadline = time.monotonic() + 30.0
     # The write-ahead log has two pages (of 4 KiB and a header) for the empty table, and more with the first rows.
     log = directory / "cases.sqlite-wal"
