@@ -5,7 +5,7 @@ Read it in the order of a case: `parameters`, `world`, `flight`, `optics`, `expo
 """
 
 from scenarios.descent.flight import flown_descent
-from scenarios.descent.optics import Optics, camera_optics
+from scenarios.descent.optics import camera_optics
 from scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
 from scenarios.descent.scenario import DescentScenario
 
@@ -13,7 +13,6 @@ __all__ = [
     "CameraParameters",
     "DescentScenario",
     "DescentScenarioParameters",
-    "Optics",
     "camera_optics",
     "flown_descent",
 ]

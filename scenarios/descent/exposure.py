@@ -11,9 +11,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scenarios.descent.faults import clouds_over, delivered
 from scenarios.descent.haze import veiled
 from scenarios.descent.heat_shield import HeatShield
-from scenarios.descent.optics import Optics
 from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.descent.world import World
+from scenarios.optics import Optics
 from sim.dynamics import State
 from sim.render import Frame, Scene, process_renderer
 from sim.sensor import Detector, ImageMotion

@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
 from scenarios.descent.parameters import CameraParameters
+from scenarios.optics import Optics
 from sim.camera import Cahv, Cahvor
-from sim.render import PixelRays
-from sim.sensor import natural_fall_off
-
-
-@dataclass(frozen=True)
-class Optics:
-    """What depends on the camera's design alone and is shared by all cases of a worker."""
-
-    camera: Cahvor
-    rays: PixelRays
-    fall_off: Float32[np.ndarray, "rows columns"]
 
 
 @cache
 def camera_optics(parameters: CameraParameters) -> Optics:
     """The descent camera in the body frame: at its origin, looking down, columns to the east at zero attitude."""
-    camera = _camera(parameters, 1.0, (0.0, 0.0), 0.0)
-    return Optics(camera, PixelRays.of(camera), natural_fall_off(camera))
+    return Optics.of(_camera(parameters, 1.0, (0.0, 0.0), 0.0))
 
 
 def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) -> Cahvor:

@@ -16,8 +16,6 @@ from sim.terrain import Environment, Surface, TerrainBank
 
 #: Sunlight over that at 1 AU for which the descent camera's responsivity is stated: Mars at 1.5 AU.
 SUNLIGHT_OF_RESPONSIVITY = 1.0 / 1.5**2
-#: Half the angle that the sun takes at 1 AU, radians.
-SUN_RADIUS_AT_EARTH_RAD = 0.00465
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ class World:
         if p.preset is None:
             return cls(surface, None, Sun(towards_sun))
         air = p.preset.environment
-        sun = Sun(towards_sun, SUN_RADIUS_AT_EARTH_RAD * float(np.sqrt(air.solar_irradiance)))
+        sun = Sun(towards_sun, air.sun_radius_rad)
         brightness = air.direct_share(elevation) * air.solar_irradiance / SUNLIGHT_OF_RESPONSIVITY
         ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.place.terrain))
         return cls(surface, ground, sun, brightness)

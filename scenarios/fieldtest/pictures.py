@@ -7,36 +7,24 @@ from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt16
+from jaxtyping import Float64, UInt16
 
 from scenarios.fieldtest.run import Run, RunKey, field_camera, worked_out
+from scenarios.optics import Optics
 from scenarios.views import Eye, SiteGround, site_scene
-from sim.camera import CameraModel
 from sim.dynamics import State
-from sim.render import PixelRays, Scene, Sun, process_renderer
-from sim.sensor import Detector, ImageMotion, natural_fall_off
+from sim.render import Scene, Sun, process_renderer
+from sim.sensor import Detector, ImageMotion
 from sim.terrain import TerrainBank, site
 
-#: Half the angle that the sun takes, radians.
-SUN_RADIUS_RAD = 0.00465
 #: Distance of the pixels whose ground points are kept.
 GRID_PX = 32
 
 
-@dataclass(frozen=True)
-class FieldOptics:
-    """The camera with its pixels' rays and the fall-off of its lens."""
-
-    camera: CameraModel
-    rays: PixelRays
-    fall_off: Float32[np.ndarray, "rows columns"]
-
-
 @cache
-def field_optics() -> FieldOptics:
+def field_optics() -> Optics:
     """The field test's camera; shared by all cases of a process."""
-    camera = field_camera()
-    return FieldOptics(camera, PixelRays.of(camera), natural_fall_off(camera))
+    return Optics.of(field_camera())
 
 
 @dataclass(frozen=True)
@@ -81,7 +69,12 @@ def cloud_transmittances(
     if run.clouds is None:
         return np.ones((len(times_s), *ground_m.shape[:2]))
     layer = run.clouds
-    return np.stack([layer.transmittance(ground_m, Sun(run.sun(time), SUN_RADIUS_RAD), time) for time in times_s])
+    return np.stack([layer.transmittance(ground_m, sun_at(run, time), time) for time in times_s])
+
+
+def sun_at(run: Run, time_s: float) -> Sun:
+    """The sun over a run's site at a time of the run."""
+    return Sun(run.sun(time_s), site(run.parameters.site).environment.sun_radius_rad)
 
 
 @lru_cache(maxsize=2)
@@ -101,5 +94,5 @@ def _scene(key: RunKey, step: int) -> Scene:
     pixel_rad = float(np.median(field_optics().rays.pixel_angles))
     east, north, _ = run.flight.origin_m.tolist()
     eye = Eye(east, north, p.helicopter.lowest_m, pixel_rad)
-    scene = site_scene(ground, eye, Sun(run.sun(step * p.sun_step_s), SUN_RADIUS_RAD))
+    scene = site_scene(ground, eye, sun_at(run, step * p.sun_step_s))
     return replace(scene, clouds=run.clouds)

@@ -91,24 +91,6 @@ def node_boxes(triangles: Array, order: Longs) -> Boxes:
 
 
 @njit(cache=True, inline="always")
-def _passes(boxes: Boxes, node: int, x: float, y: float, z: float, ix: float, iy: float, iz: float) -> bool:
-    """Whether a ray, given by its start and the inverse of its direction, passes through a node's box."""
-    a = (boxes[node, 0] - x) * ix
-    b = (boxes[node, 3] - x) * ix
-    near = min(a, b)
-    far = max(a, b)
-    a = (boxes[node, 1] - y) * iy
-    b = (boxes[node, 4] - y) * iy
-    near = max(near, min(a, b))
-    far = min(far, max(a, b))
-    a = (boxes[node, 2] - z) * iz
-    b = (boxes[node, 5] - z) * iz
-    near = max(near, min(a, b))
-    far = min(far, max(a, b))
-    return bool(far >= max(near, 0.0))
-
-
-@njit(cache=True, inline="always")
 def _entry(boxes: Boxes, node: int, x: float, y: float, z: float, ix: float, iy: float, iz: float) -> float:
     """Distance at which a ray enters a node's box, 0 from within; infinite where it does not."""
     a = (boxes[node, 0] - x) * ix
@@ -257,7 +239,7 @@ def anything_hit(tree: Hierarchy, x: float, y: float, z: float, direction: Array
     # depth first without a stack, which would cost more than the walk: after a subtree comes its right neighbour
     node = 0
     while True:
-        if _passes(boxes, node, x, y, z, ix, iy, iz):
+        if _entry(boxes, node, x, y, z, ix, iy, iz) < math.inf:
             if node < first_leaf:
                 node = 2 * node + 1
                 continue
