@@ -134,8 +134,9 @@ def look(
     levels, spacing
         The surface's pyramid and the spacing of its level 0.
     depth, ids, focal, view_from_body
-        Pinhole views from `position`: depth along the axis, number of the triangle plus one (0 for ground), focal
-        lengths in samples, and rotations from body axes to the views' (x right, y down, z forward).
+        Pinhole views from `position`: depth along the axis, number of the triangle plus one (0 for ground; empty where
+        no triangles were drawn, for none are in view), focal lengths in samples, and rotations from body axes to the
+        views' (x right, y down, z forward).
     face_of_pixel
         The view that holds each pixel.
     world_from_body, position
@@ -154,7 +155,7 @@ def look(
     middle = depth.shape[1] / 2.0 - 0.5
     inverse_spacing = 1.0 / spacing
     top_level = len(levels) - 1
-    things = tree[0].shape[0] > 0
+    things = ids.shape[1] > 0
     w = world_from_body
     for n in range(directions.shape[0]):
         bx = directions[n, 0]

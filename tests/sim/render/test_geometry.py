@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.camera import Cahvor
 from sim.frames import direction, rigid
-from sim.render import Photometry, PixelRays, Scene, Sun
+from sim.render import Objects, Photometry, PixelRays, Scene, Sun
 from sim.render.backend import RenderingError
 from sim.terrain import Surface
 
@@ -150,6 +150,25 @@ def test_pixels_above_the_horizon_see_the_sky(renderer, rough, descent_camera) -
     assert np.isfinite(lower).all()
     assert (frame.radiance[:60] == np.float32(PAINT.sky_radiance)).all()
     assert np.isnan(frame.points_world()[:60]).all()
+
+
+def test_what_is_out_of_view_does_not_change_the_picture(renderer, rough, descent_camera) -> None:
+    """Where nothing but ground is in view no triangle is drawn: the search for one must not read what is not there."""
+    position = np.array([100.0, 200.0, 300.0])
+    corners = position + np.array([[0.0, 0.0, 100.0], [1.0, 0.0, 100.0], [0.0, 1.0, 100.0]])
+    faces = np.array([[0, 1, 2]], dtype=np.int32)
+    above = Objects.of_mesh(corners, np.tile([0.0, 0.0, 1.0], (3, 1)), faces, np.zeros(1, np.int32), albedo=0.1)
+    low_sun = Sun(direction(0.3, np.radians(5.0)))
+    rays = PixelRays.of(descent_camera(256))
+    with_it, without = (
+        renderer.render(
+            Scene(rough, (100.0, 200.0), low_sun, PAINT, things, mesh_in_view=True), rays, rigid(TILTED, position)
+        )
+        for things in (above, Objects.none())
+    )
+    assert (with_it.body == -1).all()
+    np.testing.assert_array_equal(with_it.range_m, without.range_m)
+    np.testing.assert_array_equal(with_it.radiance, without.radiance)
 
 
 def test_refuses_a_camera_below_the_ground(renderer, rough, descent_camera) -> None:
