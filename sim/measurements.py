@@ -1,4 +1,4 @@
-"""What instruments deliver to flight software: the only thing that an algorithm is given.
+"""What instruments deliver to flight software: the only thing that an algorithm is given; and what it asks of wheels.
 
 Nothing here holds truth. Cameras are as calibrated, times are as tagged, attitudes and altitudes are as measured.
 """
@@ -203,6 +203,45 @@ class RoverMeasurements:
     azimuth_rad: float
     elevation_rad: float
     world_from_rover: RigidTransform
+
+
+@dataclass(frozen=True)
+class DriveCommand:
+    """A motion asked of a rover's wheels: a constant velocity and rate of turn, held until the motion is done.
+
+    Straight ahead is ``(d, 0, 0)``, backward ``(-d, 0, 0)``, crabbing ``(0, d, 0)``, a turn in place ``(0, 0, t)``, an
+    arc of radius d / t ``(d, 0, t)``; ``(0, -r * t, t)`` moves sideways around a point that stays r ahead.
+
+    Attributes
+    ----------
+    forward_m, left_m
+        Path along the rover's x and y axes, metres; both axes turn with the rover.
+    turn_left_rad
+        Turn about the rover's z axis, counterclockwise seen from above, radians.
+    """
+
+    forward_m: float = 0.0
+    left_m: float = 0.0
+    turn_left_rad: float = 0.0
+
+    @property
+    def length_m(self) -> float:
+        """Length of the rover's path, metres."""
+        return float(np.hypot(self.forward_m, self.left_m))
+
+    @property
+    def displacement_m(self) -> Float[np.ndarray, "2"]:
+        """Where the motion ends, in the axes of its start (forward, left), metres, if the wheels do not slip."""
+        # chord of an arc: the path, shortened by sin(t/2) / (t/2) and turned by t/2
+        half = 0.5 * self.turn_left_rad
+        shortened = float(np.sinc(half / np.pi))
+        sine, cosine = np.sin(half), np.cos(half)
+        path = np.array([[cosine, -sine], [sine, cosine]]) @ np.array([self.forward_m, self.left_m])
+        return np.asarray(shortened * path)
+
+    def part(self, share: float) -> DriveCommand:
+        """The motion over a share of its time."""
+        return DriveCommand(share * self.forward_m, share * self.left_m, share * self.turn_left_rad)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,85 @@
+"""Ground with rocks on it as wheels feel it: the terrain, and above it the tops of triangles on a fine grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.ndimage import map_coordinates
+
+from sim.dynamics.rover import Ground
+
+#: Side of the grid's cells, metres: a tenth of a wheel's radius.
+CELL_M = 0.0125
+#: Points laid on triangles are at most this share of a cell apart.
+_FILL = 0.7
+
+
+@dataclass(frozen=True)
+class RockyGround:
+    """A ground with bodies on it within a square; beyond, the ground alone.
+
+    Heights are interpolated linearly between the middles of cells, each as high as the highest point of a body in it:
+    a body's side is drawn up to a cell too far out. Overhangs are filled.
+
+    Attributes
+    ----------
+    ground
+        What the bodies stand on.
+    corner_m
+        World x, y of the middle of cell (0, 0).
+    above_m
+        Height above the ground of each cell, 0 where there is no body; row i lies at y = corner + i cells.
+    """
+
+    ground: Ground
+    corner_m: tuple[float, float]
+    above_m: Float64[np.ndarray, "rows columns"]
+
+    @classmethod
+    def of(
+        cls,
+        ground: Ground,
+        triangles: Float64[np.ndarray, "triangles 3 3"],
+        centre_m: tuple[float, float],
+        half_m: float,
+    ) -> RockyGround:
+        """Ground with bodies given by their triangles (world axes, metres) within `half_m` of a centre, each way.
+
+        ``mesh.vertices[mesh.faces]`` of a `sim.terrain.RockMesh` gives a field's rocks.
+        """
+        cells = 2 * int(np.ceil(half_m / CELL_M)) + 1
+        corner = np.array(centre_m) - 0.5 * (cells - 1) * CELL_M
+        points = _filled(triangles)
+        cell = np.rint((points[:, :2] - corner) / CELL_M).astype(np.int64)
+        inside = np.all((cell >= 0) & (cell < cells), axis=1)
+        column, row = cell[inside].T
+        top = np.full((cells, cells), -np.inf)
+        np.maximum.at(top, (row, column), points[inside, 2])
+        y, x = np.nonzero(np.isfinite(top))
+        above = np.zeros((cells, cells))
+        below = ground.height(corner[0] + CELL_M * x, corner[1] + CELL_M * y)
+        above[y, x] = np.maximum(top[y, x] - below, 0.0)
+        above.setflags(write=False)
+        return cls(ground, (float(corner[0]), float(corner[1])), above)
+
+    def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """Height of ground or rocks at world positions, metres."""
+        cells = [(y - self.corner_m[1]) / CELL_M, (x - self.corner_m[0]) / CELL_M]
+        above = map_coordinates(self.above_m, cells, order=1, mode="constant", prefilter=False)
+        height: Float[np.ndarray, "*batch"] = self.ground.height(x, y) + above
+        return height
+
+
+def _filled(triangles: Float64[np.ndarray, "triangles 3 3"]) -> Float64[np.ndarray, "points 3"]:
+    """Points on triangles, closer to each other than `_FILL` cells."""
+    edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    steps = np.ceil(edges / (_FILL * CELL_M)).astype(np.int64)
+    parts = [np.empty((0, 3))]
+    for count in np.unique(steps):
+        i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1))
+        first, second = i[i + j <= count] / count, j[i + j <= count] / count
+        weights = np.stack([1.0 - first - second, first, second], axis=1)
+        parts.append(np.einsum("pk,tki->tpi", weights, triangles[steps == count]).reshape(-1, 3))
+    return np.concatenate(parts)

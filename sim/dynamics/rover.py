@@ -1,0 +1,295 @@
+"""A rover of six wheels on a rocker-bogie suspension, at rest on the ground.
+
+Model. Each side has a rocker, which carries the front wheel and the bogie's pivot, and a bogie, which carries the
+middle and the rear wheel. Rockers and bogies turn about axes parallel to the body's y axis. A differential turns the
+two rockers against the body by opposite angles: the body's pitch is the mean of the rockers'. Wheels are cylinders
+whose axles keep the direction of the body's y axis, as if they were not steered; nothing is sprung, and the joints have
+no stops.
+
+At a place (east, north) and an azimuth six numbers are left: height, pitch and roll of the body, the differential's
+angle and the two bogies'. They are those at which all six wheels touch the ground and none goes into it: six equations,
+solved by Levenberg-Marquardt. On a plane the joints rest and the body lies as the plane does.
+
+Frame
+-----
+The rover's (body) frame has x forward, y to the left and z up. Its origin is the point of the ground between the two
+middle wheels when the rover stands on level ground.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Float64
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from sim.frames import rigid
+
+Metres = Annotated[float, Field(gt=0.0, le=5.0)]
+
+#: Names of the wheels in the order of all arrays: two columns, left and right, of three.
+WHEELS = ("left front", "left middle", "left rear", "right front", "right middle", "right rear")
+#: The sides' signs along y, and in the differential.
+_SIDE = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
+#: Points of a tread that may touch: angles about the axle from straight below, and lines across the tread.
+_TREAD_RAD = np.radians(np.linspace(-72.0, 72.0, 25))
+_TREAD_LINES = np.array([-0.5, 0.0, 0.5])
+#: Steps of the six numbers in which derivatives are taken: metres and radians.
+_DIFFERENCE = 1e-6
+
+
+@runtime_checkable
+class Ground(Protocol):
+    """What wheels stand on: `sim.terrain.Surface`, or one with rocks (`sim.dynamics.relief.RockyGround`)."""
+
+    def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """Height of the ground at world positions, metres."""
+        ...
+
+
+class RoverParameters(BaseModel):
+    """Shape of a rover. The defaults are a MER's.
+
+    Wheels: 0.25 m across (press kit: 26 cm with cleats; Opportunity's odometer counts 0.8 m a turn), 0.16 m wide; the
+    wheel base is 1.41 m and the track 1.06 m, 1.22 m between the middle wheels (Lindemann & Voorhees 2005). Where the
+    pivots are is assumed. The body's size is the press kit's (1.6 m long, 2.3 m wide with its solar panels; the mast
+    carries the cameras at 1.54 m, Maki et al. 2003).
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    wheel_radius_m: Annotated[Metres, Field(description="radius of a wheel, m")] = 0.125
+    wheel_width_m: Annotated[Metres, Field(description="width of a wheel's tread, m")] = 0.16
+    front_m: Annotated[Metres, Field(description="x of the front wheels, m")] = 0.705
+    rear_m: Annotated[Metres, Field(description="how far the rear wheels are behind the middle ones, m")] = 0.705
+    half_track_m: Annotated[Metres, Field(description="|y| of the front and rear wheels, m")] = 0.53
+    middle_half_track_m: Annotated[Metres, Field(description="|y| of the middle wheels, m")] = 0.61
+    rocker_pivot_x_m: Annotated[
+        float, Field(ge=-2.0, le=2.0, description="x of the axis about which rockers turn against the body, m")
+    ] = 0.08
+    rocker_pivot_z_m: Annotated[Metres, Field(description="its height, m")] = 0.40
+    bogie_pivot_x_m: Annotated[
+        float, Field(ge=-2.0, le=2.0, description="x of the axes about which bogies turn against rockers, m")
+    ] = -0.35
+    bogie_pivot_z_m: Annotated[Metres, Field(description="their height, m")] = 0.28
+    body_length_m: Annotated[Metres, Field(description="length of the body's deck, m")] = 1.6
+    body_width_m: Annotated[Metres, Field(description="width of the deck with its panels, m")] = 2.3
+    clearance_m: Annotated[Metres, Field(description="height of the body's belly, m")] = 0.29
+    deck_m: Annotated[Metres, Field(description="height of the deck, m")] = 0.64
+
+    @model_validator(mode="after")
+    def _is_a_rover(self) -> RoverParameters:
+        if not -self.rear_m < self.bogie_pivot_x_m < 0.0:
+            raise ValueError(
+                f"bogie_pivot_x_m is {self.bogie_pivot_x_m:g}; it must lie between the rear wheels ({-self.rear_m:g}) "
+                "and the middle ones (0)"
+            )
+        if not self.bogie_pivot_x_m < self.rocker_pivot_x_m < self.front_m:
+            raise ValueError(
+                f"rocker_pivot_x_m is {self.rocker_pivot_x_m:g}; it must lie between bogie_pivot_x_m "
+                f"({self.bogie_pivot_x_m:g}) and front_m ({self.front_m:g})"
+            )
+        return self
+
+    @property
+    def wheel_places_m(self) -> Float64[np.ndarray, "6 3"]:
+        """Centres of the wheels on level ground, rover frame, in the order of `WHEELS`."""
+        along = np.tile([self.front_m, 0.0, -self.rear_m], 2)
+        across = _SIDE * np.tile([self.half_track_m, self.middle_half_track_m, self.half_track_m], 2)
+        return np.stack([along, across, np.full(6, self.wheel_radius_m)], axis=1)
+
+    @property
+    def reach_m(self) -> float:
+        """Radius of the circle about the origin that holds wheels and body, seen from above, metres."""
+        wheel = np.hypot(
+            max(self.front_m, self.rear_m) + self.wheel_radius_m, self.half_track_m + 0.5 * self.wheel_width_m
+        )
+        return float(max(wheel, np.hypot(0.5 * self.body_length_m, 0.5 * self.body_width_m)))
+
+
+#: The Mars Exploration Rover, and its engineering model on Earth.
+MER = RoverParameters()
+#: The research rover of the tracking paper's section 5: six steered and driven wheels, about as large as a MER without
+#: panels (Rocky 8; its exact measures are assumed).
+ROCKY_8 = RoverParameters(
+    wheel_radius_m=0.10,
+    wheel_width_m=0.12,
+    front_m=0.60,
+    rear_m=0.60,
+    half_track_m=0.45,
+    middle_half_track_m=0.45,
+    rocker_pivot_x_m=0.07,
+    rocker_pivot_z_m=0.35,
+    bogie_pivot_x_m=-0.30,
+    bogie_pivot_z_m=0.24,
+    body_length_m=0.9,
+    body_width_m=0.7,
+    clearance_m=0.28,
+    deck_m=0.60,
+)
+
+
+@dataclass(frozen=True)
+class Stance:
+    """A rover at rest on the ground: truth.
+
+    Attributes
+    ----------
+    world_from_rover
+        Pose of the rover.
+    differential_rad
+        Angle of the left rocker against the body; the right one's is its opposite. Positive: its front wheel is low.
+    bogies_rad
+        Angles of the left and the right bogie against their rockers; positive: the middle wheel is low.
+    gaps_m
+        What is left between each wheel and the ground, in the order of `WHEELS`; not zero where no stance has all six
+        on the ground.
+    """
+
+    world_from_rover: RigidTransform
+    differential_rad: float
+    bogies_rad: tuple[float, float]
+    gaps_m: Float64[np.ndarray, "6"]
+
+    @property
+    def east_m(self) -> float:
+        """World x of the rover's origin, metres."""
+        return float(self.world_from_rover.translation[0])
+
+    @property
+    def north_m(self) -> float:
+        """World y of the rover's origin, metres."""
+        return float(self.world_from_rover.translation[1])
+
+    @cached_property
+    def _yaw_pitch_roll(self) -> tuple[float, float, float]:
+        yaw, pitch, roll = self.world_from_rover.rotation.as_euler("ZYX")
+        return float(yaw), float(pitch), float(roll)
+
+    @property
+    def azimuth_rad(self) -> float:
+        """Where the rover heads: azimuth of its x axis, clockwise from north, in (-pi, pi]."""
+        azimuth = 0.5 * np.pi - self._yaw_pitch_roll[0]
+        return float(np.arctan2(np.sin(azimuth), np.cos(azimuth)))
+
+    @property
+    def pitch_rad(self) -> float:
+        """Elevation of the rover's x axis: positive with the nose up."""
+        return -self._yaw_pitch_roll[1]
+
+    @property
+    def roll_rad(self) -> float:
+        """Turn about the x axis: positive with the left side up."""
+        return self._yaw_pitch_roll[2]
+
+    @property
+    def tilt_rad(self) -> float:
+        """Angle of the rover's z axis from the vertical."""
+        return float(np.arccos(np.clip(self.world_from_rover.rotation.as_matrix()[2, 2], -1.0, 1.0)))
+
+
+def settle(
+    rover: RoverParameters,
+    ground: Ground,
+    east_m: float,
+    north_m: float,
+    azimuth_rad: float,
+    near: Stance | None = None,
+) -> Stance:
+    """The rover at rest at a place.
+
+    Parameters
+    ----------
+    rover
+        Its shape.
+    ground
+        What it stands on.
+    east_m, north_m
+        World place of its origin.
+    azimuth_rad
+        Where it heads, clockwise from north.
+    near
+        A stance close by, from which the solution starts; by default from level on the ground's height.
+    """
+    frame = _Frame(rover, ground, np.array([east_m, north_m]), 0.5 * np.pi - azimuth_rad)
+    solved = least_squares(frame.gaps, frame.start(near), jac=frame.gap_slopes, method="lm", xtol=1e-10, ftol=1e-12)
+    differential, left, right = (float(angle) for angle in solved.x[3:])
+    pose = rigid(frame.rotation(solved.x[None])[0], np.array([east_m, north_m, solved.x[0]]))
+    return Stance(pose, differential, (left, right), solved.fun)
+
+
+def wheel_centres(
+    rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]
+) -> Float64[np.ndarray, "6 3"]:
+    """Centres of the wheels in the rover frame at these angles of the joints, metres."""
+    centres: Float64[np.ndarray, "6 3"] = _wheel_centres(rover, np.array([[differential_rad, *bogies_rad]]))[0]
+    return centres
+
+
+def _wheel_centres(rover: RoverParameters, joints: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 6 3"]:
+    rest = rover.wheel_places_m
+    rocker_pivot = np.array([rover.rocker_pivot_x_m, rover.rocker_pivot_z_m])
+    bogie_pivot = np.array([rover.bogie_pivot_x_m, rover.bogie_pivot_z_m])
+    rocker = joints[:, :1] * _SIDE
+    bogie = np.repeat(joints[:, 1:], 3, axis=1) * np.tile([0.0, 1.0, 1.0], 2)
+    about_bogie = bogie_pivot + _turned(rest[:, [0, 2]] - bogie_pivot, bogie)
+    centres = np.broadcast_to(rest, (len(joints), 6, 3)).copy()
+    centres[..., [0, 2]] = rocker_pivot + _turned(about_bogie - rocker_pivot, rocker)
+    return centres
+
+
+def _turned(points: Float64[np.ndarray, "*n 6 2"], angles: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6 2"]:
+    """Points (x, z) turned about y: a positive angle lowers what is in front."""
+    x, z = np.broadcast_to(points, (*angles.shape, 2))[..., 0], points[..., 1]
+    sine, cosine = np.sin(angles), np.cos(angles)
+    return np.stack([cosine * x + sine * z, cosine * z - sine * x], axis=-1)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """The equations of a stance: gaps under the wheels as a function of (height, pitch, roll, differential, bogies)."""
+
+    rover: RoverParameters
+    ground: Ground
+    place_m: Float64[np.ndarray, "2"]
+    yaw_rad: float
+
+    def start(self, near: Stance | None) -> Float64[np.ndarray, "6"]:
+        if near is None:
+            return np.array([float(self.ground.height(*self.place_m[:, None])[0]), 0.0, 0.0, 0.0, 0.0, 0.0])
+        height = float(near.world_from_rover.translation[2])
+        return np.array([height, near.pitch_rad, near.roll_rad, near.differential_rad, *near.bogies_rad])
+
+    def rotation(self, unknown: Float64[np.ndarray, "n 6"]) -> Rotation:
+        yaw = np.full(len(unknown), self.yaw_rad)
+        return Rotation.from_euler("ZYX", np.stack([yaw, -unknown[:, 1], unknown[:, 2]], axis=1))
+
+    def gaps(self, unknown: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6"]:
+        gaps: Float64[np.ndarray, "6"] = self._gaps(unknown[None])[0]
+        return gaps
+
+    def gap_slopes(self, unknown: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6 6"]:
+        beside = np.concatenate([unknown - _DIFFERENCE * np.eye(6), unknown + _DIFFERENCE * np.eye(6)])
+        low, high = np.split(self._gaps(beside), 2)
+        slopes: Float64[np.ndarray, "6 6"] = ((high - low) / (2.0 * _DIFFERENCE)).T
+        return slopes
+
+    def _gaps(self, unknown: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+        """Least height of each wheel's tread above the ground."""
+        turn = self.rotation(unknown).as_matrix()
+        centres = _wheel_centres(self.rover, unknown[:, 3:])
+        angle, line = np.meshgrid(_TREAD_RAD, _TREAD_LINES)
+        radius, width = self.rover.wheel_radius_m, self.rover.wheel_width_m
+        tread = np.stack([radius * np.sin(angle), width * line, -radius * np.cos(angle)], axis=-1).reshape(-1, 3)
+        points = np.einsum("nij,nwtj->nwti", turn, centres[:, :, None, :] + tread)
+        world = (
+            points + np.concatenate([np.tile(self.place_m, (len(unknown), 1)), unknown[:, :1]], axis=1)[:, None, None]
+        )
+        ground = self.ground.height(world[..., 0], world[..., 1])
+        gaps: Float64[np.ndarray, "n 6"] = (world[..., 2] - ground).min(axis=2)
+        return gaps

@@ -1,0 +1,39 @@
+"""Grounds whose stances are known in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane through a height at the origin, with slopes dz/dx and dz/dy."""
+
+    slope_east: float = 0.0
+    slope_north: float = 0.0
+    height_m: float = 0.0
+
+    def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        return self.height_m + self.slope_east * x + self.slope_north * y
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Level ground with smooth mounds under single wheels: (x, y, height) of each, constant within 0.2 m."""
+
+    mounds: tuple[tuple[float, float, float], ...]
+
+    def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        ground = np.zeros(np.broadcast_shapes(x.shape, y.shape))
+        for east, north, high in self.mounds:
+            away = np.hypot(x - east, y - north)
+            ground = ground + high * np.clip((0.3 - away) / 0.1, 0.0, 1.0)
+        return ground
+
+
+def uphill_east(slope_deg: float) -> Plane:
+    """A plane that rises to the east."""
+    return Plane(float(np.tan(np.radians(slope_deg))))

@@ -1,0 +1,150 @@
+"""What wheels are told, and what the rover does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim.dynamics import MER, NO_SLIP, SlipParameters, Soil, drive, settle
+from sim.measurements import DriveCommand
+from tests.sim.dynamics.grounds import Plane, uphill_east
+
+EAST, NORTH = 0.5 * np.pi, 0.0
+#: The defaults without what is drawn.
+STEADY = SlipParameters(soil_spread=0.0, step_spread=0.0, wander_deg_m=0.0)
+PERFECT = Soil(NO_SLIP, 1.0)
+COMMANDS = [
+    DriveCommand(forward_m=1.0),
+    DriveCommand(forward_m=-0.7),
+    DriveCommand(left_m=0.5),
+    DriveCommand(forward_m=1.2, turn_left_rad=-0.8),
+    DriveCommand(turn_left_rad=2.0),
+    DriveCommand(left_m=-7.0 * 0.3, turn_left_rad=0.3),
+]
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("slope_deg", [0.0, 15.0])
+def test_without_slip_the_rover_does_as_it_is_told(command: DriveCommand, slope_deg: float) -> None:
+    # on a plane the motion in the body's axes is the planar one, whatever the slope
+    ground = uphill_east(slope_deg)
+    start = settle(MER, ground, 1.0, 2.0, 0.4)
+    driven = drive(MER, ground, PERFECT, start, command, _rng())
+    motion = start.world_from_rover.inv() * driven.end.world_from_rover
+    assert motion.translation == pytest.approx([*command.displacement_m, 0.0], abs=1e-8)
+    assert motion.rotation.as_rotvec() == pytest.approx([0.0, 0.0, command.turn_left_rad], abs=1e-7)
+    assert sum(part.command.length_m for part in driven.parts) == pytest.approx(command.length_m)
+    assert driven.aside_m == pytest.approx(0.0, abs=1e-8)
+    assert driven.stances[0] is start
+    assert driven.stances[-1] is driven.end
+
+
+def test_a_command_ends_where_many_small_motions_end() -> None:
+    command = DriveCommand(forward_m=1.3, left_m=-0.4, turn_left_rad=1.1)
+    count, place, angle = 20000, np.zeros(2), 0.0
+    step = np.array([command.forward_m, command.left_m]) / count
+    for _ in range(count):
+        angle += 0.5 * command.turn_left_rad / count
+        place += np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ step
+        angle += 0.5 * command.turn_left_rad / count
+    assert command.displacement_m == pytest.approx(place, abs=1e-8)
+
+
+def test_moving_sideways_around_a_target_keeps_it_ahead() -> None:
+    ahead, turn = 7.0, np.radians(10.0)
+    command = DriveCommand(left_m=-ahead * turn, turn_left_rad=turn)
+    start = settle(MER, Plane(), 0.0, 0.0, EAST)
+    end = drive(MER, Plane(), PERFECT, start, command, _rng()).end
+    target = end.world_from_rover.inv().apply(np.array([ahead, 0.0, 0.0]))
+    assert target == pytest.approx([ahead, 0.0, 0.0], abs=1e-7)
+    # turning to the left, the rover goes to the right of its first heading
+    assert end.north_m < 0.0
+
+
+def test_slip_of_half_is_half_the_way() -> None:
+    # the default curve loses half at 15 deg: s(15 deg) = 0.01 + 0.99 0.75**2.4
+    lost = 0.01 + 0.99 * 0.75**2.4
+    assert lost == pytest.approx(0.5, abs=0.01)
+    ground = uphill_east(15.0)
+    start = settle(MER, ground, 0.0, 0.0, EAST)
+    driven = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=2.0), _rng())
+    way = np.linalg.norm(driven.end.world_from_rover.translation - start.world_from_rover.translation)
+    assert way == pytest.approx(2.0 * (1.0 - lost), rel=1e-9)
+    assert driven.slip == pytest.approx(lost, rel=1e-9)
+
+
+@pytest.mark.parametrize(("slope_deg", "slip"), [(0.0, 0.01), (10.0, 0.2), (20.0, 1.0), (25.0, 1.0)])
+def test_uphill_slip_reaches_all(slope_deg: float, slip: float) -> None:
+    ground = uphill_east(slope_deg)
+    start = settle(MER, ground, 0.0, 0.0, EAST)
+    up = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.5), _rng())
+    assert up.slip == pytest.approx(slip, abs=0.005)
+    # backwards up the same slope is no easier; down it the rover runs on
+    turned = settle(MER, ground, 0.0, 0.0, -EAST)
+    back = drive(MER, ground, Soil(STEADY, 1.0), turned, DriveCommand(forward_m=-0.5), _rng())
+    assert back.slip == pytest.approx(up.slip, abs=1e-9)
+    down = drive(MER, ground, Soil(STEADY, 1.0), turned, DriveCommand(forward_m=0.5), _rng())
+    assert down.slip == pytest.approx(0.01 - 0.3 * (up.slip - 0.01), abs=1e-9)
+
+
+@pytest.mark.parametrize("azimuth_rad", [NORTH, np.pi])
+def test_across_a_slope_the_rover_slides_downhill(azimuth_rad: float) -> None:
+    ground = uphill_east(10.0)
+    start = settle(MER, ground, 0.0, 0.0, azimuth_rad)
+    driven = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=1.0), _rng())
+    moved = driven.end.world_from_rover.translation - start.world_from_rover.translation
+    sideways = 0.5 * (STEADY.share(np.radians(10.0)) - STEADY.flat)
+    # the ground falls to the west
+    assert moved[0] == pytest.approx(-sideways * np.cos(np.radians(10.0)), abs=1e-9)
+    assert driven.aside_m == pytest.approx(sideways * (1.0 if azimuth_rad == NORTH else -1.0), abs=1e-9)
+    assert driven.slip == pytest.approx(STEADY.flat, abs=1e-9)
+
+
+def test_turns_fall_short() -> None:
+    start = settle(MER, Plane(), 0.0, 0.0, EAST)
+    driven = drive(MER, Plane(), Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _rng())
+    assert np.degrees(start.azimuth_rad - driven.end.azimuth_rad) == pytest.approx(40.0 * 0.97)
+    assert driven.turn_slip == pytest.approx(0.03)
+    assert np.isnan(driven.slip)
+    steep = uphill_east(15.0)
+    start = settle(MER, steep, 0.0, 0.0, EAST)
+    driven = drive(MER, steep, Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(10.0)), _rng())
+    assert driven.turn_slip == pytest.approx(0.03 + 0.5 * (STEADY.share(np.radians(15.0)) - 0.01), rel=1e-6)
+
+
+def test_soils_and_steps_scatter_as_stated() -> None:
+    parameters = SlipParameters(soil_spread=0.3, step_spread=0.0, wander_deg_m=0.0)
+    factors = np.log([Soil.drawn(parameters, np.random.default_rng(n)).factor for n in range(400)])
+    # 0.3 within four standard errors, 0.3 / sqrt(800)
+    assert np.std(factors) == pytest.approx(0.3, abs=0.042)
+    ground = uphill_east(10.0)
+    start = settle(MER, ground, 0.0, 0.0, EAST)
+    loose = drive(MER, ground, Soil(STEADY, 1.5), start, DriveCommand(forward_m=0.3), _rng())
+    firm = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.3), _rng())
+    assert loose.slip == pytest.approx(1.5 * firm.slip, rel=1e-9)
+    rng = np.random.default_rng(1)
+    stepping = Soil(SlipParameters(soil_spread=0.0, step_spread=0.2, wander_deg_m=0.0), 1.0)
+    slips = [drive(MER, ground, stepping, start, DriveCommand(forward_m=0.1), rng).slip for _ in range(200)]
+    assert np.std(np.log(slips)) == pytest.approx(0.2, abs=0.04)
+    wandering = Soil(SlipParameters(step_spread=0.0, wander_deg_m=1.0), 1.0)
+    turns = [
+        np.degrees(drive(MER, ground, wandering, start, DriveCommand(forward_m=0.09), rng).end.azimuth_rad) - 90.0
+        for _ in range(200)
+    ]
+    assert np.std(turns) == pytest.approx(0.3, abs=0.06)
+
+
+def test_drives_are_reproducible_and_their_parts_join() -> None:
+    ground = uphill_east(8.0)
+    start = settle(MER, ground, 0.0, 0.0, 0.3)
+    one, two = (
+        drive(MER, ground, Soil(SlipParameters(), 1.1), start, COMMANDS[3], np.random.default_rng(9)) for _ in range(2)
+    )
+    assert np.array_equal(one.end.world_from_rover.as_matrix(), two.end.world_from_rover.as_matrix())
+    for before, after in zip(one.parts, one.parts[1:], strict=False):
+        assert before.after is after.before
+    assert all(part.command.length_m <= 0.1 + 1e-12 for part in one.parts)

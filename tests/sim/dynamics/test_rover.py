@@ -1,0 +1,121 @@
+"""A rover stands as its suspension and the ground make it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from sim.dynamics import MER, ROCKY_8, Ground, RockyGround, RoverParameters, settle
+from sim.dynamics.rover import WHEELS, wheel_centres
+from sim.terrain import PlacedRock, RockField, RockParameters, Surface
+from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
+
+EAST, NORTH = 0.5 * np.pi, 0.0
+
+
+def test_wheels_rest_at_the_stated_places() -> None:
+    places = dict(zip(WHEELS, MER.wheel_places_m, strict=True))
+    assert places["left front"] == pytest.approx([0.705, 0.53, 0.125])
+    assert places["right rear"] == pytest.approx([-0.705, -0.53, 0.125])
+    assert wheel_centres(MER, 0.0, (0.0, 0.0)) == pytest.approx(MER.wheel_places_m)
+
+
+@pytest.mark.parametrize("rover", [MER, ROCKY_8])
+@pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 200.0, -37.0])
+def test_on_a_plane_the_body_lies_as_the_plane_does(rover: RoverParameters, azimuth_deg: float) -> None:
+    plane = Plane(0.3, -0.2, 5.0)
+    stance = settle(rover, plane, 4.0, -3.0, np.radians(azimuth_deg))
+    turn = stance.world_from_rover.rotation.as_matrix()
+    normal = np.array([-0.3, 0.2, 1.0]) / np.linalg.norm([-0.3, 0.2, 1.0])
+    assert turn[:, 2] == pytest.approx(normal, abs=1e-9)
+    assert stance.world_from_rover.translation == pytest.approx([4.0, -3.0, 5.0 + 1.2 + 0.6], abs=1e-9)
+    heading = np.degrees(np.arctan2(turn[0, 0], turn[1, 0]))
+    assert np.cos(np.radians(heading - azimuth_deg)) == pytest.approx(1.0)
+    assert stance.azimuth_rad == pytest.approx(np.arctan2(turn[0, 0], turn[1, 0]))
+    assert [stance.differential_rad, *stance.bogies_rad] == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
+
+
+def test_pitch_and_roll_of_a_slope_faced_and_crossed() -> None:
+    # facing uphill the slope is the pitch; heading north on ground that rises to the east, the left side is low
+    facing = settle(MER, uphill_east(12.0), 0.0, 0.0, EAST)
+    crossing = settle(MER, uphill_east(12.0), 0.0, 0.0, NORTH)
+    assert np.degrees([facing.pitch_rad, facing.roll_rad]) == pytest.approx([12.0, 0.0], abs=1e-6)
+    assert np.degrees([crossing.pitch_rad, crossing.roll_rad]) == pytest.approx([0.0, -12.0], abs=1e-6)
+    assert np.degrees(crossing.tilt_rad) == pytest.approx(12.0, abs=1e-6)
+
+
+def test_body_pitches_by_the_mean_of_its_rockers() -> None:
+    # the left front wheel on a block of 10 cm: rocker and bogie of that side turn, and of the other the opposite way;
+    # heading east, the left front wheel stands at (0.705, 0.53)
+    high = 0.10
+    stance = settle(MER, Steps(((0.705, 0.53, high),)), 0.0, 0.0, EAST)
+    assert np.abs(stance.gaps_m).max() < 1e-9
+    both = settle(MER, Steps(((0.705, 0.53, high), (0.705, -0.53, high))), 0.0, 0.0, EAST)
+    assert both.roll_rad == pytest.approx(0.0, abs=1e-9)
+    assert both.differential_rad == pytest.approx(0.0, abs=1e-9)
+    # to first order in the height: one block pitches the body by half of what two do, the differential by as much
+    assert stance.pitch_rad == pytest.approx(0.5 * both.pitch_rad, rel=0.06)
+    assert -stance.differential_rad == pytest.approx(stance.pitch_rad, rel=0.06)
+    # front wheel up by h, bogie pivot on the level line through the other two: arm from bogie pivot to front wheel
+    assert both.pitch_rad == pytest.approx(high / (MER.front_m - MER.bogie_pivot_x_m), rel=0.06)
+
+
+def test_bogie_takes_up_a_block_under_the_middle_wheel() -> None:
+    # the middle wheel up by h lifts the bogie's pivot by h times its distance from the rear wheel over the wheels'
+    high = 0.06
+    stance = settle(MER, Steps(((0.0, 0.61, high), (0.0, -0.61, high))), 0.0, 0.0, EAST)
+    lift = high * (MER.rear_m + MER.bogie_pivot_x_m) / MER.rear_m
+    nose_down = lift / (MER.front_m - MER.bogie_pivot_x_m)
+    assert stance.pitch_rad == pytest.approx(-nose_down, rel=0.05)
+    assert stance.bogies_rad[0] == pytest.approx(stance.bogies_rad[1])
+    assert stance.bogies_rad[0] == pytest.approx(-high / MER.rear_m - nose_down, rel=0.05)
+
+
+def test_all_wheels_stand_on_rough_ground() -> None:
+    samples = np.zeros((256, 256, 2), dtype=np.float32)
+    samples[..., 0] = 0.03 * np.random.default_rng(3).standard_normal((256, 256))
+    surface = Surface.from_samples(samples, 0.1)
+    assert isinstance(surface, Ground)
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        stance = settle(MER, surface, *rng.uniform(0.0, 25.0, 2).tolist(), float(rng.uniform(-3.0, 3.0)))
+        assert np.abs(stance.gaps_m).max() < 1e-6
+        # no point under the middle of a wheel is deeper than its rim
+        centres = stance.world_from_rover.apply(wheel_centres(MER, stance.differential_rad, stance.bogies_rad))
+        above = centres[:, 2] - surface.height(centres[:, 0], centres[:, 1])
+        assert np.all(above > 0.9 * MER.wheel_radius_m)
+
+
+def test_rocks_lift_wheels() -> None:
+    samples = np.zeros((128, 128, 2), dtype=np.float32)
+    surface = Surface.from_samples(samples, 0.1)
+    rock = PlacedRock(name="step", east_m=6.4 + 0.705, north_m=6.4 + 0.53, diameter_m=0.3, height_m=0.1)
+    field = RockField.on(surface, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
+    mesh = field.rock(0)
+    ground = RockyGround.of(surface, mesh.vertices[mesh.faces], (6.4, 6.4), 1.5)
+    x, y = (np.array([value]) for value in (rock.east_m, rock.north_m))
+    assert ground.height(np.array([8.5]), np.array([6.4]))[0] == 0.0
+    top = mesh.vertices[:, 2].max()
+    heights = ground.height(*np.meshgrid(np.linspace(6.9, 7.3, 201), np.linspace(6.7, 7.1, 201)))
+    assert heights.max() == pytest.approx(top, abs=0.003)
+    bare = settle(MER, surface, 6.4, 6.4, EAST)
+    stance = settle(MER, ground, 6.4, 6.4, EAST)
+    assert np.abs(stance.gaps_m).max() < 1e-4
+    assert bare.pitch_rad == pytest.approx(0.0, abs=1e-9)
+    assert stance.pitch_rad > 0.5 * 0.05 * ground.height(x, y)[0] / (MER.front_m - MER.bogie_pivot_x_m)
+    assert stance.roll_rad < 0.0 or stance.differential_rad < 0.0
+
+
+def test_stance_does_not_depend_on_where_it_is_looked_for() -> None:
+    ground = Steps(((0.705, 0.53, 0.1), (-0.705, -0.53, 0.05)))
+    cold = settle(MER, ground, 0.0, 0.0, EAST)
+    warm = settle(MER, ground, 0.0, 0.0, EAST, near=settle(MER, uphill_east(5.0), 0.1, 0.0, EAST))
+    assert warm.world_from_rover.as_matrix() == pytest.approx(cold.world_from_rover.as_matrix(), abs=1e-8)
+
+
+def test_pivots_must_lie_between_their_wheels() -> None:
+    with pytest.raises(ValidationError, match="bogie_pivot_x_m"):
+        RoverParameters(bogie_pivot_x_m=0.1)
+    with pytest.raises(ValidationError, match="rocker_pivot_x_m"):
+        RoverParameters(rocker_pivot_x_m=0.9)
