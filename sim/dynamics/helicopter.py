@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
+from sim.dynamics.angles import turning
 from sim.dynamics.state import State
 from sim.dynamics.trajectory import Motion
 
@@ -213,16 +214,8 @@ class HelicopterFlight:
         yaw_rate = self.turned.derivative()(times_s)
         pitch, pitch_rate = self.tilt_along.derivatives(times_s)
         roll, roll_rate = self.tilt_across.derivatives(times_s)
-        attitudes = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=-1))
-        rates = np.stack(
-            [
-                roll_rate - yaw_rate * np.sin(pitch),
-                pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll),
-                -pitch_rate * np.sin(roll) + yaw_rate * np.cos(pitch) * np.cos(roll),
-            ],
-            axis=-1,
-        )
-        return attitudes, rates
+        angles = np.stack([yaw, pitch, roll], axis=-1)
+        return turning(angles, np.stack([yaw_rate, pitch_rate, roll_rate], axis=-1))
 
 
 def helicopter_flight(
