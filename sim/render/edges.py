@@ -73,6 +73,7 @@ def rays_within(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int)
 
 def look_within(
     surface: Surface,
+    bounds_m: tuple[float, float, float, float],
     objects: Objects,
     rotation: Float64[np.ndarray, "3 3"],
     position: Float64[np.ndarray, "3"],
@@ -85,8 +86,8 @@ def look_within(
 
     Parameters
     ----------
-    surface, objects
-        The ground and what stands on it.
+    surface, bounds_m, objects
+        The ground, where it ends (least and greatest x, least and greatest y), and what stands on it.
     rotation, position
         Pose of the camera: rotation matrix of the body, world position of its centre of projection.
     columns
@@ -100,6 +101,7 @@ def look_within(
     look_closely(
         surface.levels,
         surface.spacing_m,
+        bounds_m,
         objects.hierarchy,
         rotation,
         position,

@@ -93,6 +93,12 @@ class Scene:
         """Offsets of the mesh's lines from the centre."""
         return graded_offsets(self.mesh_reach_m, self.mesh_finest_m, self.mesh_lines)
 
+    @property
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """Where the mesh ends: least and greatest x, least and greatest y."""
+        (x, y), reach = self.centre_m, self.mesh_reach_m
+        return x - reach, x + reach, y - reach, y + reach
+
     @cached_property
     def height_range_m(self) -> tuple[float, float]:
         """Bounds of the ground's height."""
@@ -230,6 +236,7 @@ class Renderer:
         look(
             scene.surface.levels,
             scene.surface.spacing_m,
+            scene.bounds_m,
             depth,
             numbers,
             rays.focal_px,
@@ -258,7 +265,9 @@ class Renderer:
         if scene.edge_rays > 1:
             pixels = edge_pixels(frame.radiance, frame.range_m, frame.body)
             within = rays_within(rays, pixels, scene.edge_rays)
-            seen = look_within(scene.surface, scene.objects, rotation, position, columns, pixels, within, sight)
+            seen = look_within(
+                scene.surface, scene.bounds_m, scene.objects, rotation, position, columns, pixels, within, sight
+            )
             finer, _, _ = _shaded(scene, rotation, position, within, seen, light)
             radiance[pixels] = finer.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)
         return frame

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, cross_ground
+from sim.render.kernels.ground import Array32, Bounds, cross_ground, way_out
 from sim.render.kernels.hierarchy import Hierarchy, in_beam, nearest_hit
 from sim.render.kernels.intersection import hit_triangle
 from sim.render.kernels.sight import Ints
@@ -166,6 +166,7 @@ def _nearest_listed(
 def look_closely(
     levels: tuple[Level, ...],
     spacing: float,
+    bounds: Bounds,
     tree: Hierarchy,
     world_from_body: Array,
     position: Array,
@@ -191,7 +192,7 @@ def look_closely(
 
     Parameters
     ----------
-    levels, spacing, world_from_body, position
+    levels, spacing, bounds, world_from_body, position
         As for `look`.
     tree
         Triangles that stand on the ground, and their hierarchy.
@@ -286,6 +287,7 @@ def look_closely(
                 while c + 1 < count and found[c + 1] == level:
                     c += 1
                 end = (TO_HORIZON if sky and c + 1 == count else BEYOND) * ranges[c]
+                end = min(end, way_out(bounds, x0, y0, dx, dy))
                 smooth = max(level, 0)
                 scale = inverse_spacing / (1 << smooth)
                 t = cross_ground(levels[smooth], scale, x0, y0, z0, dx, dy, dz, start, end)

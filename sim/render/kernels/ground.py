@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from sim.terrain.kernels import Array, Level, sample
 
 Array32 = NDArray[np.float32]
+#: Where the ground that is drawn ends: least and greatest x, least and greatest y, metres.
+Bounds = tuple[float, float, float, float]
 #: Shortest step along a ray that looks for the ground, as a share of the distance.
 FINEST_STEP = 0.005
 
@@ -101,10 +103,19 @@ def cross_ground(
     return 0.5 * (before + t)
 
 
+@njit(cache=True, inline="always")
+def way_out(bounds: Bounds, x: float, y: float, dx: float, dy: float) -> float:
+    """Distance along a ray to where it leaves the ground's bounds, in which it begins."""
+    along_x = ((bounds[1] if dx > 0.0 else bounds[0]) - x) / dx if dx != 0.0 else math.inf
+    along_y = ((bounds[3] if dy > 0.0 else bounds[2]) - y) / dy if dy != 0.0 else math.inf
+    return min(along_x, along_y)
+
+
 @njit(cache=True)
 def first_ground(
     field: Level,
     inverse_spacing: float,
+    bounds: Bounds,
     x0: float,
     y0: float,
     z0: float,
@@ -115,9 +126,10 @@ def first_ground(
 ) -> float:
     """Distance at which a flat ray first dips below the ground, from four fifths of the way to a guess to past it.
 
-    The mesh that gives the guess does not hold every crest. The guess itself where the ray does not dip.
+    The mesh that gives the guess does not hold every crest. The guess itself where the ray does not dip within the
+    bounds.
     """
-    farthest = 1.25 * guess + 4.0 / inverse_spacing
+    farthest = min(1.25 * guess + 4.0 / inverse_spacing, way_out(bounds, x0, y0, dx, dy))
     met = cross_ground(field, inverse_spacing, x0, y0, z0, dx, dy, dz, 0.8 * guess, farthest)
     return met if met < math.inf else guess
 
@@ -137,9 +149,11 @@ def height_range(field: Level) -> tuple[float, float]:
 __all__ = [
     "Array",
     "Array32",
+    "Bounds",
     "Level",
     "cross_ground",
     "first_ground",
     "height_range",
     "meet_ground",
+    "way_out",
 ]

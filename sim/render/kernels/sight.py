@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, first_ground, meet_ground
+from sim.render.kernels.ground import Array32, Bounds, first_ground, meet_ground
 from sim.render.kernels.hierarchy import Hierarchy, nearest_hit
 from sim.render.kernels.intersection import hit_triangle
 from sim.terrain.kernels import Array, Level
@@ -111,6 +111,7 @@ def _meet_object(
 def look(
     levels: tuple[Level, ...],
     spacing: float,
+    bounds: Bounds,
     depth: Array32,
     ids: Ints,
     focal: Array,
@@ -131,8 +132,8 @@ def look(
 
     Parameters
     ----------
-    levels, spacing
-        The surface's pyramid and the spacing of its level 0.
+    levels, spacing, bounds
+        The surface's pyramid, the spacing of its level 0, and where the mesh ends.
     depth, ids, focal, view_from_body
         Pinhole views from `position`: depth along the axis, number of the triangle plus one (0 for ground; empty where
         no triangles were drawn, for none are in view), focal lengths in samples, and rotations from body axes to the
@@ -190,7 +191,7 @@ def look(
                 smooth = min(int(math.log2(stretched / (FINE_UNTIL * spacing))) + 1, top_level)
             scale = inverse_spacing / (1 << smooth)
             if dz > -GRAZING:
-                t = first_ground(levels[smooth], scale, x0, y0, z0, dx, dy, dz, t)
+                t = first_ground(levels[smooth], scale, bounds, x0, y0, z0, dx, dy, dz, t)
             t = meet_ground(levels[smooth], scale, x0, y0, z0, dx, dy, dz, t)
             met = smooth == 0 and t != first_guess
         triangle = -1
