@@ -18,6 +18,7 @@ run; each command draws another on top.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -109,10 +110,20 @@ class DrivenPart:
     before: Stance
     after: Stance
 
-    @property
+    @cached_property
     def motion(self) -> RigidTransform:
         """True motion: the pose after in the axes of the pose before."""
         return self.before.world_from_rover.inv() * self.after.world_from_rover
+
+    @cached_property
+    def length_m(self) -> float:
+        """Length of the true motion."""
+        return float(np.linalg.norm(self.motion.translation))
+
+    @cached_property
+    def turn_left_rad(self) -> float:
+        """True turn about the rover's own z axis, to the left: what a gyro there sums up."""
+        return float(self.motion.rotation.as_rotvec()[2])
 
 
 @dataclass(frozen=True)
@@ -146,6 +157,16 @@ class Drive:
         return (self.start, *(part.after for part in self.parts))
 
     @property
+    def length_m(self) -> float:
+        """Length of the true path."""
+        return sum(part.length_m for part in self.parts)
+
+    @property
+    def turn_left_rad(self) -> float:
+        """True turn about the rover's z axis, to the left."""
+        return sum(part.turn_left_rad for part in self.parts)
+
+    @property
     def slip(self) -> float:
         """Share of the commanded path that was not gained along it; NaN for a turn in place. Negative: it ran on."""
         if self.command.length_m < _NO_PATH_M:
@@ -163,8 +184,7 @@ class Drive:
         """Share of the commanded turn that was not made; NaN where none was asked for."""
         if self.command.turn_left_rad == 0.0:
             return float("nan")
-        turned = sum(_turn(part.motion) for part in self.parts)
-        return 1.0 - turned / self.command.turn_left_rad
+        return 1.0 - self.turn_left_rad / self.command.turn_left_rad
 
 
 def drive(
@@ -254,9 +274,3 @@ def _along(part: DrivenPart, turned_rad: float = 0.0) -> float:
     angle = float(np.arctan2(ahead[1], ahead[0])) + 0.5 * part.command.turn_left_rad + turned_rad
     chord = length / max(float(np.hypot(*part.command.displacement_m)), _NO_PATH_M)
     return chord * float(part.motion.translation[:2] @ np.array([np.cos(angle), np.sin(angle)]))
-
-
-def _turn(motion: RigidTransform) -> float:
-    """Turn of a motion about its own z axis, radians, to the left."""
-    forward = motion.rotation.as_matrix()[:, 0]
-    return float(np.arctan2(forward[1], forward[0]))

@@ -10,6 +10,7 @@ from sim.sensor.inertial import InertialSolution, NavigationErrors
 from sim.sensor.instrument import Instrument, Readings, Sampling
 from sim.sensor.laser import LaserAltimeter, LaserParameters
 from sim.sensor.motion import ImageMotion
+from sim.sensor.odometry import Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
 from sim.sensor.optics import natural_fall_off
 from sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, Preset, preset
 from sim.sensor.radar import RadarAltimeter, RadarParameters
@@ -41,11 +42,15 @@ __all__ = [
     "LaserAltimeter",
     "LaserParameters",
     "NavigationErrors",
+    "Odometer",
+    "OdometryParameters",
+    "PoseEstimate",
     "Preset",
     "RadarAltimeter",
     "RadarParameters",
     "Readings",
     "Sampling",
+    "VisualOdometryParameters",
     "WarmUp",
     "auto_expose",
     "height_above_ground",
