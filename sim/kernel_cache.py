@@ -15,7 +15,7 @@ from pathlib import Path
 from sim.cache import cache_directory
 
 #: The folders that hold kernels, side by side in the tree and where they are installed.
-_FOLDERS = ("sim", "algorithms")
+_FOLDERS = ("sim", "algorithms", "scenarios")
 
 
 def use_own_folder() -> None:

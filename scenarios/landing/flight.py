@@ -1,0 +1,100 @@
+"""Where the camera truly was at the two pictures, and where the on-board filter has it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from scenarios.landing.faults import outage_errors
+from scenarios.landing.parameters import LandingScenarioParameters
+from scenarios.views import nadir_pose
+from sim.dynamics import State
+from sim.frames import rigid
+from sim.measurements import PoseMeasurement
+from sim.streams import Streams
+from sim.terrain import Surface
+
+#: Shortest time between pictures, for a camera that stands still, s.
+LEAST_INTERVAL_S = 0.1
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Truth and belief at the two pictures.
+
+    Attributes
+    ----------
+    states
+        True states of the body; the camera is at its origin.
+    poses
+        The on-board filter's.
+    up_body
+        Upwards at the first picture as the inclinometers have it, unit vector in body axes.
+    """
+
+    states: tuple[State, State]
+    poses: tuple[PoseMeasurement, PoseMeasurement]
+    up_body: Float64[np.ndarray, "3"]
+
+    @classmethod
+    def of(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> Flight:
+        """The flight of a case."""
+        states = true_states(p, surface, streams)
+        poses = believed_poses(p, states, streams)
+        upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
+        tilt = np.radians(p.navigation.inclinometer_deg) * streams.generator("inclinometers").standard_normal(3)
+        return cls(states, poses, Rotation.from_rotvec(tilt).apply(upright))
+
+    @property
+    def position_error_m(self) -> Float64[np.ndarray, "3"]:
+        """What the first on-board position is off the true one, metres."""
+        error: Float64[np.ndarray, "3"] = (
+            np.array(self.poses[0].world_from_body.translation) - self.states[0].position_m
+        )
+        return error
+
+
+def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams) -> tuple[State, State]:
+    """The body's states at the pictures, as the parameters state them."""
+    flown = p.flown
+    first = nadir_pose(surface, p.place.east_m, p.place.north_m, flown.height_m, flown.heading_deg)
+    towards = np.radians(flown.tilt_towards_deg)
+    # turned about the horizontal axis to the right of the azimuth, the axis below moves towards it
+    tilt = Rotation.from_rotvec(np.radians(flown.tilt_deg) * np.array([np.cos(towards), -np.sin(towards), 0.0]))
+    attitude = tilt * first.rotation
+    # the body's x runs along the picture's columns to its right, y to its upper edge, z against the optical axis
+    change = Rotation.from_rotvec(np.radians([flown.pitch_deg, flown.yaw_deg, flown.roll_deg]))
+    course = np.radians(flown.heading_deg + flown.course_deg)
+    along = flown.baseline_share * flown.height_m
+    moved = np.array([along * np.sin(course), along * np.cos(course), flown.climb_share * flown.height_m])
+    interval = max(float(np.linalg.norm(moved)) / max(flown.speed_m_s, 1e-6), LEAST_INTERVAL_S)
+    velocity = flown.speed_m_s * np.array([np.sin(course), np.cos(course), 0.0])
+    rates = np.radians(flown.rate_deg_s) * streams.generator("attitude rates").standard_normal((2, 3))
+    start = np.array(first.translation)
+    return (
+        State(0.0, start, velocity, attitude, rates[0], np.zeros(3)),
+        State(interval, start + moved, velocity, attitude * change, rates[1], np.zeros(3)),
+    )
+
+
+def believed_poses(
+    p: LandingScenarioParameters, states: tuple[State, State], streams: Streams
+) -> tuple[PoseMeasurement, PoseMeasurement]:
+    """The filter's poses: errors that both share, and those of the motion between them."""
+    n, rng = p.navigation, streams.generator("navigation")
+    position = n.position_m * rng.standard_normal(3)
+    motion = n.motion_m * rng.standard_normal(3)
+    tilt, azimuth = np.radians(n.tilt_deg) * rng.standard_normal(2), np.radians(n.azimuth_deg) * rng.standard_normal()
+    turn = np.radians(n.turn_deg) * rng.standard_normal(3)
+    drift, drift_motion = outage_errors(p.faults, states[1].time_s, streams.generator("outage"))
+    common = Rotation.from_rotvec(np.array([tilt[0], tilt[1], azimuth]))
+    positions = (position + drift, position + motion + drift + drift_motion)
+    turns = (common, Rotation.from_rotvec(turn) * common)
+    first, second = (
+        PoseMeasurement(rigid(turned * state.attitude, state.position_m + off), state.time_s)
+        for state, off, turned in zip(states, positions, turns, strict=True)
+    )
+    return first, second

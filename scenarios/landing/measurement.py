@@ -1,0 +1,28 @@
+"""What the helicopter's computer holds: pictures, poses, the laser's range, the inclinometers' vertical."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scenarios.landing.faults import faulty_range
+from scenarios.landing.flight import Flight
+from scenarios.landing.parameters import LandingScenarioParameters
+from scenarios.landing.pictures import Pair
+from sim.measurements import LandingMeasurements
+from sim.sensor.ranging import RangingUnit
+from sim.streams import Streams
+
+
+def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: Streams) -> LandingMeasurements:
+    """The measurements of a case. The a-priori site is the ground on the first picture's optical axis."""
+    unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
+    reading = unit.readings(np.zeros(1), np.array([pair.axis_range_m]), streams.generator("laser noise"))
+    slant = faulty_range(p.faults, float(reading.values[0]))
+    ahead = pair.axis_range_m * pair.images[0].camera.a
+    return LandingMeasurements(
+        images=pair.images,
+        poses=flight.poses,
+        slant_range_m=slant,
+        up_body=flight.up_body,
+        apriori_site_world=np.asarray(flight.poses[0].world_from_body.apply(ahead)),
+    )

@@ -1,0 +1,165 @@
+"""Everything that a campaign of landings may set or disperse."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from algorithms.hda import HdaOptions, TrackSeed
+from scenarios.descent.parameters import Place, RenderParameters, SunParameters
+from scenarios.estimators import check_site_estimator
+from scenarios.landing.faults import Faults
+from scenarios.landing.relief import Limits
+from sim.sensor import PRESETS, AutoExposureParameters, DetectorChoice, LaserParameters, preset
+from sim.terrain import Site, TerrainParameters, site, sites
+
+Size = Annotated[float, Field(ge=0.0)]
+Angle = Annotated[float, Field(ge=-720.0, le=720.0)]
+
+
+class _Parameters(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class PassParameters(_Parameters):
+    """Where the camera is at the two pictures: at one height over a straight line, as far as nothing else is asked for.
+
+    The change between the pictures that tracking must bear is stated by its parts: along the course, up, and turned
+    about the first picture's optical axis, its columns and its rows.
+    """
+
+    height_m: Annotated[float, Field(gt=0.0, le=2000.0, description="above the ground below the first picture, m")] = (
+        15.0
+    )
+    baseline_share: Annotated[
+        float, Field(ge=0.0, le=2.0, description="horizontal distance of the pictures over the height")
+    ] = 0.2
+    speed_m_s: Annotated[float, Field(ge=0.0, le=200.0, description="along the course, m/s")] = 3.0
+    heading_deg: Annotated[Angle, Field(description="azimuth of the picture's upper edge")] = 0.0
+    course_deg: Annotated[Angle, Field(description="from there to the course, clockwise: 90 is along the rows")] = 90.0
+    tilt_deg: Annotated[float, Field(ge=0.0, le=60.0, description="of the first picture's axis from nadir")] = 0.0
+    tilt_towards_deg: Annotated[Angle, Field(description="azimuth towards which it is tilted")] = 0.0
+    climb_share: Annotated[
+        float, Field(gt=-0.9, le=5.0, description="change of height between the pictures over the height")
+    ] = 0.0
+    roll_deg: Annotated[Angle, Field(description="turn about the optical axis between the pictures")] = 0.0
+    pitch_deg: Annotated[Angle, Field(description="turn about the picture's columns' direction, its right")] = 0.0
+    yaw_deg: Annotated[Angle, Field(description="turn about the picture's rows' direction, its upper edge's")] = 0.0
+    rate_deg_s: Annotated[Size, Field(le=100.0, description="RMS attitude rate per axis at a picture")] = 0.0
+
+
+class NavigationParameters(_Parameters):
+    """Errors of the on-board poses and of the inclinometers, drawn for a case; one standard deviation per axis."""
+
+    position_m: Annotated[Size, Field(le=100.0, description="of the position, the same at both pictures, m")] = 0.02
+    motion_m: Annotated[Size, Field(le=10.0, description="of the motion between the pictures, m")] = 0.01
+    tilt_deg: Annotated[Size, Field(le=30.0, description="of the attitude's roll and pitch, common to both, deg")] = 0.3
+    azimuth_deg: Annotated[Size, Field(le=30.0, description="of the attitude's azimuth, common to both, deg")] = 1.0
+    turn_deg: Annotated[Size, Field(le=10.0, description="of the turn between the pictures, deg")] = 0.1
+    inclinometer_deg: Annotated[Size, Field(le=30.0, description="of the inclinometers' roll and pitch, deg")] = 0.2
+
+
+class LanderParameters(_Parameters):
+    """The lander: what it can stand on, and the shadow that it casts."""
+
+    diameter_m: Annotated[
+        float, Field(gt=0.0, le=100.0, description="of its footprint, a disc; the helicopter is 2 m long (paper, IV)")
+    ] = 2.0
+    max_slope_deg: Annotated[float, Field(gt=0.0, lt=90.0, description="steepest plane that it can stand on")] = 15.0
+    max_roughness_m: Annotated[
+        float, Field(gt=0.0, le=100.0, description="farthest that ground may be off that plane, m")
+    ] = 0.2
+    caster_diameter_m: Annotated[
+        Size, Field(le=100.0, description="diameter of the disc that casts its shadow into the picture; 0: none")
+    ] = 0.0
+
+    @property
+    def limits(self) -> Limits:
+        """What it can stand on."""
+        return Limits(self.diameter_m, float(np.radians(self.max_slope_deg)), self.max_roughness_m)
+
+
+class LandingScenarioParameters(_Parameters):
+    """Everything that a campaign of landings may set or disperse.
+
+    The keys that the table `terrain` sets are changes of the site's own terrain at the stated scale.
+    """
+
+    site: Annotated[str, Field(description="preset of terrain, light, texture and rocks")] = "heli-hazardous"
+    scale: Annotated[Literal["ground", "descent"], Field(description="which of the site's terrains")] = "ground"
+    terrain_of: Annotated[
+        str | None, Field(description="whose terrain is below; filled in, and not to be set otherwise")
+    ] = None
+    terrain: TerrainParameters = TerrainParameters()
+    place: Place = Place()
+    texture: Annotated[
+        Size, Field(le=10.0, description="contrast of ground finer than the terrain, over the site's own")
+    ] = 1.0
+    sun: SunParameters = SunParameters()
+    camera: Annotated[str, Field(description="camera preset that looks down")] = "xc-55"
+    detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
+    exposure: Annotated[AutoExposureParameters, Field(description="how the exposure is set")] = AutoExposureParameters()
+    flown: Annotated[PassParameters, Field(description="the two pictures' places")] = PassParameters()
+    navigation: NavigationParameters = NavigationParameters()
+    laser: LaserParameters = LaserParameters()
+    lander: LanderParameters = LanderParameters()
+    faults: Faults = Faults()
+    algorithm: Annotated[
+        str, Field(description="estimator under test: hda, essential-matrix, semi-global, or your own 'module:Class'")
+    ] = "hda"
+    hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions(
+        track_seed=TrackSeed.POSE
+    )
+    render: RenderParameters = Field(default_factory=RenderParameters)
+
+    @field_validator("site")
+    @classmethod
+    def _site_is_there(cls, name: str) -> str:
+        if name not in sites():
+            raise ValueError(f"no site is called '{name}'; allowed: {', '.join(sites())}")
+        return name
+
+    @field_validator("camera")
+    @classmethod
+    def _camera_looks_down(cls, name: str) -> str:
+        down = [known for known in PRESETS if preset(known).design.down]
+        if name not in down:
+            raise ValueError(f"no camera preset that looks down is called '{name}'; allowed: {', '.join(down)}")
+        return name
+
+    @field_validator("algorithm")
+    @classmethod
+    def _algorithm_is_there(cls, name: str) -> str:
+        check_site_estimator(name)
+        return name
+
+    @model_validator(mode="before")
+    @classmethod
+    def _terrain_of_the_site(cls, stated: Any) -> Any:
+        """Completes the table `terrain` with the site's own."""
+        if not isinstance(stated, Mapping):
+            return stated
+        name, scale = stated.get("site", "heli-hazardous"), stated.get("scale", "ground")
+        if name not in sites() or getattr(sites()[name], str(scale), None) is None or "terrain_of" in stated:
+            return stated
+        changes = stated.get("terrain", {})
+        if not isinstance(changes, Mapping):
+            return stated
+        return {**stated, "terrain_of": name, "terrain": site(name).terrain(scale).changed(changes).model_dump()}
+
+    @model_validator(mode="after")
+    def _terrain_is_the_sites(self) -> LandingScenarioParameters:
+        """A terrain that was completed for one site must not be lit as another's."""
+        if getattr(self.preset, self.scale) is None:
+            raise ValueError(f"site {self.site} has no terrain at the scale '{self.scale}'")
+        if self.terrain_of != self.site:
+            raise ValueError(f"site is {self.site}, but the terrain is of {self.terrain_of}; a site is not dispersed")
+        return self
+
+    @property
+    def preset(self) -> Site:
+        """The site."""
+        return site(self.site)

@@ -1,0 +1,151 @@
+"""The exact ground of a landing, rocks and all, and what it is like under a lander: the truth about hazards.
+
+Slope and roughness are defined as the algorithm defines them (section III of the paper): the angle of the
+least-median-of-squares plane over the lander's footprint, and the greatest distance from it, upwards or downwards. They
+are taken from the terrain's own heights and its rocks' triangles, over the very footprint in question: nothing is
+interpolated between footprints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from scenarios.landing import kernels
+from scenarios.views import SiteGround
+
+#: Spacing of the exact heights, in footprints' diameters: 80 points across a footprint, 2.5 cm for one of 2 m.
+SPACING_DIAMETERS = 1.0 / 80.0
+#: Every so many of these are used to lay planes: 20 points across, some 310 in all.
+FITTED_EVERY = 4
+#: Random triples of points for a plane. With a third of the points off the plane all of 60 miss it in one footprint of
+#: three billion, with half of them off in one of three thousand.
+PLANE_TRIALS = 60
+#: Of the triples, always the same: truth is a function of the ground.
+SEED = 2005
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a lander can stand on.
+
+    Attributes
+    ----------
+    diameter_m
+        Diameter of its footprint, a disc.
+    max_slope_rad, max_roughness_m
+        Steepest plane and farthest distance from it.
+    """
+
+    diameter_m: float
+    max_slope_rad: float
+    max_roughness_m: float
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """The true ground under landers at some places.
+
+    Attributes
+    ----------
+    slope_rad, roughness_m
+        As defined above.
+    exceeding_m2
+        Area of the footprint that is farther from the plane than the limit.
+    safe
+        Whether slope and roughness are within the limits.
+    """
+
+    slope_rad: Float[np.ndarray, "*places"]
+    roughness_m: Float[np.ndarray, "*places"]
+    exceeding_m2: Float[np.ndarray, "*places"]
+    safe: Bool[np.ndarray, "*places"]
+
+
+@dataclass(frozen=True)
+class Relief:
+    """Exact heights on a grid along the world's axes.
+
+    Attributes
+    ----------
+    heights_m
+        Of ground and rocks; row i lies at y = south + i spacing, column j at x = west + j spacing.
+    west_m, south_m, spacing_m
+        Where the grid lies.
+    """
+
+    heights_m: Float[np.ndarray, "rows columns"]
+    west_m: float
+    south_m: float
+    spacing_m: float
+
+    @classmethod
+    def of(
+        cls, ground: SiteGround, low_m: Float[np.ndarray, "2"], high_m: Float[np.ndarray, "2"], spacing_m: float
+    ) -> Relief:
+        """The ground between two corners (x, y); rocks are drawn so finely that no grid can tell."""
+        columns, rows = (int(n) for n in np.ceil((high_m - low_m) / spacing_m) + 1)
+        west, south = float(low_m[0]), float(low_m[1])
+        x, y = np.meshgrid(west + spacing_m * np.arange(columns), south + spacing_m * np.arange(rows))
+        heights = np.array(ground.surface.height(x, y))
+        if ground.rocks is not None:
+            middle = 0.5 * (low_m + high_m)
+            reach = 0.5 * float(np.hypot(*(high_m - low_m))) + float(ground.rocks.diameter_m.max(initial=0.0))
+            # as if seen from far above by pixels of the grid's spacing
+            mesh = ground.rocks.near(
+                float(middle[0]), float(middle[1]), reach, above_m=1e3 * reach, pixel_rad=spacing_m / (1e3 * reach)
+            )
+            kernels.raise_by_triangles(heights, west, south, spacing_m, mesh.vertices, mesh.faces)
+        return cls(heights, west, south, spacing_m)
+
+    def cells(self, places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Row and column of places (x, y), not whole."""
+        return np.asarray((places - np.array([self.west_m, self.south_m]))[..., ::-1] / self.spacing_m)
+
+    def averaged(self, places: Float[np.ndarray, "rows columns 2"], side_m: float) -> Float[np.ndarray, "rows columns"]:
+        """Mean height over squares of this side about places (x, y); NaN outside the grid."""
+        width = max(round(side_m / self.spacing_m), 1)
+        means = cv2.blur(self.heights_m, (width, width)) if width > 1 else self.heights_m
+        rows, columns = np.moveaxis(self.cells(places).astype(np.float32), -1, 0)
+        return np.asarray(
+            cv2.remap(means, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
+        )
+
+    def footprints(self, places: Float[np.ndarray, "*places 2"], limits: Limits) -> Footprints:
+        """The ground under landers at places (x, y).
+
+        Raises
+        ------
+        ValueError
+            If a footprint does not lie within the grid.
+        """
+        offsets, fitted = _disc(round(0.5 * limits.diameter_m / self.spacing_m))
+        middles = np.rint(self.cells(places)).astype(np.int64).reshape(-1, 2)
+        reach = int(offsets.max())
+        if np.any(middles < reach) or np.any(middles >= np.array(self.heights_m.shape) - reach):
+            raise ValueError("a footprint reaches beyond the ground whose heights are known")
+        slopes, roughness, exceeding = (np.empty(len(middles)) for _ in range(3))
+        triples = np.random.default_rng(SEED).random((PLANE_TRIALS, 3))
+        rows, columns = middles.T.copy()
+        kernels.footprints(
+            self.heights_m, rows, columns, offsets, fitted, self.spacing_m, triples, limits.max_roughness_m,
+            slopes, roughness, exceeding,
+        )  # fmt: skip
+        shape = places.shape[:-1]
+        safe = (slopes <= limits.max_slope_rad) & (roughness <= limits.max_roughness_m)
+        return Footprints(
+            slopes.reshape(shape), roughness.reshape(shape), exceeding.reshape(shape), safe.reshape(shape)
+        )
+
+
+@lru_cache(maxsize=4)
+def _disc(radius: int) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, "m 2"]]:
+    """Points of a disc from its middle (row, column): all of them, and those through which planes are laid."""
+    across = np.arange(-radius, radius + 1)
+    points = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = points[np.hypot(*points.T) <= radius]
+    return points, points[np.all(points % FITTED_EVERY == 0, axis=1)].copy()

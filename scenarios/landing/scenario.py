@@ -1,0 +1,67 @@
+"""One flight, step by step: world, motion, pictures, measurements, estimate, truth, score."""
+
+from __future__ import annotations
+
+import time
+
+from pydantic import BaseModel
+
+from scenarios.estimators import site_estimator
+from scenarios.interface import CaseResult
+from scenarios.landing.flight import Flight
+from scenarios.landing.measurement import measure
+from scenarios.landing.parameters import LandingScenarioParameters
+from scenarios.landing.pictures import take_pictures
+from scenarios.landing.score import conditions, map_row, motion_row, products, provenance, site_row
+from scenarios.landing.truth import GroundTruth
+from scenarios.landing.world import World, camera_optics
+from sim.streams import Streams
+from sim.terrain import TerrainBank
+
+
+class LandingScenario:
+    """Two pictures of the ground from a moving camera, given to an estimator of landing sites."""
+
+    name = "landing"
+    parameters_type = LandingScenarioParameters
+
+    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
+        """Numbers of the bank's terrains."""
+        return tuple(range(_checked(parameters).place.bank))
+
+    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
+        """Builds one terrain of the bank."""
+        p = _checked(parameters)
+        TerrainBank(p.terrain, p.place.bank_seed).terrain(shared_input)
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """One flight."""
+        p = _checked(parameters)
+        world = World.of(p)
+        flight = Flight.of(p, world.ground.surface, streams)
+        pair = take_pictures(p, world, flight, camera_optics(p.camera), streams)
+        measurements = measure(p, flight, pair, streams)
+        started = time.process_time()
+        estimate = site_estimator(p.algorithm, p.hda).estimate(measurements)
+        taken = time.process_time() - started
+        truth = GroundTruth.of(world, flight, pair, p.lander.limits)
+        row = {
+            **site_row(estimate, flight, truth),
+            **motion_row(estimate.details, flight, pair),
+            **map_row(p, estimate, flight, truth),
+            **conditions(p, world, flight, pair, measurements, truth),
+            "estimation_time_s": taken,
+            **provenance(p, pair),
+        }
+        return CaseResult(
+            outcome=estimate.outcome.name,
+            answered=estimate.outcome.converged,
+            row=row,
+            products=products(estimate, flight, pair, truth),
+        )
+
+
+def _checked(parameters: BaseModel) -> LandingScenarioParameters:
+    if not isinstance(parameters, LandingScenarioParameters):
+        raise TypeError(f"the landing scenario takes LandingScenarioParameters, not {type(parameters).__name__}")
+    return parameters

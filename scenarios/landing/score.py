@@ -1,0 +1,262 @@
+"""What is stored of a flight: motion, maps and site against the truth, conditions, what figures are drawn from."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from algorithms.hda import HdaDetails, hda_products
+from algorithms.hda.view import camera_pose
+from algorithms.interface import SiteEstimate, SiteOutcome
+from scenarios.interface import Scalar
+from scenarios.landing.confusion import MapAtPlaces, hazard_counts, map_errors
+from scenarios.landing.flight import Flight
+from scenarios.landing.parameters import LandingScenarioParameters
+from scenarios.landing.pictures import Pair
+from scenarios.landing.truth import GroundTruth
+from scenarios.landing.world import World
+from sim.measurements import LandingMeasurements
+from sim.processor import processor_features
+from sim.render import process_renderer
+from sim.sensor import height_above_ground
+
+NAN = float("nan")
+#: Pixels that a track may be off the true place and still count as right.
+RIGHT_PX = 1.0
+
+
+def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict[str, Scalar]:
+    """The answer against the truth.
+
+    The site is where the coordinates that were handed over lead a helicopter whose navigation is off as it was at the
+    first picture. Nothing but SAFE_SITE reports a safe site: where the algorithm did not converge the a-priori site is
+    scored.
+    """
+    places = {"site": estimate.site_world}
+    row: dict[str, Scalar] = {
+        "converged": estimate.outcome.converged,
+        "site_reported": estimate.outcome is SiteOutcome.SAFE_SITE,
+        "no_site_reported": estimate.outcome is SiteOutcome.NO_SAFE_SITE,
+        "safe_exists": bool(np.any(truth.safe)),
+        "none_exists": not np.any(truth.safe),
+        "roomy_exists": bool(np.any(truth.roomy)),
+        "truly_safe_share": float(truth.safe.sum() / max(int(truth.covered.sum()), 1)),
+    }
+    for name, place in places.items():
+        row |= place_row(name, None if place is None else (place - flight.position_error_m)[:2], truth)
+    return row
+
+
+def place_row(name: str, place: np.ndarray | None, truth: GroundTruth) -> dict[str, Scalar]:
+    """The true ground under a lander at a place (x, y)."""
+    under = None if place is None else truth.under(place)
+    if place is None or under is None:
+        return {f"{name}_safe": False, **dict.fromkeys(_place_columns(name), NAN)}
+    values = (
+        float(place[0]),
+        float(place[1]),
+        float(np.degrees(under.slope_rad[0])),
+        float(under.roughness_m[0]),
+        truth.distance_to_hazard_m(place),
+    )
+    return {f"{name}_safe": bool(under.safe[0]), **dict(zip(_place_columns(name), values, strict=True))}
+
+
+def _place_columns(name: str) -> list[str]:
+    return [f"{name}_{part}" for part in ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m")]
+
+
+def true_motion(flight: Flight, pair: Pair) -> RigidTransform:
+    """The true motion from the first to the second camera's frame."""
+    first, second = (
+        state.world_from_body * camera_pose(image.camera)
+        for state, image in zip(flight.states, pair.images, strict=True)
+    )
+    return second.inv() * first
+
+
+def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]:
+    """Tracks, and the motion against the true one; NaN for what was not reached."""
+    names = (
+        "features", "tracks", "features_in_view", "tracks_right", "tracked_share", "tracks_wrong_share", "inliers",
+        "parallax_px", "rotation_error_deg", "direction_error_deg", "length_error_m", "baseline_error_share",
+        "motion_residual_px", "points", "matched_share", "map_rows", "map_columns", "cell_m",
+    )  # fmt: skip
+    row: dict[str, Scalar] = dict.fromkeys(names, NAN)
+    if not isinstance(details, HdaDetails):
+        return row
+    if details.tracks is not None:
+        row |= _tracks_row(details, flight, pair)
+    true = true_motion(flight, pair)
+    if details.motion is not None:
+        found = details.motion.second_from_first
+        length, true_length = (float(np.linalg.norm(one.translation)) for one in (found, true))
+        turned = (found.rotation * true.rotation.inv()).magnitude()
+        off = float(np.linalg.norm(found.translation - true.translation))
+        row |= {
+            "inliers": int(details.motion.inliers.sum()),
+            "parallax_px": details.motion.parallax_px,
+            "rotation_error_deg": float(np.degrees(turned)),
+            "direction_error_deg": float(np.degrees(2.0 * np.arcsin(min(_apart(found, true) / 2.0, 1.0)))),
+            "length_error_m": length - true_length,
+            "baseline_error_share": off / true_length if true_length > 0.0 else NAN,
+            "motion_residual_px": float(np.median(details.motion.residuals_px)),
+        }
+    if details.matches is not None:
+        row |= {"points": len(details.matches.points), "matched_share": float(details.matches.accepted.mean())}
+    if details.ground is not None:
+        rows, columns = details.ground.elevation.elevation_m.shape
+        row |= {"map_rows": rows, "map_columns": columns, "cell_m": details.ground.elevation.cell_m}
+    return row
+
+
+def _apart(one: RigidTransform, other: RigidTransform) -> float:
+    """Distance of the directions of two translations."""
+    a, b = (np.array(each.translation) for each in (one, other))
+    if not (np.any(a) and np.any(b)):
+        return NAN
+    return float(np.linalg.norm(a / np.linalg.norm(a) - b / np.linalg.norm(b)))
+
+
+def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Scalar]:
+    """How many of the features that the second picture shows were found again, and rightly."""
+    tracks = details.tracks
+    if tracks is None or len(tracks.first) == 0:
+        return {"features": 0}
+    column, row = np.rint(tracks.first).astype(np.int64).T
+    points = pair.frames[0].points_world()[row * pair.images[0].calibration.rows_summed, column]
+    camera = pair.images[1].camera.moved(flight.states[1].world_from_body)
+    pixels, ahead = camera.project(points)
+    room = 12.0
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixels >= room) & (pixels <= np.array(camera.size) - 1.0 - room), axis=1) & ahead
+        off = np.hypot(*(tracks.second - pixels).T)
+        right = tracks.accepted & inside & (off <= RIGHT_PX)
+    accepted = int(tracks.accepted.sum())
+    return {
+        "features": len(tracks.first),
+        "tracks": accepted,
+        "features_in_view": int(inside.sum()),
+        "tracks_right": int(right.sum()),
+        "tracked_share": float(right.sum() / inside.sum()) if np.any(inside) else NAN,
+        "tracks_wrong_share": float(np.mean(~right[tracks.accepted])) if accepted else NAN,
+    }
+
+
+def map_row(
+    p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth
+) -> dict[str, Scalar]:
+    """The maps against the truth; nothing where there is no map."""
+    if not isinstance(estimate.details, HdaDetails) or estimate.details.ground is None:
+        return {}
+    ground = estimate.details.ground
+    at = MapAtPlaces.of(ground, flight, truth, (p.hda.max_slope_rad, p.hda.max_roughness_m))
+    return {**map_errors(ground, flight, at, truth), **hazard_counts(ground, at, truth)}
+
+
+def conditions(
+    p: LandingScenarioParameters,
+    world: World,
+    flight: Flight,
+    pair: Pair,
+    measurements: LandingMeasurements,
+    truth: GroundTruth,
+) -> dict[str, Scalar]:
+    """What the case was like, read from the simulated objects."""
+    fault, size = p.faults.name_and_size
+    sun = world.sun.direction
+    states, poses = flight.states, flight.poses
+    heights = height_above_ground(world.ground.surface, np.stack([state.position_m for state in states]))
+    moved = states[1].position_m - states[0].position_m
+    turned = (states[1].attitude * states[0].attitude.inv()).magnitude()
+    errors = [
+        (pose.world_from_body.rotation * state.attitude.inv()).as_rotvec()
+        for pose, state in zip(poses, states, strict=True)
+    ]
+    upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
+    level = float(np.arccos(np.clip(upright @ measurements.up_body, -1.0, 1.0)))
+    motion_error = np.array(poses[1].world_from_body.translation) - states[1].position_m - flight.position_error_m
+    covered = truth.covered
+    return {
+        "site": p.site,
+        "terrain": p.place.terrain,
+        "fault": fault,
+        "fault_size": size,
+        "place_east_m": p.place.east_m,
+        "place_north_m": p.place.north_m,
+        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0], sun[1])) % 360.0),
+        "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(sun[2], -1.0, 1.0)))),
+        "height_m": float(heights[0]),
+        "baseline_m": float(np.linalg.norm(moved)),
+        "height_change_share": float(moved[2] / heights[0]),
+        "turned_deg": float(np.degrees(turned)),
+        "off_nadir_deg": float(np.degrees(np.arccos(np.clip(upright[2], -1.0, 1.0)))),
+        "exposure_s": pair.images[0].calibration.exposure_s,
+        "picture_median_dn": float(np.median(pair.counts[0])),
+        "range_m": pair.axis_range_m,
+        "range_error_m": measurements.slant_range_m - pair.axis_range_m,
+        "level_error_deg": float(np.degrees(level)),
+        "pose_position_error_m": float(np.linalg.norm(flight.position_error_m)),
+        "pose_motion_error_m": float(np.linalg.norm(motion_error)),
+        "pose_tilt_error_deg": float(np.degrees(np.hypot(*errors[0][:2]))),
+        "pose_azimuth_error_deg": float(np.degrees(errors[0][2])),
+        "pose_turn_error_deg": float(np.degrees(np.linalg.norm(errors[1] - errors[0]))),
+        "covered_m2": float(covered.sum() * truth.step_m**2),
+        "true_slope_median_deg": _median_deg(truth, covered),
+        "rocks_abundance": 0.0 if p.terrain.rocks is None else p.terrain.rocks.abundance,
+    }
+
+
+def _median_deg(truth: GroundTruth, covered: np.ndarray) -> float:
+    return float(np.degrees(np.median(truth.footprints.slope_rad[covered]))) if np.any(covered) else NAN
+
+
+def provenance(p: LandingScenarioParameters, pair: Pair) -> dict[str, Scalar]:
+    """Hash of the pictures, and what their last bits depend on."""
+    digest = hashlib.sha256()
+    for counts in pair.counts:
+        digest.update(np.ascontiguousarray(counts).tobytes())
+    return {
+        "image_hash": digest.hexdigest(),
+        "gl_backend": p.render.backend,
+        "gl_version": process_renderer(p.render.backend).description(),
+        "processor_features": processor_features(),
+    }
+
+
+def products(estimate: SiteEstimate, flight: Flight, pair: Pair, truth: GroundTruth) -> dict[str, Any]:
+    """Arrays from which the case's figures are drawn.
+
+    Those of `algorithms.hda.hda_products` (Figs. 1-5 and 7), and
+
+    - `image_1`, `image_2`: the pictures;
+    - `true_rotation`, `true_translation`: of the second from the first camera;
+    - `true_places`, `true_slope`, `true_roughness`, `true_safe`, `true_covered`: the truth's lattice, world axes;
+    - `true_heights`, `true_corner`, `true_spacing`: exact heights, world axes (row i at y = corner[1] + i spacing);
+    - `camera_true`, `camera_believed`: poses of the body at the first picture (4 x 4), true and on board;
+    - `site_true`: world x, y to which the handed-over coordinates lead (see `site_row`).
+    """
+    kept: dict[str, Any] = {"image_1": pair.counts[0], "image_2": pair.counts[1]}
+    if isinstance(estimate.details, HdaDetails):
+        kept |= hda_products(estimate.details)
+    true = true_motion(flight, pair)
+    kept |= {
+        "true_rotation": true.rotation.as_matrix(),
+        "true_translation": np.array(true.translation),
+        "true_places": truth.places,
+        "true_slope": truth.footprints.slope_rad,
+        "true_roughness": truth.footprints.roughness_m,
+        "true_safe": truth.footprints.safe,
+        "true_covered": truth.covered,
+        "true_heights": truth.relief.heights_m,
+        "true_corner": np.array([truth.relief.west_m, truth.relief.south_m]),
+        "true_spacing": np.array([truth.relief.spacing_m]),
+        "camera_true": flight.states[0].world_from_body.as_matrix(),
+        "camera_believed": flight.poses[0].world_from_body.as_matrix(),
+    }
+    if estimate.site_world is not None:
+        kept["site_true"] = (estimate.site_world - flight.position_error_m)[:2]
+    return kept

@@ -1,0 +1,119 @@
+"""What is true of a flight's ground: where a lander would stand safely, and whether there is such a place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
+
+from scenarios.landing.flight import Flight
+from scenarios.landing.pictures import Pair, seen_by_both
+from scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
+from scenarios.landing.world import World
+
+#: Distance of the places at which the truth is asked for, in diameters of the footprint: 20 cm for 2 m.
+STEP_DIAMETERS = 0.1
+#: Room beyond the ground in sight, in diameters: footprints and landings beside it are still told.
+MARGIN_DIAMETERS = 1.5
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """The true ground of a flight.
+
+    Places are a lattice about the first picture, along its horizontal axes.
+
+    Attributes
+    ----------
+    relief
+        Exact heights.
+    limits
+        What the lander can stand on.
+    places
+        World x, y of the lattice.
+    footprints
+        The ground under a lander at each place.
+    covered
+        Whether both pictures show all of the ground under it.
+    step_m
+        Distance of the places.
+    """
+
+    relief: Relief
+    limits: Limits
+    places: Float[np.ndarray, "rows columns 2"]
+    footprints: Footprints
+    covered: Bool[np.ndarray, "rows columns"]
+    step_m: float
+
+    @classmethod
+    def of(cls, world: World, flight: Flight, pair: Pair, limits: Limits) -> GroundTruth:
+        """The truth about the ground that both pictures show."""
+        centre = flight.states[0].position_m
+        axes = _horizontal_axes(flight.states[0].attitude)
+        points = _border_points(pair)
+        outline = (points - centre[:2]) @ axes.T
+        step = STEP_DIAMETERS * limits.diameter_m
+        low, high = (np.floor(end / step) * step for end in (outline.min(axis=0), outline.max(axis=0)))
+        x, y = (np.arange(a, b + 0.5 * step, step) for a, b in zip(low, high, strict=True))
+        local = np.stack(np.meshgrid(x, y), axis=-1)
+        places = np.asarray(centre[:2] + local @ axes)
+        margin = MARGIN_DIAMETERS * limits.diameter_m
+        corners = places.reshape(-1, 2)
+        relief = Relief.of(
+            world.ground,
+            corners.min(axis=0) - margin,
+            corners.max(axis=0) + margin,
+            SPACING_DIAMETERS * limits.diameter_m,
+        )
+        heights = relief.averaged(places, relief.spacing_m)
+        seen = seen_by_both(pair, flight, np.concatenate([corners, heights.reshape(-1, 1)], axis=1), 0.0)
+        around = distance_transform_edt(np.pad(seen.reshape(heights.shape), 1))[1:-1, 1:-1] * step
+        covered = around >= 0.5 * limits.diameter_m
+        return cls(relief, limits, places, relief.footprints(places, limits), covered, step)
+
+    @property
+    def safe(self) -> Bool[np.ndarray, "rows columns"]:
+        """Where a lander would stand safely on ground that both pictures show."""
+        return np.asarray(self.covered & self.footprints.safe)
+
+    @property
+    def roomy(self) -> Bool[np.ndarray, "rows columns"]:
+        """Safe places with safe places all around up to a radius of the footprint: room for errors."""
+        return np.asarray(distance_transform_edt(np.pad(self.safe, 1))[1:-1, 1:-1] * self.step_m > self.margin_m)
+
+    @property
+    def margin_m(self) -> float:
+        """Room that a roomy place has about it, metres."""
+        return 0.5 * self.limits.diameter_m
+
+    def distance_to_hazard_m(self, place: Float[np.ndarray, "2"]) -> float:
+        """From a place (x, y) to the nearest one where a lander would not stand safely; to the lattice's step."""
+        unsafe = self.places[~self.footprints.safe]
+        return float(np.hypot(*(unsafe - place).T).min()) if len(unsafe) else float("inf")
+
+    def under(self, place: Float[np.ndarray, "2"]) -> Footprints | None:
+        """The ground under a lander at any place (x, y); None where it is not known."""
+        try:
+            return self.relief.footprints(place[None], self.limits)
+        except ValueError:
+            return None
+
+
+def _horizontal_axes(attitude: Rotation) -> Float[np.ndarray, "2 2"]:
+    """The picture's right and up, as unit vectors on the ground (rows)."""
+    right = attitude.apply(np.array([1.0, 0.0, 0.0]))[:2]
+    right = right / np.hypot(*right)
+    return np.array([right, [-right[1], right[0]]])
+
+
+def _border_points(pair: Pair) -> Float[np.ndarray, "n 2"]:
+    """World x, y of what the first picture shows, thinned."""
+    points = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
+    points = points[np.all(np.isfinite(points), axis=1)]
+    hull = cv2.convexHull(points.astype(np.float32))
+    return np.asarray(hull[:, 0].astype(np.float64))

@@ -1,0 +1,71 @@
+"""The world of a landing: ground with rocks, light, and what the camera sees of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from scenarios.landing.parameters import LandingScenarioParameters
+from scenarios.optics import Optics
+from scenarios.views import Eye, SiteGround, site_scene
+from sim.frames import direction
+from sim.render import Scene, Sun
+from sim.sensor import preset
+from sim.terrain import TerrainBank, TerrainParameters, site
+from sim.terrain.sites import SiteTexture
+
+#: Grounds that a worker keeps: their rocks take a second or two to place.
+KEPT_GROUNDS = 64
+
+
+@dataclass(frozen=True)
+class World:
+    """Where a landing happens.
+
+    Attributes
+    ----------
+    ground
+        The terrain with its rocks.
+    sun
+        The sun.
+    brightness
+        Sunlight at the ground over that at 1 AU above the air. The exposure is set by the picture, so that a detector
+        whose responsivity is stated for another distance from the sun is only exposed for longer.
+    """
+
+    ground: SiteGround
+    sun: Sun
+    brightness: float
+
+    @classmethod
+    def of(cls, p: LandingScenarioParameters) -> World:
+        """The world of a case; its terrain comes from the disk, or is built."""
+        ground = site_ground(p.site, p.terrain, p.place.bank_seed, p.place.terrain)
+        textured = SiteTexture(
+            coarsest_m=p.preset.ground_texture.coarsest_m,
+            amplitudes=tuple(p.texture * amplitude for amplitude in p.preset.ground_texture.amplitudes),
+        )
+        ground = replace(ground, site=p.preset.model_copy(update={"ground_texture": textured}))
+        air = p.preset.environment
+        elevation = float(np.radians(p.sun.elevation_deg))
+        sun = Sun(direction(np.radians(p.sun.azimuth_deg), elevation), air.sun_radius_rad)
+        return cls(ground, sun, air.direct_share(elevation) * air.solar_irradiance)
+
+    def scene(self, eye: Eye, caster_diameter_m: float) -> Scene:
+        """One scene for both pictures, as fine as the lower one sees."""
+        return replace(site_scene(self.ground, eye, self.sun), caster_diameter_m=caster_diameter_m)
+
+
+@lru_cache(maxsize=KEPT_GROUNDS)
+def site_ground(site_name: str, terrain: TerrainParameters, bank_seed: int, number: int) -> SiteGround:
+    """A terrain of a site's bank with its rocks, kept by the process."""
+    bank = TerrainBank(terrain, bank_seed)
+    return SiteGround(site(site_name), terrain, bank.terrain(number), bank.rocks(number))
+
+
+@lru_cache(maxsize=4)
+def camera_optics(camera: str) -> Optics:
+    """A camera preset in the body frame: at its origin, looking down, columns along x."""
+    return Optics.of(preset(camera).cameras()[0])
