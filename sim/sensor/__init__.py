@@ -9,6 +9,15 @@ from sim.sensor.imu import Imu, ImuIncrements, ImuParameters, WarmUp
 from sim.sensor.inertial import InertialSolution, NavigationErrors
 from sim.sensor.instrument import Instrument, Readings, Sampling
 from sim.sensor.laser import LaserAltimeter, LaserParameters
+from sim.sensor.mast import (
+    MASTS,
+    Mast,
+    MastState,
+    PointingParameters,
+    StereoCalibrationParameters,
+    StereoHead,
+    stereo_mast,
+)
 from sim.sensor.motion import ImageMotion
 from sim.sensor.odometry import Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
 from sim.sensor.optics import natural_fall_off
@@ -17,6 +26,7 @@ from sim.sensor.radar import RadarAltimeter, RadarParameters
 from sim.sensor.ranging import height_above_ground
 
 __all__ = [
+    "MASTS",
     "POST_PROCESSED",
     "PRESETS",
     "RTK",
@@ -41,19 +51,25 @@ __all__ = [
     "Instrument",
     "LaserAltimeter",
     "LaserParameters",
+    "Mast",
+    "MastState",
     "NavigationErrors",
     "Odometer",
     "OdometryParameters",
+    "PointingParameters",
     "PoseEstimate",
     "Preset",
     "RadarAltimeter",
     "RadarParameters",
     "Readings",
     "Sampling",
+    "StereoCalibrationParameters",
+    "StereoHead",
     "VisualOdometryParameters",
     "WarmUp",
     "auto_expose",
     "height_above_ground",
     "natural_fall_off",
     "preset",
+    "stereo_mast",
 ]
