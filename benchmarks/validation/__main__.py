@@ -9,10 +9,16 @@ import time
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.validation import dimes_checks, document, geometry_checks, light_checks, motion_checks
+from benchmarks.validation import dimes_checks, document, geometry_checks, light_checks, motion_checks, sampling_checks
 from benchmarks.validation.records import Measure
 
-CHECKS = (*geometry_checks.CHECKS, *motion_checks.CHECKS, *light_checks.CHECKS, *dimes_checks.CHECKS)
+CHECKS = (
+    *geometry_checks.CHECKS,
+    *motion_checks.CHECKS,
+    *light_checks.CHECKS,
+    *dimes_checks.CHECKS,
+    *sampling_checks.CHECKS,
+)
 
 
 def _arguments() -> argparse.Namespace:

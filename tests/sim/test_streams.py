@@ -2,7 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.streams import Streams
+from benchmarks.validation.sampling_checks import all_seeds, collisions, seeds, stream_words
+from sim.streams import Streams, stream_key
 
 
 def _first(streams: Streams, name: str) -> tuple[int, ...]:
@@ -46,3 +47,22 @@ def test_streams_of_neighbouring_cases_are_uncorrelated() -> None:
     correlation = np.corrcoef(draws) - np.eye(20)
     # 190 pairs of 1,000 draws: the largest of them stays below 4.5 standard errors
     assert np.abs(correlation).max() < 4.5 / np.sqrt(1000)
+
+
+@given(
+    seed=st.integers(0, 2**63 - 1), campaign=st.text(max_size=5), case=st.integers(0, 2**31), name=st.text(max_size=5)
+)
+def test_seeds_are_worked_out_as_numpy_does(seed, campaign, case, name) -> None:
+    ours = seeds(stream_words(seed, campaign, np.array([case]), name))[0]
+    numpys = np.random.SeedSequence(seed, spawn_key=stream_key(campaign, case, name)).pool
+    assert ours.tolist() == numpys.view(np.uint64).tolist()
+
+
+def test_no_two_of_four_hundred_thousand_streams_share_a_seed() -> None:
+    """By chance that is one in 4e27; `make validate` does it with ten million."""
+    names = [*(f"dispersion:{letter}" for letter in "abcdefghijklmnop"), "gusts", "landing", "altimeter", "clock"]
+    found = all_seeds(campaigns=10, cases=2000, names=names)
+    assert len(found) == 400_000
+    assert collisions(found) == 0
+    # and it would be seen
+    assert collisions(np.concatenate([found, found[7:9]])) == 2
