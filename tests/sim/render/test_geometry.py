@@ -6,10 +6,12 @@ from scipy.ndimage import map_coordinates
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from benchmarks.validation.raycast import Ground
 from sim.camera import Cahvor
 from sim.frames import direction, rigid
 from sim.render import Objects, Photometry, PixelRays, Scene, Sun
 from sim.render.backend import RenderingError
+from sim.render.kernels.ground import cross_ground
 from sim.terrain import Surface
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
@@ -130,6 +132,24 @@ def test_ranges_agree_with_an_independent_ray_cast_over_rough_ground(renderer, r
     theirs = np.array([_cast(rough, pose.translation, ray, t) for ray, t in zip(directions, ours, strict=True)])
     assert np.mean(np.abs(ours / theirs - 1.0) < 1e-6) >= 0.99
     assert np.abs(ours / theirs - 1.0).max() < 1e-4
+
+
+def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough) -> None:
+    """Rays that graze rough ground hundreds of samples away, against steps of a thirtieth of a sample."""
+    rng = np.random.default_rng(3)
+    count, ground = 400, Ground(rough)
+    origins = np.column_stack([rng.uniform(0.0, rough.period_m, (count, 2)), np.full(count, ground.highest + 60.0)])
+    rays = np.array([direction(a, -np.radians(e)) for a, e in rng.uniform([-np.pi, 2.5], [np.pi, 5.0], (count, 2))])
+    expected = ground.cast(origins, rays, 4000.0, 0.05)
+    level, scale = rough.levels[0], 1.0 / rough.spacing_m
+    found = np.array(
+        [
+            cross_ground(level, scale, *origin, *ray, 0.8 * t, 1.25 * t)
+            for origin, ray, t in zip(origins, rays, expected, strict=True)
+        ]
+    )
+    assert np.median(expected) > 500.0 * rough.spacing_m
+    assert np.mean(np.abs(found / expected - 1.0) < 1e-4) > 0.99
 
 
 def test_the_mesh_only_starts_the_search(renderer, rough, descent_camera) -> None:
