@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import types
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from campaigns.dispersions import FRIENDLY, AnyDispersion
+from campaigns.correlation import Correlation
+from campaigns.design import Design
+from campaigns.dispersions import FRIENDLY, AnyDispersion, Grid, Normal
 from campaigns.errors import near_match
 
 #: A key in nested tables and lists, part by part.
 Key = tuple[str | int, ...]
-
-#: Outcome of a case that raised or took its worker process down; no scenario may use the name.
-CRASHED = "CRASHED"
 
 #: The most cases a campaign may have: numbers of cases are stored as 64-bit integers, and a slip of the keyboard shows.
 MOST_CASES = 1_000_000_000
@@ -54,15 +54,43 @@ class Requirement(BaseModel):
 
 
 class Retain(BaseModel):
-    """Which cases keep their products (pictures and intermediate results) beside their rows.
+    """Which cases keep their products (histories, pictures, intermediate results) beside their rows.
 
-    `showcase` is the case that the report shows: the answered case with the worst metric of the first requirement,
-    the first case, or none.
+    Rows are always kept. `showcase` is the case that the report shows: the answered case with the worst metric of the
+    first requirement, the first case, or none.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     showcase: Literal["worst", "first", "none"] = "worst"
+    products: Literal["none", "failed", "worst", "every", "all"] = Field(
+        default="none",
+        description="of no case beside the showcase, of those that fail a requirement, of the `worst` by the metric of "
+        "the first requirement with a bound, of `every` so manieth, or of all",
+    )
+    worst: Annotated[int, Field(strict=True, ge=1)] = 10
+    every: Annotated[int, Field(strict=True, ge=1)] = 100
+    budget_gb: Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)] = Field(
+        default=10.0, description="disk that kept products may take; when it is used up no more are kept"
+    )
+
+
+#: A number above zero, of seconds or bytes.
+_Amount = Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)]
+
+
+class Limits(BaseModel):
+    """What one case may use before it is ended; rows of cases that were ended say so in their outcome."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    case_time_s: _Amount = Field(default=600.0, description="wall-clock time of a case")
+    prepare_time_s: _Amount = Field(default=3600.0, description="wall-clock time of building a shared input")
+    memory_gb: _Amount | None = Field(
+        default=None,
+        description="memory that a worker has to itself; by default a share of 80 % of what is free at the start",
+    )
+    output_mb: _Amount = Field(default=10.0, description="what a case may write to standard output and error")
 
 
 class CampaignConfiguration(BaseModel):
@@ -74,11 +102,22 @@ class CampaignConfiguration(BaseModel):
     scenario: Annotated[str, Field(min_length=1)]
     description: str = ""
     cases: Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)]
-    seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = 0
+    design: Design = Design()
     parameters: dict[str, Any] = {}
     dispersions: dict[str, AnyDispersion] = {}
+    correlations: tuple[Correlation, ...] = ()
     requirements: tuple[Requirement, ...] = ()
     retain: Retain = Retain()
+    limits: Limits = Limits()
+    appended: tuple[Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)], ...] = Field(
+        default=(), strict=False, description="sizes of the blocks of cases that were added behind the first"
+    )
+
+    @property
+    def total_cases(self) -> int:
+        """Cases of all blocks."""
+        return self.cases + sum(self.appended)
 
     @model_validator(mode="after")
     def _requirements_are_told_apart(self) -> CampaignConfiguration:
@@ -87,6 +126,63 @@ class CampaignConfiguration(BaseModel):
         if repeated:
             raise ValueError(f"requirements share an id: {', '.join(repeated)}")
         return self
+
+    @property
+    def grids(self) -> dict[str, Grid]:
+        """The dispersions that are swept, in the file's order."""
+        return {path: one for path, one in self.dispersions.items() if isinstance(one, Grid)}
+
+    @property
+    def grid_size(self) -> int:
+        """Points of the full factorial over the grids; 1 where there are none."""
+        return math.prod(len(grid.points) for grid in self.grids.values())
+
+    @property
+    def blocks(self) -> tuple[int, ...]:
+        """Sizes of the blocks of cases, the first one's before those appended."""
+        return (self.cases, *self.appended)
+
+    def sampling_problems(self) -> list[tuple[Key, str]]:
+        """What is wrong with design, correlated groups and their dispersions together: keys, and what is allowed."""
+        problems: list[tuple[Key, str]] = []
+        unlaid = self.design.problem(self.blocks, self.grid_size)
+        if unlaid is not None:
+            block, message = unlaid
+            problems.append((("appended", block - 1) if block else ("cases",), message))
+        grouped: dict[str, int] = {}
+        for number, group in enumerate(self.correlations):
+            for place, path in enumerate(group.parameters):
+                wrong = self._member_problem(group, path)
+                if path in grouped:
+                    wrong = f"'{path}' is in correlations[{grouped[path]}] already"
+                if wrong:
+                    problems.append((("correlations", number, "parameters", place), wrong))
+                grouped[path] = number
+        stated = {path for group in self.correlations if group.covariance for path in group.parameters}
+        for path, dispersion in self.dispersions.items():
+            if isinstance(dispersion, Normal) and dispersion.sd is None and path not in stated:
+                problems.append((("dispersions", path, "sd"), "required, but missing"))
+            inside = next((other for other in self.dispersions if path.startswith(f"{other}.")), None)
+            if inside is not None:
+                problems.append((("dispersions", path), f"lies within '{inside}', which is dispersed as a whole"))
+        return problems
+
+    def _member_problem(self, group: Correlation, path: str) -> str:
+        """What keeps a dispersion from being correlated; empty if nothing does."""
+        dispersion = self.dispersions.get(path)
+        if dispersion is None:
+            return f"'{path}' is not dispersed{near_match(path, self.dispersions)}"
+        if not dispersion.continuous:
+            return f"'{path}' has no density: only continuous distributions can be correlated"
+        if dispersion.formulas:
+            return f"'{path}' has a formula; allowed: distributions that do not change from case to case"
+        if group.rank is not None:
+            return ""
+        if not isinstance(dispersion, Normal) or dispersion.truncate is not None:
+            return f"'{path}' is not normal and uncut, as {group.kind} asks; state the group's rank correlation instead"
+        if group.covariance is not None and dispersion.sd is not None:
+            return f"'{path}' has an sd, which the covariance states already; leave one of them out"
+        return ""
 
 
 def problems_of(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:
@@ -138,6 +234,18 @@ def fields_at(model: type[BaseModel], location: Sequence[str | int]) -> list[str
         here = _inner(here, part)
     models = [kind for kind in _alternatives(here) if isinstance(kind, type) and issubclass(kind, BaseModel)]
     return sorted({name for kind in models for name in kind.model_fields})
+
+
+def description_at(model: type[BaseModel], path: str) -> str:
+    """What a model says of its field at a dotted path; empty where it says nothing."""
+    *tables, name = path.split(".")
+    here: Any = model
+    for part in tables:
+        here = _inner(here, int(part) if part.isdigit() else part)
+    for kind in _alternatives(here):
+        if isinstance(kind, type) and issubclass(kind, BaseModel) and name in kind.model_fields:
+            return kind.model_fields[name].description or ""
+    return ""
 
 
 def _inner(kind: Any, part: str | int) -> Any:

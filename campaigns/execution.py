@@ -6,13 +6,17 @@ import re
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
-from campaigns.configuration import CRASHED, CampaignConfiguration
+from campaigns.configuration import CampaignConfiguration, Limits
+from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
+from campaigns.products import PackedProducts, pack_products
+from campaigns.retention import Keep
 from campaigns.sampling import Campaign
-from campaigns.workers import WorkerDiedError, Workers, limit_threads
+from campaigns.worker_process import LOADING_S, Done, settle, start_clock
+from campaigns.workers import Workers, WorkLimits, limit_threads
 from scenarios.interface import CaseResult, Scalar
 from scenarios.registry import scenario
 
@@ -26,49 +30,64 @@ TRAILING_COLUMNS = ("wall_time_s", "cpu_time_s", "error", "traceback")
 
 @dataclass(frozen=True)
 class CompletedCase:
-    """A case's row and, where asked for, the products of the scenario."""
+    """A case's row and, where they are kept, the products of the scenario.
+
+    `note` is why products that were to be kept could not be.
+    """
 
     row: Row
-    products: Mapping[str, Any] = field(default_factory=dict)
+    products: PackedProducts | None = None
+    note: str = ""
 
 
-def configuration_text(campaign: Campaign) -> str:
+def configuration_text(configuration: CampaignConfiguration) -> str:
     """The configuration as it travels to the workers and into `campaign.json`."""
-    return campaign.configuration.model_dump_json()
+    return configuration.model_dump_json()
 
 
 @lru_cache(maxsize=1)
 def _campaign(configuration: str) -> Campaign:
     """The campaign that a worker works on; a pure function of its text, kept because reading it takes time."""
+    start_clock(grace_s=LOADING_S)
     stated = CampaignConfiguration.model_validate_json(configuration)
     found = scenario(stated.scenario)
     limit_threads()
+    settle()
+    start_clock()
     return Campaign(stated, found)
 
 
-def run_case(configuration: str, keep_products: bool, case: int) -> CompletedCase:
+def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
     """Runs one case; whatever it raises becomes part of its row.
 
     Parameters
     ----------
     configuration
         From `configuration_text`.
-    keep_products
+    keep
         Whether the scenario's products come back with the row.
     case
         The case's number.
     """
     wall, cpu = time.perf_counter(), time.process_time()
+    products: Mapping[str, Any] = {}
     try:
         campaign = _campaign(configuration)
         wall, cpu = time.perf_counter(), time.process_time()
         result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
         row = _scored(case, result)
-        products = result.products if keep_products else {}
+        products = result.products
     except BaseException as error:
-        row, products = crashed_row(case, error, traceback.format_exc()), {}
+        outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
+        row = unfinished_row(case, outcome, f"{type(error).__name__}: {error}", traceback.format_exc())
     times = {"wall_time_s": time.perf_counter() - wall, "cpu_time_s": time.process_time() - cpu}
-    return CompletedCase({**row, **times}, products)
+    row = {**row, **times}
+    if not products or not keep.wants(row):
+        return CompletedCase(row)
+    try:
+        return CompletedCase(row, pack_products(products))
+    except TypeError as error:
+        return CompletedCase(row, None, f"the products of case {case} could not be kept: {error}")
 
 
 def prepare_input(configuration: str, shared_input: int) -> None:
@@ -78,46 +97,72 @@ def prepare_input(configuration: str, shared_input: int) -> None:
 
 
 def run_cases(
-    workers: Workers, configuration: str, cases: Iterable[int], *, keep_products: bool = False
-) -> Iterator[CompletedCase]:
-    """Runs cases, and yields each as it ends; a case that takes its worker down is a crashed one."""
-    task: Callable[[int], CompletedCase] = partial(run_case, configuration, keep_products)
-    for done in workers.run(task, cases):
-        if done.result is not None:
-            yield done.result
-        elif done.error is not None:
-            times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
-            trace = _above_engine(done.error.trace) if isinstance(done.error, WorkerDiedError) else ""
-            yield CompletedCase({**crashed_row(done.item, done.error, trace), **times})
+    workers: Workers,
+    configuration: CampaignConfiguration,
+    cases: Iterable[int],
+    *,
+    keep: Keep,
+    total: int | None = None,
+) -> Iterator[list[CompletedCase]]:
+    """Runs cases, and yields them as they end; one that takes its worker down, or must be ended, has a row as well."""
+    task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), keep)
+    for ended in workers.run(task, cases, case_limits(configuration.limits), total):
+        yield [_completed(done) for done in ended]
 
 
-def crashed_row(case: int, error: BaseException, trace: str) -> Row:
+def case_limits(limits: Limits) -> WorkLimits:
+    """What one case may use."""
+    memory = None if limits.memory_gb is None else limits.memory_gb * 1e9
+    return WorkLimits(limits.case_time_s, memory, limits.output_mb * 1e6)
+
+
+def prepare_limits(limits: Limits) -> WorkLimits:
+    """What building one shared input may use."""
+    return WorkLimits(limits.prepare_time_s, case_limits(limits).memory_bytes, limits.output_mb * 1e6)
+
+
+def _completed(done: Done[CompletedCase]) -> CompletedCase:
+    """What became of a case, as a row in any event."""
+    if done.result is not None:
+        return done.result
+    error = done.error
+    times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
+    if isinstance(error, CaseEndedError):
+        return CompletedCase({**unfinished_row(done.item, error.outcome, str(error), _above(error.trace)), **times})
+    return CompletedCase({**unfinished_row(done.item, CRASHED, f"{type(error).__name__}: {error}", ""), **times})
+
+
+def unfinished_row(case: int, outcome: str, error: str, trace: str) -> Row:
     """The row of a case that did not come to an end."""
     return {
         "case": case,
-        "outcome": CRASHED,
+        "outcome": outcome,
         "answered": False,
-        "error": _without_addresses(f"{type(error).__name__}: {error}"),
-        "traceback": _without_addresses(trace),
+        "error": _plain_text(error),
+        "traceback": _plain_text(trace),
     }
 
 
-def _above_engine(trace: str) -> str:
-    """The frames of a dump down to the one in which the engine called the scenario."""
+def _above(trace: str) -> str:
+    """A dump of frames without those above the one in which the engine called the scenario."""
     lines = trace.splitlines()
-    last = next((place for place, line in enumerate(lines) if line.endswith(" in run_case")), len(lines))
-    return "\n".join(lines[: last + 1])
+    called = next((place for place, line in enumerate(lines) if line.endswith(" in run_case")), None)
+    if called is None:
+        return trace
+    after = next((k for k in range(called + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines))
+    return "\n".join([*lines[: called + 1], *lines[after:]])
 
 
-def _without_addresses(text: str) -> str:
-    """Text without the addresses of objects, which change from run to run."""
-    return re.sub(r"\b0x[0-9a-fA-F]{4,}\b", "0x...", text)
+def _plain_text(text: str) -> str:
+    """Text that any file takes, without the addresses of objects, which change from run to run."""
+    text = re.sub(r"\b0x[0-9a-fA-F]{4,}\b", "0x...", text)
+    return text.encode("utf-8", errors="replace").decode("utf-8")
 
 
 def _scored(case: int, result: CaseResult) -> Row:
     """The row of a case that came to an end, in plain Python values."""
-    if result.outcome == CRASHED:
-        raise ValueError(f"the outcome {CRASHED} is kept for cases that do not come to an end")
+    if result.outcome in UNFINISHED:
+        raise ValueError(f"the outcome {result.outcome} is kept for cases that do not come to an end")
     clashes = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(result.row))
     if clashes:
         raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(clashes)}")
@@ -129,6 +174,8 @@ def _scored(case: int, result: CaseResult) -> Row:
 def _plain(column: str, value: Any) -> Scalar:
     """A value as one of Python's own; NumPy's scalars are unwrapped."""
     plain = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
-    if type(plain) in (float, int, str, bool):
+    if type(plain) in (float, int, bool):
         return plain  # type: ignore[no-any-return]
+    if type(plain) is str:
+        return plain.encode("utf-8", errors="replace").decode("utf-8")
     raise TypeError(f"column {column} holds a {type(value).__name__}; allowed: float, int, str, bool")

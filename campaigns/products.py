@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -16,8 +19,26 @@ from campaigns.errors import StoreError
 _ARRAY = "__array__"
 
 
-def save_products(directory: Path, products: Mapping[str, Any]) -> None:
-    """Writes products into a folder.
+@dataclass(frozen=True)
+class PackedProducts:
+    """A case's products as the bytes of their two files."""
+
+    outline: bytes
+    arrays: bytes
+
+    @staticmethod
+    def nothing() -> PackedProducts:
+        """No products at all."""
+        return pack_products({})
+
+    @property
+    def size(self) -> int:
+        """Bytes on disk."""
+        return len(self.outline) + len(self.arrays)
+
+
+def pack_products(products: Mapping[str, Any]) -> PackedProducts:
+    """Products as they lie on disk, so that a worker does the work and another process writes them.
 
     Raises
     ------
@@ -26,10 +47,35 @@ def save_products(directory: Path, products: Mapping[str, Any]) -> None:
     """
     arrays: dict[str, np.ndarray] = {}
     outline = _outline(products, "products", arrays)
-    text = json.dumps(outline, indent=2)
-    directory.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(directory / "products.npz", allow_pickle=False, **arrays)
-    (directory / "products.json").write_text(text + "\n", encoding="utf-8")
+    text = json.dumps(outline, indent=2) + "\n"
+    file = io.BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **arrays)
+    return PackedProducts(text.encode(), file.getvalue())
+
+
+def save_packed(directory: Path, packed: PackedProducts, row: Mapping[str, Any]) -> None:
+    """Writes packed products and their case's row into a folder, in the place of those that it may hold.
+
+    Raises
+    ------
+    StoreError
+        Where the folder cannot be written.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        (directory / "row.json").write_text(json.dumps(dict(row), indent=2) + "\n", encoding="utf-8")
+        (directory / "products.npz").write_bytes(packed.arrays)
+        # last, as a folder that has it counts as one of a kept case
+        (directory / "products.json").write_bytes(packed.outline)
+    except OSError as error:
+        raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
+
+
+def unpack_products(packed: PackedProducts) -> dict[str, Any]:
+    """The products that were packed; tuples come back as lists."""
+    with np.load(io.BytesIO(packed.arrays), allow_pickle=False) as arrays:
+        filled: dict[str, Any] = _filled(json.loads(packed.outline), arrays)
+    return filled
 
 
 def _outline(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
@@ -64,12 +110,10 @@ def load_products(directory: Path) -> dict[str, Any]:
         Where the folder holds none.
     """
     try:
-        outline = json.loads((directory / "products.json").read_text(encoding="utf-8"))
-        with np.load(directory / "products.npz", allow_pickle=False) as arrays:
-            loaded: dict[str, Any] = _filled(outline, arrays)
-    except (OSError, ValueError, KeyError) as error:
+        files = [(directory / name).read_bytes() for name in ("products.json", "products.npz")]
+        return unpack_products(PackedProducts(*files))
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise StoreError(f"{directory} holds no products of a case: {error}") from error
-    return loaded
 
 
 def _filled(outline: Any, arrays: Mapping[str, np.ndarray]) -> Any:

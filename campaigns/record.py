@@ -11,13 +11,12 @@ import shutil
 import subprocess
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from campaigns.configuration import CampaignConfiguration
 from campaigns.errors import StoreError
-from campaigns.sampling import Campaign
+from campaigns.identity import Identity
 
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1
@@ -33,53 +32,79 @@ def utc_now() -> str:
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def begin(directory: Path, campaign: Campaign, jobs: int) -> None:
-    """Claims a folder for a campaign and writes its record.
+def claim(directory: Path) -> None:
+    """Makes a folder for a campaign.
 
     Raises
     ------
     StoreError
-        Where the folder holds a campaign, or cannot be written.
+        Where it holds a campaign, or cannot be written.
     """
-    configuration = campaign.configuration.model_dump(mode="json")
-    record = {
-        "schema": SCHEMA,
-        "name": campaign.configuration.name,
-        "state": "running",
-        "exit_code": None,
-        "started_utc": utc_now(),
-        "finished_utc": None,
-        "cases": campaign.configuration.cases,
-        "cases_finished": 0,
-        "cases_crashed": 0,
-        "seed": campaign.configuration.seed,
-        "jobs": jobs,
-        "requirements": configuration["requirements"],
-        "configuration": configuration,
-        "showcase": None,
-        "versions": package_versions(),
-        "git_commit": git_commit(),
-        "environment": machine(),
-    }
     try:
         directory.mkdir(parents=True, exist_ok=True)
         held = [name for name in OWN_FILES if (directory / name).exists()]
-        if held:
-            raise StoreError(f"{directory} already holds a campaign ({held[0]}); choose another folder with --out")
-        with (directory / RECORD_FILE).open("x", encoding="utf-8") as file:
-            file.write(_text(record))
     except FileExistsError as error:
         raise StoreError(f"{directory} is taken; choose another folder with --out") from error
     except OSError as error:
         raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
+    if held:
+        raise StoreError(f"{directory} already holds a campaign ({held[0]}); choose another folder with --out")
+
+
+def begin(directory: Path, configuration: CampaignConfiguration, identity: Identity, crew: str) -> None:
+    """Writes the record of a campaign that begins; `crew` says who runs it."""
+    stated = configuration.model_dump(mode="json")
+    write(
+        directory,
+        {
+            "schema": SCHEMA,
+            "name": configuration.name,
+            "state": "running",
+            "exit_code": None,
+            "started_utc": utc_now(),
+            "finished_utc": None,
+            "cases": configuration.total_cases,
+            "cases_finished": 0,
+            "cases_crashed": 0,
+            "seed": configuration.seed,
+            "requirements": stated["requirements"],
+            "configuration": stated,
+            "identity": identity.plain(),
+            "sessions": [session("run", crew, 0)],
+            "changes": [],
+            "showcase": None,
+            "versions": dict(identity.versions),
+            "git_commit": git_commit(),
+            "environment": machine(),
+        },
+    )
+
+
+def session(command: str, crew: str, cases_before: int) -> dict[str, Any]:
+    """One stretch of work on a campaign, as it stands in the record."""
+    return {"command": command, "started_utc": utc_now(), "workers": crew, "cases_before": cases_before}
 
 
 def update(directory: Path, changes: Mapping[str, Any]) -> None:
     """Writes changes into a campaign's record, whole or not at all."""
+    write(directory, {**read(directory), **changes})
+
+
+def write(directory: Path, record: Mapping[str, Any]) -> None:
+    """Writes a campaign's record, whole or not at all.
+
+    Raises
+    ------
+    StoreError
+        Where that fails; the record that was there stays.
+    """
     path = directory / RECORD_FILE
     partial = path.with_suffix(".partial")
     try:
-        partial.write_text(_text({**read(directory), **changes}), encoding="utf-8")
+        with partial.open("w", encoding="utf-8") as file:
+            file.write(_text(record))
+            file.flush()
+            os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
         raise StoreError(f"{path} cannot be written: {error.strerror or error}") from error
@@ -120,22 +145,6 @@ def stored_configuration(directory: Path) -> CampaignConfiguration:
         return CampaignConfiguration.model_validate(read(directory)["configuration"])
     except (ValueError, KeyError) as error:
         raise StoreError(f"{directory / RECORD_FILE} is damaged: {error}") from error
-
-
-def package_versions() -> dict[str, str]:
-    """Versions of Marsyard and of the packages that it requires."""
-    try:
-        requirements = metadata.requires("marsyard") or []
-    except metadata.PackageNotFoundError:
-        requirements = []
-    names = {re.split(r"[^A-Za-z0-9._-]", text)[0] for text in requirements if "extra ==" not in text}
-    versions = {}
-    for name in sorted({"marsyard", *names}):
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
 
 
 def git_commit() -> str | None:

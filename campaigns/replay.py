@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from campaigns.configuration import CampaignConfiguration
-from campaigns.errors import CampaignError, StoreError
+from campaigns.errors import CampaignError
 from campaigns.execution import Row, run_cases
-from campaigns.products import save_products
-from campaigns.record import stored_configuration
-from campaigns.store import TABLE_FILE, read_rows
-from campaigns.workers import Workers
+from campaigns.identity import Identity, identity_of
+from campaigns.outcomes import UNFINISHED
+from campaigns.products import PackedProducts
+from campaigns.record import read, stored_configuration
+from campaigns.retention import KEEP_ALL
+from campaigns.table import stored_row
+from campaigns.workers import LocalWorkers, Workers
 
 
 @dataclass(frozen=True)
@@ -32,19 +33,20 @@ class Replay:
     differing
         The columns in which the two differ, those with `time` in their name aside.
     products
-        What the scenario delivered for figures.
+        What the scenario delivered for figures; None where it delivered nothing, or nothing that can be stored.
+    note
+        Why there are none; empty where nothing is amiss.
+    changed
+        In what the configuration, the code and the packages' versions differ from those that the campaign ran with.
     """
 
     case: int
     row: Row
     stored: Row | None
     differing: tuple[str, ...]
-    products: Mapping[str, Any]
-
-
-def case_directory(directory: Path, case: int) -> Path:
-    """Where a campaign keeps the products of a case."""
-    return directory / "cases" / str(case)
+    products: PackedProducts | None
+    note: str = ""
+    changed: tuple[str, ...] = ()
 
 
 def replay(directory: Path, case: int) -> Replay:
@@ -56,30 +58,32 @@ def replay(directory: Path, case: int) -> Replay:
         Where the folder holds no campaign, or the campaign has no such case.
     """
     configuration = stored_configuration(directory)
-    if not 0 <= case < configuration.cases:
-        raise CampaignError(f"{directory} has no case {case}; allowed: 0 to {configuration.cases - 1}")
-    stored = _stored_row(directory, case)
-    with Workers(1) as workers:
-        return replay_with(workers, configuration, case, stored)
+    if not 0 <= case < configuration.total_cases:
+        raise CampaignError(f"{directory} has no case {case}; allowed: 0 to {configuration.total_cases - 1}")
+    stored = stored_row(directory, case)
+    identity = read(directory).get("identity")
+    changed = Identity.read(identity).differences(identity_of(configuration)) if identity else []
+    with LocalWorkers(1) as workers:
+        return replay_with(workers, configuration, case, stored, tuple(changed))
 
 
-def replay_with(workers: Workers, configuration: CampaignConfiguration, case: int, stored: Row | None) -> Replay:
+def replay_with(
+    workers: Workers, configuration: CampaignConfiguration, case: int, stored: Row | None, changed: tuple[str, ...] = ()
+) -> Replay:
     """Runs one case again in workers that are there, and compares it with a row."""
-    (completed,) = run_cases(workers, configuration.model_dump_json(), [case], keep_products=True)
+    ((completed,),) = run_cases(workers, configuration, [case], keep=KEEP_ALL)
     differing = differing_columns(completed.row, stored) if stored is not None else ()
-    return Replay(case, completed.row, stored, differing, completed.products)
-
-
-def _stored_row(directory: Path, case: int) -> Row | None:
-    """A case's row in the table, or None if there is none."""
-    if not (directory / TABLE_FILE).exists():
-        return None
-    return next((row for row in read_rows(directory / TABLE_FILE) if row.get("case") == case), None)
+    return Replay(case, completed.row, stored, differing, completed.products, completed.note, changed)
 
 
 def differing_columns(row: Row, other: Row) -> tuple[str, ...]:
-    """Columns in which two rows differ: bit for bit, NaN equal to NaN and to nothing, times aside."""
-    names = [name for name in dict.fromkeys((*row, *other)) if "time" not in name]
+    """Columns in which two rows differ: bit for bit, NaN equal to NaN and to nothing, times aside.
+
+    Where a case did not come to its end its traceback is left aside: a process that is ended does not stand at the same
+    place twice.
+    """
+    aside = {"traceback"} if row.get("outcome") in UNFINISHED else set()
+    names = [name for name in dict.fromkeys((*row, *other)) if "time" not in name and name not in aside]
     return tuple(name for name in names if not _same(row.get(name), other.get(name)))
 
 
@@ -92,19 +96,3 @@ def _same(value: Any, other: Any) -> bool:
 
 def _absent(value: Any) -> bool:
     return value is None or value != value
-
-
-def save_replay(directory: Path, replayed: Replay) -> None:
-    """Writes a replayed case's row and products into a folder.
-
-    Raises
-    ------
-    StoreError
-        Where the folder cannot be written.
-    """
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        (directory / "row.json").write_text(json.dumps(dict(replayed.row), indent=2) + "\n", encoding="utf-8")
-        save_products(directory, replayed.products)
-    except OSError as error:
-        raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error

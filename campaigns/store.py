@@ -1,40 +1,135 @@
-"""Rows on disk: SQLite while a campaign runs, one transaction a row, and a Parquet table of all when it ends."""
+"""Rows as they are stored while a campaign runs and for good: one SQLite file, written by one process.
+
+The file is the campaign's memory: the Parquet table is made from it and can be made again. A row is a list of values in
+JSON; which columns they are is stored once a layout.
+
+Durability: the journal is a write-ahead log with `synchronous = FULL`, so that a transaction that was committed
+outlives a killed program, and a machine that loses its power as far as the disk keeps what it was told to. That costs
+one `fsync` a batch, some milliseconds for half a second of work.
+"""
 
 from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from campaigns.errors import StoreError
-from campaigns.execution import LEADING_COLUMNS, TRAILING_COLUMNS, Row
+from campaigns.execution import Row
+from campaigns.outcomes import UNFINISHED
 
-TABLE_FILE = "cases.parquet"
 ROWS_FILE = "cases.sqlite"
+
+#: Version of the tables below, kept as `PRAGMA user_version`.
+STORE_VERSION = 2
+
+#: Marks the file as ours (`PRAGMA application_id`): "Mars".
+_APPLICATION = int.from_bytes(b"Mars", "big")
+
+_TABLES = f"""
+PRAGMA journal_mode = DELETE;
+PRAGMA application_id = {_APPLICATION};
+PRAGMA user_version = {STORE_VERSION};
+BEGIN;
+CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE layouts (layout INTEGER PRIMARY KEY, names TEXT NOT NULL UNIQUE);
+CREATE TABLE kinds (name TEXT NOT NULL, kind TEXT NOT NULL, PRIMARY KEY (name, kind));
+CREATE TABLE cases (
+    case_number INTEGER PRIMARY KEY, outcome TEXT NOT NULL, layout INTEGER NOT NULL, row TEXT NOT NULL
+);
+COMMIT;
+"""
+
+
+def create_store(path: Path, about: Mapping[str, str]) -> None:
+    """Makes an empty store, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        Where nothing may be yet.
+    about
+        What the rows belong to; see `RowStore.about`.
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        partial.unlink(missing_ok=True)
+        connection = sqlite3.connect(partial, isolation_level=None)
+        try:
+            connection.executescript(_TABLES)
+            connection.executemany("INSERT INTO about VALUES (?, ?)", about.items())
+        finally:
+            connection.close()
+        partial.rename(path)
+    except (sqlite3.Error, OSError) as error:
+        raise StoreError(f"{path} cannot be written: {error}") from error
 
 
 class RowStore:
-    """The rows of a running campaign, written by one process only.
+    """The rows of a campaign, as a context.
 
-    The database is locked for as long as it is open. Its journal is a write-ahead log, so that a row is safe from a
-    killed program as soon as `add` returns.
+    Parameters
+    ----------
+    path
+        A file made by `create_store`.
+    thorough
+        Whether every page is held against its neighbours first, as is due before more is written.
+
+    Raises
+    ------
+    StoreError
+        Where there is no such file, it is damaged, or of another version. Nothing is written to it then.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, thorough: bool = False) -> None:
         self._path = path
+        if not path.is_file():
+            raise StoreError(f"{path}: no such file; the rows of this campaign cannot be added to")
         try:
-            self._connection = sqlite3.connect(path, isolation_level=None, timeout=0.0)
-            self._connection.execute("PRAGMA locking_mode = EXCLUSIVE")
-            self._connection.execute("PRAGMA journal_mode = WAL")
-            self._connection.execute("PRAGMA synchronous = NORMAL")
-            self._connection.execute(
-                "CREATE TABLE IF NOT EXISTS cases (case_number INTEGER PRIMARY KEY, row TEXT NOT NULL)"
-            )
+            self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, isolation_level=None)
         except sqlite3.Error as error:
-            raise StoreError(f"{path}: {error}") from error
+            raise StoreError(f"{path} cannot be opened: {error}") from error
+        try:
+            self._check(thorough)
+            self._connection.execute("PRAGMA journal_mode = WAL")
+            self._connection.execute("PRAGMA synchronous = FULL")
+            self._layouts = {
+                tuple(json.loads(names)): layout
+                for layout, names in self._connection.execute("SELECT layout, names FROM layouts")
+            }
+            self._kinds = set(self._connection.execute("SELECT name, kind FROM kinds"))
+        except BaseException as error:
+            self._connection.close()
+            if isinstance(error, sqlite3.Error):
+                raise self._failed(error) from error
+            raise
+
+    def _check(self, thorough: bool) -> None:
+        """Refuses what is not ours, not of this version, or not whole."""
+        (application,) = self._connection.execute("PRAGMA application_id").fetchone()
+        (version,) = self._connection.execute("PRAGMA user_version").fetchone()
+        if application != _APPLICATION:
+            raise StoreError(f"{self._path} is damaged, or no store of this version: it does not say that it is one")
+        if version != STORE_VERSION:
+            raise StoreError(f"{self._path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
+        if thorough:
+            found = [text for (text,) in self._connection.execute("PRAGMA quick_check(1)")]
+            if found != ["ok"]:
+                raise StoreError(f"{self._path} is damaged: {' '.join(found)}; nothing was written to it")
+
+    def _failed(self, error: sqlite3.Error) -> StoreError:
+        """What went wrong, in one sentence that says what to do."""
+        text = str(error)
+        if "full" in text:
+            return StoreError(f"{self._path}: the disk is full; the rows before that are safe: make room and resume")
+        if "malformed" in text or "not a database" in text:
+            return StoreError(f"{self._path} is damaged: {text}; nothing was written to it")
+        return StoreError(f"{self._path}: {text}")
 
     def __enter__(self) -> Self:
         return self
@@ -42,87 +137,125 @@ class RowStore:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._connection.close()
+        # Closing clears the log up, which may fail where writing did; the log then stays and is read the next time.
+        with suppress(sqlite3.Error):
+            self._connection.close()
 
-    def add(self, row: Row) -> None:
-        """Stores a row."""
+    @property
+    def about(self) -> dict[str, str]:
+        """What was said of the rows when the store was made."""
+        return dict(self._connection.execute("SELECT key, value FROM about"))
+
+    def add(self, rows: Iterable[Row]) -> None:
+        """Stores rows in one transaction; a case that has a row gets the new one.
+
+        Raises
+        ------
+        StoreError
+            Where that fails; then none of them is stored.
+        """
         try:
-            self._connection.execute("INSERT INTO cases VALUES (?, ?)", (row["case"], json.dumps(dict(row))))
+            self._connection.execute("BEGIN IMMEDIATE")
+            try:
+                self._connection.executemany(
+                    "INSERT OR REPLACE INTO cases VALUES (?, ?, ?, ?)", [self._entry(row) for row in rows]
+                )
+                self._connection.execute("COMMIT")
+            except BaseException:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+                raise
         except sqlite3.Error as error:
-            raise StoreError(f"{self._path}: {error}") from error
+            raise self._failed(error) from error
+
+    def _entry(self, row: Row) -> tuple[Any, ...]:
+        names = tuple(row)
+        layout = self._layouts.get(names)
+        if layout is None:
+            layout = len(self._layouts)
+            self._connection.execute("INSERT INTO layouts VALUES (?, ?)", (layout, json.dumps(names)))
+            self._layouts[names] = layout
+        for name, value in row.items():
+            kind = (name, kind_of(value))
+            if kind not in self._kinds:
+                self._connection.execute("INSERT INTO kinds VALUES (?, ?)", kind)
+                self._kinds.add(kind)
+        return row["case"], row["outcome"], layout, json.dumps(list(row.values()))
+
+    def count(self) -> int:
+        """Cases that have a row."""
+        (number,) = self._ask("SELECT count(*) FROM cases").fetchone()
+        return int(number)
+
+    def outcomes(self) -> dict[str, int]:
+        """How many cases came to each outcome."""
+        return dict(self._ask("SELECT outcome, count(*) FROM cases GROUP BY outcome"))
+
+    def unfinished(self) -> int:
+        """Cases that did not come to their end."""
+        return sum(number for outcome, number in self.outcomes().items() if outcome in UNFINISHED)
+
+    def missing(self, total: int) -> list[range]:
+        """The cases below `total` that have no row."""
+        ends = [-1, *(number for (number,) in self._ask("SELECT case_number FROM cases ORDER BY 1")), total]
+        return [range(before + 1, after) for before, after in pairwise(ends) if after > before + 1]
+
+    def with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
+        """The cases that came to any of some outcomes."""
+        asked = sorted(outcomes)
+        marks = ", ".join("?" * len(asked))
+        query = f"SELECT case_number FROM cases WHERE outcome IN ({marks}) ORDER BY 1"  # noqa: S608 (marks only)
+        return [number for (number,) in self._ask(query, asked)]
+
+    def first_completed(self) -> int | None:
+        """The first case that came to its end; None where none did."""
+        marks = ", ".join("?" * len(UNFINISHED))
+        query = f"SELECT min(case_number) FROM cases WHERE outcome NOT IN ({marks})"  # noqa: S608 (marks only)
+        (found,) = self._ask(query, sorted(UNFINISHED)).fetchone()
+        return None if found is None else int(found)
+
+    def row(self, case: int) -> Row | None:
+        """The row of a case; None where it has none."""
+        found = self._ask("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
+        return None if found is None else dict(zip(self.names()[found[0]], json.loads(found[1]), strict=True))
 
     def rows(self) -> Iterator[Row]:
         """The rows in the order of their cases."""
-        for (text,) in self._connection.execute("SELECT row FROM cases ORDER BY case_number"):
-            yield json.loads(text)
+        names = self.names()
+        for layout, text in self._ask("SELECT layout, row FROM cases ORDER BY case_number"):
+            yield dict(zip(names[layout], json.loads(text), strict=True))
 
+    def names(self) -> dict[int, tuple[str, ...]]:
+        """The columns of each layout, in the order in which the layouts come with the cases."""
+        order = self._ask("SELECT layout FROM cases GROUP BY layout ORDER BY min(case_number)")
+        known = {layout: names for names, layout in self._layouts.items()}
+        return {layout: known[layout] for (layout,) in order}
 
-def columns_of(rows: Sequence[Row]) -> list[str]:
-    """Every column in any row: the engine's first and last, the scenario's between them as they first appear."""
-    found = dict.fromkeys(name for row in rows for name in row)
-    own = [name for name in found if name not in LEADING_COLUMNS and name not in TRAILING_COLUMNS]
-    return [*LEADING_COLUMNS, *own, *TRAILING_COLUMNS]
+    def kinds(self) -> dict[str, set[str]]:
+        """What each column holds: any of `bool`, `int`, `big` (beyond 64 bits), `float`, `str`."""
+        found: dict[str, set[str]] = {}
+        for name, kind in self._kinds:
+            found.setdefault(name, set()).add(kind)
+        return found
 
+    def chunks(self, size: int) -> Iterator[list[tuple[int, list[Any]]]]:
+        """Layouts and values of all rows in the order of their cases, so many at a time."""
+        cursor = self._ask("SELECT layout, row FROM cases ORDER BY case_number")
+        while found := cursor.fetchmany(size):
+            # one text for all: half the time of reading them one by one
+            values = json.loads(f"[{','.join(text for _, text in found)}]")
+            yield [(layout, row) for (layout, _), row in zip(found, values, strict=True)]
 
-def write_table(path: Path, rows: Sequence[Row], measures: Sequence[str] = ()) -> None:
-    """Writes rows as a Parquet table, whole or not at all.
-
-    A number that a row lacks is NaN, anything else that it lacks is null.
-
-    Parameters
-    ----------
-    path
-        Where to.
-    rows
-        In the order in which they are to stand.
-    measures
-        Columns of numbers that the table must have even where no row does.
-    """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    names = columns_of(rows)
-    own = names[: -len(TRAILING_COLUMNS)]
-    names = [*own, *(name for name in measures if name not in names), *TRAILING_COLUMNS]
-    table = pa.table({name: _column([row.get(name) for row in rows]) for name in names})
-    partial = path.with_suffix(".partial")
-    try:
-        pq.write_table(table, partial)
-        partial.replace(path)
-    except OSError as error:
-        raise StoreError(f"{path}: {error.strerror or error}") from error
-
-
-def _column(values: list[Any]) -> Any:
-    """A column of the narrowest type that holds all its values."""
-    import pyarrow as pa
-
-    kinds = {type(value) for value in values if value is not None}
-    if kinds <= {bool} and kinds:
-        return pa.array(values, pa.bool_())
-    if kinds == {int}:
+    def _ask(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
         try:
-            return pa.array(values, pa.int64())
-        except OverflowError:
-            kinds = {float}
-    if kinds <= {int, float}:
-        return pa.array([float("nan") if value is None else float(value) for value in values], pa.float64())
-    return pa.array([None if value is None else str(value) for value in values], pa.string())
+            return self._connection.execute(query, values)
+        except sqlite3.Error as error:
+            raise self._failed(error) from error
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a Parquet table, without what they lack.
-
-    Raises
-    ------
-    StoreError
-        Where there is no such table.
-    """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        rows: list[dict[str, Any]] = pq.read_table(path).to_pylist()
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"{path}: not a table of cases: {error}") from error
-    return [{name: value for name, value in row.items() if value is not None} for row in rows]
+def kind_of(value: Any) -> str:
+    """What a value is, in the words of `RowStore.kinds`."""
+    kind = type(value)
+    if kind is int and not -(2**63) <= value < 2**63:
+        return "big"
+    return kind.__name__

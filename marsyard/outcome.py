@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from campaigns import record
 from campaigns.errors import StoreError
-from campaigns.store import TABLE_FILE
+from campaigns.lock import is_locked
+from campaigns.table import TABLE_FILE, refresh_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,32 +18,49 @@ if TYPE_CHECKING:
 def conclude(directory: Path, console: Console) -> int:
     """Judges a campaign, writes its report, prints both, and returns the exit status.
 
+    Of a campaign that is not finished the rows are judged that it has so far, and the record is left alone.
+
     Raises
     ------
     StoreError
         Where the folder holds no campaign with rows, or the report cannot be written.
     """
     from reports.campaign import write_report
+    from reports.sampled import sampled
     from reports.tables import verdict_table
     from reports.verdicts import exit_code, judge_campaign, overall
 
     stored = record.read(directory)
+    finished = stored["state"] == "finished"
+    if not finished:
+        refresh_table(directory)
     frame = read_frame(directory)
-    verdicts = judge_campaign(frame, stored["requirements"])
-    whole = overall(verdicts, frame)
+    how = sampled(stored["configuration"])
+    verdicts = judge_campaign(frame, stored["requirements"], how)
+    whole = overall(verdicts, frame, how)
     status = exit_code(verdicts, bool(whole.crashed))
-    record.update(directory, {"exit_code": status})
+    if finished:
+        record.update(directory, {"exit_code": status})
     try:
         page = write_report(directory)
     except OSError as error:
         raise StoreError(f"the report cannot be written: {error}") from error
     console.print(verdict_table(verdicts))
     lines = [f"verdict: {whole.word}", whole.sentence, f"report: {page}"]
-    if stored["state"] != "finished":
-        lines.insert(0, f"the campaign is {stored['state']}: {len(frame)} of {stored['cases']} cases")
+    if not finished:
+        lines.insert(
+            0, f"INCOMPLETE: {len(frame)} of {stored['cases']} cases; {_how_it_stands(directory, stored['state'])}"
+        )
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     return status
+
+
+def _how_it_stands(directory: Path, state: str) -> str:
+    """Why a campaign is incomplete, and what to do."""
+    if is_locked(directory):
+        return "it is running"
+    return f"it was {'killed' if state == 'running' else state}; to go on: marsyard resume {directory}"
 
 
 def read_frame(directory: Path) -> pd.DataFrame:

@@ -3,7 +3,8 @@
 A requirement asks that `metric <= bound` (in magnitude), or a column of true and false, holds for a stated fraction of
 a population of cases, at a stated confidence. Its status follows from one-sided Clopper-Pearson bounds of the success
 rate, as for independent cases; or from the rate alone where the requirement is decided by the estimate. Where cases
-share terrains they are not independent: the verdict then says so and carries the bounds that hold nevertheless.
+share terrains they are not independent: the verdict then says so and carries the bounds that hold nevertheless. Where
+they are no random draws at all (Latin hypercube, Sobol, grids) the rate is told, and nothing is decided by it.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Int
 
+from campaigns.outcomes import UNFINISHED
 from reports.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
+from reports.sampled import INDEPENDENT, Sampled
 from reports.statistics import further_cases_needed, proportion_lower, proportion_upper
 from reports.wording import count, percent, stated
 
 #: Outcomes of cases that the engine could not finish; the algorithm under test may be innocent of them.
-ENGINE_FAILURES = frozenset({"CRASHED", "HUNG", "KILLED", "TIMED_OUT", "TIMEOUT"})
+ENGINE_FAILURES = UNFINISHED
 #: Value of a requirement's `decide_by` that has the rate seen compared with the probability.
 ESTIMATE = "estimate"
 
@@ -51,7 +54,8 @@ class Verdict:
     n, failures
         Cases of the population, and those that did not succeed (a metric that is missing or NaN is a failure).
     estimate, lower, upper
-        Success rate and its one-sided Clopper-Pearson bounds, each at the confidence; NaN for an empty population.
+        Success rate and its one-sided Clopper-Pearson bounds, each at the confidence; NaN for an empty population,
+        bounds also where the cases are not independent random draws.
     further_cases
         Cases still needed if no more fail, where that can be said; None for PASS and FAIL.
     reason
@@ -135,12 +139,25 @@ class Overall:
         return "NO REQUIREMENT" if self.status is None else str(self.status)
 
 
-def judge_campaign(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> list[Verdict]:
-    """Judges every requirement on the stored rows of a campaign; never raises for what rows or requirements lack."""
-    return [_judge(frame, requirement) for requirement in requirements]
+def judge_campaign(
+    frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], how: Sampled = INDEPENDENT
+) -> list[Verdict]:
+    """Judges every requirement on the stored rows of a campaign; never raises for what rows or requirements lack.
+
+    Parameters
+    ----------
+    frame
+        All rows; that of a nominal case is left out here.
+    requirements
+        As the campaign states them.
+    how
+        How the cases were drawn. Where they are not independent random draws every requirement stays INSUFFICIENT: its
+        rate is told, without bounds.
+    """
+    return [_judge(how.drawn(frame), requirement, how) for requirement in requirements]
 
 
-def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame) -> Overall:
+def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = INDEPENDENT) -> Overall:
     """The campaign's verdict: FAIL if any requirement failed, else INSUFFICIENT if any is open, else PASS."""
     crashed = crashed_cases(frame)
     statuses = [verdict.status for verdict in verdicts]
@@ -148,6 +165,8 @@ def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame) -> Overall:
     if not statuses:
         return Overall(None, crashed, "The campaign asks for no requirement." + tail)
     worst = next((status for status in (Status.FAIL, Status.INSUFFICIENT) if status in statuses), Status.PASS)
+    if not how.independent:
+        return Overall(worst, crashed, how.no_probability + tail)
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.FAIL: f"{statuses.count(Status.FAIL)} of {count(len(statuses), 'requirement')} not met.",
@@ -221,7 +240,7 @@ def _engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
     return frame["outcome"].isin(ENGINE_FAILURES).to_numpy(dtype=np.bool_)
 
 
-def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any]) -> Verdict:
+def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) -> Verdict:
     open_verdict = _unjudged(requirement)
     fault = _fault(frame, open_verdict)
     if fault:
@@ -231,10 +250,25 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any]) -> Verdict:
     except ValueError as error:
         return replace(open_verdict, reason=_sentence(str(error)))
     if chosen.empty:
-        further = further_cases_needed(0, 0, open_verdict.probability, open_verdict.confidence)
+        asked = (open_verdict.probability, open_verdict.confidence)
+        further = further_cases_needed(0, 0, *asked) if how.independent else None
         reason = f"No case belongs to the population '{open_verdict.population}'."
         return replace(open_verdict, reason=reason, further_cases=further)
-    return _weighed(open_verdict, chosen)
+    return _weighed(open_verdict, chosen) if how.independent else _described(open_verdict, chosen, how)
+
+
+def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
+    """The verdict by cases that carry no probability: how many succeeded, and why that decides nothing."""
+    success = succeeded(chosen, verdict.metric, verdict.bound)
+    groups = terrain_groups(chosen)
+    return replace(
+        verdict,
+        n=success.size,
+        failures=int((~success).sum()),
+        estimate=float(success.mean()),
+        terrains=None if groups is None else int(chosen["terrain"].nunique()),
+        reason=how.no_probability,
+    )
 
 
 def _weighed(verdict: Verdict, chosen: pd.DataFrame) -> Verdict:

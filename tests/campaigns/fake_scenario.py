@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from pathlib import Path
 
@@ -32,6 +33,10 @@ class FakeParameters(BaseModel):
     raising_cases: frozenset[int] = frozenset()
     aborting_cases: frozenset[int] = frozenset()
     silent_cases: frozenset[int] = frozenset()
+    looping_cases: frozenset[int] = frozenset()
+    swelling_cases: frozenset[int] = frozenset()
+    chatting_cases: frozenset[int] = frozenset()
+    leaving_cases: frozenset[int] = frozenset()
     shared: int = 0
     fail_prepare: bool = False
     cache: str = ""
@@ -44,6 +49,20 @@ class FakeParameters(BaseModel):
         if self.altitude_m < self.lowest_altitude_m:
             raise ValueError("altitude_m must be above lowest_altitude_m")
         return self
+
+
+def misbehave(parameters: FakeParameters, case: int) -> None:
+    """Does what a case must not, and does not return from most of it."""
+    if case in parameters.looping_cases:
+        # in C, without letting go of the interpreter: two to the power of 64 ways to share the letters out
+        re.match("(a+)+$", "a" * 64 + "b")
+    while case in parameters.chatting_cases:
+        os.write(1, b"and another thing\n" * 1000)
+    if case in parameters.leaving_cases:
+        os._exit(0)
+    hoard = []
+    while case in parameters.swelling_cases:
+        hoard.append(np.ones(1_000_000))
 
 
 class FakeScenario:
@@ -64,6 +83,7 @@ class FakeScenario:
             raise ZeroDivisionError(f"case {streams.case} of {object()!r}")
         if streams.case in parameters.aborting_cases:
             os.abort()
+        misbehave(parameters, streams.case)
         answered = streams.case not in parameters.silent_cases
         error = parameters.error_scale * streams.generator("noise").normal(size=2) if answered else np.full(2, np.nan)
         row = {

@@ -1,0 +1,325 @@
+"""`marsyard run`, `resume`, `append`, `report` and `replay`: campaigns and their folders."""
+
+from __future__ import annotations
+
+import functools
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from enum import IntEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ParamSpec
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from campaigns.crew import Crew
+    from campaigns.engine import Watch
+    from campaigns.replay import Replay
+    from campaigns.sampling import Campaign
+
+
+class Exit(IntEnum):
+    """Exit status of the program; where several apply 2 goes before 1 before 3."""
+
+    MET = 0
+    FAILED = 1
+    WRONG = 2
+    INSUFFICIENT = 3
+    INTERRUPTED = 130
+
+
+CampaignArgument = Annotated[
+    str, typer.Argument(metavar="CAMPAIGN", help="A name from `marsyard list`, or the path of a TOML file.")
+]
+DirectoryArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a campaign that was run.")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Instead of the file's value, for example render.backend=egl; a parameter set so is not dispersed.",
+    ),
+]
+JobsOption = Annotated[int | None, typer.Option("--jobs", metavar="J", help="Worker processes; by default one a core.")]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster", metavar="ADDRESS", help="Run on Dask: a scheduler as tcp://HOST:PORT, or local:N made here."
+    ),
+]
+CaseTimeOption = Annotated[
+    float | None,
+    typer.Option("--case-time", metavar="S", help="Seconds that a case may take (limits.case_time_s of the file)."),
+]
+ChangedOption = Annotated[
+    bool,
+    typer.Option("--allow-changed", help="Go on although code or versions have changed; the record then says so."),
+]
+
+Parameters = ParamSpec("Parameters")
+
+
+def says_what_is_wrong(command: Callable[Parameters, None]) -> Callable[Parameters, None]:
+    """A command that ends with one message and status 2 where the user has something to mend."""
+
+    @functools.wraps(command)
+    def guarded(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        # here, so that `doctor` starts, and says so, where another package stands in for ours
+        from campaigns.errors import CampaignError
+
+        try:
+            command(*args, **kwargs)
+        except CampaignError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(Exit.WRONG) from None
+
+    return guarded
+
+
+@says_what_is_wrong
+def run(
+    campaign: CampaignArgument,
+    cases: Annotated[int | None, typer.Option("-n", "--cases", metavar="N", help="Number of cases.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", metavar="S", help="Root seed.")] = None,
+    jobs: JobsOption = None,
+    cluster: ClusterOption = None,
+    case_time: CaseTimeOption = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder; by default runs/<campaign>-<UTC time>.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Estimate time and disk from a few trial cases, and run nothing else.")
+    ] = False,
+    override: SetOption = None,
+) -> None:
+    """Run a campaign, judge its requirements, and write its report."""
+    from campaigns.engine import run_campaign
+    from campaigns.loading import load_campaign
+
+    crew = _crew(jobs, cluster)
+    limits = [] if case_time is None else [f"limits.case_time_s={case_time}"]
+    loaded = load_campaign(campaign, [*(override or []), *limits], cases, seed)
+    if dry_run:
+        _print_estimate(loaded, crew)
+        return
+    directory = out if out is not None else _default_directory(loaded.configuration.name)
+    _carry_out(directory, lambda watch: run_campaign(loaded, directory, crew, watch))
+
+
+@says_what_is_wrong
+def resume(
+    directory: DirectoryArgument,
+    retry: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--retry",
+            metavar="OUTCOME",
+            help="Run these cases again as well: crashed, timed-out, out-of-memory, too-much-output, or all of them.",
+        ),
+    ] = None,
+    jobs: JobsOption = None,
+    cluster: ClusterOption = None,
+    case_time: CaseTimeOption = None,
+    allow_changed: ChangedOption = False,
+) -> None:
+    """Run the cases that an interrupted or killed campaign still lacks, and judge it; finished cases stay."""
+    from campaigns.engine import resume_campaign
+
+    crew, words = _crew(jobs, cluster), _outcomes(retry or [])
+
+    def go_on(watch: Watch) -> None:
+        resume_campaign(directory, crew, watch, retry=words, case_time_s=case_time, allow_changed=allow_changed)
+
+    _carry_out(directory, go_on)
+
+
+@says_what_is_wrong
+def append(
+    directory: DirectoryArgument,
+    cases: Annotated[int, typer.Argument(metavar="N", help="Number of cases to add.", min=1)],
+    jobs: JobsOption = None,
+    cluster: ClusterOption = None,
+    allow_changed: ChangedOption = False,
+) -> None:
+    """Add a block of cases to a finished campaign, run them, and judge all; the cases that are there stay."""
+    from campaigns.engine import append_cases
+
+    crew = _crew(jobs, cluster)
+    _carry_out(directory, lambda watch: append_cases(directory, cases, crew, watch, allow_changed=allow_changed))
+
+
+@says_what_is_wrong
+def report(directory: DirectoryArgument) -> None:
+    """Judge a campaign, also one that was interrupted or killed, and write its report, from the stored rows alone."""
+    from marsyard.outcome import conclude
+
+    raise typer.Exit(conclude(directory, console()))
+
+
+@says_what_is_wrong
+def replay(
+    directory: DirectoryArgument,
+    case: Annotated[int, typer.Argument(metavar="CASE", help="The case's number, from 0.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder for its products; by default DIR/cases/CASE.")
+    ] = None,
+    step: Annotated[
+        bool, typer.Option("--step", help="Write each stage's product as well, as pictures and files, into steps/.")
+    ] = False,
+) -> None:
+    """Run one case again, keep and draw its intermediate results, and compare its row with the stored one."""
+    from campaigns.products import PackedProducts, save_packed, unpack_products
+    from campaigns.replay import replay as run_again
+    from campaigns.retention import case_directory
+    from marsyard.steps import write_steps
+    from reports.dimes_figures import write_case_figures
+
+    replayed = run_again(directory, case)
+    target = out if out is not None else case_directory(directory, case)
+    packed = replayed.products or PackedProducts.nothing()
+    save_packed(target, packed, replayed.row)
+    typer.echo(f"case {case}: {replayed.row['outcome']}")
+    if replayed.row["error"]:
+        typer.echo(replayed.row["traceback"] or replayed.row["error"])
+    for line in (replayed.note, f"products: {target}"):
+        if line:
+            typer.echo(line)
+    products = unpack_products(packed)
+    if step:
+        typer.echo(f"stages: {write_steps(target / 'steps', products)}")
+    figure = write_case_figures(target, products)
+    if figure is not None:
+        typer.echo(f"figure: {figure}")
+    _compare(replayed)
+
+
+def _compare(replayed: Replay) -> None:
+    """Says in what a replayed row differs from the stored one; ends with status 1 where it does."""
+    if replayed.changed:
+        typer.echo(f"since the campaign ran this has changed: {'; '.join(replayed.changed)}")
+    if replayed.stored is None:
+        typer.echo("the campaign has no row of this case to compare with")
+    elif replayed.differing:
+        typer.echo(f"the row differs from the stored one in: {', '.join(replayed.differing)}")
+        for column in replayed.differing:
+            typer.echo(f"  {column}: {replayed.stored.get(column)!r} stored, {replayed.row.get(column)!r} now")
+        raise typer.Exit(Exit.FAILED)
+    else:
+        typer.echo("the row equals the stored one")
+
+
+def console(*, stderr: bool = False) -> Console:
+    """Where a command prints."""
+    from rich.console import Console
+
+    return Console(stderr=stderr)
+
+
+def _crew(jobs: int | None, cluster: str | None) -> Crew:
+    """Who runs a campaign, as the options say."""
+    from campaigns.crew import Crew
+    from campaigns.errors import CampaignError
+    from campaigns.workers import available_cores
+
+    if jobs is not None and jobs < 1:
+        raise CampaignError(f"--jobs {jobs}: at least one worker process is needed")
+    if jobs is not None and cluster is not None:
+        raise CampaignError("--jobs and --cluster exclude one another: a cluster has its own workers")
+    return Crew(jobs or available_cores(), cluster)
+
+
+def _outcomes(words: Sequence[str]) -> list[str]:
+    """What `--retry` asks for."""
+    from campaigns.errors import CampaignError, not_allowed
+    from campaigns.outcomes import RETRYABLE
+
+    for word in words:
+        if word not in (*RETRYABLE, "all"):
+            raise CampaignError(f"--retry: {not_allowed('outcome', word, [*RETRYABLE, 'all'])}")
+    return list(RETRYABLE) if "all" in words else list(words)
+
+
+def _carry_out(directory: Path, work: Callable[[Watch], None]) -> None:
+    """Does a campaign's work and judges it; where it is interrupted says how to go on."""
+    from campaigns.errors import CampaignError
+    from campaigns.record import read
+    from marsyard.outcome import conclude
+    from marsyard.progress import campaign_progress
+
+    try:
+        with _stopped_by_signals(), campaign_progress(console(stderr=True)) as progress:
+            work(progress)
+    except KeyboardInterrupt:
+        try:
+            stored = read(directory)
+            said = f"the rows so far are in {directory} ({stored['cases_finished']} of {stored['cases']})"
+        except CampaignError:
+            raise typer.Exit(Exit.INTERRUPTED) from None
+        typer.echo(f"interrupted; {said}. To go on: marsyard resume {directory}", err=True)
+        raise typer.Exit(Exit.INTERRUPTED) from None
+    raise typer.Exit(conclude(directory, console()))
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """Has the first Ctrl-C or SIGTERM stop the work; those after it do not disturb the end."""
+
+    def stop(number: int, _frame: object) -> None:
+        for kind in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(kind, signal.SIG_IGN)
+        raise KeyboardInterrupt(signal.Signals(number).name)
+
+    before = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
+
+
+def _print_estimate(campaign: Campaign, crew: Crew) -> None:
+    """Prints what a campaign would take."""
+    from campaigns.estimate import estimate
+
+    workers = crew.jobs if crew.cluster is None else os.cpu_count() or 1
+    found = estimate(campaign, workers)
+    total = campaign.configuration.total_cases
+    least, most = found.case_range_s
+    typer.echo(f"{total} cases on {workers} workers: about {_duration(found.time_s)}")
+    if found.inputs:
+        typer.echo(f"  {found.inputs} shared inputs to prepare, the first in {found.input_s:.3g} s")
+    typer.echo(f"  {found.case_s:.3g} s a case ({least:.3g} to {most:.3g} s in {found.trials} trial cases)")
+    if found.unfinished:
+        typer.echo(f"  {found.unfinished} of the trial cases did not come to their end")
+    typer.echo(f"disk: {_size(found.rows_bytes)} of rows, up to {_size(found.products_bytes)} of products")
+
+
+def _duration(seconds: float) -> str:
+    """A time as people say it."""
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
+
+
+def _size(count: float) -> str:
+    """A number of bytes as people say it."""
+    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}"
+    return f"{count:.0f} bytes"
+
+
+def _default_directory(name: str) -> Path:
+    """A folder that is not there yet: ``runs/<campaign>-<UTC time>``, with a number behind it in a busy second."""
+    from datetime import UTC, datetime
+
+    base = Path("runs") / f"{name}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    directory, number = base, 1
+    while directory.exists():
+        number += 1
+        directory = base.with_name(f"{base.name}-{number}")
+    return directory
