@@ -13,6 +13,7 @@ from scenarios.interface import Scenario
 SCENARIOS: Mapping[str, str] = {
     "descent": "scenarios.descent:DescentScenario",
     "fieldtest": "scenarios.fieldtest:FieldTestScenario",
+    "rover": "scenarios.rover:RoverScenario",
     "landing": "scenarios.landing:LandingScenario",
 }
 

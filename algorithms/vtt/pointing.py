@@ -80,12 +80,18 @@ def middle(camera: CameraModel) -> Float[np.ndarray, "2"]:
     return 0.5 * (np.array(camera.size, dtype=np.float64) - 1.0)
 
 
-def box_around(pixels: Float[np.ndarray, "n 2"], margin_px: float, camera: CameraModel) -> PixelBox | None:
-    """The part of the frame within the margin of any of the pixels; None if one of them is outside the frame."""
+def box_around(
+    pixels: Float[np.ndarray, "n 2"], margin_px: float, camera: CameraModel, beside_px: float = 0.0
+) -> PixelBox | None:
+    """The part of the frame within the margin of any of the pixels; None if one of them is outside the frame.
+
+    `beside_px` comes on top along the rows.
+    """
     if not bool(np.all(camera.in_frame(pixels))):
         return None
-    near = np.maximum(np.floor(pixels.min(axis=0) - margin_px).astype(int), 0)
-    far = np.minimum(np.ceil(pixels.max(axis=0) + margin_px).astype(int) + 1, camera.size)
+    margin = margin_px + np.array([beside_px, 0.0])
+    near = np.maximum(np.floor(pixels.min(axis=0) - margin).astype(int), 0)
+    far = np.minimum(np.ceil(pixels.max(axis=0) + margin).astype(int) + 1, camera.size)
     return PixelBox((int(near[0]), int(near[1])), (int(far[0] - near[0]), int(far[1] - near[1])))
 
 
@@ -101,9 +107,10 @@ def aim_at_position(
         return None
     point = mast.geometry.rover_from_head(*angles).inv().apply(position_rover[None])
     margin = 0.5 * options.search_px + SURROUND
+    across = margin + options.epipolar_tolerance_px
     boxes = (
         box_around(mast.left.project(point)[0], margin, mast.left),
-        box_around(mast.right.project(point)[0], margin + options.disparity_search_px, mast.right),
+        box_around(mast.right.project(point)[0], across, mast.right, options.disparity_search_px),
     )
     return None if boxes[0] is None or boxes[1] is None else MastAim(*angles, boxes[0], boxes[1])
 

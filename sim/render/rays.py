@@ -14,7 +14,7 @@ from sim.render.backend import RenderingError
 #: Samples along each side of the pinhole views of full frames (a 1024 x 1024 camera of 45 deg is drawn at about its own
 #: resolution), and of cameras of no more than `SMALL_CAMERA_PX` pixels along a side.
 VIEW_SIDE_PX, SMALL_VIEW_SIDE_PX = 1088, 288
-SMALL_CAMERA_PX = 256
+SMALL_CAMERA_PX = 268
 #: Samples left free around the pixels' field in a view.
 MARGIN_PX = 2.0
 #: Widest angle from its axis that a view is given; a wider field is cut into quarters.

@@ -114,7 +114,11 @@ def test_aims_read_out_what_the_searches_need() -> None:
     assert aim is not None
     angles = (aim.azimuth_rad, aim.elevation_rad)
     head = navcam().geometry.rover_from_head(*angles).inv().apply(np.array([6.0, 0.5, 0.1]))
-    for camera, box, reach in ((navcam().left, aim.left, 80.0), (navcam().right, aim.right, 120.0)):
+    # Half the window; to the right, disparities of half as much beside it and two rows off the epipolar curve.
+    for camera, box, reach in (
+        (navcam().left, aim.left, np.array([80.0, 80.0])),
+        (navcam().right, aim.right, np.array([120.0, 82.0])),
+    ):
         pixel = camera.project(head)[0]
         assert np.all(pixel - reach >= box.corner)
         assert np.all(pixel + reach <= np.add(box.corner, box.size) - 1)

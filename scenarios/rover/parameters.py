@@ -1,0 +1,255 @@
+"""Everything that a campaign of the rover scenario may set or disperse."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from algorithms.vtt import VttOptions
+from scenarios.estimators import check_tracker
+from sim.dynamics import SlipParameters
+from sim.render import CloudParameters
+from sim.render.backend import Backend, default_backend
+from sim.sensor import AutoExposureParameters, OdometryParameters, PointingParameters, StereoCalibrationParameters
+from sim.sensor.mast import MASTS
+from sim.terrain import site, sites
+
+Positive = Annotated[float, Field(gt=0.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+
+
+class _Parameters(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class WorldParameters(_Parameters):
+    """The ground: one terrain of a site's bank, rocks that would stand in the way taken out."""
+
+    site: Annotated[str, Field(description="preset of terrain, rocks, texture and light")] = "mars-yard"
+    bank: Annotated[int, Field(ge=1, le=100000, description="terrains in the bank")] = 8
+    bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
+    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
+    samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, 2.5 cm apart")] = 1024
+    slope_deg: Annotated[
+        float, Field(ge=0.0, le=40.0, description="an even slope that climbs to the east about the target; 0 for none")
+    ] = 0.0
+    rms_slope_deg: Annotated[
+        float | None, Field(ge=0.0, le=30.0, description="RMS slope of the rough ground; by default the site's")
+    ] = None
+    rock_abundance: Annotated[
+        float | None, Field(ge=0.0, le=0.4, description="share of the ground under rocks; by default the site's")
+    ] = None
+    largest_near_m: Annotated[
+        NonNegative, Field(description="largest rock left between the start and the target, m: operators choose a way")
+    ] = 0.08
+    east_m: Annotated[float, Field(description="where the target's rock lies, on the periodic terrain")] = 8.0
+    north_m: Annotated[float, Field(description="where the target's rock lies, on the periodic terrain")] = 8.0
+    rocks_underfoot: Annotated[
+        bool, Field(description="whether wheels feel the rocks they meet, or the ground alone")
+    ] = False
+    background_half_deg: Annotated[
+        float, Field(gt=0.0, le=180.0, description="half the angle behind the target over which rocks are drawn")
+    ] = 50.0
+
+    @field_validator("site")
+    @classmethod
+    def _site_has_ground(cls, name: str) -> str:
+        known = [one.name for one in sites().values() if one.ground is not None]
+        if name not in known:
+            raise ValueError(f"no site for a rover is called '{name}'; allowed: {', '.join(known)}")
+        return name
+
+    @model_validator(mode="after")
+    def _terrain_is_there(self) -> WorldParameters:
+        if self.terrain >= self.bank:
+            raise ValueError(f"terrain {self.terrain} is not in the bank; allowed: 0 to {self.bank - 1}")
+        if self.samples & (self.samples - 1):
+            raise ValueError(f"samples is {self.samples}; a power of two is needed")
+        if self.slope_deg and site(self.site).terrain("ground").ramp is not None:
+            raise ValueError(f"site {self.site} has a slope of its own")
+        return self
+
+
+class ObstacleParameters(_Parameters):
+    """A rock in or beside the way, placed from the target."""
+
+    towards_start_m: Annotated[float, Field(description="distance from the target towards the start, m")] = 4.0
+    right_m: Annotated[float, Field(description="to the right of that line, seen from the start, m")] = 0.0
+    diameter_m: Annotated[float, Field(gt=0.0, le=5.0)] = 0.3
+    height_m: Annotated[Positive | None, Field(description="by default half the diameter")] = None
+
+
+class TargetParameters(_Parameters):
+    """The rock that is driven to, the point on it, and how that is told to the rover.
+
+    The point is picked where the rock is seen from the start: `across` from its left (-1) to its right (1) outline at
+    `up`, from its foot (0) to its top (1).
+    """
+
+    diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="of the rock")] = 0.8
+    height_m: Annotated[Positive | None, Field(description="of the rock; by default half the diameter")] = None
+    shape: Annotated[int | None, Field(ge=0, le=31, description="its shape, see PlacedRock; drawn by default")] = None
+    yaw_deg: Annotated[float | None, Field(description="its turn; drawn by default")] = None
+    across: Annotated[float, Field(ge=-1.0, le=1.0, description="place of the point across the rock")] = 0.0
+    up: Annotated[float, Field(ge=0.0, le=1.0, description="place of the point up the rock")] = 0.5
+    designation: Annotated[
+        Literal["pixel", "rover", "site"], Field(description="how the ground names the target (section 3)")
+    ] = "pixel"
+
+
+class StartParameters(_Parameters):
+    """Where the rover stands at first, seen from the target."""
+
+    distance_m: Annotated[
+        float, Field(gt=1.0, le=40.0, description="horizontally from the camera to the target, m")
+    ] = 10.0
+    bearing_deg: Annotated[
+        float, Field(ge=-360.0, le=720.0, description="direction from the target to the rover, clockwise from north")
+    ] = 270.0
+    target_azimuth_deg: Annotated[
+        float, Field(ge=-180.0, le=180.0, description="where the target is seen, to the right of straight ahead")
+    ] = 0.0
+
+
+class LegParameters(_Parameters):
+    """A part of a run. After each of its steps the target is tracked.
+
+    ========== ========================================================================================================
+    stay       stands for `steps` updates; with `autonav` it begins the navigator's map
+    approach   drives at the target's latest estimate until it is `goal_m` away
+    back-off   drives backwards, away from the target, until it is `goal_m` away
+    straight   drives `steps` times `step_m` along its heading (backwards where negative)
+    turn       turns in place `steps` times by `step_deg` (to the right where positive)
+    circle     crabs around the target's latest estimate, facing it, `steps` times by `step_deg` (clockwise from above)
+    ========== ========================================================================================================
+    """
+
+    motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
+    steps: Annotated[int, Field(ge=1, le=200, description="steps; at most so many of an approach or back-off")] = 60
+    step_share: Annotated[
+        float, Field(gt=0.0, le=0.9, description="length of a step over the distance from camera to target")
+    ] = 0.1
+    step_m: Annotated[float | None, Field(description="length of a step instead; needed for straight")] = None
+    step_deg: Annotated[float, Field(ge=-180.0, le=180.0, description="of a turn or circle")] = 5.0
+    goal_m: Annotated[
+        Positive, Field(description="horizontal distance of the rover's origin from the target in the end, m")
+    ] = 2.0
+    offset_right_m: Annotated[
+        float, Field(description="how far to the right of the target's direction the goal lies, m")
+    ] = 0.0
+    shuffle_m: Annotated[
+        NonNegative, Field(description="forth, and back after the next step: saves a steering motor that is stuck, m")
+    ] = 0.0
+    visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
+    visual_odometry_step_m: Annotated[
+        Positive, Field(description="longest drive between two of its pictures, m (60 % overlap)")
+    ] = 0.75
+    autonav: Annotated[bool, Field(description="whether the navigator steers around what wedges of pictures show")] = (
+        False
+    )
+    map_by: Annotated[Literal["body", "mast"], Field(description="cameras that map for the navigator")] = "mast"
+    wedges: Annotated[int, Field(ge=1, le=4, description="wedges of the mast's pictures at each step")] = 2
+    target_is_no_obstacle: Annotated[
+        bool, Field(description="whether the navigator may come near the target's rock (section 6)")
+    ] = True
+
+    @model_validator(mode="after")
+    def _has_a_step(self) -> LegParameters:
+        if self.motion == "straight" and self.step_m is None:
+            raise ValueError("a straight leg needs step_m")
+        return self
+
+
+class SunParameters(_Parameters):
+    """Where the sun stands at the start, and how it moves."""
+
+    azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 225.0
+    elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="above the horizon")] = 45.0
+    hour_angle_deg_min: Annotated[
+        float, Field(ge=-1.0, le=1.0, description="its motion about the pole: 16 deg in 66 min (Table IV)")
+    ] = 16.0 / 66.0
+    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0
+    held_s: Annotated[Positive, Field(description="time for which it is held in the pictures' light, s")] = 120.0
+
+
+class TimingParameters(_Parameters):
+    """How long a run's activities take (Table IV, means)."""
+
+    track_s: Annotated[NonNegative, Field(description="a tracking update, s")] = 45.0
+    visual_odometry_s: Annotated[NonNegative, Field(description="a visual odometry update, s")] = 105.0
+    autonav_s: Annotated[NonNegative, Field(description="a navigation update, s")] = 300.0
+    drive_s: Annotated[NonNegative, Field(description="a step's motion, s (19 min for 15 steps in section 7.2)")] = 30.0
+
+
+class ExposureParameters(_Parameters):
+    """How the pictures are exposed (section 4.5)."""
+
+    of: Annotated[
+        Literal["subframe", "full-frame", "fixed"],
+        Field(description="auto-exposure over the subframe, over the full frame with what sky it shows, or none"),
+    ] = "subframe"
+    auto: AutoExposureParameters = AutoExposureParameters()
+
+
+class CameraParameters(_Parameters):
+    """The stereo pair on the mast."""
+
+    preset: Annotated[str, Field(description="a pair of `sim.sensor.mast.MASTS`")] = "mer-navcam"
+    detector_noise: Annotated[bool, Field(description="whether pictures have a detector's noise and response")] = True
+
+    @field_validator("preset")
+    @classmethod
+    def _is_a_pair(cls, name: str) -> str:
+        if name not in MASTS:
+            raise ValueError(f"no mast carries cameras called '{name}'; allowed: {', '.join(MASTS)}")
+        return name
+
+
+class ScoreParameters(_Parameters):
+    """What counts as tracked, and what of each update is stored."""
+
+    tracked_px: Annotated[
+        Positive, Field(description="most distance of a tracked target from the true projection of the point, px")
+    ] = 10.0
+    stored_updates: Annotated[
+        int, Field(ge=0, le=100, description="first updates whose figures are stored in the row, one column each")
+    ] = 0
+
+
+class RoverScenarioParameters(_Parameters):
+    """Everything that a campaign of the rover scenario may set or disperse."""
+
+    world: WorldParameters = WorldParameters()
+    target: TargetParameters = TargetParameters()
+    obstacles: tuple[ObstacleParameters, ...] = ()
+    start: StartParameters = StartParameters()
+    legs: Annotated[tuple[LegParameters, ...], Field(min_length=1, description="parts of the run, in order")] = (
+        LegParameters(),
+    )
+    slip: SlipParameters = SlipParameters()
+    odometry: OdometryParameters = OdometryParameters()
+    pointing: PointingParameters = PointingParameters()
+    stereo: StereoCalibrationParameters = StereoCalibrationParameters()
+    camera: CameraParameters = CameraParameters()
+    exposure: ExposureParameters = ExposureParameters()
+    sun: SunParameters = SunParameters()
+    clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the run")] = None
+    rover_shadow: Annotated[bool, Field(description="whether the rover and its mast cast shadows")] = True
+    timing: TimingParameters = TimingParameters()
+    algorithm: Annotated[
+        str, Field(description="tracker under test: vtt, pure-ncc, lucas-kanade, or your own 'module:Class'")
+    ] = "vtt"
+    vtt: Annotated[VttOptions, Field(description="options of the tracker; pure-ncc takes no scale and roll")] = (
+        VttOptions()
+    )
+    score: ScoreParameters = ScoreParameters()
+    backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
+        default_factory=default_backend
+    )
+
+    @field_validator("algorithm")
+    @classmethod
+    def _algorithm_is_there(cls, name: str) -> str:
+        check_tracker(name)
+        return name

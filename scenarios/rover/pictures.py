@@ -1,0 +1,163 @@
+"""Stereo subframes: rendered through the true cameras, exposed by their detectors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float32
+from scipy.spatial.transform import RigidTransform
+
+from algorithms.interface import PixelBox
+from scenarios.rover.parameters import ExposureParameters
+from sim.camera import CameraModel
+from sim.measurements import MastImage
+from sim.render import PixelRays, Scene, process_renderer
+from sim.render.backend import Backend
+from sim.sensor import Detector, auto_expose, natural_fall_off, preset
+
+#: The full frame is judged for its exposure in a picture so many times smaller.
+_BINNED = 16
+#: Sunlight, over that at 1 AU, for which a preset's responsivity is stated: MER's cameras at Mars.
+_SUNLIGHT = {"mer": 1.0 / 1.5**2, "research": 1.0}
+
+
+def sunlight_of_preset(name: str) -> float:
+    """Sunlight over that at 1 AU for which a camera's responsivity is stated."""
+    return _SUNLIGHT[name.partition("-")[0]]
+
+
+@lru_cache(maxsize=8)
+def fall_off(camera: CameraModel) -> Float32[np.ndarray, "rows columns"]:
+    """A lens's fall-off; kept, as all runs of a process share cameras as designed."""
+    return natural_fall_off(camera)
+
+
+@dataclass(frozen=True)
+class Detectors:
+    """The detectors of a pair, their pixels drawn: the left and the right one.
+
+    Without noise, counts are the light in proportion, rounded, at an exposure that suits the subframe's own pixels.
+    """
+
+    left: Detector
+    right: Detector
+    noise: bool
+
+    @classmethod
+    def drawn(cls, name: str, noise: bool, rng: np.random.Generator) -> Detectors:
+        """Detectors of a preset's pair."""
+        chosen = preset(name)
+        left, right = (Detector.drawn(fall_off(camera), chosen.detector, rng) for camera in chosen.cameras())
+        return cls(left, right, noise)
+
+
+@dataclass(frozen=True)
+class StereoPictures:
+    """A stereo pair of subframes as delivered, and its exposure time."""
+
+    left: MastImage
+    right: MastImage
+    exposure_s: float
+
+
+@dataclass(frozen=True)
+class Photographer:
+    """Takes stereo subframes.
+
+    Attributes
+    ----------
+    backend
+        Of the renderer.
+    detectors
+        Of the pair.
+    exposure
+        How it is set.
+    noise
+        Stream of the detectors' noise.
+    """
+
+    backend: Backend
+    detectors: Detectors
+    exposure: ExposureParameters
+    noise: np.random.Generator
+
+    def take(
+        self,
+        scene: Scene,
+        world_from_head: RigidTransform,
+        cameras: tuple[CameraModel, CameraModel],
+        boxes: tuple[PixelBox, PixelBox],
+        brightness: float,
+        time_s: float,
+    ) -> StereoPictures:
+        """Subframes of the true cameras on a head.
+
+        Parameters
+        ----------
+        scene
+            What is there.
+        world_from_head
+            True pose of the mast's head.
+        cameras
+            The true cameras in the head's frame.
+        boxes
+            Parts of the full frames to deliver.
+        brightness
+            Sunlight over that for which the detectors' responsivity is stated.
+        time_s
+            When.
+        """
+        light = [
+            self._light(scene, world_from_head, camera.cropped(*box.corner, box.size), brightness, time_s)
+            for camera, box in zip(cameras, boxes, strict=True)
+        ]
+        if not self.detectors.noise:
+            counts = [_noise_free(one, light[0]) for one in light]
+            return StereoPictures(MastImage(counts[0], boxes[0].corner), MastImage(counts[1], boxes[1].corner), 0.0)
+        parts = [
+            detector.window(*box.corner, box.size)
+            for detector, box in zip((self.detectors.left, self.detectors.right), boxes, strict=True)
+        ]
+        exposure_s = self._exposure_s(scene, world_from_head, cameras[0], parts[0], light[0], brightness, time_s)
+        images = [
+            MastImage(part.with_exposure(exposure_s).expose(one, self.noise), box.corner)
+            for part, one, box in zip(parts, light, boxes, strict=True)
+        ]
+        return StereoPictures(images[0], images[1], exposure_s)
+
+    def _light(
+        self, scene: Scene, world_from_head: RigidTransform, camera: CameraModel, brightness: float, time_s: float
+    ) -> Float32[np.ndarray, "rows columns"]:
+        frame = process_renderer(self.backend).render(scene, PixelRays.of(camera), world_from_head, time_s)
+        light: Float32[np.ndarray, "rows columns"] = frame.radiance * np.float32(brightness)
+        return light
+
+    def _exposure_s(
+        self,
+        scene: Scene,
+        world_from_head: RigidTransform,
+        camera: CameraModel,
+        part: Detector,
+        light: Float32[np.ndarray, "rows columns"],
+        brightness: float,
+        time_s: float,
+    ) -> float:
+        if self.exposure.of == "fixed":
+            return part.parameters.exposure_s
+        if self.exposure.of == "subframe":
+            return auto_expose(part, light, self.exposure.auto, self.noise).detector.parameters.exposure_s
+        # the whole frame, each block of pixels by its mean light, through a detector of as many pixels
+        whole = self._light(
+            replace(scene, edge_rays=1), world_from_head, camera.scaled(1.0 / _BINNED), brightness, time_s
+        )
+        block = part.response[: len(whole), : whole.shape[1]]
+        judged = replace(part, response=np.resize(block, whole.shape), hot_e_s=None)
+        return auto_expose(judged, whole, self.exposure.auto, self.noise).detector.parameters.exposure_s
+
+
+def _noise_free(light: Float32[np.ndarray, "rows columns"], reference: Float32[np.ndarray, "_ _"]) -> np.ndarray:
+    """Counts of 12 bits in proportion to the light, the reference's brightest at three quarters of full scale."""
+    scale = 3071.0 / max(float(np.percentile(reference, 98.0)), 1e-9)
+    return np.clip(np.rint(scale * light), 0, 4095).astype(np.uint16)

@@ -1,0 +1,127 @@
+"""The designated point: chosen on the target's rock where it is seen from the start, and told to the rover."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import RigidTransform
+
+from algorithms.vtt.pointing import mast_angles
+from algorithms.vtt.stereo import triangulated
+from scenarios.rover.parameters import RoverScenarioParameters
+from scenarios.rover.points import Sight, distances, shaded
+from scenarios.rover.rig import Rig
+from scenarios.rover.world import TARGET, RunWorld
+from sim.dynamics.rover import Stance
+from sim.frames import SITE_FROM_WORLD
+from sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
+
+#: Directions about a point's own in which the rock must be seen too, lest it lies on the rock's edge.
+_AROUND = 12
+
+
+@dataclass(frozen=True)
+class Rock:
+    """The target's rock as it is."""
+
+    diameter_m: float
+    height_m: float
+    shape: int
+    yaw_deg: float
+
+
+@dataclass(frozen=True)
+class ChosenTarget:
+    """The point that is driven to.
+
+    Attributes
+    ----------
+    point_world
+        The designated point of the rock's surface, world, metres.
+    designation
+        How it is told to the rover.
+    rock
+        The rock that it is on.
+    on_edge
+        Whether the template about it, as seen from the start, reaches over the rock's outline.
+    lit
+        Whether the sun shines on it at the start: no part of the rock is before the sun.
+    """
+
+    point_world: Float64[np.ndarray, "3"]
+    designation: TargetDesignation
+    rock: Rock
+    on_edge: bool
+    lit: bool
+
+
+def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance: Stance) -> ChosenTarget:
+    """The point at the place of the rock's face that the parameters ask for.
+
+    The operators pick it in a picture taken from where the rover stands, with the mast as it then stands; the rover's
+    first pictures are taken from there without moving the mast.
+    """
+    rocks = world.rocks
+    number = rocks.by_name(TARGET)
+    middle = rocks.position_m[number] + np.array([0.0, 0.0, 0.5 * rocks.height_m[number]])
+    rover_from_world = stance.world_from_rover.inv()
+    angles = mast_angles(np.asarray(rover_from_world.apply(middle)), rig.calibrated, p.vtt.aim_pair)
+    if angles is None:
+        raise ValueError("the mast cannot point at the target's rock from the start; start.target_azimuth_deg turns it")
+    rig.point(*angles)
+    world_from_head = stance.world_from_rover * rig.rover_from_head
+    eye = np.asarray(world_from_head.apply(rig.left.c.copy()))
+    point = Sight.of(world.target_triangles, eye, float(rocks.position_m[number, 2])).point(
+        p.target.across, p.target.up
+    )
+    sun = world.sun.direction(0.0)
+    return ChosenTarget(
+        point_world=point,
+        designation=_told(p, rig, stance.world_from_rover, rig.state.readings_rad, world_from_head, point),
+        rock=Rock(
+            float(rocks.diameter_m[number]),
+            float(rocks.height_m[number]),
+            int(rocks.shape[number]),
+            float(np.degrees(rocks.yaw_rad[number])),
+        ),
+        on_edge=_on_edge(world, eye, point, 0.5 * p.vtt.template_px * rig.pixel_rad),
+        lit=not bool(shaded(world.target_triangles, point[None], sun)[0]),
+    )
+
+
+def _on_edge(world: RunWorld, eye: Float64[np.ndarray, "3"], point: Float64[np.ndarray, "3"], reach_rad: float) -> bool:
+    """Whether some line of sight within an angle of the point passes the rock by."""
+    ahead = point - eye
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    turns = np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
+    around = ahead + reach_rad * (np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * up)
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    return bool(np.any(np.isinf(distances(world.target_triangles, eye, around))))
+
+
+def _told(
+    p: RoverScenarioParameters,
+    rig: Rig,
+    world_from_rover: RigidTransform,
+    angles: tuple[float, float],
+    world_from_head: RigidTransform,
+    point: Float64[np.ndarray, "3"],
+) -> TargetDesignation:
+    """The designation: the point's true pixel, or what the ground makes of the pair of pixels by triangulation."""
+    in_head = np.asarray(world_from_head.inv().apply(point.copy()))
+    left, right = (np.asarray(camera.project(in_head)[0]) for camera in (rig.left, rig.right))
+    if p.target.designation == "pixel":
+        return PixelTarget(left, *angles)
+    known = rig.calibrated
+    position = triangulated(known.left, known.right, left, right)
+    if position is None:
+        raise ValueError("the target cannot be triangulated from the start")
+    in_rover = np.asarray(known.geometry.rover_from_head(*angles).apply(position))
+    if p.target.designation == "rover":
+        return RoverTarget(in_rover)
+    return SiteTarget(np.asarray(SITE_FROM_WORLD.apply(world_from_rover.apply(in_rover))))

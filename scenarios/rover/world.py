@@ -1,0 +1,267 @@
+"""The world of a rover's run: a site's ground, the target's rock and obstacles among its rocks, and the light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
+from scenarios.views import Eye, SiteGround, site_scene
+from sim.dynamics import RoverParameters, Stance
+from sim.frames import direction
+from sim.measurements import MastGeometry
+from sim.render import CloudLayer, Objects, Scene, Sun, rover_objects
+from sim.streams import Streams
+from sim.terrain import PlacedRock, RockField, RockParameters, Site, Surface, TerrainBank, TerrainParameters, site
+from sim.terrain.landforms import Ramp
+
+#: Name of the target's rock.
+TARGET = "target"
+#: Height above the target's foot from which the scene's detail is chosen: that of a mast's head at the goal.
+EYE_HEIGHT_M = 1.2
+#: How far behind the target ground and rocks are drawn.
+BACKGROUND_M = 25.0
+#: Spacing of the ground's mesh about the target, and by how much it grows from line to line.
+MESH_FINEST_M, MESH_GROWTH = 0.02, 0.012
+#: Even slopes: their length as a share of the terrain's period, which the landform centres at a quarter of it.
+RAMP_SHARE = 0.4
+#: How far beyond start and target the ground is cleared of rocks that would stand in the way.
+CLEARED_M = 2.0
+#: Rocks lie at least this far from the outline of one that was placed.
+FREE_M = 0.05
+#: Middle of the rover above the ground and the radius of a sphere about it, metres; how far from the target a subframe
+#: shows, over its distance: 6 deg are more than half the diagonal of 161 pixels of a navcam.
+ROVER_MIDDLE_M, ROVER_REACH_M, SEEN_SHARE = 0.8, 1.6, 0.11
+_ROCK_ARRAYS = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up")
+
+
+def terrain_parameters(w: WorldParameters) -> TerrainParameters:
+    """The terrain of the site with what the campaign changes."""
+    changes: dict[str, object] = {"samples": w.samples}
+    if w.rms_slope_deg is not None:
+        changes["rms_slope_deg"] = w.rms_slope_deg
+    base = site(w.site).terrain("ground")
+    if w.rock_abundance is not None:
+        changes["rocks"] = (base.rocks or RockParameters()).model_dump() | {"abundance": w.rock_abundance}
+    if w.slope_deg:
+        changes["ramp"] = Ramp(slope_deg=w.slope_deg, length_m=RAMP_SHARE * w.samples * base.spacing_m).model_dump()
+    return base.changed(changes)
+
+
+@lru_cache(maxsize=4)
+def _bare_ground(terrain: TerrainParameters, site_name: str, bank_seed: int, number: int) -> SiteGround:
+    """A terrain of the bank with its own rocks; kept, as the runs of a process share terrains."""
+    bank = TerrainBank(terrain, bank_seed)
+    return SiteGround(site(site_name), terrain, bank.terrain(number), bank.rocks(number))
+
+
+@dataclass(frozen=True)
+class SunPath:
+    """The sun over a run: it turns about the pole, westwards."""
+
+    parameters: SunParameters
+
+    def direction(self, time_s: float) -> Float64[np.ndarray, "3"]:
+        """Unit vector to the sun, world axes."""
+        p = self.parameters
+        first = direction(np.radians(p.azimuth_deg), np.radians(p.elevation_deg))
+        pole = direction(0.0, np.radians(p.latitude_deg))
+        angle = -np.radians(p.hour_angle_deg_min * time_s / 60.0)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        turned = cosine * first + sine * np.cross(pole, first) + (1.0 - cosine) * (pole @ first) * pole
+        unit: Float64[np.ndarray, "3"] = turned / np.linalg.norm(turned)
+        return unit
+
+    def step(self, time_s: float) -> int:
+        """Number of the span of time within which pictures share a sun."""
+        return int(time_s // self.parameters.held_s)
+
+    def held(self, step: int, angular_radius_rad: float) -> Sun:
+        """The sun of a span of time: that in its middle."""
+        return Sun(self.direction((step + 0.5) * self.parameters.held_s), angular_radius_rad)
+
+
+@dataclass
+class RunWorld:
+    """Where a run happens.
+
+    Attributes
+    ----------
+    ground
+        The ground with all its rocks; the target's is called `TARGET`, obstacles `obstacle-1`, `obstacle-2`, ...
+    base
+        The scene at the start, without the rover.
+    sun
+        The sun over the run.
+    target_triangles
+        Triangles of the target's rock as it is drawn: what pictures show is what truth is.
+    """
+
+    ground: SiteGround
+    base: Scene
+    sun: SunPath
+    target_triangles: Float64[np.ndarray, "triangles 3 3"]
+    _latest: tuple[int, Scene] | None = field(default=None, repr=False)
+
+    @classmethod
+    def of(cls, p: RoverScenarioParameters, pixel_rad: float, streams: Streams) -> RunWorld:
+        """The world of a run; its terrain comes from the disk, or is built."""
+        w = p.world
+        ground = furnished(p, streams.generator("placed rocks"))
+        path = SunPath(p.sun)
+        reach = p.start.distance_m + BACKGROUND_M
+        middle, half = np.radians(p.start.bearing_deg + 180.0), np.radians(w.background_half_deg)
+        eye = Eye(w.east_m, w.north_m, EYE_HEIGHT_M, pixel_rad, float(middle), float(half), reach)
+        lines = 2 * int(np.ceil(np.arcsinh(reach / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1
+        clouds = None
+        if p.clouds is not None:
+            level = float(ground.surface.height(w.east_m, w.north_m))
+            clouds = CloudLayer.drawn(p.clouds, streams.generator("clouds"), ground_m=level)
+        scene = replace(
+            site_scene(ground, eye, path.held(0, ground.site.environment.sun_radius_rad)),
+            mesh_finest_m=MESH_FINEST_M,
+            mesh_reach_m=reach,
+            mesh_lines=lines,
+            clouds=clouds,
+        )
+        return cls(ground, scene, path, _triangles_of(ground, scene.objects))
+
+    @property
+    def surface(self) -> Surface:
+        """The ground's surface."""
+        return self.ground.surface
+
+    @property
+    def site(self) -> Site:
+        """The site."""
+        return self.ground.site
+
+    @property
+    def rocks(self) -> RockField:
+        """All rocks of the ground; those that were placed have names."""
+        if self.ground.rocks is None:
+            raise ValueError("a furnished ground has rocks")
+        return self.ground.rocks
+
+    @property
+    def placed_m(self) -> Float64[np.ndarray, "rocks 3"]:
+        """East, north and diameter of the target's rock and of the obstacles."""
+        numbers = list(self.rocks.names.values())
+        return np.column_stack([self.rocks.position_m[numbers, :2], self.rocks.diameter_m[numbers]])
+
+    def scene(self, time_s: float) -> Scene:
+        """The scene at a time of the run, without the rover. The sun is held for `SunParameters.held_s`."""
+        step = self.sun.step(time_s)
+        if self._latest is None or self._latest[0] != step:
+            sun = self.sun.held(step, self.site.environment.sun_radius_rad)
+            self._latest = (step, replace(self.base, sun=sun, photometry=self.ground.photometry(sun)))
+        return self._latest[1]
+
+    def with_rover(
+        self,
+        scene: Scene,
+        rover: RoverParameters,
+        stance: Stance,
+        mast: MastGeometry,
+        angles_rad: tuple[float, float],
+        target_m: Float64[np.ndarray, "3"],
+    ) -> Scene:
+        """The scene with the rover in it, whose shadow may fall on what a subframe about the target shows.
+
+        Where its shadow stays clear of that it is left out: it would change nothing, and costs a new search tree.
+        """
+        middle = stance.world_from_rover.translation + np.array([0.0, 0.0, ROVER_MIDDLE_M])
+        away = target_m - middle
+        behind = -float(away @ scene.sun.direction)
+        beside = float(np.linalg.norm(away + behind * scene.sun.direction))
+        if behind < 0.0 or beside > ROVER_REACH_M + SEEN_SHARE * float(np.linalg.norm(away)):
+            return scene
+        body = rover_objects(rover, stance, mast, *angles_rad)
+        return replace(scene, objects=Objects.joined([scene.objects, body]))
+
+    def brightness(self, time_s: float) -> float:
+        """Direct sunlight on the ground over that at 1 AU."""
+        air = self.site.environment
+        elevation = float(np.arcsin(self.scene(time_s).sun.direction[2]))
+        return air.direct_share(elevation) * air.solar_irradiance
+
+
+def furnished(p: RoverScenarioParameters, rng: np.random.Generator) -> SiteGround:
+    """The ground with the target's rock and the obstacles; the bank's own rocks make room for them and for the way."""
+    w = p.world
+    bare = _bare_ground(terrain_parameters(w), w.site, w.bank_seed, w.terrain)
+    field = RockField.on(bare.surface, RockParameters(abundance=0.0, placed=placed_rocks(p)), rng)
+    if bare.rocks is None:
+        return replace(bare, rocks=field)
+    kept = _kept(p, bare.rocks, field)
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(field, name), getattr(bare.rocks, name)[kept]]) for name in _ROCK_ARRAYS
+    }
+    return replace(bare, rocks=replace(field, **arrays))
+
+
+def placed_rocks(p: RoverScenarioParameters) -> tuple[PlacedRock, ...]:
+    """The target's rock and the obstacles, in world coordinates."""
+    t, w = p.target, p.world
+    bearing = np.radians(p.start.bearing_deg)
+    along, right = np.array([np.sin(bearing), np.cos(bearing)]), np.array([-np.cos(bearing), np.sin(bearing)])
+    rocks = [
+        PlacedRock(
+            name=TARGET,
+            east_m=w.east_m,
+            north_m=w.north_m,
+            diameter_m=t.diameter_m,
+            height_m=t.height_m,
+            shape=t.shape,
+            yaw_deg=t.yaw_deg,
+        )
+    ]
+    for number, one in enumerate(p.obstacles, start=1):
+        east, north = np.array([w.east_m, w.north_m]) + one.towards_start_m * along + one.right_m * right
+        rocks.append(
+            PlacedRock(
+                name=f"obstacle-{number}",
+                east_m=float(east),
+                north_m=float(north),
+                diameter_m=one.diameter_m,
+                height_m=one.height_m,
+            )
+        )
+    return tuple(rocks)
+
+
+def _kept(p: RoverScenarioParameters, rocks: RockField, placed: RockField) -> Bool[np.ndarray, "rocks"]:
+    """Which of the bank's rocks stay: small ones near the run, all of them beyond, none upon a placed rock."""
+    w = p.world
+    near = _distance(rocks, np.array([w.east_m, w.north_m])) < p.start.distance_m + CLEARED_M
+    kept = ~near | (rocks.diameter_m <= w.largest_near_m)
+    for place, diameter in zip(placed.position_m[:, :2], placed.diameter_m, strict=True):
+        apart = _distance(rocks, place) - 0.6 * (rocks.diameter_m + diameter)
+        kept &= apart > FREE_M
+    return kept
+
+
+def _distance(rocks: RockField, place: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "rocks"]:
+    """Horizontal distance of the rocks from a place on the periodic ground."""
+    away = rocks.position_m[:, :2] - place
+    away -= rocks.period_m * np.round(away / rocks.period_m)
+    distance: Float64[np.ndarray, "rocks"] = np.hypot(away[:, 0], away[:, 1])
+    return distance
+
+
+def _triangles_of(ground: SiteGround, objects: Objects) -> Float64[np.ndarray, "triangles 3 3"]:
+    """Triangles of the target's rock. Where the scene reaches over a period, the first body of its name may be a copy:
+    the one nearest to the target's place is taken.
+    """
+    if ground.rocks is None:
+        raise ValueError("the ground has no rocks")
+    number = ground.rocks.by_name(TARGET)
+    bodies = np.flatnonzero(objects.names == number)
+    place = ground.rocks.position_m[number]
+    nearest = bodies[np.argmin(np.linalg.norm(objects.spheres[bodies, :2] - place[:2], axis=1))]
+    first, end = objects.first_triangle[nearest : nearest + 2]
+    return objects.triangles[first:end]
