@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from campaigns.checking import sampling_problems
 from campaigns.configuration import CampaignConfiguration, Key, key_text, problems_of
-from campaigns.dispersions import Choice
+from campaigns.correlation import KINDS
 from campaigns.errors import ConfigurationError, Problem, not_allowed
-from campaigns.sampling import Campaign, leaves
+from campaigns.sampling import Campaign
 from scenarios.interface import Scenario
 from scenarios.registry import UnknownScenarioError, scenario
 
-#: Cases whose draws are tried together before a campaign starts; the reach of each dispersion is tried in full.
-TRIED_CASES = 32
-
 CATALOGUE = Path(__file__).resolve().parent.parent / "scenarios" / "catalogue"
 
-_TABLES = ("parameters", "dispersions", "retain")
-_PLAIN = ("cases", "seed", "name", "description", "scenario")
+_TABLES = ("parameters", "dispersions", "design", "retain", "limits")
+_PLAIN = ("cases", "seed", "name", "description", "scenario", "correlations")
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -109,7 +107,7 @@ def _read(path: Path) -> dict[str, Any]:
     """The tables of a TOML file."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a ValueError of its own too for numbers of thousands of digits
         raise ConfigurationError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
     except OSError as error:
         raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
@@ -123,7 +121,7 @@ def _override(tables: Mapping[str, Any], override: str, overridden: dict[tuple[s
         raise ConfigurationError([Problem(option, "", "expected KEY=VALUE, such as --set render.backend=egl")])
     try:
         stated = _parse(key, value.strip())
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigurationError([Problem(option, "", f"'{key}' is not a dotted key: {error}")]) from error
     first = next(iter(stated))
     if first not in (*_TABLES, *_PLAIN):
@@ -134,15 +132,33 @@ def _override(tables: Mapping[str, Any], override: str, overridden: dict[tuple[s
     fixed = {".".join(path[1:]) for path in paths if path[0] == "parameters"}
     dispersions = merged.get("dispersions")
     if fixed and isinstance(dispersions, dict):
-        merged["dispersions"] = {path: stated for path, stated in dispersions.items() if not _under(path, fixed)}
+        kept = {path: stated for path, stated in dispersions.items() if not _under(path, fixed)}
+        gone = set(dispersions).difference(kept)
+        merged["dispersions"] = kept
+        if gone and isinstance(merged.get("correlations"), list):
+            groups = [_without_members(group, gone) for group in merged["correlations"]]
+            merged["correlations"] = [group for group in groups if group != {}]
     return merged
+
+
+def _without_members(group: Any, gone: set[str]) -> Any:
+    """A correlated group without the dispersions that are gone; empty where none is left; as it is where it is none."""
+    names = group.get("parameters") if isinstance(group, Mapping) else None
+    if not isinstance(names, list):
+        return group
+    places = [place for place, name in enumerate(names) if name not in gone]
+    try:
+        matrices = {kind: [[rows[i][j] for j in places] for i in places] for kind in KINDS if (rows := group.get(kind))}
+    except (IndexError, KeyError, TypeError):
+        return group
+    return {**group, "parameters": [names[place] for place in places], **matrices} if places else {}
 
 
 def _parse(key: str, value: str) -> dict[str, Any]:
     """One assignment, its value in TOML's notation or, where it is none, as plain text."""
     try:
         return tomllib.loads(f"{key} = {value}")
-    except tomllib.TOMLDecodeError:
+    except ValueError:
         return tomllib.loads(f"{key} = {json.dumps(value)}")
 
 
@@ -185,7 +201,7 @@ def _checked(document: _Document) -> Campaign:
         raise ConfigurationError(problems)
     complete = parameters.model_dump(mode="json", round_trip=True)
     campaign = Campaign(configuration.model_copy(update={"parameters": complete}), found)
-    problems += _dispersion_problems(document, campaign) or _draw_problems(document, campaign)
+    problems += [document.problem(key, message) for key, message in sampling_problems(campaign)]
     if problems:
         raise ConfigurationError(problems)
     return campaign
@@ -212,57 +228,3 @@ def _scenario(document: _Document, problems: list[Problem]) -> Scenario | None:
     except UnknownScenarioError as error:
         problems.append(document.problem(("scenario",), str(error)))
         return None
-
-
-def _dispersion_problems(document: _Document, campaign: Campaign) -> list[Problem]:
-    """Dispersions of what is no parameter, and draws that a parameter refuses."""
-    known = dict(leaves(campaign.configuration.parameters))
-    problems = []
-    for path, dispersion in campaign.configuration.dispersions.items():
-        if path not in known:
-            table = any(leaf.startswith(f"{path}.") for leaf in known)
-            if not (table and isinstance(dispersion, Choice)):
-                unknown = not_allowed("parameter", path, known, _beside(path, known))
-                message = "is a table; disperse one of its values, or choose between tables" if table else unknown
-                problems.append(document.problem(("dispersions", path), message))
-                continue
-        for value in dispersion.extremes():
-            refused = _refusal(campaign, {path: value})
-            if refused:
-                message = f"{dispersion.describe()} reaches {value!r}, which the parameter does not take: {refused}"
-                problems.append(document.problem(("dispersions", path), message))
-    return problems
-
-
-def _beside(path: str, known: Iterable[str]) -> list[str]:
-    """The parameters in the innermost table on a path that there is, further tables in it by their names alone."""
-    names = list(known)
-    table = path
-    while table:
-        table = table.rpartition(".")[0]
-        prefix = f"{table}." if table else ""
-        inside = [name.removeprefix(prefix).partition(".") for name in names if name.startswith(prefix)]
-        if inside:
-            return list(dict.fromkeys(f"{prefix}{head}{'.*' if rest else ''}" for head, rest, _ in inside))
-    return names
-
-
-def _draw_problems(document: _Document, campaign: Campaign) -> list[Problem]:
-    """The first case whose draws are refused together, if there is one early on."""
-    if not campaign.configuration.dispersions:
-        return []
-    for case in range(min(campaign.configuration.cases, TRIED_CASES)):
-        refused = _refusal(campaign, campaign.draws(case))
-        if refused:
-            return [document.problem(("dispersions",), f"the draws of case {case} are refused together: {refused}")]
-    return []
-
-
-def _refusal(campaign: Campaign, values: Mapping[str, Any]) -> str:
-    """Why the scenario refuses its parameters with these values; empty where it takes them."""
-    try:
-        campaign.with_values(values)
-    except ValidationError as error:
-        found = problems_of(error, campaign.scenario.parameters_type)
-        return "; ".join(f"{key_text(key)}: {message}" if key else message for key, message in found)
-    return ""

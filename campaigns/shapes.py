@@ -95,8 +95,10 @@ class Frozen:
         self.whole = scipy_distributions()[distribution]
         self._where = f"{distribution} is not defined for {', '.join(f'{key} = {one}' for key, one in stated.items())}"
         try:
-            self._shape: Any = getattr(stats, distribution)(**stated)
-            low, high = (float(one) for one in self._shape.support())
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self._shape: Any = getattr(stats, distribution)(**stated)
+                low, high = (float(one) for one in self._shape.support())
         except (ArithmeticError, TypeError, ValueError) as error:
             raise ValueError(f"{self._where}: {error}") from error
         if math.isnan(low) or math.isnan(high) or not low <= high:
@@ -147,12 +149,13 @@ def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probabi
     ValueError
         Where the limits are in the wrong order, or leave nothing to draw.
     """
+    low, high = shape.support() if limits is None else limits
     if limits is None:
         value = shape.ppf(probability)
-        return _whole(value) if shape.whole else value
-    low, high = limits
-    inverse, at_low, at_high = _cut(shape, low, high)
-    value = min(max(inverse(at_low + probability * (at_high - at_low)), low), high)
+    else:
+        inverse, at_low, at_high = _cut(shape, low, high)
+        value = inverse(at_low + probability * (at_high - at_low))
+    value = min(max(value, low), high)
     return _whole(value) if shape.whole else value
 
 

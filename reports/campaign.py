@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +14,18 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from reports import gallery, sections
 from reports.answers import answers_section
 from reports.carried import carried_section
-from reports.columns import primary_metric
+from reports.columns import label, numbers, primary_metric
 from reports.conditions import conditions_section
 from reports.faults import faults_section
 from reports.fieldtest import field_test_section
 from reports.landing import landing_section
+from reports.sampled import sampled
 from reports.section import Section, SectionMaker, Subject
 from reports.sensitivity import sensitivity_section
 from reports.stored import StoredRun, read_run
 from reports.tables import error_summaries, outcome_counts
 from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overall
+from reports.wording import number
 
 #: Version of the layout of `report.json`.
 SCHEMA = 1
@@ -63,30 +65,32 @@ def write_report(directory: Path) -> Path:
         Where the report cannot be written.
     """
     run = read_run(directory)
-    verdicts = judge_campaign(run.frame, run.requirements)
-    whole = overall(verdicts, run.frame)
-    metric = primary_metric(run.frame, run.requirements)
+    how = sampled(run.configuration)
+    verdicts = judge_campaign(run.frame, run.requirements, how)
+    whole = overall(verdicts, run.frame, how)
+    drawn = replace(run, frame=how.drawn(run.frame))
+    metric = primary_metric(drawn.frame, run.requirements)
     bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
-    subject = Subject(run, metric, bound)
+    subject = Subject(drawn, metric, bound)
     further = [section for make in FURTHER_SECTIONS if (section := make(subject)) is not None]
-    twin = summary(subject, verdicts, whole, further)
+    twin = summary(run, subject, verdicts, whole, further)
     _write(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
     page = directory / PAGE_FILE
-    context = page_context(subject, verdicts, whole, further)
+    context = page_context(run, subject, verdicts, whole, further)
     _write(page, _environment().get_template("report.html.j2").render(context))
     return page
 
 
 def page_context(
-    subject: Subject, verdicts: Sequence[Verdict], whole: Overall, further: Sequence[Section]
+    run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], whole: Overall, further: Sequence[Section]
 ) -> dict[str, Any]:
-    """Everything that the page's template is given."""
-    run, metric, bound = subject.run, subject.metric, subject.bound
+    """Everything that the page's template is given: statistics of the subject's cases, all else of the whole run's."""
+    metric, bound = subject.metric, subject.bound
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.said("description") or ""),
         "whole": whole,
-        "cautions": sections.cautions(verdicts, whole),
+        "cautions": [*sections.cautions(verdicts, whole), *sampling_cautions(run, metric)],
         "interrupted": run.said("state") not in (None, "finished"),
         "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
         "metric": metric,
@@ -95,7 +99,7 @@ def page_context(
         "outcomes": sections.outcome_grid(run.frame),
         "outcome_plates": gallery.outcome_plates(run.frame),
         "crashed": sections.crashed_rows(run),
-        "dispersions": sections.dispersion_grid(run),
+        "dispersions": sections.dispersion_grid(subject.run),
         "shown": gallery.shown_cases(run),
         "provenance": sections.provenance(run),
         "versions": sections.versions(run),
@@ -104,15 +108,33 @@ def page_context(
         "replay": sections.replay_command(run, "CASE"),
     }
     pictured = [str(case.case) for case in context["shown"]]
-    return {**context, **_error_sections(run, metric, bound, pictured)}
+    return {**context, **_error_sections(subject.run, metric, bound, pictured)}
+
+
+def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
+    """What a reader must know of how the cases were drawn: that they are no random draws, and which one is nominal."""
+    how = sampled(run.configuration)
+    said = []
+    if not how.independent:
+        said.append(
+            f"The cases are no independent random draws: {how.text}. Statistics describe these cases; intervals, "
+            "bounds and probabilities on this page, which take cases as independent draws, do not hold for them."
+        )
+    nominal = run.frame[run.frame["case"] == 0] if how.nominal and "case" in run.frame else run.frame[:0]
+    if len(nominal):
+        told = str(nominal["outcome"].iloc[0]) if "outcome" in nominal else "stored"
+        if metric is not None:
+            told += f", {label(metric)} {number(float(numbers(nominal, metric)[0]))}"
+        said.append(f"Case 0 is the nominal one ({told}); it counts in no verdict and in no statistic.")
+    return said
 
 
 def summary(
-    subject: Subject, verdicts: Sequence[Verdict], whole: Overall, further: Sequence[Section]
+    run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], whole: Overall, further: Sequence[Section]
 ) -> dict[str, Any]:
     """The report as plain data; NaN and infinities are null."""
-    run, metric = subject.run, subject.metric
-    summaries = error_summaries(run.frame, metric) if metric is not None else []
+    metric, how = subject.metric, sampled(run.configuration)
+    summaries = error_summaries(subject.frame, metric) if metric is not None else []
     twin = {
         "schema": SCHEMA,
         "campaign": run.name,
@@ -123,6 +145,7 @@ def summary(
         "finished_utc": run.said("finished_utc"),
         "cases": len(run.frame),
         "crashed": whole.crashed,
+        "sampling": {**asdict(how), "independent": how.independent, "text": how.text},
         "verdict": whole.word,
         "sentence": whole.sentence,
         "exit_code": exit_code(verdicts, bool(whole.crashed)),
@@ -138,7 +161,7 @@ def summary(
         "outcomes": dict(outcome_counts(run.frame)),
         "metric": metric,
         "statistics": {name: asdict(summarized) for name, summarized in summaries},
-        "worst_cases": [] if metric is None else [row.case for row in sections.worst_cases(run, metric).rows],
+        "worst_cases": [] if metric is None else [row.case for row in sections.worst_cases(subject.run, metric).rows],
         "sections": {section.key: section.data for section in further},
         "showcases": run.showcases,
     }

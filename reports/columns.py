@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 #: Endings of column names and the unit they stand for, longest first.
 _UNITS = (
+    ("_deg_h_k", "deg/h/K"),
     ("_m_s2", "m/s²"),
     ("_deg_s", "deg/s"),
     ("_rad_s", "rad/s"),
@@ -26,6 +27,7 @@ _UNITS = (
     ("_ms", "ms"),
     ("_m", "m"),
     ("_s", "s"),
+    ("_k", "K"),
 )
 _AXES = ("x", "y", "z")
 #: Columns that describe the run rather than the case.

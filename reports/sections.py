@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from reports.columns import axis_columns, driver_columns, label, numbers
+from reports.sampled import sampled
 from reports.stored import StoredRun, table
 from reports.tables import error_summaries, outcome_counts, statistics_rows
 from reports.verdicts import Overall, Verdict, members
@@ -77,14 +79,16 @@ class CaseTable:
 def verdict_row(verdict: Verdict) -> VerdictRow:
     """A verdict as the page shows it."""
     asked = asked_text(verdict, label(verdict.metric))
-    bounds = NOTHING if verdict.n == 0 else f"{percent(verdict.lower)} to {percent(verdict.upper)}"
+    bounds = f"{percent(verdict.lower)} to {percent(verdict.upper)}"
+    if math.isnan(verdict.lower):
+        bounds = NOTHING if math.isnan(verdict.estimate) else f"{percent(verdict.estimate)} seen"
     further = NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}"
     evidence = [count(verdict.n, "case"), f"{verdict.failures:,} failed"]
     return VerdictRow(verdict, asked, evidence, bounds, further, _strip(verdict))
 
 
 def _strip(verdict: Verdict) -> Strip | None:
-    if verdict.n == 0:
+    if math.isnan(verdict.lower):
         return None
     lowest = min(verdict.lower, verdict.probability)
     left = max(0.0, lowest - 0.25 * (1.0 - lowest))
@@ -171,6 +175,7 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
         ("Scenario", run.said("scenario")),
         ("State", run.said("state")),
         ("Root seed", run.said("seed")),
+        ("Sampling", sampled(run.configuration).text),
         ("Cases asked", run.said("cases")),
         ("Cases stored", len(run.frame)),
         ("Started", run.said("started_utc")),
@@ -271,7 +276,7 @@ def _distribution(dispersion: Mapping[str, Any]) -> str:
     told = {
         name: value
         for name, value in dispersion.items()
-        if name not in ("distribution", "source") and value is not None
+        if name not in ("distribution", "source", "unit", "description") and value is not None
     }
     return f"{dispersion.get('distribution', '?')}({', '.join(f'{name}={value}' for name, value in told.items())})"
 

@@ -5,6 +5,7 @@ Texts from files are put into `Text` objects, never into markup: a name in squar
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import pandas as pd
@@ -35,7 +36,7 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
             Text(str(verdict.status), style=_STYLES[verdict.status]),
             f"{verdict.failures} of {verdict.n}",
             percent(verdict.estimate),
-            NOTHING if verdict.n == 0 else f"≥ {percent(verdict.lower)}\n≤ {percent(verdict.upper)}",
+            NOTHING if math.isnan(verdict.lower) else f"≥ {percent(verdict.lower)}\n≤ {percent(verdict.upper)}",
             NOTHING if verdict.further_cases is None else str(verdict.further_cases),
         )
     if not verdicts:
@@ -112,7 +113,11 @@ def _requirement(verdict: Verdict) -> Text:
 def _caption(verdicts: Sequence[Verdict]) -> Text:
     """What the columns mean, and what a reader must know before trusting them."""
     lines = []
-    if verdicts:
+    if any(not math.isnan(verdict.lower) for verdict in verdicts):
         lines.append("Bounds: one-sided Clopper-Pearson at the stated confidence. More: further cases if no more fail.")
-    lines += [f"{verdict.requirement_id}: {verdict.note}" for verdict in verdicts if verdict.note]
+    shared = {verdict.note for verdict in verdicts}
+    if len(verdicts) > 1 and len(shared) == 1 and verdicts[0].note:
+        lines.append(verdicts[0].note)
+    else:
+        lines += [f"{verdict.requirement_id}: {verdict.note}" for verdict in verdicts if verdict.note]
     return Text("\n".join(lines), style="dim", justify="left")
