@@ -231,6 +231,15 @@ def wheel_centres(
     return centres
 
 
+def bogie_pivots(rover: RoverParameters, differential_rad: float) -> Float64[np.ndarray, "2 3"]:
+    """Where the rockers carry the left and the right bogie, rover frame, metres."""
+    rocker_pivot = np.array([rover.rocker_pivot_x_m, rover.rocker_pivot_z_m])
+    away = np.tile(np.array([rover.bogie_pivot_x_m, rover.bogie_pivot_z_m]) - rocker_pivot, (6, 1))
+    turned = rocker_pivot + _turned(away, differential_rad * _SIDE[None])[0, [0, 3]]
+    half = rover.half_track_m
+    return np.array([[turned[0, 0], half, turned[0, 1]], [turned[1, 0], -half, turned[1, 1]]])
+
+
 def _wheel_centres(rover: RoverParameters, joints: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 6 3"]:
     rest = rover.wheel_places_m
     rocker_pivot = np.array([rover.rocker_pivot_x_m, rover.rocker_pivot_z_m])

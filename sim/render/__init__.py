@@ -5,6 +5,7 @@ from sim.render.objects import Objects
 from sim.render.photometry import DustySky, Photometry, Sun, Texture
 from sim.render.rays import PixelRays
 from sim.render.renderer import Frame, Renderer, Scene, process_renderer
+from sim.render.rover import may_shade, rover_objects
 
 __all__ = [
     "CloudLayer",
@@ -18,5 +19,7 @@ __all__ = [
     "Scene",
     "Sun",
     "Texture",
+    "may_shade",
     "process_renderer",
+    "rover_objects",
 ]

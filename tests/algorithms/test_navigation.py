@@ -65,8 +65,8 @@ def test_free_ground_is_crossed_straight() -> None:
 
 def test_a_goal_aside_is_reached_along_gentle_arcs() -> None:
     plan = navigate(EVERYWHERE, _pose(0.0, 0.0), np.array([4.0, 1.0]), 0.3, OPTIONS)
-    # the circle that leaves the origin along x and passes (4, 1) has the curvature 2 y / (x^2 + y^2) = 2 / 17; a pair of
-    # arcs may bend a little more at first, and less later
+    # the circle that leaves the origin along x and passes (4, 1) has the curvature 2 y / (x^2 + y^2) = 2 / 17; a pair
+    # of arcs may bend a little more at first, and less later
     assert plan.commands[0].turn_left_rad / plan.commands[0].forward_m == pytest.approx(2.0 / 17.0, abs=0.05)
     assert _driven(EVERYWHERE, _pose(0.0, 0.0), np.array([4.0, 1.0]), 0.3)[-1] == pytest.approx([4.0, 1.0], abs=0.02)
 

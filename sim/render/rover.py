@@ -1,0 +1,160 @@
+"""A rover's shape, for the shadows that it and its mast cast, and for pictures that show its deck.
+
+Boxes and cylinders: six wheels, rockers and bogies, body, deck with its panels, mast and head. They stand as the
+suspension stands and the mast points. The head lies behind its cameras, so that it hides nothing from them.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import trimesh
+from jaxtyping import Float64
+from scipy.spatial.transform import RigidTransform
+
+from sim.dynamics.rover import RoverParameters, Stance, bogie_pivots, wheel_centres
+from sim.measurements import MastGeometry
+from sim.render.objects import Objects
+
+#: Albedo of everything: bright metal and glass under dust. Assumed.
+ALBEDO = 0.25
+#: Numbers that rocks have count from 0; the rover is none of them.
+ROVER_NAME = -1
+#: Sizes that matter to shadows only, assumed: widths of legs and mast, thickness of the deck, and the body's share of
+#: the deck's length and width, m.
+_LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_SHARE = 0.05, 0.05, 0.04, (0.65, 0.4)
+#: The head: depth, height, how much wider than the cameras' baseline, and how far behind their centres it ends, m.
+_HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
+_SIDES = 24
+
+Triangles = Float64[np.ndarray, "triangles 3 3"]
+
+
+def rover_objects(
+    rover: RoverParameters,
+    stance: Stance,
+    mast: MastGeometry,
+    azimuth_rad: float,
+    elevation_rad: float,
+    baseline_m: float = 0.3,
+) -> Objects:
+    """The rover as one body, where it stands, its mast as it points.
+
+    Join it with a scene's rocks: ``Objects.joined([scene.objects, rover_objects(...)])``.
+
+    Parameters
+    ----------
+    rover, stance
+        Its shape, and where and how it stands.
+    mast
+        The mast; its head turns to the angles.
+    azimuth_rad, elevation_rad
+        True angles of the mast.
+    baseline_m
+        Distance of the widest pair of cameras: the head is as wide and a little more.
+    """
+    parts = [
+        _body(rover, mast),
+        _undercarriage(rover, stance.differential_rad, stance.bogies_rad),
+        _moved(_head(baseline_m), mast.rover_from_head(azimuth_rad, elevation_rad)),
+        _elevation_axis(mast, azimuth_rad, elevation_rad),
+    ]
+    triangles = _moved(np.concatenate(parts), stance.world_from_rover)
+    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = across / np.linalg.norm(across, axis=1, keepdims=True)
+    faces = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
+    names = np.full(len(triangles), ROVER_NAME, dtype=np.int32)
+    return Objects.of_mesh(triangles.reshape(-1, 3), np.repeat(normals, 3, axis=0), faces, names, ALBEDO)
+
+
+def may_shade(
+    objects: Objects, sun_direction: Float64[np.ndarray, "3"], place_m: Float64[np.ndarray, "3"], radius_m: float
+) -> bool:
+    """Whether bodies can hide the sun from any point within a radius of a place: false is certain, true is not.
+
+    A rover joined with a scene's rocks makes their tree of triangles be built anew at every stop; this tells where it
+    cannot matter to what a picture shows.
+    """
+    away = objects.spheres[:, :3] - place_m
+    along = away @ sun_direction
+    reach = objects.spheres[:, 3] + radius_m
+    beside = np.linalg.norm(away - along[:, None] * sun_direction, axis=1)
+    return bool(np.any((beside <= reach) & (along >= -reach)))
+
+
+def _body(rover: RoverParameters, mast: MastGeometry) -> Triangles:
+    """Body, deck, and mast up to the elbow."""
+    length, width = (
+        share * size for share, size in zip(_BODY_SHARE, (rover.body_length_m, rover.body_width_m), strict=True)
+    )
+    body = _box((length, width, rover.deck_m - rover.clearance_m), (0.0, 0.0, 0.5 * (rover.deck_m + rover.clearance_m)))
+    deck = _box((rover.body_length_m, rover.body_width_m, _DECK_M), (0.0, 0.0, rover.deck_m))
+    x, y, z = mast.base_m
+    top = z + mast.elbow_m[2]
+    return np.concatenate([body, deck, _rod((x, y, rover.deck_m), (x, y, top), _MAST_RADIUS_M)])
+
+
+def _undercarriage(rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]) -> Triangles:
+    """Wheels, and the legs that carry them."""
+    centres = wheel_centres(rover, differential_rad, bogies_rad)
+    bogies = bogie_pivots(rover, differential_rad)
+    parts = []
+    for side, bogie in enumerate(bogies):
+        front, middle, rear = centres[3 * side : 3 * side + 3]
+        rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
+        parts += [
+            _rod(a, b, 0.5 * _LEG_M) for a, b in ((rocker, front), (rocker, bogie), (bogie, middle), (bogie, rear))
+        ]
+    half = np.array([0.0, 0.5 * rover.wheel_width_m, 0.0])
+    parts += [_rod(centre - half, centre + half, rover.wheel_radius_m) for centre in centres]
+    return np.concatenate(parts)
+
+
+def _head(baseline_m: float) -> Triangles:
+    """The bar that carries the cameras, in the head's frame: behind the cameras' centres, which lie on its y axis."""
+    depth, height, wider = _HEAD_M
+    return _box((depth, baseline_m + wider, height), (-_BEHIND_M - 0.5 * depth, 0.0, 0.0))
+
+
+def _elevation_axis(mast: MastGeometry, azimuth_rad: float, elevation_rad: float) -> Triangles:
+    """From the elbow to the head's middle."""
+    head = mast.rover_from_head(azimuth_rad, elevation_rad)
+    elbow = head.apply(-mast.head_m)
+    return _rod(elbow, head.apply(np.array([-_BEHIND_M - 0.5 * _HEAD_M[0], 0.0, 0.0])), _MAST_RADIUS_M)
+
+
+def _box(size_m: tuple[float, float, float], middle_m: tuple[float, float, float]) -> Triangles:
+    return np.asarray(_unit_box() * np.array(size_m) + np.array(middle_m))
+
+
+@cache
+def _unit_box() -> Triangles:
+    return np.asarray(trimesh.creation.box().triangles, dtype=np.float64)
+
+
+@cache
+def _unit_rod() -> Triangles:
+    """A cylinder along z from 0 to 1, of radius 1."""
+    rod = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=_SIDES)
+    return np.asarray(rod.triangles + np.array([0.0, 0.0, 0.5]), dtype=np.float64)
+
+
+def _rod(
+    start: Float64[np.ndarray, "3"] | tuple[float, float, float],
+    end: Float64[np.ndarray, "3"] | tuple[float, float, float],
+    radius_m: float,
+) -> Triangles:
+    """A closed cylinder between two points."""
+    along = np.subtract(end, start)
+    length = float(np.linalg.norm(along))
+    beside = np.eye(3)[int(np.argmin(np.abs(along)))]
+    x = np.cross(beside, along)
+    x /= np.linalg.norm(x)
+    y = np.cross(along / length, x)
+    axes = np.stack([radius_m * x, radius_m * y, along], axis=1)
+    return np.asarray(np.asarray(start) + _unit_rod() @ axes.T)
+
+
+def _moved(triangles: Triangles, new_from_old: RigidTransform) -> Triangles:
+    return np.asarray(new_from_old.apply(triangles.reshape(-1, 3))).reshape(-1, 3, 3)

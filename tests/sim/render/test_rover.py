@@ -1,0 +1,121 @@
+"""The rover's shape: where it is, and where its shadow falls."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.validation.raycast import meet_triangles
+from sim.camera import Cahv
+from sim.dynamics import MER, ROCKY_8, RoverParameters, settle
+from sim.frames import direction, rigid
+from sim.measurements import MastGeometry
+from sim.render import Photometry, PixelRays, Renderer, Scene, Sun, rover_objects
+from sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
+from sim.terrain import Surface
+from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
+
+LAMBERT = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
+EAST = 0.5 * np.pi
+
+
+@pytest.mark.parametrize(("rover", "mast"), [(MER, MER_MAST), (ROCKY_8, RESEARCH_MAST)])
+def test_the_rover_stands_on_the_ground_with_its_stated_size(rover: RoverParameters, mast: MastGeometry) -> None:
+    stance = settle(rover, Plane(height_m=2.0), 10.0, 20.0, EAST)
+    objects = rover_objects(rover, stance, mast, 0.0, 0.0)
+    low, high = objects.triangles.min(axis=(0, 1)), objects.triangles.max(axis=(0, 1))
+    # wheels reach the ground; their cylinders have 24 sides, so that a side may be a hundredth of a radius short
+    assert low[2] == pytest.approx(2.0, abs=0.01 * rover.wheel_radius_m)
+    assert high[2] == pytest.approx(2.0 + (mast.base_m + mast.elbow_m + mast.head_m)[2] + 0.06, abs=1e-9)
+    assert (low[1], high[1]) == pytest.approx(
+        (20.0 - 0.5 * rover.body_width_m, 20.0 + 0.5 * rover.body_width_m), abs=0.2
+    )
+    assert len(objects) == 1
+    assert objects.names[0] == -1
+
+
+def test_normals_point_outwards() -> None:
+    stance = settle(MER, Plane(), 0.0, 0.0, EAST)
+    objects = rover_objects(MER, stance, MER_MAST, 0.3, -0.2)
+    # closed bodies: the flux of the position through their faces is three times their volume, which is positive
+    crossed = np.cross(*(objects.triangles[:, k] - objects.triangles[:, 0] for k in (1, 2)))
+    assert np.einsum("ti,ti->", objects.triangles[:, 0], crossed) > 0.0
+    areas = np.linalg.norm(crossed, axis=1, keepdims=True)
+    assert objects.normals[:, 0] == pytest.approx(crossed / areas)
+
+
+def test_wheels_follow_the_suspension() -> None:
+    # a block under the left front wheel: the rover's lowest points there lie on the block
+    stance = settle(MER, Steps(((0.705, 0.53, 0.1),)), 0.0, 0.0, EAST)
+    corners = rover_objects(MER, stance, MER_MAST, 0.0, 0.0).triangles.reshape(-1, 3)
+    for x, y, height in ((0.705, 0.53, 0.1), (0.705, -0.53, 0.0), (-0.705, 0.53, 0.0)):
+        under = corners[np.hypot(corners[:, 0] - x, corners[:, 1] - y) < 0.15]
+        assert under[:, 2].min() == pytest.approx(height, abs=0.01)
+
+
+@pytest.mark.parametrize("elevation_deg", [10.0, 0.0, -20.0, -35.0])
+@pytest.mark.parametrize("azimuth_deg", [0.0, 70.0, -150.0])
+def test_the_head_hides_nothing_from_its_cameras(azimuth_deg: float, elevation_deg: float) -> None:
+    angles = (float(np.radians(azimuth_deg)), float(np.radians(elevation_deg)))
+    pair = stereo_mast("mer-navcam")
+    stance = settle(MER, Plane(), 0.0, 0.0, EAST)
+    objects = rover_objects(MER, stance, pair.geometry, *angles, baseline_m=0.2)
+    world_from_head = stance.world_from_rover * pair.geometry.rover_from_head(*angles)
+    for camera in (pair.left.moved(world_from_head), pair.right.moved(world_from_head)):
+        # about the middle of the picture, where targets are
+        u, v = np.meshgrid(np.linspace(430.0, 590.0, 9), np.linspace(430.0, 590.0, 9))
+        origins, directions = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))
+        met = meet_triangles(objects, origins, directions, nearest=1e-3)
+        # steeply aside the deck shows, 0.9 m below; nothing nearer, and ahead nothing at all
+        assert met.min() > (0.9 if azimuth_deg else 100.0)
+
+
+def test_it_leans_with_the_ground() -> None:
+    stance = settle(MER, uphill_east(10.0), 0.0, 0.0, EAST)
+    objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
+    level = rover_objects(MER, settle(MER, Plane(), 0.0, 0.0, EAST), MER_MAST, 0.0, 0.0)
+    assert objects.triangles.reshape(-1, 3) == pytest.approx(
+        stance.world_from_rover.apply(level.triangles.reshape(-1, 3)), abs=1e-9
+    )
+
+
+def test_the_masts_shadow_falls_where_the_sun_says(renderer: Renderer) -> None:
+    samples = np.zeros((64, 64, 2), dtype=np.float32)
+    samples[..., 1] = 0.2
+    surface = Surface.from_samples(samples, 1.0)
+    stance = settle(MER, surface, 32.0, 32.0, 0.0)
+    elevation = np.radians(25.0)
+    sun = Sun(direction(EAST, elevation))
+    objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
+    scene = Scene(surface, (32.0, 32.0), sun, LAMBERT, objects, mesh_finest_m=0.2, mesh_reach_m=60.0, edge_rays=1)
+    # high up on the mast, so that it is not in the deck's shadow: it falls to the west by height / tan(elevation)
+    mast = stance.world_from_rover.apply(np.array([*MER_MAST.base_m[:2], 0.0]))
+    high = 1.28
+    shade = mast + np.array([-high / np.tan(elevation), 0.0, 0.0])
+    camera = Cahv.from_field_of_view(
+        horizontal_rad=0.1, size=(101, 101), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
+    )
+    pose = rigid(Rotation.identity(), shade + np.array([0.0, 0.0, 6.0]))
+    frame = renderer.render(scene, PixelRays.of(camera), pose)
+    points = frame.points_world()
+    dark = frame.radiance < 0.1 * frame.radiance.max()
+    assert 0.1 < np.mean(dark) < 0.5
+    # the shadow is a band along east, as wide as the mast
+    band = points[dark & (np.abs(points[..., 0] - shade[0]) < 0.1)]
+    assert band[:, 1].mean() == pytest.approx(shade[1], abs=0.01)
+    assert np.ptp(band[:, 1]) == pytest.approx(2 * 0.05, abs=0.02)
+
+
+def test_what_a_rover_cannot_shade() -> None:
+    objects = rover_objects(MER, settle(MER, Plane(), 0.0, 0.0, EAST), MER_MAST, 0.0, 0.0)
+    low = direction(EAST, np.radians(20.0))
+    # the mast's tip, 1.6 m up, throws its shadow 4.4 m to the west and none to the east
+    corners = objects.triangles.reshape(-1, 3)
+    shadow = corners - corners[:, 2:] / low[2] * low
+    for place in shadow[:: len(shadow) // 50]:
+        assert may_shade(objects, low, place, 0.0)
+    assert not may_shade(objects, low, np.array([2.5, 0.0, 0.0]), 0.3)
+    assert may_shade(objects, low, np.array([2.5, 0.0, 0.0]), 2.0)
+    assert not may_shade(objects, low, np.array([-8.0, 0.0, 0.0]), 0.3)
+    assert not may_shade(objects, low, np.array([-2.0, 4.0, 0.0]), 0.3)
