@@ -11,7 +11,7 @@ from sim.camera import Cahv
 from sim.dynamics import MER, ROCKY_8, RoverParameters, settle
 from sim.frames import direction, rigid
 from sim.measurements import MastGeometry
-from sim.render import Photometry, PixelRays, Renderer, Scene, Sun, rover_objects
+from sim.render import Photometry, PixelRays, Renderer, Scene, Sun, may_shade, rover_objects
 from sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
 from sim.terrain import Surface
 from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
