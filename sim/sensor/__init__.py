@@ -5,31 +5,23 @@ from sim.sensor.clock import Clock, ClockParameters
 from sim.sensor.detector import Detector, DetectorParameters
 from sim.sensor.exposure import AutoExposure, AutoExposureParameters, auto_expose
 from sim.sensor.gps import POST_PROCESSED, RTK, STANDALONE, Gps, GpsParameters
-from sim.sensor.imu import Imu, ImuIncrements, ImuParameters, WarmUp
+from sim.sensor.imu import SMALL_UNIT, Imu, ImuIncrements, ImuParameters, WarmUp
 from sim.sensor.inertial import InertialSolution, NavigationErrors
 from sim.sensor.instrument import Instrument, Readings, Sampling
 from sim.sensor.laser import LaserAltimeter, LaserParameters
-from sim.sensor.mast import (
-    MASTS,
-    Mast,
-    MastState,
-    PointingParameters,
-    StereoCalibrationParameters,
-    StereoHead,
-    stereo_mast,
-)
 from sim.sensor.motion import ImageMotion
-from sim.sensor.odometry import Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
 from sim.sensor.optics import natural_fall_off
 from sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, Preset, preset
 from sim.sensor.radar import RadarAltimeter, RadarParameters
 from sim.sensor.ranging import height_above_ground
+from sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
+from sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 
 __all__ = [
-    "MASTS",
     "POST_PROCESSED",
     "PRESETS",
     "RTK",
+    "SMALL_UNIT",
     "STANDALONE",
     "Approach",
     "ApproachParameters",
@@ -51,25 +43,21 @@ __all__ = [
     "Instrument",
     "LaserAltimeter",
     "LaserParameters",
-    "Mast",
-    "MastState",
     "NavigationErrors",
-    "Odometer",
-    "OdometryParameters",
-    "PointingParameters",
-    "PoseEstimate",
     "Preset",
     "RadarAltimeter",
     "RadarParameters",
     "Readings",
+    "RtkParameters",
+    "RtkReceiver",
+    "RtkSolutions",
     "Sampling",
-    "StereoCalibrationParameters",
-    "StereoHead",
-    "VisualOdometryParameters",
+    "TiltCompass",
+    "TiltCompassParameters",
+    "TiltCompassReadings",
     "WarmUp",
     "auto_expose",
     "height_above_ground",
     "natural_fall_off",
     "preset",
-    "stereo_mast",
 ]

@@ -92,6 +92,27 @@ class ImuParameters(BaseModel):
     clock: ClockParameters = ClockParameters(offset_sd_s=0.0002, jitter_sd_s=0.00002)
 
 
+#: A small unit of quartz or silicon, as a helicopter of 2 m carries; assumed (the landing paper names an
+#: ISIS of Inertial Science, without figures). The gyros' bias is what zeroing them on the ground has left.
+SMALL_UNIT = ImuParameters(
+    rate_hz=100.0,
+    gyro_bias_deg_h=60.0,
+    gyro_wander_deg_h=20.0,
+    gyro_bias_deg_h_k=0.0,
+    angular_random_walk_deg_sqrt_h=2.0,
+    gyro_scale_ppm=1000.0,
+    gyro_misalignment_mrad=1.0,
+    gyro_count_rad=2.0**-19,
+    accelerometer_bias_mg=3.0,
+    accelerometer_wander_mg=0.3,
+    accelerometer_bias_mg_k=0.0,
+    velocity_random_walk_ug_sqrt_hz=200.0,
+    accelerometer_scale_ppm=1000.0,
+    accelerometer_misalignment_mrad=1.0,
+    clock=ClockParameters(),
+)
+
+
 @dataclass(frozen=True)
 class Triad:
     """Three gyros or accelerometers: the errors of one unit. Below, "unit" is rad for gyros and m/s for accelerometers.

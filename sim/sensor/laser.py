@@ -27,12 +27,16 @@ class LaserParameters(RangingParameters):
     noise_m: Annotated[float, Field(ge=0.0, le=100.0, description="at any range, new in every reading, m")] = 0.05
     count_m: Annotated[float, Field(ge=0.0, le=100.0, description="range of a count, m; 0: no rounding")] = 0.01
     max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="longest range that is read, m")] = 300.0
+    beam_mrad: Annotated[float, Field(ge=0.0, le=50.0, description="full width of the beam, mrad")] = 0.0
     clock: ClockParameters = ClockParameters(offset_sd_s=0.002, jitter_sd_s=0.0005)
 
 
 @dataclass(frozen=True)
 class LaserAltimeter:
-    """A laser altimeter over one terrain, its beam of no width along a body axis."""
+    """A laser altimeter over one terrain, its beam along a body axis.
+
+    What a beam of some width reads is the mean range of seven rays that share it evenly.
+    """
 
     parameters: LaserParameters
     surface: Surface
@@ -62,12 +66,30 @@ class LaserAltimeter:
     def true_ranges(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         """Range along the axis to the ground, metres; infinite if there is none within reach."""
         motion = trajectory.motion(times_s)
-        axes = motion.attitudes.apply(np.array(self.axis_body))
+        width = 1e-3 * self.parameters.beam_mrad
+        rays = np.array(self.axis_body)[None] if width == 0.0 else beam_rays(self.axis_body, width)
+        axes = np.stack([motion.attitudes.apply(ray) for ray in rays], axis=1)
         ranges = [
-            range_along(self.surface, position, axis, self.parameters.max_range_m)
-            for position, axis in zip(motion.positions_m, axes, strict=True)
+            np.mean([range_along(self.surface, position, axis, self.parameters.max_range_m) for axis in beam])
+            for position, beam in zip(motion.positions_m, axes, strict=True)
         ]
         return np.array(ranges, dtype=np.float64)
+
+
+def beam_rays(axis: Float64[np.ndarray, "3"], width_rad: float) -> Float64[np.ndarray, "7 3"]:
+    """Unit vectors in the middles of seven equal parts of a round beam's area: its middle and a ring about it.
+
+    Each ray stands for a seventh of the area; the ring lies at the root mean square radius of what the middle leaves.
+    """
+    sideways = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    sideways /= np.linalg.norm(sideways)
+    # outside a seventh of the area r^2 runs evenly from 1/7 to 1 of the beam's radius squared
+    ring = 0.5 * width_rad * np.sqrt(4.0 / 7.0)
+    turns = np.arange(6) * np.pi / 3.0
+    around = np.outer(np.cos(turns), sideways) + np.outer(np.sin(turns), np.cross(axis, sideways))
+    rays = np.concatenate([axis[None], axis + np.tan(ring) * around])
+    unit: Float64[np.ndarray, "7 3"] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit
 
 
 def range_along(

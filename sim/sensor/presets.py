@@ -30,6 +30,8 @@ from sim.sensor.radiometry import DARK_E_S, NG3_FIELD, NG4_FLIGHT, LightPath
 MARS_AU = 1.5
 #: Distortion of Opportunity's left navcam (its PDS label), R of CAHVOR.
 NAVCAM_RADIAL = (0.00096, -0.002183, 0.018547)
+#: Barrel distortion of a small C-mount lens, R of CAHVOR: 1.8 % in the corner of the XC-55's picture; assumed.
+C_MOUNT_RADIAL = (0.0, -0.08, 0.025)
 #: What an exposure is set for where it is not known: a radiance factor of 0.3 fills 60 % of the full well.
 BRIGHT_RADIANCE_FACTOR, BRIGHT_SHARE = 0.3, 0.6
 
@@ -194,8 +196,8 @@ def _research_pancam() -> Preset:
 
 
 def _xc55() -> Preset:
-    """The lens is assumed: 6 mm, 43 deg. It looks down."""
-    return _interline(CameraDesign(6.0, 7.4, (640, 480), down=True), 20000.0, 8)
+    """The lens is assumed: 6 mm, 43 deg, with some distortion. It looks down."""
+    return _interline(CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8)
 
 
 PRESETS: Mapping[str, Callable[[], Preset]] = MappingProxyType(

@@ -31,6 +31,9 @@ from sim.dynamics.rotorcraft.parameters import (
 )
 from sim.dynamics.rotorcraft.path import FlownPath, Vibration
 
+#: How long after the last picture the flight for pictures ends, s: clocks may be late.
+TAIL_S = 0.1
+
 
 @dataclass(frozen=True)
 class Air:
@@ -145,7 +148,7 @@ def transit_flight(
     air: Air,
     rng: np.random.Generator,
 ) -> RotorcraftFlight:
-    """The flight up to the last picture.
+    """The flight up to a moment after the last picture.
 
     Parameters
     ----------
@@ -157,7 +160,7 @@ def transit_flight(
         Phases of the vibration.
     """
     p, step = transit, craft.step_s
-    count = int(np.ceil((p.lead_s + p.pictures_s) / step - 1e-9)) + 1
+    count = int(np.ceil((p.lead_s + p.pictures_s + TAIL_S) / step - 1e-9)) + 1
     times = -p.lead_s + step * np.arange(count)
     along = np.array([np.cos(course_rad), np.sin(course_rad), 0.0])
     reference = np.concatenate([np.multiply.outer(one, along) for one in _run_up(p, times)], axis=1)
@@ -180,8 +183,9 @@ def landing_flight(
     air: Air,
     ground: GroundPatch,
     laser: LandingLaser,
+    end_s: float | None = None,
 ) -> RotorcraftFlight:
-    """The flight on to a site and down; it ends a while after the touchdown, or when the time is up.
+    """The flight on to a site and down; it ends when told, or else a while after the touchdown or when the time is up.
 
     Parameters
     ----------
@@ -228,7 +232,9 @@ def landing_flight(
         craft.craft(flown.path.gravity_m_s2),
     )
     landed = np.flatnonzero(phases == Phase.ON_GROUND.value)
-    if landed.size:
+    if end_s is not None:
+        count = min(count, round((end_s - flown.path.start_s) / step) + 1)
+    elif landed.size:
         count = min(count, int(landed[0]) + int(np.ceil(guidance.rest_s / step)))
     return RotorcraftFlight(replace(flown.path, rows=rows[:count]), phases[:count], carried, flown.heading_rad)
 

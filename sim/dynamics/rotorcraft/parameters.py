@@ -44,7 +44,8 @@ class AirParameters(BaseModel):
 class RotorcraftParameters(BaseModel):
     """A helicopter of the class of JPL's (2 m long, gas powered) with its autopilot.
 
-    The paper gives no figure of either. All assumed: an attitude loop of about 1 Hz and position loops several times slower, as such helicopters fly.
+    The paper gives no figure of either. All assumed: an attitude loop of about 1 Hz and position loops several times
+    slower, as such helicopters fly.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from sim.camera import Cahvore
+from sim.camera import Cahv, Cahvor, Cahvore
 from sim.sensor import PRESETS, Detector, DetectorChoice, DetectorParameters, natural_fall_off, preset
 
 
@@ -35,6 +35,20 @@ def _fields_deg(name: str) -> tuple[float, float]:
 )
 def test_fields_of_view(name: str, across: float, down: float, tolerance: float) -> None:
     assert _fields_deg(name) == pytest.approx((across, down), abs=tolerance)
+
+
+def test_the_helicopters_camera_has_a_lens_with_distortion() -> None:
+    """640 x 480 pixels of 7.4 um behind 6 mm, CAHVOR: corners are drawn in by 1.8 % of 400 px."""
+    camera = preset("xc-55").cameras()[0]
+    assert isinstance(camera, Cahvor)
+    ideal = Cahv.from_focal_length(
+        focal_m=6e-3, pixel_pitch_m=7.4e-6, size=(640, 480), centre=camera.c, axis=camera.a, right=camera.right
+    )
+    corner = np.array([[639.5, 479.5]]) - 0.5
+    point = 10.0 * ideal.rays(corner)[1]
+    (drawn,), _ = camera.project(point)
+    towards_middle = np.linalg.norm(corner[0] - [319.5, 239.5]) - np.linalg.norm(drawn - [319.5, 239.5])
+    assert towards_middle == pytest.approx(0.018 * 400.0, abs=0.3)
 
 
 @pytest.mark.parametrize(

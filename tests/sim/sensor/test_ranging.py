@@ -233,6 +233,25 @@ def test_a_laser_reads_the_slant_range_of_its_axis() -> None:
     assert readings.values[0] == pytest.approx(expected, abs=1e-4)
 
 
+def test_a_wide_beam_reads_the_mean_range_of_its_footprint() -> None:
+    """Over a step of 2 m about half of either height, within one ray in seven and what the spline makes of the step."""
+    heights = np.zeros((SIDE, SIDE))
+    heights[:, SIDE // 2 :] = 2.0
+    surface, wide = _surface(heights, 0.05), LaserParameters(noise_m=0.0, count_m=0.0, clock={}, beam_mrad=40.0)
+    middle = 0.5 * SIDE * 0.05 - 0.025
+
+    def read(east: float) -> float:
+        still = Swaying(position_m=(east, 20.0, 12.0))
+        laser = LaserAltimeter.drawn(wide, surface, np.random.default_rng(0))
+        return float(laser.measure(still, np.array([0.0]), np.random.default_rng(0)).values[0])
+
+    # far from the step the ring's obliquity is all: 12 m times half of (20 mrad)^2 4/7 6/7
+    assert read(5.0) == pytest.approx(12.0, abs=2e-3)
+    assert read(35.0) == pytest.approx(10.0, abs=2e-3)
+    # three rays on either side, one on the step
+    assert read(middle) == pytest.approx(11.0, abs=2.0 / 14.0 + 0.01)
+
+
 def test_a_laser_that_looks_up_reads_nothing() -> None:
     laser = LaserAltimeter.drawn(LaserParameters(), FLAT, np.random.default_rng(0), np.array([0.0, 0.0, 1.0]))
     readings = laser.measure(DESCENT, np.array([0.0]), np.random.default_rng(0))

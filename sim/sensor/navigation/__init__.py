@@ -1,0 +1,11 @@
+"""The helicopter's on-board filter."""
+
+from sim.sensor.navigation.filter import (
+    FilterParameters,
+    FilterState,
+    Innovations,
+    NavigationFilter,
+    NavigationSolution,
+)
+
+__all__ = ["FilterParameters", "FilterState", "Innovations", "NavigationFilter", "NavigationSolution"]

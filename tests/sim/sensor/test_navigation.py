@@ -1,0 +1,179 @@
+"""The on-board filter: consistent with its own covariance over flights, and sane where instruments fail."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from sim.dynamics.rotorcraft import (
+    Air,
+    AirParameters,
+    FlownPath,
+    RotorcraftParameters,
+    TransitParameters,
+    transit_flight,
+)
+from sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
+from sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
+from sim.sensor.navigation.kernels import GPS_PLACE, GPS_SPEED
+from sim.sensor.rtk import Outage, RtkParameters, RtkReceiver
+from sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
+
+GRAVITY, FLIGHTS = 9.8, 50
+CRAFT, TRANSIT = RotorcraftParameters(), TransitParameters()
+RTK, COMPASS = RtkParameters(), TiltCompassParameters()
+
+
+@cache
+def _path(seed: int) -> FlownPath:
+    rng = np.random.default_rng(seed)
+    air = Air.drawn(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s, rng)
+    over, heading = np.array([100.0, 50.0, 10.0]), rng.uniform(0.0, 2.0 * np.pi)
+    return transit_flight(CRAFT, TRANSIT, over, 0.3, heading, GRAVITY, air, rng).path
+
+
+def _flown(
+    seed: int,
+    imu_class: ImuParameters = SMALL_UNIT,
+    rtk_class: RtkParameters = RTK,
+    compass_class: TiltCompassParameters = COMPASS,
+    keep_s: tuple[float, ...] = (),
+    parameters: FilterParameters = FilterParameters(),  # noqa: B008 - frozen
+) -> tuple[FlownPath, Imu, NavigationSolution]:
+    path, rng = _path(seed), np.random.default_rng([seed, 1])
+    span = path.span_s
+    imu = Imu.drawn(imu_class, span, rng)
+    receiver, compass = RtkReceiver.drawn(rtk_class, span, rng), TiltCompass.drawn(compass_class, rng)
+    increments = imu.increments(path, *span, rng)
+    solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
+    readings = compass.measure(path, compass.sampling.within(*span), rng)
+    navigation = NavigationFilter(parameters, SMALL_UNIT, rtk_class, compass_class, GRAVITY)
+    start = navigation.started(solutions, readings)
+    return path, imu, navigation.run(start, increments, solutions, readings, np.array(keep_s))
+
+
+def _errors(path: FlownPath, imu: Imu, solution: NavigationSolution, at: np.ndarray) -> np.ndarray:
+    """True less believed, fifteen columns; what gravity makes of scale and misalignment counts as bias."""
+    times = imu.boundaries(*path.span_s)[at]
+    true = path.motion(times)
+    lifted = imu.accelerometer.sensitivity_error[:, 2] * GRAVITY
+    return np.concatenate(
+        [
+            true.positions_m - solution.positions_m[at],
+            true.velocities_m_s - solution.velocities_m_s[at],
+            (true.attitudes * solution.attitudes[at].inv()).as_rotvec(),
+            imu.gyro.bias_at(times) - solution.gyro_biases_rad_s[at],
+            imu.accelerometer.bias_at(times) + lifted - solution.accelerometer_biases_m_s2[at],
+        ],
+        axis=1,
+    )
+
+
+def test_errors_are_what_the_covariance_says() -> None:
+    """Normalised errors squared over independent flights: chi-square, fifteen degrees a flight (99.8 % band)."""
+    floating = RtkParameters(float_share=0.3, float_s=10.0)
+    squares = []
+    for seed in range(FLIGHTS):
+        path, imu, solution = _flown(seed, rtk_class=floating, keep_s=(-3.0, 0.0, 2.5, 5.0))
+        errors = _errors(path, imu, solution, solution.kept_at)
+        covariances = solution.covariances
+        squares.append([float(e @ np.linalg.solve(p, e)) for e, p in zip(errors, covariances, strict=True)])
+    low, high = chi2.ppf([0.001, 0.999], 15 * FLIGHTS) / FLIGHTS
+    means = np.mean(squares, axis=0)
+    assert np.all((means > low) & (means < high)), means
+
+
+def test_innovations_are_white() -> None:
+    normalised: dict[int, list[float]] = {GPS_PLACE: [], GPS_SPEED: []}
+    products: dict[int, list[float]] = {GPS_PLACE: [], GPS_SPEED: []}
+    for seed in range(20):
+        said = _flown(seed)[2].innovations
+        assert np.mean(said.used) > 0.99
+        for kind in normalised:
+            for axis in range(3):
+                one = said.normalised[(said.kinds == kind) & (said.axes == axis) & (said.times_s > -8.0)]
+                normalised[kind].extend(one)
+                products[kind].extend(one[1:] * one[:-1])
+    for kind in normalised:
+        # 7,600 values: a variance is known to 1.6 %, a correlation to 0.011; the bias of what is left out adds to both
+        assert np.var(normalised[kind]) == pytest.approx(1.0, abs=0.1)
+        assert abs(np.mean(products[kind])) < 0.12
+
+
+def test_better_instruments_make_smaller_errors() -> None:
+    """An inertial unit without errors, and 2 mm and 5 mm/s of white noise only, averaged over a second or so."""
+    none = {name: 0.0 for name, value in SMALL_UNIT.model_dump().items() if isinstance(value, float)}
+    times = {"rate_hz": 100.0, "gyro_wander_s": 100.0, "accelerometer_wander_s": 60.0}
+    ideal = ImuParameters.model_validate(none | times | {"clock": {}})
+    still = {"wander_m": (0.0,) * 3, "noise_m": (2e-3,) * 3, "correlation_s": 1.0}
+    white = {"velocity_noise_m_s": (5e-3,) * 3, "velocity_wander_m_s": (0.0,) * 3, "clock": {}}
+    exact = RtkParameters.model_validate({"fixed": still, "floating": still} | white)
+    path, imu, solution = _flown(0, ideal, exact)
+    errors = _errors(path, imu, solution, np.arange(1000, 1550))
+    assert np.abs(errors[:, :3]).max() < 6e-3
+    assert np.abs(errors[:, 3:6]).max() < 0.015
+
+
+def test_through_an_outage_it_coasts_as_its_covariance_says() -> None:
+    """Eight seconds on inertial navigation: position drifts by decimetres, as a tilt of 0.2 deg makes it."""
+    away = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_share=0.0)
+    squares, sizes = [], []
+    for seed in range(FLIGHTS):
+        path, imu, solution = _flown(seed, rtk_class=away, keep_s=(5.0,))
+        error = _errors(path, imu, solution, solution.kept_at)[0]
+        squares.append(error[:9] @ np.linalg.solve(solution.covariances[0][:9, :9], error[:9]))
+        sizes.append(np.hypot(*error[:2]))
+    assert 0.2 < np.sqrt(np.mean(np.square(sizes))) < 3.0
+    # what the instruments are off by in an outage is less than the filter allows for: inclinometers count little
+    low, high = chi2.ppf([0.001, 0.999], 9 * FLIGHTS) / FLIGHTS
+    assert low < np.mean(squares) < high
+
+
+def test_stuck_instruments_stop_to_count() -> None:
+    stuck = TiltCompassParameters(heading_stuck_s=-8.0, tilt_stuck_s=-8.0)
+    tilts: dict[str, list[np.ndarray]] = {name: [] for name in ("free", "stuck")}
+    for seed in range(20):
+        for name, unit in (("free", COMPASS), ("stuck", stuck)):
+            path, imu, solution = _flown(seed, compass_class=unit)
+            error = _errors(path, imu, solution, np.array([1500]))[0]
+            tilts[name].append(np.degrees(error[6:9]))
+            if name == "stuck":
+                late = solution.innovations.kinds[solution.innovations.times_s > -7.0]
+                assert set(late) == {GPS_PLACE, GPS_SPEED}
+    free, left = (np.sqrt(np.mean(np.square(tilts[name]), axis=0)) for name in ("free", "stuck"))
+    # the receiver's velocities give the tilt whether or not the inclinometers work
+    assert np.all(left[:2] < 1.5 * free[:2] + 0.05)
+    assert left[2] < 4.0
+
+
+def test_it_starts_anew_where_it_was_led_astray() -> None:
+    """A filter that begins 20 m off: its covariance would refuse all solutions, but not for more than a second."""
+    path, rng = _path(3), np.random.default_rng(4)
+    span = path.span_s
+    imu, receiver = Imu.drawn(SMALL_UNIT, span, rng), RtkReceiver.drawn(RtkParameters(float_share=0.0), span, rng)
+    compass = TiltCompass.drawn(COMPASS, rng)
+    solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
+    readings = compass.measure(path, compass.sampling.within(*span), rng)
+    navigation = NavigationFilter(FilterParameters(), SMALL_UNIT, receiver.parameters, COMPASS, GRAVITY)
+    start = navigation.started(solutions, readings)
+    astray = replace(start, state=start.state + np.eye(16)[0] * 20.0, covariance=0.01 * start.covariance)
+    solution = navigation.run(astray, imu.increments(path, *span, rng), solutions, readings)
+    said = solution.innovations
+    assert not said.used[(said.kinds == GPS_PLACE) & (said.axes == 0)][0]
+    off = np.abs(solution.positions_m - path.motion(imu.boundaries(*span)).positions_m)
+    assert off[80, 0] > 15.0
+    assert off[200:].max() < 0.1
+
+
+def test_a_pose_is_asked_for_within_the_flight() -> None:
+    path, _, solution = _flown(0)
+    with pytest.raises(ValueError, match="known from"):
+        solution.pose(path.span_s[1] + 1.0)
+    # 5 ms after a boundary a position has moved by 5 ms of its velocity
+    tags = solution.increments.times_s
+    moved = solution.pose(tags[700] + 0.005).translation - solution.positions_m[700]
+    np.testing.assert_allclose(moved, 0.005 * solution.velocities_m_s[700], atol=1e-9)
