@@ -9,7 +9,17 @@ from sim.sensor.imu import SMALL_UNIT, Imu, ImuIncrements, ImuParameters, WarmUp
 from sim.sensor.inertial import InertialSolution, NavigationErrors
 from sim.sensor.instrument import Instrument, Readings, Sampling
 from sim.sensor.laser import LaserAltimeter, LaserParameters
+from sim.sensor.mast import (
+    MASTS,
+    Mast,
+    MastState,
+    PointingParameters,
+    StereoCalibrationParameters,
+    StereoHead,
+    stereo_mast,
+)
 from sim.sensor.motion import ImageMotion
+from sim.sensor.odometry import Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
 from sim.sensor.optics import natural_fall_off
 from sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, Preset, preset
 from sim.sensor.radar import RadarAltimeter, RadarParameters
@@ -18,6 +28,7 @@ from sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
 from sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 
 __all__ = [
+    "MASTS",
     "POST_PROCESSED",
     "PRESETS",
     "RTK",
@@ -43,7 +54,13 @@ __all__ = [
     "Instrument",
     "LaserAltimeter",
     "LaserParameters",
+    "Mast",
+    "MastState",
     "NavigationErrors",
+    "Odometer",
+    "OdometryParameters",
+    "PointingParameters",
+    "PoseEstimate",
     "Preset",
     "RadarAltimeter",
     "RadarParameters",
@@ -52,12 +69,16 @@ __all__ = [
     "RtkReceiver",
     "RtkSolutions",
     "Sampling",
+    "StereoCalibrationParameters",
+    "StereoHead",
     "TiltCompass",
     "TiltCompassParameters",
     "TiltCompassReadings",
+    "VisualOdometryParameters",
     "WarmUp",
     "auto_expose",
     "height_above_ground",
     "natural_fall_off",
     "preset",
+    "stereo_mast",
 ]
