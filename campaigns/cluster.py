@@ -10,7 +10,6 @@ again counts as crashed.
 
 from __future__ import annotations
 
-import atexit
 import multiprocessing.process
 import threading
 import time
@@ -108,7 +107,7 @@ class ClusterWorkers:
         """See `campaigns.workers.Workers.run`."""
         threads = sum(self._client.nthreads().values())
         batches = Batches(items, total, threads)
-        coming = self._distributed.as_completed()
+        coming = self._distributed.as_completed(loop=self._client.loop)
         sent: dict[Any, Sequence[int]] = {}
 
         def send(batch: Sequence[int]) -> None:
@@ -189,9 +188,8 @@ def _own_workers() -> LocalWorkers:
     """The worker process of this thread."""
     workers: LocalWorkers | None = getattr(_here, "workers", None)
     if workers is None:
-        # Dask's workers are daemons to `multiprocessing`, which may have no children: theirs would be left over. Ours
-        # end with the thread that started them.
+        # Dask's workers are daemons to `multiprocessing`, which may have no children, as those would be left over. Ours
+        # are not: the kernel ends them with the thread that started them.
         multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
         workers = _here.workers = LocalWorkers(1)
-        atexit.register(workers.stop, kill=True)
     return workers

@@ -5,7 +5,7 @@ JSON; which columns they are is stored once a layout.
 
 Durability: the journal is a write-ahead log with `synchronous = FULL`, so that a transaction that was committed
 outlives a killed program, and a machine that loses its power as far as the disk keeps what it was told to. That costs
-one `fsync` a batch, some milliseconds for half a second of work.
+one `fsync` a batch, some milliseconds for a second of work.
 """
 
 from __future__ import annotations

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -54,12 +56,10 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
     schema = pa.schema([(name, form[0]) for name, form in forms.items()])
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
-        with pq.ParquetWriter(partial, schema) as writer:
+        with pq.ParquetWriter(partial, schema) as writer, _no_search_for_garbage():
             for chunk in store.chunks(_GROUP):
-                arrays = [
-                    pa.array([convert(value) for value in values] if convert else values, type_)
-                    for values, (type_, convert) in zip(_columns(chunk, layouts, columns), forms.values(), strict=True)
-                ]
+                pairs = zip(_columns(chunk, layouts, columns), forms.values(), strict=True)
+                arrays = [_array(values, *form) for values, form in pairs]
                 writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=_GROUP)
         with partial.open("rb") as file:
             os.fsync(file.fileno())
@@ -91,6 +91,27 @@ def _columns(
         yield values
 
 
+@contextmanager
+def _no_search_for_garbage() -> Iterator[None]:
+    """Rows do not refer to themselves, and looking through millions for some that do takes as long as reading them."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _array(values: Sequence[Any], type_: Any, convert: Callable[[Any], Any] | None) -> Any:
+    """A column; numbers that are missing are NaN."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    array = pa.array([convert(value) for value in values] if convert else values, type_)
+    return pc.fill_null(array, math.nan) if array.null_count and pa.types.is_floating(type_) else array
+
+
 def _form(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
     """The narrowest type that holds all of a column's values, and what brings them to it."""
     import pyarrow as pa
@@ -99,13 +120,15 @@ def _form(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
         return pa.bool_(), None
     if kinds == {"int"}:
         return pa.int64(), None
+    if kinds <= {"float"}:
+        return pa.float64(), None
     if kinds <= {"int", "big", "float"}:
         return pa.float64(), _number
     return pa.string(), None if kinds == {"str"} else _text
 
 
-def _number(value: Any) -> float:
-    return math.nan if value is None else float(value)
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)
 
 
 def _text(value: Any) -> str | None:

@@ -216,15 +216,15 @@ def test_memory_counts_what_is_the_processs_own(tmp_path: Path) -> None:
     assert used_memory(2**22 + 1) == 0.0
 
 
-def test_batches_grow_to_half_a_second_and_shrink_to_the_end() -> None:
+def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
     batches = Batches(range(100), 100, 2)
     sizes = []
     while batch := batches.next():
         sizes.append(len(batch))
         batches.took(len(batch), 0.05 * len(batch))
     assert sum(sizes) == 100
-    assert sizes[:4] == [1, 2, 4, 8]
-    assert max(sizes) == 10
+    assert sizes[:5] == [1, 2, 4, 8, 16]
+    assert max(sizes) == 20
     assert sizes[-1] == 1
     # Empty cases go a thousand at a time, unknown numbers of them as well; slow ones alone.
     empty = Batches(range(10_000), None, 2)

@@ -1,0 +1,139 @@
+"""What a campaign costs beside its cases: time a case, memory of the parent, and the table of a million rows."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from pydantic import BaseModel, ConfigDict
+
+from benchmarks.timing import Figure
+from campaigns.configuration import CampaignConfiguration, Retain
+from campaigns.crew import Crew
+from campaigns.engine import run_campaign
+from campaigns.sampling import Campaign
+from campaigns.store import RowStore, create_store
+from campaigns.table import write_table
+from scenarios.interface import CaseResult
+from sim.streams import Streams
+
+#: Columns of numbers of a row in the table of a million.
+COLUMNS = 30
+
+
+class BusyParameters(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    busy_s: float = 0.0
+
+
+class BusyScenario:
+    """Keeps a processor busy for so long, and scores nothing."""
+
+    name = "busy"
+    parameters_type = BusyParameters
+
+    def shared_inputs(self, parameters: BusyParameters) -> tuple[int, ...]:
+        return ()
+
+    def prepare(self, parameters: BusyParameters, shared_input: int) -> None:
+        raise NotImplementedError
+
+    def run(self, parameters: BusyParameters, streams: Streams) -> CaseResult:
+        end = time.process_time() + parameters.busy_s
+        while parameters.busy_s and time.process_time() < end:
+            pass
+        return CaseResult("VALID", True, {"number": streams.case})
+
+
+class Stopwatch:
+    """A watch of a campaign that notes when a number of cases was done, and how much memory the parent then had."""
+
+    def __init__(self, marks: tuple[int, ...]) -> None:
+        self.at: dict[int, tuple[float, float]] = {}
+        self._marks = marks
+        self._done = 0
+
+    def begin(self, stage: str, total: int) -> None:
+        pass
+
+    def step(self) -> None:
+        self._done += 1
+        if self._done in self._marks:
+            self.at[self._done] = (time.perf_counter(), _resident_mb())
+
+    def note(self, text: str) -> None:
+        print(f"note: {text}")
+
+
+@dataclass(frozen=True)
+class Span:
+    """What lay between two marks of a campaign: wall-clock seconds a case, cases' own part of them, and growth."""
+
+    case_s: float
+    own_s: float
+    grown_mb: float
+
+
+def figures(repeats: int = 3) -> list[Figure]:
+    """The bars of the engine. Shares of wall-clock time, so that another program's load counts on both sides."""
+    empty = [span(0.0, 2_000, 12_000) for _ in range(repeats)]
+    busy = [span(0.05, 20, 140) for _ in range(repeats)]
+    long = span(0.0, 10_000, 100_000)
+    return [
+        Figure("engine: beside an empty case (ms)", [1e3 * (one.case_s - one.own_s) for one in empty], bar=2.0),
+        Figure("engine: beside a case of 50 ms (%)", [100.0 * (one.case_s / one.own_s - 1.0) for one in busy], bar=3.0),
+        Figure("engine: parent grows, 10,000 to 100,000 cases (MB)", [long.grown_mb], bar=10.0),
+        Figure(f"engine: table of 1,000,000 rows of {COLUMNS} numbers (s)", [table_seconds(1_000_000)], bar=30.0),
+    ]
+
+
+def span(busy_s: float, first: int, last: int) -> Span:
+    """Runs a campaign on one worker; measured between its first and last mark, so that starting up does not count."""
+    configuration = CampaignConfiguration(
+        name="busy",
+        scenario="benchmarks.engine:BusyScenario",
+        # behind the last mark workers run small batches, as the end is near
+        cases=last + (last - first) // 10,
+        parameters={"busy_s": busy_s},
+        retain=Retain(showcase="none"),
+    )
+    watch = Stopwatch((first, last))
+    with TemporaryDirectory() as folder:
+        run_campaign(Campaign(configuration, BusyScenario()), Path(folder, "run"), Crew(1), watch)
+        own = pq.read_table(Path(folder, "run", "cases.parquet"), columns=["wall_time_s"])["wall_time_s"]
+        own_s = pc.mean(own.slice(first, last - first)).as_py()
+    (began, before), (ended, after) = watch.at[first], watch.at[last]
+    return Span((ended - began) / (last - first), own_s, after - before)
+
+
+def table_seconds(rows: int) -> float:
+    """Seconds of processor time to write the table of so many rows; numbers of full length, as measurements have."""
+    head = {"outcome": "VALID", "answered": True}
+    tail = {"wall_time_s": 0.1, "cpu_time_s": 0.1, "error": "", "traceback": ""}
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "cases.sqlite")
+        create_store(path, {})
+        with RowStore(path) as store:
+            for start in range(0, rows, 1000):
+                store.add(
+                    {"case": case, **head, **{f"x{k}": (case + k) / 7.0 for k in range(COLUMNS)}, **tail}
+                    for case in range(start, start + 1000)
+                )
+            began = time.process_time()
+            write_table(Path(folder, "cases.parquet"), store)
+            return time.process_time() - began
+
+
+def _resident_mb() -> float:
+    text = Path("/proc/self/statm").read_text()
+    return int(text.split()[1]) * 4096 / 1e6
+
+
+if __name__ == "__main__":
+    for figure in figures():
+        print(f"{figure.name:<60}{figure.median:9.3f}  {figure.asked:<8}{'' if figure.met else '  MISSED'}")
