@@ -9,7 +9,15 @@ import time
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.validation import dimes_checks, document, geometry_checks, light_checks, motion_checks, sampling_checks
+from benchmarks.validation import (
+    campaign_checks,
+    dimes_checks,
+    document,
+    geometry_checks,
+    light_checks,
+    motion_checks,
+    sampling_checks,
+)
 from benchmarks.validation.records import Measure
 
 CHECKS = (
@@ -18,6 +26,7 @@ CHECKS = (
     *light_checks.CHECKS,
     *dimes_checks.CHECKS,
     *sampling_checks.CHECKS,
+    *campaign_checks.CHECKS,
 )
 
 

@@ -1,0 +1,141 @@
+"""The bars on campaigns: rows that do not depend on how they were run, and algorithms that do their worst."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from benchmarks.validation.chaos import DEEDS, ChaosParameters, deed
+from benchmarks.validation.records import Check, Measure
+from campaigns.crew import Crew
+from campaigns.engine import run_campaign
+from campaigns.loading import load_campaign
+from campaigns.replay import differing_columns, replay
+from campaigns.table import read_rows
+
+FILE = """
+name = "chaos"
+scenario = "benchmarks.validation.chaos:ChaosScenario"
+cases = 100
+seed = 9
+[retain]
+showcase = "none"
+[limits]
+case_time_s = 6
+memory_gb = 0.4
+"""
+
+#: Seconds between kills, drawn evenly: from before the first row to well into the cases.
+KILLED_AFTER_S = (0.2, 6.0)
+
+
+class Silence:
+    """A watch that says nothing."""
+
+    def begin(self, stage: str, total: int) -> None:
+        pass
+
+    def step(self) -> None:
+        pass
+
+    def note(self, text: str) -> None:
+        pass
+
+
+def same_rows(quick: bool) -> Iterator[Measure]:
+    """Rows of one campaign run in every way, against those of one worker."""
+    cases, kills = (60, 3) if quick else (400, 10)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        file = _written(folder)
+        share = 0.03
+        settings = [f"share={share}", f"cases={cases}"]
+        expected = _rows_of(file, folder / "one", Crew(1), settings)
+        ways = {
+            "two workers": lambda: _rows_of(file, folder / "two", Crew(2), settings),
+            "a Dask cluster of two": lambda: _rows_of(file, folder / "cluster", Crew(cluster="local:2"), settings),
+            f"a runner killed {kills} times": lambda: _killed(file, folder / "killed", settings, kills),
+            "single replays": lambda: [dict(replay(folder / "one", case).row) for case in range(0, cases, cases // 8)],
+        }
+        for way, run in ways.items():
+            rows = run()
+            differing = sum(bool(differing_columns(row, expected[int(row["case"])])) for row in rows)
+            missing = 0 if way == "single replays" else cases - len(rows)
+            how = f"{len(rows)} of {cases} cases, {100 * share:g} % of which misbehave; all columns but times"
+            yield Measure(f"rows of {way} that differ from one worker's, or lack", differing + missing, "", 0, how)
+
+
+def survival(quick: bool) -> Iterator[Measure]:
+    """An algorithm that does its worst at random, beside one that does nothing wrong."""
+    cases = 60 if quick else 400
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        file = _written(folder)
+        took, rows = {}, {}
+        for share in (0.0, 0.03):
+            began = time.monotonic()
+            rows[share] = _rows_of(
+                file, folder / f"{share}", Crew(2), [f"share={share}", f"cases={cases}", "work_s=0.4"]
+            )
+            took[share] = time.monotonic() - began
+        campaign = load_campaign(str(file), ["share=0.03"])
+        deeds = [_deed(campaign, case) for case in range(cases)]
+        wrong = sum(row["outcome"] != DEEDS.get(done, "VALID") for row, done in zip(rows[0.03], deeds, strict=True))
+        healthy = [k for k, done in enumerate(deeds) if not done]
+        changed = sum(bool(differing_columns(rows[0.03][k], rows[0.0][k])) for k in healthy)
+        loops = deeds.count("loop")
+        said = ", ".join(f"{deeds.count(done)} {done}" for done in DEEDS)
+        how = f"{cases} cases of 0.4 s on two workers; {said}"
+        yield Measure("outcomes that are not those of the deed", wrong, "", 0, how)
+        yield Measure("healthy cases whose rows changed", changed, "", 0, f"{how}; {len(healthy)} healthy")
+        limits_s = loops * campaign.configuration.limits.case_time_s
+        ratio = (took[0.03] - limits_s) / took[0.0]
+        yield Measure(
+            "time beyond the limits, over the undisturbed", ratio, "", 1.5, f"{how}; {limits_s:g} s of limits"
+        )
+
+
+def _deed(campaign: Any, case: int) -> str:
+    parameters = campaign.parameters(case)
+    assert isinstance(parameters, ChaosParameters)
+    return deed(parameters, campaign.streams(case))
+
+
+def _written(folder: Path) -> Path:
+    path = folder / "chaos.toml"
+    path.write_text(FILE)
+    return path
+
+
+def _rows_of(file: Path, directory: Path, crew: Crew, settings: Sequence[str]) -> list[dict[str, Any]]:
+    run_campaign(load_campaign(str(file), settings), directory, crew, Silence())
+    return read_rows(directory / "cases.parquet")
+
+
+def _killed(file: Path, directory: Path, settings: Sequence[str], kills: int) -> list[dict[str, Any]]:
+    """The rows of a campaign whose runner is killed at random moments, and resumed each time."""
+    rng = np.random.default_rng(7)
+    program = [sys.executable, "-m", "marsyard"]
+    command = [*program, "run", str(file), "--out", str(directory), "--jobs", "2"]
+    command += [part for setting in settings for part in ("--set", setting)]
+    for _ in range(kills):
+        runner = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while not (directory / "campaign.json").exists() and runner.poll() is None:
+            time.sleep(0.01)
+        time.sleep(rng.uniform(*KILLED_AFTER_S))
+        runner.kill()
+        runner.wait()
+        command = [*program, "resume", str(directory), "--jobs", "2", "--allow-changed"]
+    # cases crash, as they are to: status 1
+    subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
+    return read_rows(directory / "cases.parquet")
+
+
+CHECKS = (Check("rows", "Campaigns", same_rows), Check("survival", "Campaigns", survival))
