@@ -32,7 +32,7 @@ from sim.measurements import DriveCommand
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 #: Longest part of a command: metres of path, and radians of turn.
-PART_M, PART_RAD = 0.1, np.radians(5.0)
+PART_M, PART_RAD = 0.2, np.radians(5.0)
 #: A commanded path shorter than this is none, metres.
 _NO_PATH_M = 1e-9
 

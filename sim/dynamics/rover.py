@@ -217,7 +217,7 @@ def settle(
         A stance close by, from which the solution starts; by default from level on the ground's height.
     """
     frame = _Frame(rover, ground, np.array([east_m, north_m]), 0.5 * np.pi - azimuth_rad)
-    solved = least_squares(frame.gaps, frame.start(near), jac=frame.gap_slopes, method="lm", xtol=1e-10, ftol=1e-12)
+    solved = least_squares(frame.gaps, frame.start(near), jac=frame.gap_slopes, method="lm", xtol=1e-8, ftol=1e-12)
     differential, left, right = (float(angle) for angle in solved.x[3:])
     pose = rigid(frame.rotation(solved.x[None])[0], np.array([east_m, north_m, solved.x[0]]))
     return Stance(pose, differential, (left, right), solved.fun)

@@ -126,16 +126,17 @@ def test_soils_and_steps_scatter_as_stated() -> None:
     loose = drive(MER, ground, Soil(STEADY, 1.5), start, DriveCommand(forward_m=0.3), _rng())
     firm = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.3), _rng())
     assert loose.slip == pytest.approx(1.5 * firm.slip, rel=1e-9)
+    # 120 draws each: within four standard errors, 1 / sqrt(240) of the spread
     rng = np.random.default_rng(1)
     stepping = Soil(SlipParameters(soil_spread=0.0, step_spread=0.2, wander_deg_m=0.0), 1.0)
-    slips = [drive(MER, ground, stepping, start, DriveCommand(forward_m=0.1), rng).slip for _ in range(200)]
-    assert np.std(np.log(slips)) == pytest.approx(0.2, abs=0.04)
+    slips = [drive(MER, ground, stepping, start, DriveCommand(forward_m=0.1), rng).slip for _ in range(120)]
+    assert np.std(np.log(slips)) == pytest.approx(0.2, abs=0.052)
     wandering = Soil(SlipParameters(step_spread=0.0, wander_deg_m=1.0), 1.0)
     turns = [
         np.degrees(drive(MER, ground, wandering, start, DriveCommand(forward_m=0.09), rng).end.azimuth_rad) - 90.0
-        for _ in range(200)
+        for _ in range(120)
     ]
-    assert np.std(turns) == pytest.approx(0.3, abs=0.06)
+    assert np.std(turns) == pytest.approx(0.3, abs=0.078)
 
 
 def test_drives_are_reproducible_and_their_parts_join() -> None:
@@ -147,4 +148,4 @@ def test_drives_are_reproducible_and_their_parts_join() -> None:
     assert np.array_equal(one.end.world_from_rover.as_matrix(), two.end.world_from_rover.as_matrix())
     for before, after in zip(one.parts, one.parts[1:], strict=False):
         assert before.after is after.before
-    assert all(part.command.length_m <= 0.1 + 1e-12 for part in one.parts)
+    assert all(part.command.length_m <= 0.2 + 1e-12 for part in one.parts)
