@@ -28,6 +28,10 @@ class Instruments:
 
     Attributes
     ----------
+    approach
+        The flight before the descent, along which navigation's errors grow.
+    imu
+        The inertial unit.
     navigation
         Attitude and velocity as propagated on board, from shortly before the first picture to the thrusters' firing.
     altimeter
@@ -36,6 +40,8 @@ class Instruments:
         Of the pictures' time tags.
     """
 
+    approach: Approach
+    imu: Imu
     navigation: InertialSolution
     altimeter: RadarAltimeter
     clock: Clock
@@ -43,19 +49,24 @@ class Instruments:
     @classmethod
     def drawn(cls, p: DescentScenarioParameters, world: World, descent: SwingDescent, streams: Streams) -> Instruments:
         """The instruments of a case, and what navigation makes of its motion."""
+        start, end = -LEAD_S + MARGIN_S, descent.thruster_firing_s + MARGIN_S
+        approach = Approach(p.approach, start)
+        unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
+        imu = approach.calibrated(unit, streams.generator("inertial unit's calibration"))
         return cls(
-            navigation=_navigated(p, descent, streams),
+            approach=approach,
+            imu=imu,
+            navigation=_navigated(p, approach, imu, descent, streams),
             altimeter=RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
             clock=Clock.drawn(p.clock, streams.generator("image clock")),
         )
 
 
-def _navigated(p: DescentScenarioParameters, descent: SwingDescent, streams: Streams) -> InertialSolution:
+def _navigated(
+    p: DescentScenarioParameters, approach: Approach, imu: Imu, descent: SwingDescent, streams: Streams
+) -> InertialSolution:
     """Navigation from the last star reference, before entry, to the thrusters' firing."""
-    start, end = -LEAD_S + MARGIN_S, descent.thruster_firing_s + MARGIN_S
-    approach = Approach(p.approach, start)
-    unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
-    imu = approach.calibrated(unit, streams.generator("inertial unit's calibration"))
+    start, end = approach.end_s, descent.thruster_firing_s + MARGIN_S
     errors = approach.errors(imu, streams.generator("approach"))
     increments = imu.increments(descent, start, end, streams.generator("inertial noise"))
     state = descent.state(start)

@@ -17,6 +17,7 @@ from scenarios.descent.room import room
 from scenarios.descent.score import (
     carried_to_firing,
     conditions,
+    instrument_conditions,
     instrument_errors,
     landing_row,
     products,
@@ -78,10 +79,11 @@ class DescentScenario:
             "room_first_pair": places[0],
             "room_second_pair": places[1],
             **conditions(p, world, states, at_firing),
+            **instrument_conditions(instruments),
             **instrument_errors(world, states, measurements),
             **landing_row(landed),
             "estimation_time_s": taken,
-            **{f"descent_{name}": value for name, value in p.descent.model_dump().items()},
+            **{f"descent_{name}": value for name, value in descent.parameters.model_dump().items()},
             **provenance(p, pictures),
         }
         return CaseResult(

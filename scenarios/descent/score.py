@@ -72,8 +72,8 @@ def conditions(
         "terrain": p.place.terrain,
         "fault": fault,
         "fault_size": size,
-        "place_east_m": p.place.east_m,
-        "place_north_m": p.place.north_m,
+        "place_east_m": float(states[0].position_m[0]),
+        "place_north_m": float(states[0].position_m[1]),
         "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0], sun[1])) % 360.0),
         "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(sun[2], -1.0, 1.0)))),
         "horizontal_speed_m_s": float(np.hypot(*states[-1].velocity_m_s[:2])),
@@ -88,6 +88,17 @@ def conditions(
     row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in states)
     row["attitude_rate_max_deg_s"] = max(float(row[f"attitude_rate_{k}_deg_s"]) for k in range(1, PICTURES + 1))
     return row
+
+
+def instrument_conditions(instruments: Instruments) -> dict[str, Scalar]:
+    """What the instruments went through: the azimuth of flight before entry, and the change of temperature."""
+    approach = instruments.approach
+    flight = -approach.attitudes(np.array([approach.start_s])).as_matrix()[0, :, 2]
+    change_k = instruments.imu.gyro.warm_up.temperature_k(np.array([np.inf]))[0]
+    return {
+        "approach_heading_deg": float(np.degrees(np.arctan2(flight[0], flight[1])) % 360.0),
+        "imu_warm_up_change_k": float(change_k),
+    }
 
 
 def instrument_errors(world: World, states: Sequence[State], measurements: DescentMeasurements) -> dict[str, Scalar]:

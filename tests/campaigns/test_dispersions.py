@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +32,13 @@ def dispersion(**stated: object) -> Dispersion:
     return _ADAPTER.validate_python(stated)
 
 
+@cache
+def uniform() -> list[float]:
+    return [float(Streams(1, "ks", case).generator("dispersion:x").random()) for case in range(CASES)]
+
+
 def draws(drawn: Dispersion) -> np.ndarray:
-    uniform = [Streams(1, "ks", case).generator("dispersion:x").random() for case in range(CASES)]
-    return np.array([drawn.quantile(value) for value in uniform])
+    return np.array([drawn.quantile(value) for value in uniform()])
 
 
 @pytest.mark.parametrize(

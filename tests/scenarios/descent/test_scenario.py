@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from campaigns.loading import catalogue, load_campaign
 from scenarios.interface import CaseResult
 from sim.streams import Streams
 from tests.scenarios.descent.settings import DESCENT, FLAT, PERFECT, WORLD, run
@@ -25,6 +26,27 @@ def test_a_case_is_a_function_of_its_parameters_and_streams(nominal) -> None:
     again = run()
     assert _timeless(again.row) == _timeless(nominal.row)
     assert other.row["image_hash"] != nominal.row["image_hash"]
+
+
+def test_every_dispersion_of_the_catalogue_is_read_back() -> None:
+    """Each under the end of its path, from the objects that were simulated; the fault by its name and size."""
+    dispersed = load_campaign("dimes-gusev").draws(3)
+    drawn = {path: value for path, value in dispersed.items() if path != "place.terrain"}
+    tables: dict[str, Any] = {"place": dict(WORLD["place"]), "faults": {"late_s": 0.25}}
+    for path, value in drawn.items():
+        *names, last = path.split(".")
+        table = tables
+        for name in names:
+            table = table.setdefault(name, {})
+        table[last] = value
+    row = run(**tables).row
+    for path, value in drawn.items():
+        column = path.replace(".", "_")
+        assert row[column] == pytest.approx(value, rel=1e-9), path
+    assert (row["fault"], row["fault_size"], row["terrain"]) == ("late_s", 0.25, 0)
+    campaigns = [load_campaign(name).configuration for name in catalogue()]
+    of_descents = {path for one in campaigns if one.scenario == "descent" for path in one.dispersions}
+    assert of_descents == {*dispersed, "faults"}
 
 
 @pytest.mark.parametrize("name", ["velocity", "firing_velocity"])
