@@ -85,11 +85,11 @@ def test_visual_odometry_is_wrong_by_two_percent_of_eight_metres() -> None:
     drives = _drives(Plane(), (DriveCommand(forward_m=2.0),) * 4)
     true = drives[-1].end.world_from_rover
     errors = [
-        np.linalg.norm(_followed(drives, OdometryParameters(), n, visual=True)[1].error_m(true)) for n in range(150)
+        np.linalg.norm(_followed(drives, OdometryParameters(), n, visual=True)[1].error_m(true)) for n in range(100)
     ]
-    # rms of 150 vectors of one to three degrees of freedom: 7 % per standard deviation
+    # rms of 100 vectors of one to three degrees of freedom: up to 7 % per standard deviation
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.02 * 8.0, rel=0.2)
-    counted = [np.linalg.norm(_followed(drives, OdometryParameters(), n)[1].error_m(true)) for n in range(150)]
+    counted = [np.linalg.norm(_followed(drives, OdometryParameters(), n)[1].error_m(true)) for n in range(100)]
     assert np.sqrt(np.mean(np.square(counted))) == pytest.approx(0.011 * 8.0, rel=0.2)
 
 
@@ -98,8 +98,8 @@ def test_scale_errors_are_common_to_a_run_and_walks_are_not() -> None:
     half, whole = drives[3].end.world_from_rover, drives[7].end.world_from_rover
 
     def along(parameters: OdometryParameters) -> tuple[np.ndarray, np.ndarray]:
-        middle = [_followed(drives[:4], parameters, n)[1].error_m(half)[0] for n in range(120)]
-        end = [_followed(drives, parameters, n)[1].error_m(whole)[0] for n in range(120)]
+        middle = [_followed(drives[:4], parameters, n)[1].error_m(half)[0] for n in range(80)]
+        end = [_followed(drives, parameters, n)[1].error_m(whole)[0] for n in range(80)]
         return np.array(middle), np.array(end)
 
     middle, end = along(EXACT.model_copy(update={"scale_error": 0.01}))
@@ -108,7 +108,7 @@ def test_scale_errors_are_common_to_a_run_and_walks_are_not() -> None:
     middle, end = along(EXACT.model_copy(update={"walk_m": 0.01}))
     assert np.std(end) == pytest.approx(0.01 * np.sqrt(6.4), rel=0.25)
     # half of a walk's variance is there at half the way: their correlation is the root of a half
-    assert np.corrcoef(middle, end)[0, 1] == pytest.approx(np.sqrt(0.5), abs=0.18)
+    assert np.corrcoef(middle, end)[0, 1] == pytest.approx(np.sqrt(0.5), abs=0.22)
 
 
 def test_heading_errors_grow_as_stated_and_carry_the_position_aside() -> None:
@@ -121,7 +121,7 @@ def test_heading_errors_grow_as_stated_and_carry_the_position_aside() -> None:
     # the error at the start of each of five drives carries it 0.8 m aside: (0 + 1 + 2 + 3 + 4) steps of 0.8 m each
     assert estimate.error_m(true)[1] == pytest.approx(odometer.heading_drift_rad_m * 0.8 * 0.8 * 10.0, rel=1e-3)
     walk = EXACT.model_copy(update={"heading_walk_deg": 0.2})
-    errors = [np.degrees(_followed(drives, walk, n)[1].heading_error_rad) for n in range(150)]
+    errors = [np.degrees(_followed(drives, walk, n)[1].heading_error_rad) for n in range(100)]
     assert np.std(errors) == pytest.approx(0.2 * 2.0, rel=0.22)
     turn = _drives(Plane(), (DriveCommand(turn_left_rad=2.0),))
     odometer, estimate = _followed(turn, EXACT.model_copy(update={"heading_scale_error": 0.01}), 4)
