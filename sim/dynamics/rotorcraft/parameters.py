@@ -106,7 +106,7 @@ class TransitParameters(BaseModel):
     )
     speed_m_s: Annotated[Positive, Field(le=15.0, description="commanded speed, m/s (assumed)")] = 1.0
     acceleration_m_s2: Annotated[Positive, Field(le=3.0, description="up to that speed, m/s2 (assumed)")] = 1.0
-    hover_s: Annotated[NonNegative, Field(le=600.0, description="hovering before, s (assumed)")] = 8.0
+    hover_s: Annotated[NonNegative, Field(le=600.0, description="hovering before, s (assumed)")] = 15.0
     settle_s: Annotated[NonNegative, Field(le=60.0, description="at speed before the first picture, s (assumed)")] = 1.5
     pictures: Annotated[int, Field(ge=2, le=1000, description="pictures taken")] = 40
     pictures_s: Annotated[Positive, Field(le=120.0, description="from the first to the last picture, s")] = 5.0

@@ -24,7 +24,7 @@ from sim.sensor.rtk import Outage, RtkParameters, RtkReceiver
 from sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
 
 GRAVITY, FLIGHTS = 9.8, 50
-CRAFT, TRANSIT = RotorcraftParameters(), TransitParameters()
+CRAFT, TRANSIT = RotorcraftParameters(), TransitParameters(hover_s=8.0)
 RTK, COMPASS = RtkParameters(), TiltCompassParameters()
 
 
