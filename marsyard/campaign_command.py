@@ -190,7 +190,7 @@ def replay(
             typer.echo(line)
     products = unpack_products(packed)
     if step:
-        typer.echo(f"stages: {write_steps(target / 'steps', products)}")
+        typer.echo(f"stages: {write_steps(target / 'steps', products)} files in {target / 'steps'}")
     figure = write_case_figures(target, products)
     if figure is not None:
         typer.echo(f"figure: {figure}")

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pandas as pd
 import pytest
 from fake_campaign import HEAD, REQUIREMENT, write_campaign
@@ -102,6 +104,75 @@ def test_replay_fails_where_rows_differ(finished: Path, marsyard: Command, tmp_p
     assert "the row differs from the stored one in: altitude_m" in ended.out
 
 
+def test_stages_are_written_one_by_one(finished: Path, marsyard: Command, tmp_path: Path) -> None:
+    ended = marsyard("replay", finished, 0, "--step", "--out", tmp_path / "case")
+    assert (ended.status, ended.err) == (0, "")
+    steps = tmp_path / "case" / "steps"
+    files = sorted(str(path.relative_to(steps)) for path in steps.rglob("*.*"))
+    assert files == ["01-picture.png", "02-title.json", "03-nested/01-0/01-x.npy"]
+    picture = cv2.imread(str(steps / "01-picture.png"), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    assert picture.dtype == np.uint16
+    assert picture.tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert f"stages: 3 files in {steps}" in ended.out
+
+
+def _kill_when_rows_are_there(path: Path, directory: Path, cases: int) -> None:
+    """Runs a campaign and kills it with its rows half done."""
+    command = [
+        sys.executable,
+        "-m",
+        "marsyard",
+        "run",
+        str(path),
+        "-n",
+        str(cases),
+        "--jobs",
+        "1",
+        "--out",
+        str(directory),
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    log = directory / "cases.sqlite-wal"
+    # the header and a page for what each of the first batches wrote
+    while not (log.exists() and log.stat().st_size > 4 * 4200) and process.poll() is None:
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+
+
+def test_a_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Command) -> None:
+    path = write_campaign(tmp_path, "sleep_s = 0.1", dispersions="", requirement=REQUIREMENT)
+    _kill_when_rows_are_there(path, tmp_path / "run", 40)
+    before = (tmp_path / "run" / "campaign.json").read_bytes()
+    reported = marsyard("report", tmp_path / "run")
+    assert (reported.status, reported.err) == (3, "")
+    said = re.search(r"INCOMPLETE: (\d+) of 40 cases; it was killed; to go on: marsyard resume (\S+)", reported.out)
+    assert said
+    assert said[2] == str(tmp_path / "run")
+    assert 0 < int(said[1]) == len(pd.read_parquet(tmp_path / "run" / "cases.parquet")) < 40
+    assert (tmp_path / "run" / "campaign.json").read_bytes() == before
+    refused = marsyard("append", tmp_path / "run", 2)
+    assert (refused.status, "is not finished (running): marsyard resume" in refused.err) == (2, True)
+    resumed = marsyard("resume", tmp_path / "run", "--jobs", 1, "--allow-changed")
+    assert (resumed.status, "INCOMPLETE" in resumed.out) == (3, False)
+    assert list(pd.read_parquet(tmp_path / "run" / "cases.parquet")["case"]) == list(range(40))
+    # With more cases the same requirement is decided.
+    appended = marsyard("append", tmp_path / "run", 20, "--jobs", 1, "--allow-changed")
+    assert appended.status == 3
+    assert "of 60" in appended.out
+
+
+def test_a_dry_run_only_estimates(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = marsyard("run", write_campaign(tmp_path, "sleep_s = 0.05"), "--dry-run", "-n", 100_000, "--jobs", 2)
+    assert (ended.status, ended.err) == (0, "")
+    assert re.search(r"^100000 cases on 2 workers: about [\d.]+ (min|h)$", ended.out, re.MULTILINE)
+    assert re.search(r"^  0\.\d+ s a case \(0\.\d+ to \d[\d.]* s in 9 trial cases\)$", ended.out, re.MULTILINE)
+    assert re.search(r"^disk: [\d.]+ MB of rows, up to [\d.]+ bytes of products$", ended.out, re.MULTILINE)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fake.toml"]
+
+
 def _crash(case: int) -> str:
     return f"raising_cases = [{case}]"
 
@@ -151,6 +222,18 @@ def test_what_is_wrong_goes_before_what_failed(tmp_path: Path, marsyard: Command
         (["run", "{file}", "--out", "{run}"], "already holds a campaign"),
         (["run", "{file}", "--out", "{file}/run"], "cannot be written: Not a directory"),
         (["run", "{file}", "--out", "/proc/run"], "cannot be written"),
+        (["run", "{file}", "--case-time", "0"], "--set limits.case_time_s=0.0: limits.case_time_s: input should be gr"),
+        (["run", "{file}", "--jobs", "2", "--cluster", "local:2"], "exclude one another"),
+        (["run", "{file}", "--dry-run", "--jobs", "-1"], "at least one worker process is needed"),
+        (["resume", "{folder}"], "does not hold a campaign"),
+        (["resume", "{folder}/none"], "none: no such folder"),
+        (
+            ["resume", "{run}", "--retry", "crased"],
+            "unknown outcome 'crased' (did you mean 'crashed'?); allowed: all, ",
+        ),
+        (["resume", "{run}", "--case-time", "-1"], "--case-time -1.0: input should be greater than 0"),
+        (["append", "{run}", "0"], "Invalid value for 'N'"),
+        (["append", "{folder}", "3"], "does not hold a campaign"),
         (["run"], "Missing argument"),
         (["run", "{file}", "--job", "1"], "No such option"),
         (["fly"], "No such command 'fly'"),
