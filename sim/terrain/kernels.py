@@ -83,22 +83,6 @@ def collapse(field: Level, gy: float, out: Array) -> None:
             )
 
 
-@njit(cache=True, inline="always")
-def sample_collapsed(line: Array, gx: float) -> tuple[float, float]:
-    """Both fields of a collapsed level at x = gx, counted in samples."""
-    mask = line.shape[0] - 1
-    fx = math.floor(gx)
-    j = int(fx)
-    w0, w1, w2, w3, _d0, _d1, _d2, _d3 = bspline_weights(gx - fx)
-    j0 = (j - 1) & mask
-    j1 = j & mask
-    j2 = (j + 1) & mask
-    j3 = (j + 2) & mask
-    first = w0 * line[j0, 0] + w1 * line[j1, 0] + w2 * line[j2, 0] + w3 * line[j3, 0]
-    second = w0 * line[j0, 1] + w1 * line[j1, 1] + w2 * line[j2, 1] + w3 * line[j3, 1]
-    return first, second
-
-
 @njit(cache=True)
 def evaluate_field(field: Level, spacing: float, x: Array, y: Array) -> Array:
     """Height, slopes and albedo at many places; shape (n, 4)."""

@@ -50,14 +50,17 @@ class Dunes(LandformParameters):
             float(downwind),
             rng,
         )
+        finer = max(modulation.shape[0] // ground.side, 1)
+        modulation = np.ascontiguousarray(modulation[::finer, ::finer])
         steepest = float(np.tan(np.radians(self.repose_deg)))
-        part = ground.coarser(self.height_m / steepest / SAMPLES_ON_SLIP_FACE)
+        part = ground.coarser(
+            min(self.height_m / steepest / SAMPLES_ON_SLIP_FACE, ground.period_m / modulation.shape[0])
+        )
         add_dunes(
             part.height,
             part.tone,
             part.spacing_m,
             modulation,
-            ground.period_m / modulation.shape[0],
             float(wave[0]),
             float(wave[1]),
             self.height_m,

@@ -8,9 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.terrain.kernels import Array, Level, collapse, sample_collapsed
+from sim.terrain.kernels import Array, Level, bspline_weights, collapse
 
 Grid = NDArray[np.float32]
+Line = NDArray[np.float32]
 
 
 @njit(cache=True)
@@ -53,6 +54,8 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
         x, y, radius, depth, rim, rounding, fill, bright = craters[n, :8]
         c2, s2, c3, s3, c5, s5, phase = craters[n, 8:]
         extent = reach * radius * 1.1
+        cos_7, sin_7 = math.cos(phase), math.sin(phase)
+        cos_12, sin_12 = math.cos(2.3 * phase), math.sin(2.3 * phase)
         # the bowl before it was filled
         bottom = depth / (1.0 - fill)
         soft_floor = 0.25 * fill * bottom + 1e-9
@@ -75,21 +78,27 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                 r = d / (radius * (1.0 + c2 * cc + s2 * ss + c3 * ccc + s3 * sss + c5 * c5t + s5 * s5t))
                 if r >= reach:
                     continue
-                bowl = (rim + bottom) * r**2.2 - bottom
-                if fill > 0.0:
-                    # the higher of bowl and floor, rounded where they meet
-                    meeting = max(soft_floor - abs(bowl + depth), 0.0)
-                    bowl = max(bowl, -depth) + meeting * meeting / (4.0 * soft_floor)
                 outside = max(r, 0.6)
                 fade = min((reach - r) / (reach - 1.0), 1.0)
                 blanket = rim / (outside * outside * outside) * fade
                 rays = 0.0
                 if r > 1.0:
-                    azimuth = math.atan2(s, c)
-                    rays = math.cos(7.0 * azimuth + phase) + math.cos(12.0 * azimuth + 2.3 * phase)
+                    # seven and twelve rays: cosines of 7 and 12 times the azimuth, each with a phase
+                    c7t = c5t * cc - s5t * ss
+                    s7t = s5t * cc + c5t * ss
+                    rays = c7t * cos_7 - s7t * sin_7
+                    rays += (c7t * c5t - s7t * s5t) * cos_12 - (s7t * c5t + c7t * s5t) * sin_12
                     blanket *= 1.0 + 0.25 * rays * min(2.0 * (r - 1.0), 1.0)
-                overlap = max(rounding - abs(bowl - blanket), 0.0)
-                change = min(bowl, blanket) - overlap * overlap / (4.0 * max(rounding, 1e-9))
+                change = blanket
+                # outside, the bowl's wall goes on so steeply that it soon leaves the blanket below it
+                if r <= 1.0 or (rim + bottom) * r * r - bottom < blanket + rounding:
+                    bowl = (rim + bottom) * r**2.2 - bottom
+                    if fill > 0.0:
+                        # the higher of bowl and floor, rounded where they meet
+                        meeting = max(soft_floor - abs(bowl + depth), 0.0)
+                        bowl = max(bowl, -depth) + meeting * meeting / (4.0 * soft_floor)
+                    overlap = max(rounding - abs(bowl - blanket), 0.0)
+                    change = min(bowl, blanket) - overlap * overlap / (4.0 * max(rounding, 1e-9))
                 row = i & mask
                 column = j & mask
                 height[row, column] += change
@@ -98,13 +107,58 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                     tone[row, column] += bright * max(light, 0.0)
 
 
+@njit(cache=True, inline="always")
+def _angle(x: float, y: float) -> float:
+    """Arctangent of y / x in its quadrant to 1e-7, by the polynomial of Cephes' atanf; without branches or calls."""
+    wide = abs(x)
+    high = abs(y)
+    larger = max(wide, high, 1e-30)
+    ratio = min(wide, high) / larger
+    turned = ratio > 0.41421356237309503
+    a = (ratio - 1.0) / (ratio + 1.0) if turned else ratio
+    b = a * a
+    angle = (((8.05374449538e-2 * b - 1.38776856032e-1) * b + 1.99777106478e-1) * b - 3.33329491539e-1) * b * a + a
+    angle += 0.25 * math.pi if turned else 0.0
+    angle = 0.5 * math.pi - angle if high > wide else angle
+    angle = math.pi - angle if x < 0.0 else angle
+    return -angle if y < 0.0 else angle
+
+
+# Without Python's check for a division by zero, and without calls, the loop is compiled to vector instructions.
+@njit(cache=True, error_model="numpy")
+def _add_row_of_dunes(
+    height: Line,
+    tone: Line,
+    real: Array,
+    imaginary: Array,
+    first_phase: float,
+    phase_step: float,
+    crest: float,
+    slip_of_height: float,
+    contrast: float,
+) -> None:
+    """Adds dunes along a row, given the modulation and the plane wave's phase at its samples (see `add_dunes`)."""
+    for j in range(height.shape[0]):
+        strength = math.sqrt(real[j] * real[j] + imaginary[j] * imaginary[j])
+        high = crest * min(strength, 1.6)
+        turns = (first_phase + j * phase_step + _angle(real[j], imaginary[j])) / (2.0 * math.pi)
+        u = turns - np.floor(turns)
+        slip = min(max(slip_of_height * high, 0.01), 0.5)
+        v = u / (1.0 - slip)
+        stoss = 0.25 * v + 0.75 * v * v * (3.0 - 2.0 * v)
+        w = (1.0 - u) / slip
+        face = 4.0 / 3.0 * w - 1.0 / 3.0 if w > 0.5 else 4.0 / 3.0 * w * w
+        shape = stoss if u < 1.0 - slip else face
+        height[j] += high * shape
+        tone[j] += contrast * (shape - 0.5) * min(strength, 1.0)
+
+
 @njit(cache=True)
 def add_dunes(
     height: Grid,
     tone: Grid,
     spacing: float,
     modulation: Level,
-    modulation_spacing: float,
     wave_x: float,
     wave_y: float,
     crest: float,
@@ -114,33 +168,31 @@ def add_dunes(
     """Adds transverse dunes: a gentle stoss up to the crest, a slip face of the slope `steepest`, a concave apron.
 
     The phase is that of a plane wave (wave_x, wave_y), radians per metre, times a smooth complex modulation of unit
-    mean square. Where the modulation vanishes crests end and fork, and the dunes have no height.
+    mean square: control values of the same extent as the grid, on one no finer. Where the modulation vanishes crests
+    end and fork, and the dunes have no height.
     """
-    side = height.shape[0]
-    inverse = 1.0 / modulation_spacing
+    side, cells = height.shape[0], modulation.shape[0]
+    step = side // cells
     wave = math.sqrt(wave_x * wave_x + wave_y * wave_y)
-    along = np.empty((modulation.shape[0], 2))
+    # the face falls along a line over its first half, then levels out: 4/3 as long as were it straight
+    slip_of_height = 4.0 / 3.0 * wave / (2.0 * math.pi * steepest)
+    weights = np.empty((step, 4))
+    for k in range(step):
+        weights[k] = bspline_weights(k / step)[:4]
+    along = np.empty((cells, 2))
+    real = np.empty(side)
+    imaginary = np.empty(side)
     for i in range(side):
-        y = i * spacing
         # on one row the modulation is a spline of x alone
-        collapse(modulation, inverse * y, along)
-        for j in range(side):
-            x = j * spacing
-            real, imaginary = sample_collapsed(along, inverse * x)
-            strength = math.sqrt(real * real + imaginary * imaginary)
-            high = crest * min(strength, 1.6)
-            turns = (wave_x * x + wave_y * y + math.atan2(imaginary, real)) / (2.0 * math.pi)
-            u = turns - math.floor(turns)
-            # the face falls along a line over its first half, then levels out: 4/3 as long as were it straight
-            slip = min(max(4.0 / 3.0 * high * wave / (2.0 * math.pi * steepest), 0.01), 0.5)
-            if u < 1.0 - slip:
-                v = u / (1.0 - slip)
-                shape = 0.25 * v + 0.75 * v * v * (3.0 - 2.0 * v)
-            else:
-                v = (1.0 - u) / slip
-                shape = 4.0 / 3.0 * v - 1.0 / 3.0 if v > 0.5 else 4.0 / 3.0 * v * v
-            height[i, j] += high * shape
-            tone[i, j] += contrast * (shape - 0.5) * min(strength, 1.0)
+        collapse(modulation, i / step, along)
+        for j in range(cells):
+            before, here, after, beyond = along[j - 1], along[j], along[(j + 1) % cells], along[(j + 2) % cells]
+            for k in range(step):
+                a, b, c, d = weights[k]
+                real[j * step + k] = a * before[0] + b * here[0] + c * after[0] + d * beyond[0]
+                imaginary[j * step + k] = a * before[1] + b * here[1] + c * after[1] + d * beyond[1]
+        phase = wave_y * i * spacing
+        _add_row_of_dunes(height[i], tone[i], real, imaginary, phase, wave_x * spacing, crest, slip_of_height, contrast)
 
 
 @njit(cache=True)
@@ -180,6 +232,13 @@ def add_cracks(
     `points` has shape (count, count, 2): the place of each point within its square, from 0 to 1.
     """
     count = points.shape[0]
+    # the points' places, with those beyond the border
+    places = np.empty((count + 2, count + 2, 2))
+    for row in range(-1, count + 1):
+        for column in range(-1, count + 1):
+            point = points[row % count, column % count]
+            places[row + 1, column + 1, 0] = column + point[0]
+            places[row + 1, column + 1, 1] = row + point[1]
     for i in range(height.shape[0]):
         y = i * spacing / cell
         row = int(y)
@@ -192,11 +251,10 @@ def add_cracks(
             second = 1e9
             sx = 0.0
             sy = 0.0
-            for di in range(-1, 2):
-                for dj in range(-1, 2):
-                    point = points[(row + di) % count, (column + dj) % count]
-                    dx = column + dj + point[0] - x
-                    dy = row + di + point[1] - y
+            for di in range(3):
+                for dj in range(3):
+                    dx = places[row + di, column + dj, 0] - x
+                    dy = places[row + di, column + dj, 1] - y
                     far = dx * dx + dy * dy
                     if far < nearest:
                         second = nearest

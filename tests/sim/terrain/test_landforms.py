@@ -7,10 +7,12 @@ import sys
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 
 from sim.terrain import TerrainParameters, synthesise
 from sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
 from sim.terrain.landforms.ground import finer, smooth_pair
+from sim.terrain.landforms.kernels import add_cracks, add_dunes, stamp_craters
 from sim.terrain.statistics import mean_slope_deg
 from sim.terrain.substreams import substream
 
@@ -208,3 +210,72 @@ def test_substreams_depend_on_their_name_alone() -> None:
 def test_refuses_landforms_that_do_not_fit(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         synthesise(made(**wrong), np.random.default_rng(0))
+
+
+def test_dunes_are_the_stated_shape_of_the_stated_phase() -> None:
+    """The kernel's own spline and arctangent against SciPy's and NumPy's."""
+    side, spacing, crest, steepest = 128, 3.0, 4.0, 0.6
+    modulation = np.random.default_rng(2).normal(size=(32, 32, 2)).astype(np.float32)
+    wave = 2.0 * np.pi / (side * spacing) * np.array([5.0, -3.0])
+    height, tone = np.zeros((2, side, side), dtype=np.float32)
+    add_dunes(height, tone, spacing, modulation, wave[0], wave[1], crest, steepest, 0.3)
+    rows, columns = np.mgrid[:side, :side]
+    real, imaginary = (
+        map_coordinates(part.astype(np.float64), [rows / 4, columns / 4], order=3, mode="grid-wrap", prefilter=False)
+        for part in np.moveaxis(modulation, -1, 0)
+    )
+    strength = np.hypot(real, imaginary)
+    phase = spacing * (wave[0] * columns + wave[1] * rows) + np.arctan2(imaginary, real)
+    u = np.mod(phase / (2.0 * np.pi), 1.0)
+    high = crest * np.minimum(strength, 1.6)
+    slip = np.clip(4.0 / 3.0 * high * np.linalg.norm(wave) / (2.0 * np.pi * steepest), 0.01, 0.5)
+    stoss, face = u / (1.0 - slip), (1.0 - u) / slip
+    shape = np.where(
+        u < 1.0 - slip,
+        0.25 * stoss + 0.75 * stoss**2 * (3.0 - 2.0 * stoss),
+        np.where(face > 0.5, 4.0 / 3.0 * face - 1.0 / 3.0, 4.0 / 3.0 * face**2),
+    )
+    np.testing.assert_allclose(height, high * shape, atol=1e-5)
+    np.testing.assert_allclose(tone, 0.3 * (shape - 0.5) * np.minimum(strength, 1.0), atol=1e-5)
+
+
+def test_ejecta_lie_in_seven_and_twelve_rays() -> None:
+    """Outside a round crater: the blanket falls with the cube of the distance, and its rays with the azimuth."""
+    side, spacing, radius, rim, reach, phase = 128, 1.0, 12.0, 0.8, 4.0, 0.7
+    height, tone = np.zeros((2, side, side), dtype=np.float32)
+    crater = np.array([[64.0, 64.0, radius, 3.0, rim, 0.1, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phase]])
+    stamp_craters(height, tone, spacing, crater, reach)
+    y, x = np.mgrid[:side, :side] - 64.0
+    r, azimuth = np.hypot(x, y) / radius, np.arctan2(y, x)
+    outside = (r > 1.1) & (r < reach)
+    fade = (reach - r) / (reach - 1.0)
+    rays = np.cos(7.0 * azimuth + phase) + np.cos(12.0 * azimuth + 2.3 * phase)
+    blanket = rim / np.maximum(r, 0.6) ** 3 * fade * (1.0 + 0.25 * rays * np.minimum(2.0 * (r - 1.0), 1.0))
+    np.testing.assert_allclose(height[outside], blanket[outside], atol=1e-6)
+    light = np.maximum(fade**2 * (1.0 + 0.5 * rays), 0.0)
+    np.testing.assert_allclose(tone[outside], 0.2 * light[outside], atol=1e-6)
+
+
+def test_cracks_are_the_borders_of_a_periodic_voronoi_diagram() -> None:
+    side, spacing, count, width = 96, 0.5, 8, 0.8
+    cell = side * spacing / count
+    points = np.random.default_rng(4).uniform(0.1, 0.9, (count, count, 2))
+    height, tone = np.zeros((2, side, side), dtype=np.float32)
+    add_cracks(height, tone, spacing, points, cell, width, 0.2, -0.1)
+    row, column = np.mgrid[:count, :count]
+    places = (points + np.stack([column, row], axis=-1)).reshape(-1, 2)
+    y, x = np.mgrid[:side, :side] * spacing / cell
+    distance, number = cKDTree(places, boxsize=count).query(np.stack([x, y], axis=-1), k=2)
+    between = (places[number[..., 1]] - places[number[..., 0]] + count / 2) % count - count / 2
+    border = 0.5 * (distance[..., 1] ** 2 - distance[..., 0] ** 2) / np.linalg.norm(between, axis=-1) * cell
+    share = np.clip(1.0 - border / width, 0.0, None)
+    # the two nearest points lie within a cell to each side but where cells are wide
+    assert np.mean(np.isclose(height, -0.2 * share, atol=1e-6)) > 0.999
+    assert np.mean(np.isclose(tone, -0.1 * share, atol=1e-6)) > 0.999
+
+
+def test_dunes_may_be_finer_than_the_ground() -> None:
+    """What the ground's samples cannot hold is sampled as it is, their modulation too."""
+    tiny = Dunes(wavelength_m=1.0, height_m=0.05, regularity=0.3, crest_length=0.5)
+    z = heights(made(samples=64, spacing_m=3.0, ripples=tiny))
+    assert 0.0 < np.ptp(z) < 0.1
