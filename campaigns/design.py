@@ -202,8 +202,10 @@ def grid_probabilities(sizes: Mapping[str, int], point: int) -> dict[str, float]
 
 def said_of(kind: str, grids: Sequence[str], *, nominal: bool) -> str:
     """How the cases are laid out, in words."""
-    named = {"random": "independent random draws", "latin-hypercube": "Latin hypercube", "sobol": "scrambled Sobol"}
+    named = {"random": "random draws", "latin-hypercube": "Latin hypercube", "sobol": "scrambled Sobol"}
     text = named.get(kind, kind)
+    if kind == "random" and not grids:
+        text = f"independent {text}"
     if grids:
         text += f" at each point of a grid over {', '.join(grids)}"
     return f"{text}; case 0 is the nominal one" if nominal else text

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from campaigns.products import save_products
+from campaigns.products import pack_products, save_packed
 
 VELOCITY: Mapping[str, Any] = {
     "id": "DIMES-VEL",
@@ -157,7 +157,7 @@ def write_run(
     record = {**synthetic_record(frame, requirements), **changes}
     (directory / "campaign.json").write_text(json.dumps(record), encoding="utf-8")
     if products is not None:
-        save_products(directory / "cases" / "3", products)
+        save_packed(directory / "cases" / "3", pack_products(products), {"case": 3})
     return directory
 
 

@@ -234,7 +234,7 @@ def test_twin_keeps_its_schema(make_rows: Rows, make_run: MakeRun) -> None:
     assert set(twin) == {
         "schema", "campaign", "state", "seed", "git_commit", "started_utc", "finished_utc", "cases", "crashed",
         "verdict", "sentence", "exit_code", "verdicts", "outcomes", "metric", "statistics", "worst_cases", "sections",
-        "showcases",
+        "showcases", "sampling",
     }  # fmt: skip
     assert {"requirement_id", "status", "n", "failures", "lower", "upper", "further_cases", "note"} <= set(
         twin["verdicts"][0]

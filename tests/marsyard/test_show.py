@@ -1,0 +1,271 @@
+"""`marsyard show`: every dispersion with its distribution, bounds, unit and source; draws as table, figure and JSON."""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from marsyard import cli
+
+CAMPAIGN = """
+name = "fake"
+scenario = "fake_scenario:FakeScenario"
+description = "a campaign without a world"
+cases = 25
+seed = 5
+
+[design]
+kind = "latin-hypercube"
+nominal = true
+
+[parameters]
+shared = 3
+wind = { east_m_s = 1.0, north_m_s = 2.0 }
+
+[dispersions]
+"wind.east_m_s" = { distribution = "normal", mean = 5.0, source = "flown" }
+"wind.north_m_s" = { distribution = "normal", mean = 0.0, source = "flown", unit = "m/s", description = "to the north" }
+altitude_m = { distribution = "gamma", a = 3.0, loc = 1500.0, scale = "100 + 2 * terrain", truncate = [1500.0, 3000.0] }
+lowest_altitude_m = { distribution = "derived", formula = "altitude_m - 100" }
+terrain = { distribution = "integer", low = 0, high = "shared" }
+kind = { distribution = "choice", values = ["rough", "plain"], weights = [1.0, 3.0] }
+error_scale = { distribution = "grid", low = 0.5, high = 1.5, levels = 3 }
+sleep_s = { distribution = "fixed", value = 0.0 }
+
+[[correlations]]
+parameters = ["wind.east_m_s", "wind.north_m_s"]
+covariance = [[9.0, 3.0], [3.0, 4.0]]
+source = "assumed"
+
+[[requirements]]
+id = "velocity"
+statement = "the error is small"
+metric = "velocity_error_m_s"
+bound = 5.0
+probability = 0.99
+confidence = 0.9
+
+[retain]
+showcase = "worst"
+"""
+
+
+@dataclass(frozen=True)
+class Ended:
+    status: int
+    out: str
+    err: str
+
+
+def marsyard(*arguments: object) -> Ended:
+    """Runs a command in this process."""
+    out, err, stated = io.StringIO(), io.StringIO(), sys.argv
+    sys.argv = ["marsyard", *map(str, arguments)]
+    try:
+        with redirect_stdout(out), redirect_stderr(err):
+            cli.main()
+    except SystemExit as ended:
+        return Ended(int(ended.code or 0), out.getvalue(), err.getvalue())
+    finally:
+        sys.argv = stated
+    raise AssertionError("the command did not exit")
+
+
+@pytest.fixture
+def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("COLUMNS", "160")
+    path = tmp_path / "fake.toml"
+    path.write_text(CAMPAIGN)
+    return path
+
+
+def test_every_dispersion_is_told(campaign: Path) -> None:
+    shown = marsyard("show", campaign)
+    assert (shown.status, shown.err) == (0, "")
+    for text in (
+        "sampling: Latin hypercube at each point of a grid over error_scale; case 0 is the nominal one",
+        "normal(mean=5.0, sd=3.0)",
+        "flown",
+        "to the north",
+        "gamma(truncate=[1500.0, 3000.0], a=3.0, loc=1500.0, scale=100 + 2 *",
+        "by formula",
+        "0.5 to 1.5",
+        "not stated",
+        "covariance",
+        "dispersed; nominal 2000.0",
+    ):
+        assert text in re.sub(r"\s+", " ", shown.out.replace("│", " ")) or text in shown.out, text
+
+
+def test_units_and_descriptions_come_from_the_scenario() -> None:
+    told = json.loads(marsyard("show", "dimes-gusev", "--json").out)
+    of_each = {one["parameter"]: one for one in told["dispersions"]}
+    sun = of_each["sun.elevation_deg"]
+    assert (sun["unit"], sun["description"], sun["bounds"]) == ("deg", "above the horizon", [30.0, 60.0])
+    assert all(one["source"] for one in told["dispersions"])
+    assert all(one["description"] for one in told["dispersions"])
+
+
+def test_draws_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
+    figure = tmp_path / "draws.svg"
+    shown = marsyard("show", campaign, "--draw", 25, "--figure", figure)
+    assert (shown.status, shown.err) == (0, "")
+    assert "Draws of 24 cases" in shown.out
+    assert "nominal" in shown.out
+    assert f"figure: {figure}" in shown.out
+    assert "<svg" in figure.read_text()
+    told = json.loads(marsyard("show", campaign, "--draw", 25, "--json").out)
+    assert [one["case"] for one in told["draws"]] == list(range(25))
+    assert told["draws"][0]["values"]["wind.east_m_s"] == 1.0
+    values = [one["values"] for one in told["draws"]]
+    assert all(one["lowest_altitude_m"] == pytest.approx(one["altitude_m"] - 100.0) for one in values)
+    assert [one["error_scale"] for one in values[1:4]] == [0.5, 1.0, 1.5]
+    assert f"{min(one['altitude_m'] for one in values[1:]):.5g}" in shown.out
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--draw", "0"], "--draw 0: the campaign has 25 cases; allowed: 1 to 25"),
+        (["--draw", "26"], "allowed: 1 to 25"),
+        (["--figure", "x.svg"], "say of how many cases with --draw N"),
+        (["--draw", "3", "--figure", "x.pdf"], "--figure x.pdf: unknown kind of picture; allowed: .svg, .png"),
+        (["--draw", "1", "--figure", "x.png"], "nothing is drawn in 1 case"),
+        (["--draw", "3", "--figure", "/no/x.png"], "/no/x.png: cannot be written"),
+        (["--set", "cases=26"], "--set cases=26: cases: 25 cases behind the nominal one cannot be laid out: the grid"),
+    ],
+)
+def test_what_cannot_be_shown(campaign: Path, arguments: list[str], said: str) -> None:
+    shown = marsyard("show", campaign, *arguments)
+    assert (shown.status, shown.out) == (2, "")
+    assert "Traceback" not in shown.err
+    assert said in shown.err
+
+
+def _paths(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, one in inner:
+        yield (*path, key)
+        yield from _paths(one, (*path, key))
+
+
+_DOCUMENT = tomllib.loads(CAMPAIGN)
+_PATHS = list(_paths(_DOCUMENT))
+_MISSING = object()
+_junk = st.recursive(
+    st.one_of(
+        st.booleans(),
+        st.integers(-(2**70), 2**70),
+        st.floats(),
+        st.text(max_size=8),
+        st.sampled_from(
+            ["random", "sobol", "grid", "normal", "poisson", "cauchy", "1 / terrain", "terrain - 4", "kind"]
+        ),
+    ),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text("abc.\"'", max_size=4), inner, max_size=3),
+    max_leaves=6,
+) | st.just(_MISSING)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, str):
+        return '"' + "".join(f"\\U{ord(letter):08x}" for letter in value) + '"'
+    return str(value).lower()
+
+
+def _changed(path: tuple[str | int, ...], value: Any) -> dict[str, Any]:
+    document = copy.deepcopy(_DOCUMENT)
+    table: Any = document
+    for part in path[:-1]:
+        table = table[part]
+    if value is _MISSING:
+        del table[path[-1]]
+    else:
+        table[path[-1]] = value
+    return document
+
+
+#: Keys at which a change of another shows: what is dispersed is held against the parameters, sizes against the design.
+_SHOWS_AT = {
+    "correlations": ("correlations", "dispersions"),
+    "design": ("design", "cases"),
+    "dispersions": ("dispersions", "correlations", "cases"),
+    "parameters": ("parameters", "dispersions"),
+}
+
+
+@given(path=st.sampled_from(_PATHS), value=_junk)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_every_wrong_file_ends_with_2_and_names_the_key(
+    campaign: Path, path: tuple[str | int, ...], value: Any
+) -> None:
+    """A good file with one value put wrong, or taken out: it is shown, or the message is about that key."""
+    document = _changed(path, value)
+    campaign.write_text("\n".join(f"{key} = {_toml(one)}" for key, one in document.items()))
+    shown = marsyard("show", campaign, "--draw", 2, "--json")
+    assert "Traceback" not in shown.err, shown.err
+    assert shown.status in (0, 2)
+    if shown.status == 2:
+        assert shown.out == ""
+        assert str(campaign) in shown.err
+        for line in shown.err.splitlines():
+            key = line.removeprefix("error: ").removeprefix(f"{campaign}: ")
+            assert key.startswith(_SHOWS_AT.get(str(path[0]), (str(path[0]),))), (path, value, shown.err)
+    else:
+        json.loads(shown.out)
+
+
+@given(text=st.binary(max_size=60) | st.text("[]{}=\"'.,abc123\n#\\", max_size=60).map(str.encode))
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_bytes_end_in_a_traceback(campaign: Path, text: bytes) -> None:
+    campaign.write_bytes(text)
+    shown = marsyard("show", campaign)
+    assert (shown.status, shown.out) == (2, "")
+    assert str(campaign) in shown.err
+    assert "Traceback" not in shown.err
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"seed = {'9' * 5000}",
+        f"seed = {2**63}",
+        f"values = {'[' * 500}{']' * 500}",
+        f"dispersions.kind = {{distribution = 'choice', values = [{'[' * 400}1{']' * 400}]}}",
+        "dispersions.kind = {distribution = 'choice', values = ['a', nan]}",
+        "dispersions.kind = {distribution = 'fixed', value = 2020-01-01}",
+        "parameters.altitude_m = 1979-05-27T07:32:00Z",
+        "dispersions.altitude_m = {distribution = 'uniform', low = -1e308, high = 1e308}",
+        "dispersions.altitude_m = {distribution = 'grid', low = 1.0, high = 2.0, step = 1e-9}",
+        "dispersions.altitude_m = {distribution = 'derived', formula = 'altitude_m'}",
+        "dispersions.altitude_m = {distribution = 'derived', formula = 'heights_m[7]'}",
+        "dispersions.altitude_m = {distribution = 'derived', formula = 'kind'}",
+        "dispersions.altitude_m = {distribution = 'erlang', a = 1e300, scale = 1e300}",
+    ],
+)
+def test_odd_values_are_refused(campaign: Path, line: str) -> None:
+    head = "name = 'fake'\nscenario = 'fake_scenario:FakeScenario'\ncases = 3\n"
+    campaign.write_text(head + line)
+    shown = marsyard("show", campaign)
+    assert (shown.status, shown.out) == (2, "")
+    assert "Traceback" not in shown.err
+    key = re.split(r"[ =]", line)[0]
+    assert key.rpartition(".")[2] in shown.err or "not valid TOML" in shown.err

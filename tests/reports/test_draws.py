@@ -1,0 +1,45 @@
+"""The figure of sampled inputs shows every parameter, every pair, and correlations that chance would hardly make."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.collections import PathCollection
+from matplotlib.patches import Rectangle
+
+from reports.draws import Drawn, draws_figure, save_figure
+
+
+def _drawn() -> list[Drawn]:
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=300)
+    return [
+        Drawn("wind.east_m_s", x.tolist(), rng.normal(size=1000).tolist()),
+        Drawn("wind.north_m_s", (0.9 * x + 0.1 * rng.normal(size=300)).tolist()),
+        Drawn("heights_m.1", rng.uniform(size=300).tolist()),
+        Drawn("kind", [["rough", "plain", {"a": 1}][k % 3] for k in range(300)], ["rough", "plain", {"a": 1}]),
+        Drawn("sleep_s", [0.0] * 300),
+    ]
+
+
+def test_marginals_and_pairs() -> None:
+    figure = draws_figure("a campaign", _drawn())
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles[:5] == ["wind.east (m/s)", "wind.north (m/s)", "heights_m.1", "kind", "sleep (s)"]
+    bars = [[patch for patch in axes.patches if isinstance(patch, Rectangle)] for axes in figure.axes[:5]]
+    assert [sum(bar.get_height() for bar in of_one) for of_one in bars] == [300.0] * 5
+    pairs = figure.axes[5]
+    texts = {text.get_text(): text.get_fontweight() for text in pairs.texts}
+    assert {"east", "north", "heights\nm\n1", "kind"} <= set(texts)
+    assert [text for text, weight in texts.items() if weight == "bold"] == ["+0.99"]
+    points = next(one for one in pairs.collections if isinstance(one, PathCollection))
+    assert len(points.get_offsets()) == 6 * 300
+
+
+def test_one_parameter_has_no_pairs(tmp_path: Path) -> None:
+    figure = draws_figure("[a] $x$", _drawn()[:1])
+    assert len(figure.axes) == 1
+    for name in ("one.svg", "one.png"):
+        save_figure(figure, tmp_path / name)
+        assert (tmp_path / name).stat().st_size > 1000

@@ -1,0 +1,108 @@
+"""Only independent random draws carry a probability verdict; designs, grids and the nominal case say what they are."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from reports.campaign import write_report
+from reports.sampled import INDEPENDENT, Sampled, sampled
+from reports.tables import verdict_table
+from reports.verdicts import Status, exit_code, judge_campaign, overall
+
+Rows = Callable[..., pd.DataFrame]
+MakeRun = Callable[..., Path]
+
+GRID = {"a": {"distribution": "grid", "values": [1, 2]}, "b": {"distribution": "uniform", "low": 0, "high": 1}}
+DESIGNED = [
+    ({"design": {"kind": "latin-hypercube"}}, "the design is Latin hypercube, and only independent random draws"),
+    ({"design": {"kind": "sobol"}}, "the design is scrambled Sobol, and only"),
+    ({"dispersions": GRID}, "the design is random draws at each point of a grid over a, and only"),
+]
+
+
+@pytest.mark.parametrize(
+    "odd", [{}, {"design": None}, {"design": 3}, {"design": {"kind": None, "nominal": "x"}}, {"dispersions": [1]}]
+)
+def test_what_states_no_design_is_drawn_independently(odd: dict[str, Any]) -> None:
+    assert sampled(odd) == INDEPENDENT
+    assert INDEPENDENT.no_probability == ""
+
+
+@pytest.mark.parametrize(("configuration", "said"), DESIGNED)
+def test_designs_tell_rates_and_decide_nothing(
+    make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], said: str
+) -> None:
+    frame, how = make_rows(2000), sampled(configuration)
+    asked = [{**velocity, "decide_by": how_decided} for how_decided in ("confidence", "estimate")]
+    for verdict, plain in zip(judge_campaign(frame, asked, how), judge_campaign(frame, asked), strict=True):
+        assert verdict.status is Status.INSUFFICIENT
+        assert (verdict.n, verdict.failures, verdict.estimate) == (plain.n, plain.failures, plain.estimate)
+        assert math.isnan(verdict.lower)
+        assert math.isnan(verdict.upper)
+        assert verdict.further_cases is None
+        assert said in verdict.note
+    verdicts = judge_campaign(frame, asked, how)
+    whole = overall(verdicts, frame, how)
+    assert (whole.word, said in whole.sentence) == ("INSUFFICIENT", True)
+    assert exit_code(verdicts, crashed=False) == 3
+    assert exit_code(verdicts, crashed=True) == 1
+    printed = io.StringIO()
+    Console(file=printed, width=200).print(verdict_table(verdicts))
+    assert printed.getvalue().count("No probability statement") == 1
+    assert "Clopper" not in printed.getvalue()
+
+
+def test_a_design_without_requirements_has_no_verdict(make_rows: Rows) -> None:
+    frame = make_rows(5)
+    assert overall([], frame, Sampled("sobol")).status is None
+    assert exit_code([], crashed=False) == 0
+
+
+def test_the_nominal_case_counts_in_no_verdict(make_rows: Rows, velocity: dict[str, Any]) -> None:
+    frame = make_rows(231)
+    frame["velocity_error_m_s"] = 1.0
+    frame["answered"] = True
+    frame["terrain"] = range(231)
+    frame.loc[0, "velocity_error_m_s"] = 9.0
+    (without,) = judge_campaign(frame, [velocity], Sampled(nominal=True))
+    assert (without.status, without.n, without.failures) == (Status.PASS, 230, 0)
+    (among,) = judge_campaign(frame, [velocity])
+    assert (among.n, among.failures) == (231, 1)
+
+
+def test_the_page_and_its_twin_say_how_cases_were_drawn(make_rows: Rows, make_run: MakeRun) -> None:
+    frame = make_rows(60)
+    frame.loc[0, "velocity_error_m_s"] = 77.0
+    run = make_run(frame)
+    record = json.loads((run / "campaign.json").read_text())
+    record["configuration"]["design"] = {"kind": "latin-hypercube", "nominal": True}
+    (run / "campaign.json").write_text(json.dumps(record))
+    page = write_report(run).read_text()
+    twin = json.loads((run / "report.json").read_text())
+    for text in (
+        "The cases are no independent random draws: Latin hypercube; case 0 is the nominal one.",
+        "velocity error (m/s) 77.0",
+        "No probability statement: the design is Latin hypercube",
+        "% seen",
+    ):
+        assert text in page, text
+    assert "Further cases</th>" in page
+    assert twin["sampling"] == {
+        "design": "latin-hypercube",
+        "grids": [],
+        "nominal": True,
+        "independent": False,
+        "text": "Latin hypercube; case 0 is the nominal one",
+    }
+    assert (twin["cases"], twin["exit_code"]) == (60, 3)
+    assert 0 not in [int(case) for case in twin["worst_cases"]]
+    assert twin["statistics"]["velocity error (m/s)"]["largest"] < 77.0
