@@ -14,6 +14,7 @@ SCENARIOS: Mapping[str, str] = {
     "descent": "scenarios.descent:DescentScenario",
     "fieldtest": "scenarios.fieldtest:FieldTestScenario",
     "rover": "scenarios.rover:RoverScenario",
+    "rover-drive": "scenarios.rover:SharedDriveScenario",
     "landing": "scenarios.landing:LandingScenario",
 }
 

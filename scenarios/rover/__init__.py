@@ -1,12 +1,22 @@
 """A rover drives to what it sees: the scenario of visual target tracking.
 
 Read it in the order of a run: `parameters`, `world`, `rig`, `vehicle`, `target`, then the loop in `run` with `route`,
-`mapping` and `pictures`, and `score`; `scenario` runs a case.
+`mapping` and `pictures`, and `score`; `scenario` runs a case. `shared` tracks many targets over
+the pictures of one drive.
 """
 
 from scenarios.rover.parameters import RoverScenarioParameters
 from scenarios.rover.run import Run, run_case
 from scenarios.rover.scenario import RoverScenario
+from scenarios.rover.shared import SharedDriveParameters, SharedDriveScenario
 from scenarios.rover.stops import RunOutcome
 
-__all__ = ["RoverScenario", "RoverScenarioParameters", "Run", "RunOutcome", "run_case"]
+__all__ = [
+    "RoverScenario",
+    "RoverScenarioParameters",
+    "Run",
+    "RunOutcome",
+    "SharedDriveParameters",
+    "SharedDriveScenario",
+    "run_case",
+]

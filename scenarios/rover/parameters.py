@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from algorithms.vtt import VttOptions
@@ -23,6 +24,17 @@ class _Parameters(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class InclineParameters(_Parameters):
+    """An even slope about the target that climbs to the east, and how the way to the target lies on it."""
+
+    name: Annotated[str, Field(min_length=1, description="what the report calls such ground")] = "flat ground"
+    slope_deg: Annotated[float, Field(ge=0.0, le=40.0, description="0 for none")] = 0.0
+    oblique_deg: Annotated[
+        float,
+        Field(ge=-180.0, le=180.0, description="turn of the start about the target, added to its bearing"),
+    ] = 0.0
+
+
 class WorldParameters(_Parameters):
     """The ground: one terrain of a site's bank, rocks that would stand in the way taken out."""
 
@@ -30,10 +42,8 @@ class WorldParameters(_Parameters):
     bank: Annotated[int, Field(ge=1, le=100000, description="terrains in the bank")] = 8
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
-    samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, 2.5 cm apart")] = 1024
-    slope_deg: Annotated[
-        float, Field(ge=0.0, le=40.0, description="an even slope that climbs to the east about the target; 0 for none")
-    ] = 0.0
+    samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, 2.5 cm apart")] = 2048
+    incline: InclineParameters = InclineParameters()
     rms_slope_deg: Annotated[
         float | None, Field(ge=0.0, le=30.0, description="RMS slope of the rough ground; by default the site's")
     ] = None
@@ -66,7 +76,7 @@ class WorldParameters(_Parameters):
             raise ValueError(f"terrain {self.terrain} is not in the bank; allowed: 0 to {self.bank - 1}")
         if self.samples & (self.samples - 1):
             raise ValueError(f"samples is {self.samples}; a power of two is needed")
-        if self.slope_deg and site(self.site).terrain("ground").ramp is not None:
+        if self.incline.slope_deg and site(self.site).terrain("ground").ramp is not None:
             raise ValueError(f"site {self.site} has a slope of its own")
         return self
 
@@ -116,7 +126,7 @@ class LegParameters(_Parameters):
     """A part of a run. After each of its steps the target is tracked.
 
     ========== ========================================================================================================
-    stay       stands for `steps` updates; with `autonav` it begins the navigator's map
+    stay       stands for `steps` updates
     approach   drives at the target's latest estimate until it is `goal_m` away
     back-off   drives backwards, away from the target, until it is `goal_m` away
     straight   drives `steps` times `step_m` along its heading (backwards where negative)
@@ -148,6 +158,7 @@ class LegParameters(_Parameters):
     autonav: Annotated[bool, Field(description="whether the navigator steers around what wedges of pictures show")] = (
         False
     )
+    maps_first: Annotated[bool, Field(description="whether the navigator's map is begun or added to before it")] = False
     map_by: Annotated[Literal["body", "mast"], Field(description="cameras that map for the navigator")] = "mast"
     wedges: Annotated[int, Field(ge=1, le=4, description="wedges of the mast's pictures at each step")] = 2
     target_is_no_obstacle: Annotated[
@@ -158,6 +169,8 @@ class LegParameters(_Parameters):
     def _has_a_step(self) -> LegParameters:
         if self.motion == "straight" and self.step_m is None:
             raise ValueError("a straight leg needs step_m")
+        if self.autonav and self.motion != "approach":
+            raise ValueError(f"the navigator drives to the target, not a leg of {self.motion}")
         return self
 
 
@@ -247,6 +260,11 @@ class RoverScenarioParameters(_Parameters):
     backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
         default_factory=default_backend
     )
+
+    @property
+    def bearing_rad(self) -> float:
+        """Direction from the target to the start, clockwise from north."""
+        return float(np.radians(self.start.bearing_deg + self.world.incline.oblique_deg))
 
     @field_validator("algorithm")
     @classmethod

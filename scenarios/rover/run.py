@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from algorithms.interface import MastAim, TargetTracker, TrackingState
-from algorithms.navigation import NavigationOutcome, NavigationPlan
+from algorithms.navigation import NavigationOutcome
 from algorithms.vtt import GoalReached, HandOffOutcome, hand_off
 from scenarios.estimators import target_tracker
 from scenarios.rover.mapping import Mapper
@@ -108,6 +108,8 @@ class _Loop:
             return failed
         for number, leg in enumerate(self.p.legs):
             done = 0
+            if leg.maps_first:
+                self._map(leg)
             while not finished(leg, done, self._belief()):
                 failed = self._step(number, leg, done)
                 if failed is not None:
@@ -121,23 +123,21 @@ class _Loop:
         """One step of a leg and the update after it."""
         told: Iterable[DriveCommand] = commands(leg, done, self._belief())
         if leg.autonav:
-            plan = self._navigated(leg)
-            if plan is not None:
-                if plan.outcome not in (NavigationOutcome.PATH, NavigationOutcome.AT_GOAL):
-                    return RunOutcome.NO_PATH
-                told = plan.commands
+            self._map(leg)
+            plan = self.run.mapper.plan(leg, self._belief(), self.run.vehicle.estimated)
+            if plan.outcome not in (NavigationOutcome.PATH, NavigationOutcome.AT_GOAL):
+                return RunOutcome.NO_PATH
+            told = plan.commands
         for command in told:
             self._drive(leg, command)
         return self._track(number)
 
-    def _navigated(self, leg: LegParameters) -> NavigationPlan | None:
-        """Maps, and plans the next step of an approach; None where the leg only maps."""
-        run, belief = self.run, self._belief()
+    def _map(self, leg: LegParameters) -> None:
+        """Takes the pictures of a navigation update."""
+        run, vehicle = self.run, self.run.vehicle
         run.autonav_updates += 1
         run.time_s += self.p.timing.autonav_s
-        vehicle = run.vehicle
-        run.mapper.sense(leg, belief, run.world, vehicle.rover, vehicle.stance, vehicle.estimated)
-        return run.mapper.plan(leg, belief, vehicle.estimated) if leg.motion == "approach" else None
+        run.mapper.sense(leg, self._belief(), run.world, vehicle.rover, vehicle.stance, vehicle.estimated)
 
     def _drive(self, leg: LegParameters, command: DriveCommand) -> None:
         run, timing = self.run, self.p.timing

@@ -17,7 +17,6 @@ from scenarios.rover.stops import RunOutcome, Stop
 from sim.processor import processor_features
 from sim.render import process_renderer
 
-#: Directions over which the errors of an estimated azimuth are spread.
 _FULL_TURN_DEG = 360.0
 
 
@@ -46,6 +45,7 @@ def score(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     drift = float(np.hypot(*last))
     return {
         "tracked": bool(completed and drift <= p.score.tracked_px),
+        "not_tracked": not (completed and drift <= p.score.tracked_px),
         "true_track": false == 0,
         "false_updates": false,
         "position_error_m": float(np.linalg.norm(error)),
@@ -188,6 +188,8 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "site": p.world.site,
         "terrain": p.world.terrain,
         "camera": p.camera.preset,
+        "navcam": p.camera.preset.endswith("navcam"),
+        "pancam": p.camera.preset.endswith("pancam"),
         "algorithm": p.algorithm,
         "search_px": p.vtt.search_px,
         "rock_diameter_m": rock.diameter_m,
@@ -199,7 +201,8 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "point_on_edge": chosen.on_edge,
         "point_lit": chosen.lit,
         "selectable": chosen.lit and not chosen.on_edge,
-        "slope_deg": p.world.slope_deg,
+        "incline": p.world.incline.name,
+        "slope_deg": p.world.incline.slope_deg,
         "range_start_m": float("nan") if first is None else first.range_m,
         "range_end_m": float("nan") if last is None else last.range_m,
         "tilt_max_deg": float(np.degrees(_most(tilts))),
@@ -209,6 +212,12 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "pose_error_m": pose_error,
         "pose_error_share": pose_error / driven if driven > 0.0 else float("nan"),
         "duration_min": 0.0 if last is None else last.time_s / 60.0,
+        "bearing_deg": float(np.degrees(p.bearing_rad)) % _FULL_TURN_DEG,
+        "visual_odometry": any(leg.visual_odometry for leg in p.legs),
+        "autonav": any(leg.autonav for leg in p.legs),
+        "roll_compensated": p.vtt.roll and p.algorithm != "pure-ncc",
+        "roll_ignored": not p.vtt.roll or p.algorithm == "pure-ncc",
+        "clear_sky": p.clouds is None or p.clouds.cover == 0.0,
         "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0][0], sun[0][1])) % _FULL_TURN_DEG),
         "sun_elevation_deg": float(np.degrees(np.arcsin(sun[0][2]))),
         "sun_moved_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),

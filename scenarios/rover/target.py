@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
+from algorithms.vtt import VttOptions
 from algorithms.vtt.pointing import mast_angles
 from algorithms.vtt.stereo import triangulated
 from scenarios.rover.parameters import RoverScenarioParameters
-from scenarios.rover.points import Sight, distances, shaded
+from scenarios.rover.points import Sight, distances, hidden, shaded
 from scenarios.rover.rig import Rig
-from scenarios.rover.world import TARGET, RunWorld
+from scenarios.rover.world import RunWorld
+from sim.camera import CameraModel
 from sim.dynamics.rover import Stance
 from sim.frames import SITE_FROM_WORLD
 from sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
@@ -63,32 +66,76 @@ def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance:
     The operators pick it in a picture taken from where the rover stands, with the mast as it then stands; the rover's
     first pictures are taken from there without moving the mast.
     """
-    rocks = world.rocks
-    number = rocks.by_name(TARGET)
-    middle = rocks.position_m[number] + np.array([0.0, 0.0, 0.5 * rocks.height_m[number]])
-    rover_from_world = stance.world_from_rover.inv()
-    angles = mast_angles(np.asarray(rover_from_world.apply(middle)), rig.calibrated, p.vtt.aim_pair)
+    number = world.target_number
+    middle = world.rocks.position_m[number] + np.array([0.0, 0.0, 0.5 * world.rocks.height_m[number]])
+    angles = mast_angles(np.asarray(stance.world_from_rover.inv().apply(middle)), rig.calibrated, p.vtt.aim_pair)
     if angles is None:
         raise ValueError("the mast cannot point at the target's rock from the start; start.target_azimuth_deg turns it")
     rig.point(*angles)
     world_from_head = stance.world_from_rover * rig.rover_from_head
     eye = np.asarray(world_from_head.apply(rig.left.c.copy()))
-    point = Sight.of(world.target_triangles, eye, float(rocks.position_m[number, 2])).point(
-        p.target.across, p.target.up
+    point, on_edge, lit = point_on(world, eye, p.target.across, p.target.up, rig.pixel_rad, p.vtt)
+    told = _told(p, rig, stance.world_from_rover, world_from_head, point)
+    return rock_of(world, point, told, on_edge, lit)
+
+
+def point_on(
+    world: RunWorld,
+    eye: Float64[np.ndarray, "3"],
+    across: float,
+    up: float,
+    pixel_rad: float,
+    options: VttOptions,
+) -> tuple[Float64[np.ndarray, "3"], bool, bool]:
+    """A point of the rock's face as seen from a place; whether it is on the rock's edge, and whether it is lit."""
+    point = Sight.of(world.target_triangles, eye, float(world.rocks.position_m[world.target_number, 2])).point(
+        across, up
     )
-    sun = world.sun.direction(0.0)
-    return ChosenTarget(
-        point_world=point,
-        designation=_told(p, rig, stance.world_from_rover, rig.state.readings_rad, world_from_head, point),
-        rock=Rock(
-            float(rocks.diameter_m[number]),
-            float(rocks.height_m[number]),
-            int(rocks.shape[number]),
-            float(np.degrees(rocks.yaw_rad[number])),
-        ),
-        on_edge=_on_edge(world, eye, point, 0.5 * p.vtt.template_px * rig.pixel_rad),
-        lit=not bool(shaded(world.target_triangles, point[None], sun)[0]),
+    on_edge = _on_edge(world, eye, point, 0.5 * options.template_px * pixel_rad)
+    return point, on_edge, not bool(shaded(world.target_triangles, point[None], world.sun.direction(0.0))[0])
+
+
+def in_view(
+    world: RunWorld,
+    point: Float64[np.ndarray, "3"],
+    eyes: Sequence[Float64[np.ndarray, "3"]],
+    pixel_rad: float,
+    options: VttOptions,
+) -> bool:
+    """Whether a point of the rock is seen from all these places, its template always within the rock's outline."""
+    reach = 0.5 * options.template_px * pixel_rad
+    return not any(
+        bool(hidden(world.target_triangles, point[None], eye)[0]) or _on_edge(world, eye, point, reach) for eye in eyes
     )
+
+
+def rock_of(
+    world: RunWorld,
+    point: Float64[np.ndarray, "3"],
+    designation: TargetDesignation,
+    on_edge: bool,
+    lit: bool,
+) -> ChosenTarget:
+    """A chosen point with the rock that it is on."""
+    rocks, number = world.rocks, world.target_number
+    rock = Rock(
+        float(rocks.diameter_m[number]),
+        float(rocks.height_m[number]),
+        int(rocks.shape[number]),
+        float(np.degrees(rocks.yaw_rad[number])),
+    )
+    return ChosenTarget(point, designation, rock, on_edge, lit)
+
+
+def told_by_pixel(
+    left: CameraModel,
+    world_from_head: RigidTransform,
+    point: Float64[np.ndarray, "3"],
+    angles_rad: tuple[float, float],
+) -> PixelTarget:
+    """The designation by the point's true pixel in a picture of the left camera as it is."""
+    pixel = left.project(np.asarray(world_from_head.inv().apply(point.copy())))[0]
+    return PixelTarget(np.asarray(pixel), *angles_rad)
 
 
 def _on_edge(world: RunWorld, eye: Float64[np.ndarray, "3"], point: Float64[np.ndarray, "3"], reach_rad: float) -> bool:
@@ -108,16 +155,15 @@ def _told(
     p: RoverScenarioParameters,
     rig: Rig,
     world_from_rover: RigidTransform,
-    angles: tuple[float, float],
     world_from_head: RigidTransform,
     point: Float64[np.ndarray, "3"],
 ) -> TargetDesignation:
     """The designation: the point's true pixel, or what the ground makes of the pair of pixels by triangulation."""
+    angles, known = rig.state.readings_rad, rig.calibrated
+    if p.target.designation == "pixel":
+        return told_by_pixel(rig.left, world_from_head, point, angles)
     in_head = np.asarray(world_from_head.inv().apply(point.copy()))
     left, right = (np.asarray(camera.project(in_head)[0]) for camera in (rig.left, rig.right))
-    if p.target.designation == "pixel":
-        return PixelTarget(left, *angles)
-    known = rig.calibrated
     position = triangulated(known.left, known.right, left, right)
     if position is None:
         raise ValueError("the target cannot be triangulated from the start")

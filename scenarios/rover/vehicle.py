@@ -48,7 +48,7 @@ class Vehicle:
     def placed(cls, p: RoverScenarioParameters, world: RunWorld, rig: Rig, streams: Streams) -> Vehicle:
         """The rover at its start, its pose known there."""
         rover = rover_of(p.camera.preset)
-        bearing = np.radians(p.start.bearing_deg)
+        bearing = p.bearing_rad
         away = np.array([np.sin(bearing), np.cos(bearing)])
         azimuth = bearing + np.pi - np.radians(p.start.target_azimuth_deg)
         ahead = np.array([np.sin(azimuth), np.cos(azimuth)])

@@ -47,8 +47,10 @@ def terrain_parameters(w: WorldParameters) -> TerrainParameters:
     base = site(w.site).terrain("ground")
     if w.rock_abundance is not None:
         changes["rocks"] = (base.rocks or RockParameters()).model_dump() | {"abundance": w.rock_abundance}
-    if w.slope_deg:
-        changes["ramp"] = Ramp(slope_deg=w.slope_deg, length_m=RAMP_SHARE * w.samples * base.spacing_m).model_dump()
+    if w.incline.slope_deg:
+        changes["ramp"] = Ramp(
+            slope_deg=w.incline.slope_deg, length_m=RAMP_SHARE * w.samples * base.spacing_m
+        ).model_dump()
     return base.changed(changes)
 
 
@@ -114,7 +116,7 @@ class RunWorld:
         ground = furnished(p, streams.generator("placed rocks"))
         path = SunPath(p.sun)
         reach = p.start.distance_m + BACKGROUND_M
-        middle, half = np.radians(p.start.bearing_deg + 180.0), np.radians(w.background_half_deg)
+        middle, half = p.bearing_rad + np.pi, np.radians(w.background_half_deg)
         eye = Eye(w.east_m, w.north_m, EYE_HEIGHT_M, pixel_rad, float(middle), float(half), reach)
         lines = 2 * int(np.ceil(np.arcsinh(reach / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1
         clouds = None
@@ -146,6 +148,11 @@ class RunWorld:
         if self.ground.rocks is None:
             raise ValueError("a furnished ground has rocks")
         return self.ground.rocks
+
+    @property
+    def target_number(self) -> int:
+        """Number of the target's rock."""
+        return self.rocks.by_name(TARGET)
 
     @property
     def placed_m(self) -> Float64[np.ndarray, "rocks 3"]:
@@ -207,7 +214,7 @@ def furnished(p: RoverScenarioParameters, rng: np.random.Generator) -> SiteGroun
 def placed_rocks(p: RoverScenarioParameters) -> tuple[PlacedRock, ...]:
     """The target's rock and the obstacles, in world coordinates."""
     t, w = p.target, p.world
-    bearing = np.radians(p.start.bearing_deg)
+    bearing = p.bearing_rad
     along, right = np.array([np.sin(bearing), np.cos(bearing)]), np.array([-np.cos(bearing), np.sin(bearing)])
     rocks = [
         PlacedRock(

@@ -1,0 +1,321 @@
+"""One drive, many targets: trackers that are run over the same pictures, as in sections 5.1 to 5.3 of the paper.
+
+The rover is driven as told, by the true distance of the rock's middle, and its mast points there; at every stop a part
+of both frames is taken that holds the rock and the search windows about it. A case then tracks one of the targets over
+every (skip + 1)-th stop: larger steps are made by leaving pictures out. What the tracker answers moves nothing.
+
+A drive is a function of the parameters, the campaign's seed and the run's number; processes keep the last one.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from scipy.spatial.transform import RigidTransform
+
+from algorithms.interface import PixelBox, TrackingState
+from algorithms.vtt import VttOptions
+from algorithms.vtt.pointing import box_around, mast_angles
+from scenarios.estimators import target_tracker
+from scenarios.interface import CaseResult, Scalar
+from scenarios.rover.parameters import LegParameters, RoverScenarioParameters
+from scenarios.rover.pictures import Detectors, Photographer, StereoPictures, sunlight_of_preset
+from scenarios.rover.rig import Rig
+from scenarios.rover.route import Belief, commands, finished
+from scenarios.rover.run import Run
+from scenarios.rover.score import conditions, products, provenance, score, stored_updates, tracking
+from scenarios.rover.stops import RunOutcome, Stop
+from scenarios.rover.target import in_view, point_on, rock_of, told_by_pixel
+from scenarios.rover.vehicle import Vehicle
+from scenarios.rover.world import RunWorld, terrain_parameters
+from sim.camera import CameraModel
+from sim.dynamics import Stance
+from sim.measurements import RoverMeasurements
+from sim.streams import Streams
+from sim.terrain import TerrainBank
+
+
+class _Parameters(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class VariantParameters(_Parameters):
+    """What one run has of its own: its rock, its place and its light."""
+
+    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
+    diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="of the rock")] = 1.4
+    height_m: Annotated[float, Field(gt=0.01, le=5.0, description="of the rock")] = 0.8
+    shape: Annotated[int, Field(ge=0, le=31, description="its shape, see PlacedRock")] = 0
+    yaw_deg: Annotated[float, Field(description="its turn")] = 0.0
+    sun_azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 225.0
+    sun_elevation_deg: Annotated[float, Field(gt=3.0, le=90.0)] = 45.0
+
+
+class PointParameters(_Parameters):
+    """A target on the rock's face, see `scenarios.rover.TargetParameters`."""
+
+    across: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
+    up: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+
+
+class BandParameters(_Parameters):
+    """A range of steps by which requirements choose their cases: a column of true and false of this name."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$")]
+    least: float = 0.0
+    most: float = 1.0
+
+
+class SharedDriveParameters(_Parameters):
+    """Drives whose pictures many cases share; `run`, `target`, `skip`, `drive.algorithm`, `drive.vtt` make a case."""
+
+    drive: Annotated[RoverScenarioParameters, Field(description="the drive at its finest steps, and the tracker")]
+    variants: Annotated[tuple[VariantParameters, ...], Field(min_length=1, description="the runs")]
+    targets: Annotated[tuple[PointParameters, ...], Field(min_length=1, description="points on every run's rock")]
+    run: Annotated[int, Field(ge=0, description="number of the run")] = 0
+    target: Annotated[int, Field(ge=0, description="number of the target")] = 0
+    skip: Annotated[int, Field(ge=0, le=100, description="stops left out between two updates")] = 0
+    margin_px: Annotated[float, Field(gt=0.0, description="what of the frame is taken around the rock")] = 110.0
+    bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps that are told apart")] = ()
+
+    @model_validator(mode="after")
+    def _are_there(self) -> SharedDriveParameters:
+        for name, number, there in (
+            ("run", self.run, len(self.variants)),
+            ("target", self.target, len(self.targets)),
+        ):
+            if number >= there:
+                raise ValueError(f"{name} is {number}; allowed: 0 to {there - 1}")
+        if len(self.drive.legs) != 1:
+            raise ValueError(f"a shared drive has one leg, not {len(self.drive.legs)}")
+        return self
+
+    @property
+    def step(self) -> float:
+        """The step between two updates: a share of the distance, or degrees of a turn or circle."""
+        leg = self.drive.legs[0]
+        if leg.motion in ("turn", "circle"):
+            return abs(leg.step_deg) * (self.skip + 1)
+        return float(1.0 - (1.0 - leg.step_share) ** (self.skip + 1))
+
+    def of_run(self) -> RoverScenarioParameters:
+        """The drive of the run, its tracker left out: what its pictures depend on."""
+        v, p = self.variants[self.run], self.drive
+        target = {"diameter_m": v.diameter_m, "height_m": v.height_m, "shape": v.shape, "yaw_deg": v.yaw_deg}
+        sun = {"azimuth_deg": v.sun_azimuth_deg, "elevation_deg": v.sun_elevation_deg}
+        return p.model_copy(
+            update={
+                "world": p.world.model_copy(update={"terrain": v.terrain}),
+                "target": p.target.model_copy(update=target),
+                "sun": p.sun.model_copy(update=sun),
+                "algorithm": "vtt",
+                "vtt": VttOptions(),
+            }
+        )
+
+
+@dataclass(frozen=True)
+class View:
+    """A stop of a drive, without a tracker. See `Stop` for what is the same."""
+
+    time_s: float
+    stance: Stance
+    estimated: RigidTransform
+    angles_rad: tuple[float, float]
+    world_from_head: RigidTransform
+    pictures: StereoPictures
+
+
+@dataclass(frozen=True)
+class SharedDrive:
+    """A drive and its pictures."""
+
+    world: RunWorld
+    rig: Rig
+    vehicle: Vehicle
+    views: tuple[View, ...]
+
+
+@lru_cache(maxsize=1)
+def shared_drive(p: RoverScenarioParameters, margin_px: float, seed: int, campaign: str, run: int) -> SharedDrive:
+    """The drive of a run; its streams are named by it and belong to no case."""
+    streams = Streams(seed, f"{campaign}: run {run}", 0)
+    rig = Rig.of(p, streams)
+    world = RunWorld.of(p, rig.pixel_rad, streams)
+    vehicle = Vehicle.placed(p, world, rig, streams)
+    photographer = Photographer(
+        p.backend,
+        Detectors.drawn(p.camera.preset, p.camera.detector_noise, streams.generator("detector response")),
+        p.exposure,
+        streams.generator("detector noise"),
+    )
+    corners = world.target_triangles.reshape(-1, 3)
+    corners = corners[corners[:, 2] > world.rocks.position_m[world.target_number, 2]]
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    leg, views, time_s = p.legs[0], [], 0.0
+    while True:
+        time_s += p.timing.track_s
+        views.append(_view(p, world, rig, vehicle, photographer, corners, middle, margin_px, time_s))
+        belief = _belief(rig, vehicle, middle)
+        if finished(leg, len(views) - 1, belief):
+            return SharedDrive(world, rig, vehicle, tuple(views))
+        _drive(leg, len(views) - 1, belief, vehicle)
+        time_s += p.timing.drive_s
+
+
+def _belief(rig: Rig, vehicle: Vehicle, middle: Float64[np.ndarray, "3"]) -> Belief:
+    """The rock's middle as it truly lies from the rover: the drive is the test's, not the tracker's."""
+    position = np.asarray(vehicle.stance.world_from_rover.inv().apply(middle.copy()))
+    return Belief(position, rig.range_m(position))
+
+
+def _drive(leg: LegParameters, done: int, belief: Belief, vehicle: Vehicle) -> None:
+    for command in commands(leg, done, belief):
+        vehicle.drive(command, leg.visual_odometry)
+
+
+def _view(
+    p: RoverScenarioParameters,
+    world: RunWorld,
+    rig: Rig,
+    vehicle: Vehicle,
+    photographer: Photographer,
+    corners: Float64[np.ndarray, "corners 3"],
+    middle: Float64[np.ndarray, "3"],
+    margin_px: float,
+    time_s: float,
+) -> View:
+    """Points at the rock's middle and takes what of both frames shows the rock, and a margin."""
+    stance, known = vehicle.stance, rig.calibrated
+    angles = mast_angles(np.asarray(stance.world_from_rover.inv().apply(middle.copy())), known, p.vtt.aim_pair)
+    if angles is None:
+        raise ValueError("the mast cannot point at the target's rock from every stop of this drive")
+    rig.point(*angles)
+    world_from_head = stance.world_from_rover * rig.rover_from_head
+    in_head = np.asarray(world_from_head.inv().apply(corners.copy()))
+    boxes = (_box(rig.left, in_head, margin_px), _box(rig.right, in_head, margin_px))
+    scene = world.scene(time_s)
+    if p.rover_shadow:
+        scene = world.with_rover(scene, vehicle.rover, stance, known.geometry, rig.state.true_rad, middle)
+    brightness = world.brightness(time_s) / sunlight_of_preset(p.camera.preset)
+    pictures = photographer.take(scene, world_from_head, (rig.left, rig.right), boxes, brightness, time_s)
+    return View(time_s, stance, vehicle.estimated, rig.state.readings_rad, world_from_head, pictures)
+
+
+def _box(camera: CameraModel, points: Float64[np.ndarray, "points 3"], margin_px: float) -> PixelBox:
+    """The part of the frame about all points that are in it."""
+    pixels = camera.project(points)[0]
+    seen = pixels[camera.in_frame(pixels)]
+    box = box_around(seen, margin_px, camera) if len(seen) else None
+    if box is None:
+        raise ValueError("the camera does not see the target's rock")
+    return box
+
+
+def tracked(p: SharedDriveParameters, drive: SharedDrive) -> Run:
+    """A tracker run over the drive's pictures for one of the targets."""
+    first = drive.views[0]
+    eye = np.asarray(first.world_from_head.apply(drive.rig.left.c.copy()))
+    chosen = p.targets[p.target]
+    point, on_edge, lit = point_on(drive.world, eye, chosen.across, chosen.up, drive.rig.pixel_rad, p.drive.vtt)
+    told = told_by_pixel(drive.rig.left, first.world_from_head, point, first.angles_rad)
+    run = Run(drive.world, drive.rig, drive.vehicle, rock_of(drive.world, point, told, on_edge, lit))
+    tracker = target_tracker(p.drive.algorithm, p.drive.vtt)
+    tracker.designate(told, first.estimated)
+    for view in drive.views[:: p.skip + 1]:
+        pictures = view.pictures
+        measurements = RoverMeasurements(
+            pictures.left, pictures.right, drive.rig.calibrated, *view.angles_rad, view.estimated
+        )
+        started = time.process_time()
+        update = tracker.update(measurements)
+        taken = time.process_time() - started
+        in_head = np.asarray(view.world_from_head.inv().apply(point.copy()))
+        run.stops.append(
+            Stop(
+                leg=0,
+                time_s=view.time_s,
+                stance=view.stance,
+                estimated=view.estimated,
+                angles_rad=view.angles_rad,
+                world_from_head=view.world_from_head,
+                pictures=pictures,
+                update=update,
+                point_px=np.asarray(drive.rig.left.project(in_head)[0]),
+                point_rover=np.asarray(view.stance.world_from_rover.inv().apply(point.copy())),
+                range_m=float(np.linalg.norm(in_head - drive.rig.left.c)),
+                drives=(),
+                track_time_s=taken,
+            )
+        )
+        if update.state is TrackingState.FAILURE:
+            break
+    run.outcome = _outcome(run)
+    return run
+
+
+def _outcome(run: Run) -> RunOutcome:
+    if not run.stops[0].update.found:
+        return RunOutcome.NOT_SEEDED
+    return RunOutcome.COMPLETED if run.stops[-1].update.found else RunOutcome.LOST
+
+
+class SharedDriveScenario:
+    """Many targets tracked over the pictures of one drive."""
+
+    name = "rover-drive"
+    parameters_type = SharedDriveParameters
+
+    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
+        """Numbers of the bank's terrains that runs use."""
+        return tuple(sorted({one.terrain for one in _checked(parameters).variants}))
+
+    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
+        """Builds one terrain of the bank."""
+        w = _checked(parameters).drive.world
+        TerrainBank(terrain_parameters(w), w.bank_seed).terrain(shared_input)
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """One target of one run, tracked with one step."""
+        p = _checked(parameters)
+        of_run = p.of_run()
+        drive = shared_drive(of_run, p.margin_px, streams.seed, streams.campaign, p.run)
+        run = tracked(p, drive)
+        case = of_run.model_copy(update={"algorithm": p.drive.algorithm, "vtt": p.drive.vtt, "score": p.drive.score})
+        eyes = [np.asarray(one.world_from_head.apply(drive.rig.left.c.copy())) for one in drive.views]
+        bands: dict[str, Scalar] = {one.name: bool(one.least <= p.step <= one.most) for one in p.bands}
+        row = {
+            **score(case, run),
+            **tracking(run),
+            **conditions(case, run),
+            "run": p.run,
+            "target": p.target,
+            "point_across": p.targets[p.target].across,
+            "point_up": p.targets[p.target].up,
+            "skip": p.skip,
+            "step": p.step,
+            "with_scale": p.drive.algorithm != "pure-ncc" and p.drive.vtt.scale,
+            "pure_ncc": p.drive.algorithm == "pure-ncc",
+            "in_view": in_view(drive.world, run.target.point_world, eyes, drive.rig.pixel_rad, p.drive.vtt),
+            **bands,
+            **stored_updates(run, p.drive.score.stored_updates),
+            **provenance(case, run),
+        }
+        return CaseResult(
+            outcome=run.outcome.name,
+            answered=run.outcome is RunOutcome.COMPLETED,
+            row=row,
+            products=products(case, run),
+        )
+
+
+def _checked(parameters: BaseModel) -> SharedDriveParameters:
+    if not isinstance(parameters, SharedDriveParameters):
+        raise TypeError(f"the shared drive takes SharedDriveParameters, not {type(parameters).__name__}")
+    return parameters
