@@ -102,7 +102,8 @@ class _View:
         if not np.all(self.corners[:, 2] < 0.0):
             return None
         reach = (level_m - self.centre_m[2]) / self.corners[:, 2]
-        return (self.centre_m[:2] - origin_m[:2] + reach[:, None] * self.corners[:, :2]).astype(np.float32)
+        corners = self.centre_m[:2] - origin_m[:2] + reach[:, None] * self.corners[:, :2]
+        return np.asarray(corners, dtype=np.float32)
 
 
 def _overlap(first: Float32[np.ndarray, "4 2"] | None, second: Float32[np.ndarray, "4 2"] | None) -> float:

@@ -16,7 +16,7 @@ from sim.dynamics.trajectory import Motion
 
 @dataclass(frozen=True)
 class Vibration:
-    """Sines along the world's axes and in yaw, pitch and roll: rows of derivatives add to both.
+    """Sines along the world's axes and in yaw, pitch and roll, added to places and angles.
 
     Attributes
     ----------
