@@ -73,7 +73,10 @@ def test_parameters(campaign_file: CampaignFile, parameters: str, said: str) -> 
         ("altitude_m = {distribution='gamma', scale=2}", "parameter 'a' is missing; gamma takes a, loc, scale"),
         ("altitude_m = {distribution='gamma', a=1, scal=2}", "unknown parameter 'scal' (did you mean 'scale'?)"),
         ("altitude_m = {distribution='gamma', a=-1}", "gamma is not defined for a = -1.0"),
-        ("altitude_m = {distribution='gamma', a='x'}", "dispersions.altitude_m.a: unknown parameter 'x'; allowed: abort"),
+        (
+            "altitude_m = {distribution='gamma', a='x'}",
+            "dispersions.altitude_m.a: unknown parameter 'x'; allowed: abort",
+        ),
         ("altitude_m = {distribution='gamma', a=[1]}", "altitude_m.a: input should be a valid number"),
         ("altitude_m = 'uniform'", "dispersions.altitude_m: input should be a valid dictionary"),
         ("altitude_m = {low = 1}", "dispersions.altitude_m.distribution: required, but missing"),
@@ -198,6 +201,15 @@ def test_the_catalogue_is_found_by_name_and_loads() -> None:
     for name, path in catalogue().items():
         assert find_campaign(name) == path
         assert load_campaign(name).configuration.name == name
+
+
+def test_the_example_of_the_documentation_loads(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "sampling.md").read_text()
+    example = text.partition("```toml\n")[2].partition("```")[0]
+    path = tmp_path / "example.toml"
+    path.write_text(f"name = 'example'\nscenario = 'descent'\ncases = 41\n{example}")
+    campaign = load_campaign(str(path))
+    assert [campaign.draws(case)["descent.altitude_first_m"] for case in (1, 2, 40)] == [1400.0, 1700.0, 2600.0]
 
 
 def test_overrides(campaign_file: CampaignFile) -> None:
