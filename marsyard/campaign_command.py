@@ -176,7 +176,7 @@ def replay(
     from campaigns.replay import replay as run_again
     from campaigns.retention import case_directory
     from marsyard.steps import write_steps
-    from reports.dimes_figures import write_case_figures
+    from reports.systems import write_case_figures
 
     replayed = run_again(directory, case)
     target = out if out is not None else case_directory(directory, case)
@@ -191,8 +191,7 @@ def replay(
     products = unpack_products(packed)
     if step:
         typer.echo(f"stages: {write_steps(target / 'steps', products)} files in {target / 'steps'}")
-    figure = write_case_figures(target, products)
-    if figure is not None:
+    for figure in write_case_figures(target, products):
         typer.echo(f"figure: {figure}")
     _compare(replayed)
 

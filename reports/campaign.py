@@ -13,16 +13,17 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from reports import gallery, sections
 from reports.answers import answers_section
-from reports.carried import carried_section
 from reports.columns import label, numbers, primary_metric
 from reports.conditions import conditions_section
+from reports.dimes.carried import carried_section
+from reports.dimes.fieldtest import field_test_section
+from reports.dimes.landing import landing_section
+from reports.dimes.sensitivity import sensitivity_section
 from reports.faults import faults_section
-from reports.fieldtest import field_test_section
-from reports.landing import landing_section
 from reports.sampled import sampled
 from reports.section import Section, SectionMaker, Subject
-from reports.sensitivity import sensitivity_section
 from reports.stored import StoredRun, read_run
+from reports.systems import shown_cases
 from reports.tables import error_summaries, outcome_counts
 from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overall
 from reports.wording import number
@@ -100,7 +101,7 @@ def page_context(
         "outcome_plates": gallery.outcome_plates(run.frame),
         "crashed": sections.crashed_rows(run),
         "dispersions": sections.dispersion_grid(subject.run),
-        "shown": gallery.shown_cases(run),
+        "shown": shown_cases(run),
         "provenance": sections.provenance(run),
         "versions": sections.versions(run),
         "configuration": sections.configuration_text(run),

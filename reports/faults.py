@@ -6,15 +6,14 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from reports.answers import CONFIDENCE, Share, share_of
 from reports.columns import label, numbers, split_unit
-from reports.gallery import Plate
+from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes, svg_markup
+from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from reports.verdicts import is_flag, members, succeeded
 from reports.wording import NOTHING, percent, stated
 
@@ -61,13 +60,13 @@ def faults_section(subject: Subject) -> Section | None:
     unit = split_unit(subject.metric)[1]
     caption = "Full: answers within the bound. Hatched: no answer. Crossed: wrong answers."
     figure = fault_bars(rows)
-    plate = Plate(Markup(svg_markup(figure, "faults", caption)), caption)  # noqa: S704  (matplotlib escapes texts)
+    drawn = plate(figure, "faults", caption)
     note = (
         f"Valid: answered within {subject.bound:g} {unit}. Invalid: no answer, as the algorithm said, or crashed. "
         f"Wrong: answered, but beyond the bound; with the two-sided Clopper-Pearson interval of its share of "
         f"all cases at {stated(CONFIDENCE)} confidence."
     )
-    blocks = [Block(plates=[plate]), Block(grid=_grid(rows), note=note)]
+    blocks = [Block(plates=[drawn]), Block(grid=_grid(rows), note=note)]
     return Section("faults", "Faults", "Faults by size", blocks, {"rows": [asdict(row) for row in rows]})
 
 

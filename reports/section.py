@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 
-from reports.gallery import Plate
+from reports.plates import Plate
 from reports.sections import Grid
 from reports.stored import StoredRun
 

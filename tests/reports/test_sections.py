@@ -13,12 +13,12 @@ import pytest
 
 from reports.answers import answer_shares
 from reports.campaign import write_report
-from reports.carried import carried_section
 from reports.conditions import conditions_section, cuts, terrain_spread
+from reports.dimes.carried import carried_section
+from reports.dimes.landing import landing_section
+from reports.dimes.sensitivity import analyse, sensitivity_section
 from reports.faults import fault_rows, faults_section
-from reports.landing import landing_section
 from reports.section import Section, Subject
-from reports.sensitivity import analyse, sensitivity_section
 from reports.stored import StoredRun
 
 Rows = Callable[..., pd.DataFrame]

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from reports.answers import CONFIDENCE, share_of
 from reports.columns import numbers
-from reports.gallery import Plate
+from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics import quantile_bounds
-from reports.svg import SERIES, in_page_style, new_axes, svg_markup
+from reports.svg import SERIES, in_page_style, new_axes
 from reports.verdicts import is_flag, members
 from reports.wording import number, percent, stated
 
@@ -49,7 +48,7 @@ def landing_section(subject: Subject) -> Section | None:
     ]
     caption = "Share of landings with a horizontal speed at touchdown of more than so much."
     figure = speed_figure(with_it, without)
-    plate = Plate(Markup(svg_markup(figure, "landing", caption)), caption)  # noqa: S704  (matplotlib escapes texts)
+    drawn = plate(figure, "landing", caption)
     confidence = stated(CONFIDENCE)
     gain, loss = number(float(-change.min())), number(float(change.max()))
     note = (
@@ -57,7 +56,7 @@ def landing_section(subject: Subject) -> Section | None:
         f"Pearson, at {confidence} confidence. Largest gain and loss: {gain} and {loss} m/s."
     )
     blocks = [
-        Block(plates=[plate]),
+        Block(plates=[drawn]),
         Block(heading="Good and harm", grid=Grid(["", "Landings", "Share", f"{confidence} interval"], rows), note=note),
         Block(heading="Horizontal speed at touchdown", grid=_speeds_grid(with_it, without)),
     ]

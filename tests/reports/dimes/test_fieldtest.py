@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from reports.campaign import write_report
-from reports.fieldtest import PAPER, cells, field_test_section
+from reports.dimes.fieldtest import PAPER, cells, field_test_section
 from reports.section import Subject
 from reports.stored import read_run
 

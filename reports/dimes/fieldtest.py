@@ -14,16 +14,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from reports.answers import CONFIDENCE, Share, share_of
 from reports.columns import axis_columns, label, numbers, split_unit
-from reports.gallery import Plate
+from reports.plates import Plate, plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.svg import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes, svg_markup
+from reports.svg import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
 from reports.verdicts import is_flag, members
 from reports.wording import NOTHING, count, number, percent, stated
 
@@ -208,7 +207,7 @@ def scatter_plates(subject: Subject) -> list[Plate]:
         if len(chosen):
             caption = f"{category[:1].upper()}{category[1:]}: {count(len(chosen), 'valid triple')}."
             figure = _scatter(chosen, parts, subject, reach)
-            plates.append(Plate(Markup(svg_markup(figure, f"fieldtest{place}", caption)), caption))  # noqa: S704
+            plates.append(plate(figure, f"fieldtest{place}", caption))
     return plates
 
 

@@ -102,18 +102,16 @@ def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
     return figure
 
 
-def write_case_figures(directory: Path, products: Mapping[str, Any]) -> Path | None:
-    """Writes a case's figure, as `draw_dimes_case` draws it, into a folder as `dimes.png`.
-
-    Returns its path; None where the products are not those of a DIMES case.
+def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> Path:
+    """Writes a case's figure, as `draw_dimes_case` draws it, into a folder as `dimes.png`; returns its path.
 
     Raises
     ------
+    ValueError
+        Where the products are not those of a DIMES case.
     OSError
         Where it cannot be written.
     """
-    if not is_dimes_case(products):
-        return None
     path = directory / "dimes.png"
     draw_dimes_case(products).savefig(path, dpi=110, facecolor="#ffffff", metadata={"Software": None})
     return path

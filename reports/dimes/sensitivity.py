@@ -13,15 +13,14 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from jaxtyping import Float
-from markupsafe import Markup
 from matplotlib.figure import Figure
 from scipy import stats
 
 from reports.columns import label, magnitude_label, numbers, split_unit
-from reports.gallery import Plate
+from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.svg import MUTED, SERIES, in_page_style, new_axes, svg_markup
+from reports.svg import MUTED, SERIES, in_page_style, new_axes
 from reports.verdicts import terrain_groups
 from reports.wording import number, stated
 
@@ -73,14 +72,14 @@ def sensitivity_section(subject: Subject) -> Section | None:
     metric, unit = subject.metric, split_unit(subject.metric)[1]
     caption = f"Change of the mean {magnitude_label(metric)} from the 5 % to the 95 % quantile of each condition."
     figure = effect_figure(drivers, unit)
-    plate = Plate(Markup(svg_markup(figure, "sensitivity", caption)), caption)  # noqa: S704  (matplotlib escapes texts)
+    drawn = plate(figure, "sensitivity", caption)
     note = (
         f"Regression of {magnitude_label(metric)} on all conditions at once, cases with an answer only. Intervals: "
         f"{stated(CONFIDENCE)}, by bootstrap over terrains where cases share them, else over cases. Effect: from the "
         "5 % to the 95 % quantile of the condition, the others held."
     )
     data = {"drivers": [asdict(driver) for driver in drivers]}
-    blocks = [Block(plates=[plate]), Block(grid=_grid(drivers, unit), note=note)]
+    blocks = [Block(plates=[drawn]), Block(grid=_grid(drivers, unit), note=note)]
     return Section("sensitivity", "Sensitivity", "What drives the error", blocks, data)
 
 
