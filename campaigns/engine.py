@@ -174,7 +174,15 @@ def _go_on(
             said["identity"] = identity_of(configuration).plain()
         said.update(cases=configuration.total_cases, configuration=configuration.model_dump(mode="json"))
         record.update(directory, said)
+        _note_other_machine(stored["environment"], said["sessions"][-1]["environment"], watch)
         _run(_Work(campaign, directory, crew, store, watch), again)
+
+
+def _note_other_machine(before: dict[str, Any], now: dict[str, Any], watch: Watch) -> None:
+    """Says where rows may differ in their last bits from those that another processor gave."""
+    if any(before.get(key) != now[key] for key in ("machine", "processor", "processor_features")):
+        was = before.get("processor")
+        watch.note(f"the campaign began on another processor ({was}): rows may differ from its rows in their last bits")
 
 
 def _identity_changes(

@@ -6,7 +6,7 @@ import fcntl
 import os
 import platform
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from campaigns.errors import StoreError
@@ -36,9 +36,11 @@ def folder_lock(directory: Path) -> Iterator[None]:
             file.seek(0)
             holder = file.read().strip() or "another process"
             raise StoreError(f"{directory} is in use: {holder} works in it; wait for it, or end it") from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {platform.node()}\n")
-        file.flush()
+        # only for the message to others: a full disk, of which the store will say more, is no reason to stop here
+        with suppress(OSError):
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {platform.node()}\n")
+            file.flush()
         yield
 
 

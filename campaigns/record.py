@@ -82,7 +82,13 @@ def begin(directory: Path, configuration: CampaignConfiguration, identity: Ident
 
 def session(command: str, crew: str, cases_before: int) -> dict[str, Any]:
     """One stretch of work on a campaign, as it stands in the record."""
-    return {"command": command, "started_utc": utc_now(), "workers": crew, "cases_before": cases_before}
+    return {
+        "command": command,
+        "started_utc": utc_now(),
+        "workers": crew,
+        "cases_before": cases_before,
+        "environment": machine(),
+    }
 
 
 def update(directory: Path, changes: Mapping[str, Any]) -> None:

@@ -9,6 +9,7 @@ from campaigns import record
 from campaigns.errors import StoreError
 from campaigns.lock import is_locked
 from campaigns.table import TABLE_FILE, refresh_table
+from marsyard.campaign_command import Exit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
 def conclude(directory: Path, console: Console) -> int:
     """Judges a campaign, writes its report, prints both, and returns the exit status.
 
-    Of a campaign that is not finished the rows are judged that it has so far, and the record is left alone.
+    Of a campaign that is not finished the rows are judged that it has so far, with a status that is never 0, and the
+    record is left alone.
 
     Raises
     ------
@@ -53,7 +55,8 @@ def conclude(directory: Path, console: Console) -> int:
         )
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    return status
+    # what has been met so far is not met yet
+    return status if finished else status or Exit.INSUFFICIENT
 
 
 def _how_it_stands(directory: Path, state: str) -> str:
