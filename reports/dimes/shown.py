@@ -18,9 +18,10 @@ from reports.wording import number
 _NOT_SHOWN = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
 _LEGEND = (
     "Below, the pictures as delivered, columns binned: squares mark templates (red) and tracked places (green), not "
-    "their size; dotted yellow outlines the overlap, a yellow cross the zero-phase spot. Above, both pictures of a pair "
-    "rectified to one camera that looks straight down, north up, with templates, search windows (blue) and tracked "
-    "places to scale. Between, templates and windows as they are correlated. Dashed: a validity check was not passed."
+    "their size; dotted yellow outlines the overlap, a yellow cross the zero-phase spot. Above, both pictures of a "
+    "pair rectified to one camera that looks straight down, north up, with templates, search windows (blue) and "
+    "tracked places to scale. Between, templates and windows as they are correlated. Dashed: a validity check was not "
+    "passed."
 )
 
 
