@@ -206,7 +206,7 @@ def landing_flight(
         site_east_m=float(site_m[0]),
         site_north_m=float(site_m[1]),
         hover_m=float(rows[before - 1, 2] + held[before - 1, 2]),
-        wait_until=before - 1 + round(guidance.wait_s / step),
+        wait_until=before - 1 + round((guidance.wait_s - TAIL_S) / step),
         approach_m_s=guidance.approach_m_s,
         near_m=guidance.near_m,
         descent_m_s=guidance.descent_m_s,

@@ -125,7 +125,7 @@ class LandingGuidance(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    wait_s: Annotated[NonNegative, Field(le=60.0, description="hovering until the site is known, s")] = 1.8
+    wait_s: Annotated[NonNegative, Field(le=60.0, description="from the last picture until the site is known, s")] = 1.8
     approach_m_s: Annotated[Positive, Field(le=15.0, description="greatest commanded speed to the site, m/s")] = 2.0
     near_m: Annotated[Positive, Field(le=50.0, description="distance from the site at which it descends, m")] = 2.0
     descent_m_s: Annotated[Positive, Field(le=5.0, description="commanded speed of the descent, m/s")] = 0.7
