@@ -16,7 +16,7 @@ from scenarios.views import Eye, SiteGround, nadir_pose, site_scene
 from sim.camera import Cahv, Cahvor
 from sim.frames import direction, rigid
 from sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture, process_renderer
-from sim.render.backend import DepthRenderer, default_backend
+from sim.render.backend import compile_shaders_once, default_backend
 from sim.render.mesh import graded_offsets, ground_mesh
 from sim.render.rays import VIEW_SIDE_PX
 from sim.sensor import Detector, DetectorParameters
@@ -77,7 +77,8 @@ def _pyrender_shaded(scene: Scene, pose: np.ndarray, focal_px: float) -> Callabl
     middle = VIEW_SIDE_PX / 2.0
     camera = pyrender.IntrinsicsCamera(focal_px, focal_px, middle, middle, znear=100.0, zfar=40000.0)
     theirs.add(camera, pose=pose)
-    renderer = DepthRenderer(VIEW_SIDE_PX, default_backend())._offscreen
+    renderer = pyrender.OffscreenRenderer(VIEW_SIDE_PX, VIEW_SIDE_PX)
+    compile_shaders_once(renderer._renderer)
     flags = pyrender.RenderFlags.SHADOWS_DIRECTIONAL
     return lambda: renderer.render(theirs, flags=flags)
 
@@ -101,7 +102,7 @@ def rover_pictures(repeats: int) -> list[Figure]:
         mesh_finest_m=0.04,
         mesh_reach_m=600.0,
         mesh_lines=641,
-        mesh_in_view=True,
+        among_objects=True,
     )
     pinhole = Cahv.from_focal_length(
         focal_m=14.67e-3,

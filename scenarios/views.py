@@ -42,7 +42,7 @@ _CLASS_RATIO = float(np.sqrt(2.0))
 _MESH_FINEST, _MESH_GROWTH, _MESH_REACH_HEIGHTS, _MESH_REACH_M = 0.0085, 0.012, 14.0, 700.0
 #: Radius of Mars, by which its horizon is as far as the mesh has to reach where an eye sees it.
 _MARS_RADIUS_M = 3.39e6
-#: Height of the eye below which a picture shows little of the mesh.
+#: Height of the eye below which pictures are taken among the rocks.
 _LOW_M = 100.0
 
 
@@ -150,7 +150,7 @@ class Eye:
 def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
     """The scene that a camera sees from here: ground, the rocks it can tell apart, texture and light.
 
-    Near the ground only what is in view is drawn (`Scene.mesh_in_view`); from higher up one mesh serves all pictures.
+    Near the ground pictures are taken among the rocks; from higher up they show where their shadows fall.
     """
     spacing = ground.surface.spacing_m
     finest = max(_MESH_FINEST * eye.height_m, 0.8 * spacing)
@@ -168,7 +168,7 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
         mesh_finest_m=finest,
         mesh_reach_m=reach,
         mesh_lines=2 * half + 1,
-        mesh_in_view=eye.height_m < _LOW_M,
+        among_objects=eye.height_m < _LOW_M,
     )
 
 

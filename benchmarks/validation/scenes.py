@@ -174,7 +174,7 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
         mesh_finest_m=0.04,
         mesh_reach_m=600.0,
         mesh_lines=641,
-        mesh_in_view=True,
+        among_objects=True,
     )
     down = np.arctan2(MAST_M - 0.3 * ROCK_DIAMETER_M, away - 0.3 * ROCK_DIAMETER_M)
     return View(scene, camera, rigid(Rotation.from_euler("y", down), eye))
@@ -193,7 +193,7 @@ def ground_view(name: str) -> View:
         mesh_finest_m=0.04,
         mesh_reach_m=600.0,
         mesh_lines=641,
-        mesh_in_view=True,
+        among_objects=True,
     )
     camera = forward(preset("mer-navcam").cameras()[0])
     return View(scene, camera, rigid(Rotation.from_euler("y", 20.0, degrees=True), eye))

@@ -78,12 +78,10 @@ def _colours(number: Int64[np.ndarray, "count"]) -> Float32[np.ndarray, "count 4
     return spelled.astype(np.float32) / np.float32(255.0)
 
 
-def _numbers(colours: UInt8[np.ndarray, "rows columns channels"]) -> Int32[np.ndarray, "rows columns"]:
-    """The numbers that colours spell; OSMesa's have three channels, EGL's four."""
-    numbers = colours[..., 2].astype(np.int32)
-    for channel in (1, 0):
-        numbers <<= 8
-        numbers |= colours[..., channel]
+def _numbers(colours: UInt8[np.ndarray, "rows columns 4"]) -> Int32[np.ndarray, "rows columns"]:
+    """The numbers that colours spell; opacity spells nothing."""
+    spelled = colours.view("<u4")[..., 0]
+    numbers: Int32[np.ndarray, "rows columns"] = np.bitwise_and(spelled, 0xFFFFFF).view(np.int32)
     return numbers
 
 
@@ -114,7 +112,8 @@ class DepthRenderer:
                 f"no OpenGL context through {backend} ({error}); run 'marsyard doctor' to see what is missing"
             ) from error
         _draw_single_sampled(self._offscreen._renderer)
-        _compile_shaders_once(self._offscreen._renderer)
+        compile_shaders_once(self._offscreen._renderer)
+        _read_quickly(self._offscreen._renderer)
         self._pyrender = pyrender
         self._scene: Any = None
         self._flags = 0
@@ -182,8 +181,8 @@ class DepthRenderer:
             self._scene.remove_node(node)
         if isinstance(drawn, tuple):
             colours, depth = drawn
-            return np.ascontiguousarray(depth), _numbers(colours)
-        return np.ascontiguousarray(drawn), np.zeros((0, 0), dtype=np.int32)
+            return depth, _numbers(colours)
+        return drawn, np.zeros((0, 0), dtype=np.int32)
 
     def _clear(self) -> None:
         """Releases what is loaded, on the card too, now rather than when pyrender next draws."""
@@ -228,7 +227,7 @@ def _import_pyrender(backend: Backend) -> Any:
     return pyrender
 
 
-def _compile_shaders_once(renderer: Any) -> None:
+def compile_shaders_once(renderer: Any) -> None:
     """Makes pyrender find the shaders that it has compiled.
 
     pyrender looks them up by the current context. PyOpenGL tells OSMesa's context by a new pointer object each time, so
@@ -274,3 +273,66 @@ def _draw_single_sampled(renderer: Any) -> None:
             GL.glRenderbufferStorage(GL.GL_RENDERBUFFER, kind, *size)
 
     renderer._configure_main_framebuffer = configure_single_sampled
+
+
+def _read_quickly(renderer: Any) -> None:
+    """Makes pyrender read pictures in few passes over memory, to the same values, with four channels of colour.
+
+    Its own reading takes as long as drawing does.
+    """
+
+    def read(what: int, kind: int, values: Any) -> Any:
+        from OpenGL import GL
+
+        size = (renderer.viewport_width, renderer.viewport_height)
+        pixels = np.frombuffer(GL.glReadPixels(0, 0, *size, what, kind), dtype=values)
+        return pixels.reshape(size[1], size[0], -1)[::-1]
+
+    def depth(near_m: float, far_m: float) -> Float32[np.ndarray, "rows columns"]:
+        from OpenGL import GL
+
+        drawn = read(GL.GL_DEPTH_COMPONENT, GL.GL_FLOAT, np.float32)[..., 0]
+        metres: Float32[np.ndarray, "rows columns"] = np.multiply(drawn, -2.0, order="C")
+        metres += 1.0
+        metres *= far_m - near_m
+        metres += far_m + near_m
+        np.divide(2.0 * near_m * far_m, metres, out=metres)
+        metres[drawn == 1.0] = 0.0
+        return metres
+
+    def colours() -> UInt8[np.ndarray, "rows columns 4"]:
+        from OpenGL import GL
+
+        return np.ascontiguousarray(read(GL.GL_RGBA, GL.GL_UNSIGNED_BYTE, np.uint8))
+
+    def from_screen() -> None:
+        from OpenGL import GL
+
+        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, 0)
+        GL.glReadBuffer(GL.GL_FRONT)
+
+    def read_depth_buf() -> Float32[np.ndarray, "rows columns"]:
+        from_screen()
+        return depth(renderer._latest_znear, renderer._latest_zfar)
+
+    def read_color_buf() -> UInt8[np.ndarray, "rows columns 4"]:
+        from_screen()
+        return colours()
+
+    def read_main_framebuffer(scene: Any, flags: int) -> Any:
+        from OpenGL import GL
+        from pyrender import RenderFlags
+
+        width, height = renderer._main_fb_dims
+        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, renderer._main_fb_ms)
+        GL.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, renderer._main_fb)
+        for buffer in (GL.GL_COLOR_BUFFER_BIT, GL.GL_DEPTH_BUFFER_BIT):
+            GL.glBlitFramebuffer(0, 0, width, height, 0, 0, width, height, buffer, GL.GL_NEAREST)
+        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, renderer._main_fb)
+        camera = scene.main_camera_node.camera
+        metres = depth(camera.znear, camera.zfar)
+        return metres if flags & RenderFlags.DEPTH_ONLY else (colours(), metres)
+
+    renderer.read_depth_buf = read_depth_buf
+    renderer.read_color_buf = read_color_buf
+    renderer._read_main_framebuffer = read_main_framebuffer

@@ -65,9 +65,9 @@ class Scene:
         Clouds that dim the sun as they drift; None for none.
     mesh_finest_m, mesh_reach_m, mesh_lines
         Spacing of the mesh at the centre, how far it reaches to each side, and the number of its lines.
-    mesh_in_view
-        Whether only the ground and the objects that a picture shows are drawn. They are loaded anew for every picture
-        then, which pays for narrow views of wide scenes; without it one mesh serves all pictures of the scene.
+    among_objects
+        Whether pictures are taken from among the objects, whose shadows may then fall nearly anywhere in them. Without
+        it the places where they may fall are found before, which spares all others the search (`sim.render.reach`).
     edge_rays
         Rays along each side of a pixel that holds an edge (`sim.render.edges`); 1 draws every pixel by one ray.
     """
@@ -85,7 +85,7 @@ class Scene:
     mesh_finest_m: float = 12.0
     mesh_reach_m: float = 20000.0
     mesh_lines: int = 513
-    mesh_in_view: bool = False
+    among_objects: bool = False
     edge_rays: int = 2
 
     @cached_property
@@ -114,8 +114,8 @@ class Scene:
 
     @cached_property
     def reach(self) -> Reach:
-        """Where objects may shade the ground; near the ground, among rocks, that is nearly everywhere."""
-        if self.mesh_in_view:
+        """Where objects may shade the ground."""
+        if self.among_objects:
             return EVERYWHERE
         towards = np.asarray(self.sun.direction, dtype=np.float64)
         return shade_reach(self.objects.spheres, towards, self.height_range_m[0])
@@ -198,7 +198,7 @@ class Renderer:
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
         self._views: dict[int, DepthRenderer] = {}
-        self._loaded: dict[int, Scene] = {}
+        self._last: Scene | None = None
 
     def description(self) -> str:
         """Renderer and version strings of OpenGL."""
@@ -210,7 +210,7 @@ class Renderer:
         Parameters
         ----------
         scene
-            Ground, objects and light; its mesh stays loaded until another scene is asked for.
+            Ground, objects and light; what the picture shows of them is drawn.
         rays
             The camera in the body frame, `PixelRays.of(camera)`.
         world_from_body
@@ -277,7 +277,7 @@ class Renderer:
         for view in self._views.values():
             view.close()
         self._views.clear()
-        self._loaded.clear()
+        self._last = None
 
     def _view_renderer(self, side_px: int) -> DepthRenderer:
         if side_px not in self._views:
@@ -291,20 +291,15 @@ class Renderer:
         rotation: Float64[np.ndarray, "3 3"],
         position: Float64[np.ndarray, "3"],
     ) -> None:
-        """Loads the mesh that this picture needs, if it is not there."""
-        side = rays.view_side_px
-        if self._loaded.get(side) is scene and not scene.mesh_in_view:
-            return
-        x, y = (centre + scene.mesh_offsets for centre in scene.centre_m)
-        numbers = np.arange(len(scene.objects.triangles))
-        if scene.mesh_in_view:
-            (west, east), (south, north) = _seen(scene, rays, rotation, position)
-            x, y = lines_in_view(x, west, east), lines_in_view(y, south, north)
-            numbers = scene.objects.in_cone(position, rotation @ rays.axis, rays.half_angle_rad)
-        triangles = scene.objects.triangles[numbers]
-        self._view_renderer(side).load(ground_mesh(scene.surface, x, y), triangles, numbers)
-        self._loaded[side] = scene
-        if not scene.mesh_in_view:
+        """Loads the ground and the objects that this picture shows."""
+        (west, east), (south, north) = _seen(scene, rays, rotation, position)
+        x = lines_in_view(scene.centre_m[0] + scene.mesh_offsets, west, east)
+        y = lines_in_view(scene.centre_m[1] + scene.mesh_offsets, south, north)
+        numbers = scene.objects.in_cone(position, rotation @ rays.axis, rays.half_angle_rad)
+        ground = ground_mesh(scene.surface, x, y)
+        self._view_renderer(rays.view_side_px).load(ground, scene.objects.triangles[numbers], numbers)
+        if self._last is not scene:
+            self._last = scene
             _return_freed_memory()
 
     def _draw(

@@ -8,45 +8,41 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, Bounds, first_ground, meet_ground
+from sim.render.kernels.ground import Array32, Bounds, first_ground
 from sim.render.kernels.hierarchy import Hierarchy, nearest_hit
 from sim.render.kernels.intersection import hit_triangle
-from sim.terrain.kernels import Array, Level
+from sim.terrain.kernels import Array, Level, sample
 
 Ints = NDArray[np.int32]
+Longs = NDArray[np.int64]
 #: Sine of the flattest angle at which a pixel's footprint on the ground is still drawn out in full.
 FLATTEST = 0.01
 #: Samples of the terrain up to which a footprint is met by the terrain itself, not by a smoothed level of it.
 FINE_UNTIL = 8.0
 #: Sine of the angle below which a ray may pass over crests that the mesh does not hold.
 GRAZING = 0.4
+#: Rays that are followed side by side: the processor works on several at once, and what is kept of them stays near it.
+STRIP = 256
+#: Most steps of Newton's method, the share of the first guess that they may change it by, and the shallowest closing.
+STEPS, FARTHEST, CLOSING = 8, 0.05, -1e-3
 #: Slack of a triangle's edge, as a share: so that no ray slips between two triangles.
 SLACK = 1e-9
 
 
 @njit(cache=True, inline="always")
-def _ground_depth(depth: Array32, ids: Ints, things: bool, face: int, u: float, v: float) -> float:
-    """Depth of the ground between the samples of a depth picture; 0 where no sample around shows ground.
+def _ground_depth(depth: Array32, ids: Ints, shown: int, face: int, i: int, j: int, fu: float, fv: float) -> float:
+    """Depth of the ground between four samples of a depth picture; 0 where none of them shows ground.
 
-    Where all four samples show one stretch of ground its inverse depth, linear over a plane's picture, is interpolated;
-    across an edge the nearest sample of the ground is taken.
+    Where all of them show one stretch of ground its inverse depth, linear over a plane's picture, is interpolated;
+    across an edge the nearest sample of the ground is taken. `shown` is 0 where none of them shows a triangle.
     """
-    side = depth.shape[1]
-    i = min(max(math.floor(v), 0), side - 2)
-    j = min(max(math.floor(u), 0), side - 2)
-    fu = u - j
-    fv = v - i
     a = depth[face, i, j]
     b = depth[face, i, j + 1]
     c = depth[face, i + 1, j]
     d = depth[face, i + 1, j + 1]
     smallest = min(min(a, b), min(c, d))
     largest = max(max(a, b), max(c, d))
-    whole = smallest > 0.0 and largest < 1.1 * smallest
-    if whole and things:
-        whole = ids[face, i, j] == 0 and ids[face, i, j + 1] == 0
-        whole = whole and ids[face, i + 1, j] == 0 and ids[face, i + 1, j + 1] == 0
-    if whole:
+    if smallest > 0.0 and largest < 1.1 * smallest and shown == 0:
         above = (1.0 - fu) / a + fu / b
         below = (1.0 - fu) / c + fu / d
         return float(1.0 / ((1.0 - fv) * above + fv * below))
@@ -56,18 +52,18 @@ def _ground_depth(depth: Array32, ids: Ints, things: bool, face: int, u: float, 
         for dj in range(2):
             value = depth[face, i + di, j + dj]
             far = abs(fv - di) + abs(fu - dj)
-            if value > 0.0 and far < least and (not things or ids[face, i + di, j + dj] == 0):
+            if value > 0.0 and far < least and (shown == 0 or ids[face, i + di, j + dj] == 0):
                 least = far
                 nearest = value
     return nearest
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _meet_object(
     ids: Ints,
     face: int,
-    u: float,
-    v: float,
+    i: int,
+    j: int,
     tree: Hierarchy,
     x: float,
     y: float,
@@ -82,9 +78,6 @@ def _meet_object(
     than samples: then the hierarchy is asked.
     """
     triangles = tree[0]
-    side = ids.shape[1]
-    i = min(max(math.floor(v), 0), side - 2)
-    j = min(max(math.floor(u), 0), side - 2)
     best = math.inf
     best_triangle = -1
     best_second = 0.0
@@ -106,8 +99,48 @@ def _meet_object(
     return best, best_triangle, best_second, best_third
 
 
+@njit(cache=True, error_model="numpy")
+def _meet_ground(field: Level, scale: float, ray: Array, going: Longs, count: int, met: Array) -> None:
+    """Brings some rays from a first guess onto the ground, by Newton's method; the guess stays where it fails.
+
+    All rays take a step before any takes the next, so that the processor need not finish one before it begins another,
+    nor guess which ends first.
+
+    Parameters
+    ----------
+    field, scale
+        A level of the surface and its samples to the metre.
+    ray
+        Origins and directions in world axes, shape (6, rays).
+    going, count
+        Numbers of the rays that are followed, and how many; overwritten.
+    met
+        First guesses, changed to where rays meet the ground.
+    """
+    start = met.copy()
+    for _ in range(STEPS):
+        left = 0
+        for m in range(count):
+            k = going[m]
+            t = met[k]
+            dx, dy, dz = ray[3, k], ray[4, k], ray[5, k]
+            height, slope_x, slope_y, _albedo = sample(field, scale, ray[0, k] + t * dx, ray[1, k] + t * dy)
+            miss = ray[2, k] + t * dz - height
+            closing = dz - slope_x * dx - slope_y * dy
+            step = miss / closing
+            failed = closing > CLOSING or abs(t - step - start[k]) > FARTHEST * start[k]
+            met[k] = start[k] if failed else t - step
+            # A step that short leaves, by the surface's greatest curvature of about one over its spacing, less than
+            # 1e-6 of the distance.
+            going[left] = k
+            left += not failed and step * step >= 2e-6 * start[k] / scale
+        count = left
+        if count == 0:
+            break
+
+
 # Fused multiplications round differently, but the same way every time on the same processor.
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def look(
     levels: tuple[Level, ...],
     spacing: float,
@@ -154,58 +187,116 @@ def look(
         mesh's own distance stands.
     """
     middle = depth.shape[1] / 2.0 - 0.5
+    side = depth.shape[1]
     inverse_spacing = 1.0 / spacing
     top_level = len(levels) - 1
     things = ids.shape[1] > 0
     w = world_from_body
-    for n in range(directions.shape[0]):
-        bx = directions[n, 0]
-        by = directions[n, 1]
-        bz = directions[n, 2]
-        ox = origins[n, 0]
-        oy = origins[n, 1]
-        oz = origins[n, 2]
-        face = face_of_pixel[n]
-        p = view_from_body[face]
-        px = p[0, 0] * bx + p[0, 1] * by + p[0, 2] * bz
-        py = p[1, 0] * bx + p[1, 1] * by + p[1, 2] * bz
-        pz = p[2, 0] * bx + p[2, 1] * by + p[2, 2] * bz
-        u = focal[face] * px / pz + middle
-        v = focal[face] * py / pz + middle
-        dx = w[0, 0] * bx + w[0, 1] * by + w[0, 2] * bz
-        dy = w[1, 0] * bx + w[1, 1] * by + w[1, 2] * bz
-        dz = w[2, 0] * bx + w[2, 1] * by + w[2, 2] * bz
-        x0 = position[0] + w[0, 0] * ox + w[0, 1] * oy + w[0, 2] * oz
-        y0 = position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz
-        z0 = position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz
-        t = math.inf
-        smooth = 0
-        met = True
-        guess = _ground_depth(depth, ids, things, face, u, v)
-        if guess > 0.0:
-            # Far away and at a flat angle a pixel takes in many samples along its line of sight: it sees them smoothed.
-            t = guess / pz
-            stretched = t * pixel_angles[n] / max(-dz, FLATTEST)
-            first_guess = t
-            if stretched > FINE_UNTIL * spacing:
-                smooth = min(int(math.log2(stretched / (FINE_UNTIL * spacing))) + 1, top_level)
-            scale = inverse_spacing / (1 << smooth)
-            if dz > -GRAZING:
-                t = first_ground(levels[smooth], scale, bounds, x0, y0, z0, dx, dy, dz, t)
-            t = meet_ground(levels[smooth], scale, x0, y0, z0, dx, dy, dz, t)
-            met = smooth == 0 and t != first_guess
-        triangle = -1
-        second = 0.0
-        third = 0.0
-        if things:
-            t_thing, triangle, second, third = _meet_object(ids, face, u, v, tree, x0, y0, z0, dx, dy, dz)
-            if triangle >= 0 and t_thing < t:
-                t = t_thing
-            else:
-                triangle = -1
-        distance[n] = t
-        triangle_of_pixel[n] = triangle
-        level_of_pixel[n] = 0 if met else (smooth if smooth > 0 else -1)
-        if triangle >= 0:
-            weights[n, 0] = second
-            weights[n, 1] = third
+    ray = np.empty((6, STRIP))
+    guess = np.empty(STRIP)
+    met = np.empty(STRIP)
+    row = np.empty(STRIP, dtype=np.int64)
+    column = np.empty(STRIP, dtype=np.int64)
+    shown = np.zeros(STRIP, dtype=np.int32)
+    smooth = np.empty(STRIP, dtype=np.int64)
+    onto = np.empty(STRIP, dtype=np.int64)
+    going = np.empty(STRIP, dtype=np.int64)
+    count = directions.shape[0]
+    for first in range(0, count, STRIP):
+        width = min(STRIP, count - first)
+        left = 0
+        lowest, highest = top_level, 0
+        for k in range(width):
+            n = first + k
+            bx = directions[n, 0]
+            by = directions[n, 1]
+            bz = directions[n, 2]
+            ox = origins[n, 0]
+            oy = origins[n, 1]
+            oz = origins[n, 2]
+            ray[0, k] = position[0] + w[0, 0] * ox + w[0, 1] * oy + w[0, 2] * oz
+            ray[1, k] = position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz
+            ray[2, k] = position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz
+            ray[3, k] = w[0, 0] * bx + w[0, 1] * by + w[0, 2] * bz
+            ray[4, k] = w[1, 0] * bx + w[1, 1] * by + w[1, 2] * bz
+            ray[5, k] = w[2, 0] * bx + w[2, 1] * by + w[2, 2] * bz
+            face = face_of_pixel[n]
+            p = view_from_body[face]
+            px = p[0, 0] * bx + p[0, 1] * by + p[0, 2] * bz
+            py = p[1, 0] * bx + p[1, 1] * by + p[1, 2] * bz
+            pz = p[2, 0] * bx + p[2, 1] * by + p[2, 2] * bz
+            u = focal[face] * px / pz + middle
+            v = focal[face] * py / pz + middle
+            i = min(max(math.floor(v), 0), side - 2)
+            j = min(max(math.floor(u), 0), side - 2)
+            row[k] = i
+            column[k] = j
+            if things:
+                shown[k] = ids[face, i, j] | ids[face, i, j + 1] | ids[face, i + 1, j] | ids[face, i + 1, j + 1]
+            smooth[k] = 0
+            t = math.inf
+            seen = _ground_depth(depth, ids, shown[k], face, i, j, u - j, v - i)
+            guess[k] = -1.0
+            if seen > 0.0:
+                # Far away and at a flat angle a pixel takes in many samples along its line of sight: it sees them
+                # smoothed.
+                t = seen / pz
+                stretched = t * pixel_angles[n] / max(-ray[5, k], FLATTEST)
+                guess[k] = t
+                if stretched > FINE_UNTIL * spacing:
+                    smooth[k] = min(int(math.log2(stretched / (FINE_UNTIL * spacing))) + 1, top_level)
+                lowest = min(lowest, smooth[k])
+                highest = max(highest, smooth[k])
+                onto[left] = k
+                left += 1
+            met[k] = t
+        for m in range(left):
+            k = onto[m]
+            if ray[5, k] > -GRAZING:
+                scale = inverse_spacing / (1 << smooth[k])
+                met[k] = first_ground(
+                    levels[smooth[k]],
+                    scale,
+                    bounds,
+                    ray[0, k],
+                    ray[1, k],
+                    ray[2, k],
+                    ray[3, k],
+                    ray[4, k],
+                    ray[5, k],
+                    met[k],
+                )
+        for level in range(lowest, highest + 1):
+            together = 0
+            for m in range(left):
+                going[together] = onto[m]
+                together += smooth[onto[m]] == level
+            _meet_ground(levels[level], inverse_spacing / (1 << level), ray, going, together, met)
+        for k in range(width):
+            n = first + k
+            t = met[k]
+            on_terrain = smooth[k] == 0 and t != guess[k]
+            level_of_pixel[n] = 0 if on_terrain else (smooth[k] if smooth[k] > 0 else -1)
+            triangle = -1
+            if shown[k] != 0:
+                t_thing, triangle, second, third = _meet_object(
+                    ids,
+                    face_of_pixel[n],
+                    row[k],
+                    column[k],
+                    tree,
+                    ray[0, k],
+                    ray[1, k],
+                    ray[2, k],
+                    ray[3, k],
+                    ray[4, k],
+                    ray[5, k],
+                )
+                if triangle >= 0 and t_thing < t:
+                    t = t_thing
+                    weights[n, 0] = second
+                    weights[n, 1] = third
+                else:
+                    triangle = -1
+            distance[n] = t
+            triangle_of_pixel[n] = triangle

@@ -52,7 +52,7 @@ def rocky() -> View:
         mesh_finest_m=0.04,
         mesh_reach_m=3000.0,
         mesh_lines=801,
-        mesh_in_view=True,
+        among_objects=True,
     )
     return View(scene, _camera((192, 160), 6e-3), rigid(Rotation.from_euler("y", 8.0, degrees=True), eye))
 

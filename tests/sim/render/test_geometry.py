@@ -182,7 +182,7 @@ def test_what_is_out_of_view_does_not_change_the_picture(renderer, rough, descen
     rays = PixelRays.of(descent_camera(256))
     with_it, without = (
         renderer.render(
-            Scene(rough, (100.0, 200.0), low_sun, PAINT, things, mesh_in_view=True), rays, rigid(TILTED, position)
+            Scene(rough, (100.0, 200.0), low_sun, PAINT, things, among_objects=True), rays, rigid(TILTED, position)
         )
         for things in (above, Objects.none())
     )

@@ -70,7 +70,7 @@ def test_a_rock_from_a_mast_moves_as_the_camera_does(renderer, distance_m) -> No
         Texture(0.2, (0.06,) * 8),
         mesh_finest_m=0.04,
         mesh_reach_m=200.0,
-        mesh_in_view=True,
+        among_objects=True,
     )
     camera = Cahv.from_focal_length(
         focal_m=16e-3,
