@@ -24,7 +24,9 @@ class Problem:
     message: str
 
     def __str__(self) -> str:
-        return ": ".join(part for part in (self.where, self.key, self.message) if part)
+        """One line; what a file holds of control characters does not reach the terminal."""
+        text = ": ".join(part for part in (self.where, self.key, self.message) if part)
+        return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
 class ConfigurationError(CampaignError):

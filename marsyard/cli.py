@@ -34,7 +34,7 @@ app = typer.Typer(
     help="A virtual Mars Yard: runs vision software through rendered, truth-known cases and says whether its "
     "requirements are met, with a stated confidence.",
     epilog="Exit status: 0 every requirement met, or none asked; 1 a requirement failed, or a case crashed; "
-    "2 the command or a file is wrong; 3 not enough cases to say.",
+    "2 the command or a file is wrong; 3 not enough cases to say, or no independent random draws.",
 )
 app.add_typer(terrain, name="terrain")
 for command in (run, resume, append, report, replay):
