@@ -13,6 +13,7 @@ from __future__ import annotations
 import multiprocessing.process
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from types import TracebackType
@@ -106,12 +107,13 @@ class ClusterWorkers:
     ) -> Iterator[list[Done[Result]]]:
         """See `campaigns.workers.Workers.run`."""
         threads = sum(self._client.nthreads().values())
+        sharers = self._threads_of_the_fullest_machine()
         batches = Batches(items, total, threads)
         coming = self._distributed.as_completed(loop=self._client.loop)
         sent: dict[Any, Sequence[int]] = {}
 
         def send(batch: Sequence[int]) -> None:
-            future = self._client.submit(_watch_batch, task, tuple(batch), limits, pure=False)
+            future = self._client.submit(_watch_batch, task, tuple(batch), limits, sharers, pure=False)
             sent[future] = batch
             coming.add(future)
 
@@ -136,6 +138,13 @@ class ClusterWorkers:
                     yield done
         finally:
             self._client.cancel(list(sent))
+
+    def _threads_of_the_fullest_machine(self) -> int:
+        """Among how many watchers the memory of a machine is shared."""
+        found: Counter[str] = Counter()
+        for worker in self._client.scheduler_info(n_workers=-1)["workers"].values():
+            found[worker["host"]] += worker["nthreads"]
+        return max(found.values(), default=1)
 
     def _ended(self, future: Any, batch: Sequence[int], batches: Batches) -> list[Done[Any]] | None:
         """What became of a batch; None where it was lost with its workers and its cases must be sent one by one."""
@@ -176,20 +185,20 @@ def _code_and_versions() -> tuple[str, dict[str, str]]:
 
 
 def _watch_batch(
-    task: Callable[[int], Result], batch: Sequence[int], limits: WorkLimits
+    task: Callable[[int], Result], batch: Sequence[int], limits: WorkLimits, sharers: int
 ) -> tuple[float, list[Done[Result]]]:
     """Runs a batch beside a Dask worker, in a process that belongs to the thread that this is called in."""
     began = time.perf_counter()
-    done = [one for ended in _own_workers().run(task, batch, limits, len(batch)) for one in ended]
+    done = [one for ended in _own_workers(sharers).run(task, batch, limits, len(batch)) for one in ended]
     return time.perf_counter() - began, done
 
 
-def _own_workers() -> LocalWorkers:
+def _own_workers(sharers: int) -> LocalWorkers:
     """The worker process of this thread."""
     workers: LocalWorkers | None = getattr(_here, "workers", None)
     if workers is None:
         # Dask's workers are daemons to `multiprocessing`, which may have no children, as those would be left over. Ours
         # are not: the kernel ends them with the thread that started them.
         multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
-        workers = _here.workers = LocalWorkers(1)
+        workers = _here.workers = LocalWorkers(1, sharers)
     return workers

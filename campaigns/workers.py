@@ -246,9 +246,18 @@ class _Worker:
 
 
 class LocalWorkers:
-    """A number of worker processes, as a context: left normally they end, left by an exception they are killed."""
+    """A number of worker processes, as a context: left normally they end, left by an exception they are killed.
 
-    def __init__(self, jobs: int) -> None:
+    Parameters
+    ----------
+    jobs
+        How many.
+    sharers
+        How many such groups, this one included, share the memory of the machine.
+    """
+
+    def __init__(self, jobs: int, sharers: int = 1) -> None:
+        self._share_bytes = _SHARE_OF_MEMORY * free_memory() / (jobs * sharers)
         self._folder = TemporaryDirectory(prefix="marsyard-")
         self._workers = [_Worker(Path(self._folder.name) / str(number)) for number in range(jobs)]
 
@@ -275,19 +284,25 @@ class LocalWorkers:
     ) -> Iterator[list[Done[Result]]]:
         """See `Workers.run`."""
         batches = Batches(items, total, len(self._workers))
-        yield from _Run(task, batches, limits, self._workers).results()
+        memory_bytes = limits.memory_bytes or self._share_bytes
+        yield from _Run(task, batches, limits, memory_bytes, self._workers).results()
 
 
 class _Run:
     """One task being run on many items."""
 
     def __init__(
-        self, task: Callable[[int], Any], batches: Batches, limits: WorkLimits, workers: Sequence[_Worker]
+        self,
+        task: Callable[[int], Any],
+        batches: Batches,
+        limits: WorkLimits,
+        memory_bytes: float,
+        workers: Sequence[_Worker],
     ) -> None:
         self._task = task
         self._batches = batches
         self._limits = limits
-        self._memory_bytes = limits.memory_bytes or _SHARE_OF_MEMORY * free_memory() / len(workers)
+        self._memory_bytes = memory_bytes
         self._idle = deque(workers)
         self._again: deque[list[int]] = deque()
         self._attempts: dict[int, int] = {}
