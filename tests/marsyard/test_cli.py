@@ -279,7 +279,8 @@ def test_without_out_a_run_goes_to_runs(tmp_path: Path, marsyard: Command, monke
     assert all(re.fullmatch(r"fake-\d{8}T\d{6}Z(-2)?", name) for name in folders)
 
 
-def test_list_and_show(tmp_path: Path, marsyard: Command) -> None:
+def test_list_and_show(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "120")  # narrower ones fold what is looked for
     listed = marsyard("list")
     assert (listed.status, listed.err) == (0, "")
     assert "dimes-smoke" in listed.out
