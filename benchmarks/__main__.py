@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks import descent, estimators, hda, pictures, vtt
+from benchmarks import descent, engine, estimators, hda, pictures, vtt
 from benchmarks.timing import Figure
 from sim.processor import processor_features
 from sim.render import process_renderer
@@ -36,6 +36,7 @@ def main() -> None:
         *descent.new_terrains(2),
         *vtt.figures(9),
         *hda.figures(9),
+        *engine.figures(),
     ]
     print(f"{'core-seconds, unless said otherwise':<52}{'median':>8}{'least':>8}{'most':>8}  {'bar':<8}")
     for figure in figures:

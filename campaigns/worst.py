@@ -40,4 +40,3 @@ def _columns(table: Path, names: list[str]) -> Any:
     import pyarrow.parquet as pq
 
     return pq.read_table(table, columns=names)
-
