@@ -200,7 +200,9 @@ def test_unknown_campaigns_are_answered_with_the_known_ones() -> None:
 def test_the_catalogue_is_found_by_name_and_loads() -> None:
     for name, path in catalogue().items():
         assert find_campaign(name) == path
-        assert load_campaign(name).configuration.name == name
+        configuration = load_campaign(name).configuration
+        assert configuration.name == name
+        assert [path for path, one in configuration.dispersions.items() if not one.source] == []
 
 
 def test_the_example_of_the_documentation_loads(tmp_path: Path) -> None:
@@ -245,7 +247,7 @@ def test_overrides(campaign_file: CampaignFile) -> None:
 )
 def test_overrides_are_named_where_they_are_wrong(campaign_file: CampaignFile, override: str, said: str) -> None:
     text = refusal(campaign_file(), override)
-    assert text.startswith(f"--set {override}: ")
+    assert text.startswith(f"--set {override}: ".replace("\n", "\\n"))
     assert said in text
 
 
