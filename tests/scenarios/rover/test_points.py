@@ -1,0 +1,46 @@
+"""Points of a rock: rays against triangles, outline, what hides and shades."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from scenarios.rover.points import Sight, distances, hidden, shaded
+
+
+@pytest.fixture(scope="module")
+def sphere() -> np.ndarray:
+    """Triangles of a sphere of radius 0.5 about (5, 0, 0.5)."""
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    return np.asarray(mesh.triangles, dtype=np.float64) + np.array([5.0, 0.0, 0.5])
+
+
+def test_distances_are_those_to_a_sphere(sphere: np.ndarray) -> None:
+    eye = np.array([0.0, 0.0, 1.5])
+    rng = np.random.default_rng(1)
+    aims = np.array([5.0, 0.0, 0.5]) + 0.35 * rng.uniform(-1.0, 1.0, (40, 3))
+    directions = (aims - eye) / np.linalg.norm(aims - eye, axis=1, keepdims=True)
+    offset = eye - np.array([5.0, 0.0, 0.5])
+    b = directions @ offset
+    exact = -b - np.sqrt(b * b - offset @ offset + 0.25)
+    # Flat triangles of 512 th of a sphere lie up to 0.1 % of the radius inside; seen obliquely, a few times as much.
+    np.testing.assert_allclose(distances(sphere, eye, directions), exact, atol=4e-3)
+    assert np.isinf(distances(sphere, eye, -directions[:1])[0])
+
+
+def test_points_lie_on_the_face_that_is_seen(sphere: np.ndarray) -> None:
+    eye = np.array([0.0, 0.0, 1.5])
+    sight = Sight.of(sphere, eye, 0.0)
+    middle = sight.point(0.0, 0.5)
+    assert np.linalg.norm(middle - [5.0, 0.0, 0.5]) == pytest.approx(0.5, abs=1e-3)
+    assert middle[0] < 4.6
+    # To the right seen along +x is -y.
+    assert sight.point(0.8, 0.5)[1] < -0.3 < 0.3 < sight.point(-0.8, 0.5)[1]
+    assert sight.point(0.0, 0.9)[2] > middle[2] > sight.point(0.0, 0.1)[2]
+
+
+def test_the_far_side_is_hidden_and_the_lee_in_shadow(sphere: np.ndarray) -> None:
+    near, far = np.array([4.5, 0.0, 0.5]), np.array([5.5, 0.0, 0.5])
+    points, eye = np.stack([near, far]), np.array([0.0, 0.0, 1.5])
+    assert hidden(sphere, points, eye).tolist() == [False, True]
+    west = np.array([-np.cos(0.5), 0.0, np.sin(0.5)])
+    assert shaded(sphere, points, west).tolist() == [False, True]

@@ -1,0 +1,138 @@
+"""Runs of the closed loop: what is driven, seen, tracked, scored and stored."""
+
+import numpy as np
+import pytest
+
+from scenarios.rover import RoverScenario, RoverScenarioParameters, SharedDriveParameters, SharedDriveScenario, run_case
+from scenarios.rover.shared import shared_drive, tracked
+from sim.render import PixelRays, process_renderer
+from sim.streams import Streams
+
+#: A short approach over a small, nearly bare ground.
+SHORT = {
+    "world": {"samples": 1024, "rock_abundance": 0.005, "bank": 1},
+    "start": {"distance_m": 3.6},
+    "target": {"diameter_m": 0.8, "shape": 8, "yaw_deg": 30.0},
+    "sun": {"azimuth_deg": 260.0, "elevation_deg": 50.0},
+    "legs": [{"motion": "approach", "goal_m": 3.3, "step_share": 0.1}],
+}
+
+
+def parameters(**changes: object) -> RoverScenarioParameters:
+    return RoverScenarioParameters.model_validate({**SHORT, **changes})
+
+
+def streams(case: int = 0) -> Streams:
+    return Streams(1, "rover tests", case)
+
+
+def test_a_run_is_tracked_scored_and_the_same_again() -> None:
+    scenario, p = RoverScenario(), parameters(score={"stored_updates": 2})
+    result = scenario.run(p, streams())
+    row = dict(result.row)
+    assert (result.outcome, result.answered) == ("COMPLETED", True)
+    assert row["tracked"]
+    assert row["true_track"]
+    assert not row["not_tracked"]
+    # A pixel of disparity at 3.5 m is 5 cm (Eq. 1); the calibration is wrong by up to half a pixel.
+    assert 0.0 < row["position_error_m"] < 0.04
+    assert row["position_error_m"] ** 2 == pytest.approx(row["range_error_m"] ** 2 + row["cross_error_m"] ** 2)
+    assert row["drift_px"] < 1.0
+    assert row["range_end_m"] < row["range_start_m"] < 4.1
+    assert abs(row["disparity_error_goal_px"]) <= 0.55
+    assert row["update_2_magnification"] == pytest.approx(row["magnification_max"], rel=0.05)
+    again = dict(scenario.run(p, streams()).row)
+    timed = {name for name in row if "time" in name}
+    assert {k: v for k, v in again.items() if k not in timed} == pytest.approx(
+        {k: v for k, v in row.items() if k not in timed}, abs=0.0, nan_ok=True
+    )
+    stops = int(row["updates"])
+    kept = result.products
+    assert kept["rover_true_m"].shape == (stops, 3)
+    assert kept["stop_1_left"].dtype == np.uint16
+    assert kept["figures"]["match_score"].shape == (stops,)
+
+
+def test_the_designated_point_is_where_the_picture_shows_it() -> None:
+    """The renderer's own truth, pixel by pixel, against the point that the score projects."""
+    p = parameters(camera={"detector_noise": False})
+    run = run_case(p, streams(1))
+    stop = run.stops[-1]
+    column, row = (round(value) for value in stop.point_px)
+    camera = run.rig.left.cropped(column - 4, row - 4, (9, 9))
+    frame = process_renderer(p.backend).render(run.world.base, PixelRays.of(camera), stop.world_from_head)
+    around = frame.points_world()[3:6, 3:6].reshape(-1, 3)
+    assert (frame.body[4, 4]) >= 0
+    # A pixel is 3 mm here, on a face seen obliquely a few times as much.
+    assert np.linalg.norm(around - run.target.point_world, axis=1).min() < 0.008
+
+
+def test_exact_instruments_leave_the_match_alone() -> None:
+    exact = {
+        "camera": {"detector_noise": False},
+        "stereo": dict.fromkeys(
+            ("disparity_error_px", "epipolar_error_px", "alignment_deg", "roll_deg", "focal_error"), 0.0
+        ),
+        "pointing": dict.fromkeys(("zero_deg", "backlash_deg", "settling_deg", "count_deg"), 0.0),
+    }
+    row = RoverScenario().run(parameters(**exact), streams(2)).row
+    assert row["disparity_error_goal_px"] == 0.0
+    # A tenth of a pixel of disparity, and as much across.
+    assert row["position_error_m"] < 0.008
+    assert row["drift_px"] < 0.3
+
+
+@pytest.mark.parametrize("designation", ["rover", "site"])
+def test_targets_may_be_given_by_position(designation: str) -> None:
+    run = run_case(parameters(target={**SHORT["target"], "designation": designation}), streams(3))
+    assert run.outcome.name == "COMPLETED"
+    # The mast moves to where it points then: 0.1 deg of backlash is 2.1 px an axis; half of the epipolar error, 0.2 px.
+    assert np.linalg.norm(run.stops[0].found_px(run.rig.calibrated) - run.stops[0].point_px) < 3.5
+
+
+def test_a_wrong_target_reported_as_tracked_is_counted_as_harm() -> None:
+    p = parameters(algorithm="tests.scenarios.rover.trackers:Confident")
+    result = RoverScenario().run(p, streams())
+    assert result.answered
+    assert not result.row["tracked"]
+    assert not result.row["true_track"]
+    assert result.row["false_updates"] == result.row["updates"]
+    assert result.row["position_error_m"] == pytest.approx(0.3, abs=0.04)
+
+
+def test_a_lost_target_is_no_answer() -> None:
+    result = RoverScenario().run(parameters(algorithm="tests.scenarios.rover.trackers:Blind"), streams())
+    assert (result.outcome, result.answered) == ("LOST", False)
+    assert np.isnan(result.row["position_error_m"])
+    assert result.row["true_track"]
+    assert result.row["losses"] == "LOW_MATCH_SCORE"
+
+
+def test_unknown_trackers_and_cameras_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"unknown algorithm 'vt'.*did you mean 'vtt'"):
+        parameters(algorithm="vt")
+    with pytest.raises(ValueError, match="no mast carries cameras called 'xc-55'"):
+        parameters(camera={"preset": "xc-55"})
+
+
+def test_trackers_share_the_pictures_of_a_drive() -> None:
+    scenario = SharedDriveScenario()
+    stated = {
+        "drive": {**SHORT, "legs": [{"motion": "circle", "step_deg": 5.0, "steps": 2}]},
+        "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
+        "targets": [{"across": 0.0, "up": 0.5}, {"across": 0.4, "up": 0.5}],
+        "bands": [{"name": "at_10_deg", "least": 10.0, "most": 10.0}],
+    }
+    fine, coarse = (SharedDriveParameters.model_validate({**stated, "skip": skip}) for skip in (0, 1))
+    assert (fine.step, coarse.step) == (5.0, 10.0)
+    results = [scenario.run(one, streams(case)) for case, one in enumerate((fine, coarse))]
+    assert [result.row["updates"] for result in results] == [3, 2]
+    assert [result.row["at_10_deg"] for result in results] == [False, True]
+    assert all(result.row["tracked"] for result in results)
+    drive = shared_drive(fine.of_run(), fine.margin_px, 1, "rover tests", 0)
+    other = tracked(SharedDriveParameters.model_validate({**stated, "target": 1}), drive)
+    assert other.stops[0].point_px[0] > drive.views[0].pictures.left.corner[0]
+    assert other.stops[0].pictures is drive.views[0].pictures
+    # The camera keeps its distance from the target and goes around it.
+    ranges = [stop.range_m for stop in other.stops]
+    assert np.ptp(ranges) < 0.15

@@ -1,0 +1,53 @@
+"""Trackers of a user: one that is wrong and does not know it, one that never finds anything."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
+from algorithms.vtt import VisualTargetTracker
+from sim.measurements import MastCalibration, RoverMeasurements, TargetDesignation
+
+
+class Confident:
+    """The paper's tracker, but for a position that is 0.3 m too far to the left: reported as tracked."""
+
+    def __init__(self) -> None:
+        self.inner = VisualTargetTracker()
+
+    @property
+    def state(self) -> TrackingState:
+        """See `TargetTracker`."""
+        return self.inner.state
+
+    def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
+        """See `TargetTracker`."""
+        self.inner.designate(target, world_from_rover)
+
+    def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
+        """See `TargetTracker`."""
+        return self.inner.aim(world_from_rover, mast)
+
+    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+        """See `TargetTracker`."""
+        update = self.inner.update(measurements)
+        assert update.position_rover is not None
+        return replace(update, position_rover=update.position_rover + np.array([0.0, 0.3, 0.0]), details=None)
+
+    def clear(self) -> None:
+        """See `TargetTracker`."""
+        self.inner.clear()
+
+
+class Blind(Confident):
+    """Sees the target once and never again."""
+
+    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+        """See `TargetTracker`."""
+        if self.inner.track is not None and self.inner.track.sighting is None:
+            return self.inner.update(measurements)
+        position = np.array([3.0, 0.0, 0.3])
+        return TargetUpdate(TrackingState.FAILURE, (TargetLoss.LOW_MATCH_SCORE,), position)
