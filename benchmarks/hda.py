@@ -11,6 +11,7 @@ from algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, h
 from algorithms.hda.baselines import SemiGlobalEstimator
 from algorithms.hda.estimator import expected_pixels, matched_structure, motion_from_tracks
 from algorithms.hda.features import select_features
+from algorithms.hda.footprints import map_resolution
 from algorithms.hda.landing import map_ground
 from algorithms.hda.scale import scale_factor
 from algorithms.hda.sighting import sighting
@@ -77,6 +78,7 @@ def table_one(given: LandingMeasurements, repeats: int) -> list[Figure]:
     assert ground is not None
     first, second = (view.counts for view in seen.views)
     places = undistorted(seen.views[0].camera, tracks.first[tracks.accepted])
+    resolution = map_resolution(motion, seen.views[0].focal_px, PAPER)
 
     def track() -> None:
         features = select_features(first, PAPER)
@@ -95,7 +97,7 @@ def table_one(given: LandingMeasurements, repeats: int) -> list[Figure]:
         ),
         Figure(
             f"HDA map and hazards, {rows} x {columns} (paper: 0.05 s)",
-            core_seconds(lambda: map_ground(seen, matches.points, PAPER), repeats),
+            core_seconds(lambda: map_ground(seen, matches.points, resolution, PAPER), repeats),
         ),
     ]
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from algorithms.hda.details import HdaDetails
 from algorithms.hda.features import select_features
+from algorithms.hda.footprints import map_resolution
 from algorithms.hda.landing import map_ground, site_world
 from algorithms.hda.motion import Motion, estimate_motion, plane_depths
 from algorithms.hda.options import HdaOptions, TrackSeed
@@ -83,7 +84,8 @@ def find_site(
     details = replace(details, motion=motion, matches=matches)
     if len(matches.points) < options.min_points:
         return _unconverged(SiteOutcome.NO_STRUCTURE, seen, details)
-    ground = map_ground(seen, matches.points, options)
+    resolution = map_resolution(motion, seen.views[0].focal_px, options)
+    ground = map_ground(seen, matches.points, resolution, options)
     if ground is None:
         return _unconverged(SiteOutcome.NO_STRUCTURE, seen, details)
     site = site_world(seen, ground)

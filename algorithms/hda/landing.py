@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
 from algorithms.hda.details import Ground
 from algorithms.hda.elevation import elevation_map
+from algorithms.hda.footprints import Resolution, checked
 from algorithms.hda.hazards import hazard_maps, safe_site
 from algorithms.hda.options import HdaOptions
 from algorithms.hda.sighting import Sighting
 from algorithms.hda.surface import surface_from_camera, upwards, world_from_surface
 
 
-def map_ground(sighting: Sighting, points_camera: Float[np.ndarray, "n 3"], options: HdaOptions) -> Ground | None:
+def map_ground(
+    sighting: Sighting, points_camera: Float[np.ndarray, "n 3"], resolution: Resolution, options: HdaOptions
+) -> Ground | None:
     """The maps of points in the first camera's frame, and the site; None where the points cover no area."""
     first = sighting.views[0]
     to_surface = surface_from_camera(upwards(first, sighting.up_camera, points_camera, options))
@@ -22,6 +27,8 @@ def map_ground(sighting: Sighting, points_camera: Float[np.ndarray, "n 3"], opti
     if elevation is None:
         return None
     hazards = hazard_maps(elevation, options)
+    if options.check_footprints:
+        hazards = replace(hazards, safety=checked(hazards.safety, elevation, resolution, options))
     to_world = world_from_surface(first.world_from_camera.rotation, to_surface)
     apriori = to_world.inv().apply(sighting.apriori_site_world - first.world_from_camera.translation)
     apriori_cell = elevation.cells(apriori[:2])

@@ -84,6 +84,19 @@ class HdaOptions:
     hazard_growth, unknown_growth
         By how many diameters hazards, and borders and holes of the map, are grown. The paper has 1 for hazards; "near"
         borders is taken as half of one: the lander would stand on ground that was not seen.
+    check_footprints
+        Whether places that the paper's maps call safe must also be safe for the plane of their own footprint, with a
+        margin for what the map does not see (`algorithms.hda.footprints`). The paper interpolates planes and slopes
+        between fixed squares: over curved ground the distance from that is half of the distance from a plane.
+    narrowest_hazard
+        Width at its foot of the narrowest hazard over its height. Rocks are up to 0.65 as tall as wide (Golombek &
+        Rapp 1997: 0.5, with the spread of a third that rocks have).
+    margin_deviations
+        Standard deviations of the map's noise, and of the vertical, that a place must be within the limits by.
+    match_error_px
+        Least error of a structure match: the biquadratic leans towards whole pixels by up to 0.09 px.
+    level_error_rad
+        Standard deviation of the vertical that slopes are measured from, with what the motion's error tilts the map by.
     seed
         Of the random triples, the same for every map: the answer is a function of the measurements.
     """
@@ -113,6 +126,11 @@ class HdaOptions:
     max_roughness_m: float = 0.2
     hazard_growth: float = 1.0
     unknown_growth: float = 0.5
+    check_footprints: bool = False
+    narrowest_hazard: float = 1.5
+    margin_deviations: float = 2.0
+    match_error_px: float = 0.1
+    level_error_rad: float = float(np.deg2rad(0.5))
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -140,6 +158,16 @@ _LEAST = {
     "plane_trials": 1,
     "hazard_growth": 0.0,
     "unknown_growth": 0.0,
+    "margin_deviations": 0.0,
+    "match_error_px": 0.0,
+    "level_error_rad": 0.0,
     "seed": 0,
 }
-_POSITIVE = ("robust_px", "max_residual_px", "lander_diameter_m", "max_slope_rad", "max_roughness_m")
+_POSITIVE = (
+    "robust_px",
+    "narrowest_hazard",
+    "max_residual_px",
+    "lander_diameter_m",
+    "max_slope_rad",
+    "max_roughness_m",
+)

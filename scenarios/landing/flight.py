@@ -9,11 +9,16 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from scenarios.landing.faults import outage_errors
+from scenarios.landing.helicopter import HelicopterParameters, Transit
+from scenarios.landing.pair_choice import choose_pair
 from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.views import nadir_pose
 from sim.dynamics import State
 from sim.frames import rigid
 from sim.measurements import PoseMeasurement
+from sim.sensor import preset
+from sim.sensor.laser import range_along
+from sim.sensor.ranging import DOWN, RangingUnit
 from sim.streams import Streams
 from sim.terrain import Surface
 
@@ -33,15 +38,20 @@ class Flight:
         The on-board filter's.
     up_body
         Upwards at the first picture as the inclinometers have it, unit vector in body axes.
+    transit
+        The helicopter's flight that the pictures are from; None for a pair as stated.
     """
 
     states: tuple[State, State]
     poses: tuple[PoseMeasurement, PoseMeasurement]
     up_body: Float64[np.ndarray, "3"]
+    transit: Transit | None = None
 
     @classmethod
     def of(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> Flight:
         """The flight of a case."""
+        if p.helicopter is not None:
+            return _of_helicopter(p, p.helicopter, surface, streams)
         states = true_states(p, surface, streams)
         poses = believed_poses(p, states, streams)
         upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
@@ -55,6 +65,43 @@ class Flight:
             np.array(self.poses[0].world_from_body.translation) - self.states[0].position_m
         )
         return error
+
+
+def _of_helicopter(
+    p: LandingScenarioParameters, helicopter: HelicopterParameters, surface: Surface, streams: Streams
+) -> Flight:
+    """The chosen pair of a helicopter's flight along its pictures' rows' direction or whatever the course is."""
+    ground = float(surface.height(p.place.east_m, p.place.north_m))
+    over = np.array([p.place.east_m, p.place.north_m, ground + helicopter.transit.height_m])
+    heading = -np.radians(p.flown.heading_deg)
+    course = np.pi / 2 - np.radians(p.flown.heading_deg + p.flown.course_deg)
+    gravity = p.preset.environment.gravity_m_s2
+    transit = Transit.flown(helicopter, over, float(course), float(heading), gravity, streams)
+    choice = choose_pair(
+        transit.poses(),
+        _laser_ranges(p, transit, surface, streams),
+        preset(p.camera).cameras()[0],
+        p.pair,
+        helicopter.transit.height_m,
+    )
+    first, second = choice.first, choice.second
+    return Flight(
+        (transit.state(first), transit.state(second)),
+        (transit.pose(first), transit.pose(second)),
+        transit.up_body(first),
+        transit,
+    )
+
+
+def _laser_ranges(
+    p: LandingScenarioParameters, transit: Transit, surface: Surface, streams: Streams
+) -> Float64[np.ndarray, "pictures"]:
+    """The laser's ranges at all pictures, for the choice of the pair; to the ground, rocks left out."""
+    states = [transit.state(number) for number in range(transit.times_s.size)]
+    longest = 5.0 * transit.parameters.transit.height_m
+    true = [range_along(surface, state.position_m, np.asarray(state.attitude.apply(DOWN)), longest) for state in states]
+    unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
+    return unit.readings(transit.times_s, np.array(true), streams.generator("laser noise, transit")).values
 
 
 def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams) -> tuple[State, State]:

@@ -12,6 +12,8 @@ from algorithms.hda import HdaOptions, TrackSeed
 from scenarios.descent.parameters import Place, RenderParameters, SunParameters
 from scenarios.estimators import check_site_estimator
 from scenarios.landing.faults import Faults
+from scenarios.landing.helicopter import HelicopterParameters
+from scenarios.landing.pair_choice import PairParameters
 from scenarios.landing.relief import Limits
 from sim.sensor import PRESETS, AutoExposureParameters, DetectorChoice, LaserParameters, preset
 from sim.terrain import Site, TerrainParameters, site, sites
@@ -102,8 +104,20 @@ class LandingScenarioParameters(_Parameters):
     camera: Annotated[str, Field(description="camera preset that looks down")] = "xc-55"
     detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
     exposure: Annotated[AutoExposureParameters, Field(description="how the exposure is set")] = AutoExposureParameters()
-    flown: Annotated[PassParameters, Field(description="the two pictures' places")] = PassParameters()
-    navigation: NavigationParameters = NavigationParameters()
+    flown: Annotated[
+        PassParameters,
+        Field(description="the two pictures' places; of a helicopter's flight only the azimuths are used"),
+    ] = PassParameters()
+    navigation: Annotated[
+        NavigationParameters, Field(description="errors of the poses where no helicopter is flown")
+    ] = NavigationParameters()
+    helicopter: Annotated[
+        HelicopterParameters | None,
+        Field(description="the helicopter that is flown for the pictures and to the site; none: a pair as stated"),
+    ] = None
+    pair: Annotated[PairParameters, Field(description="which two of a helicopter's pictures are used")] = (
+        PairParameters()
+    )
     laser: LaserParameters = LaserParameters()
     lander: LanderParameters = LanderParameters()
     faults: Faults = Faults()

@@ -8,6 +8,7 @@ from pydantic import BaseModel
 
 from scenarios.estimators import site_estimator
 from scenarios.interface import CaseResult
+from scenarios.landing.descent import landing_row
 from scenarios.landing.flight import Flight
 from scenarios.landing.measurement import measure
 from scenarios.landing.parameters import LandingScenarioParameters
@@ -47,6 +48,7 @@ class LandingScenario:
         truth = GroundTruth.of(world, flight, pair, p.lander.limits)
         row = {
             **site_row(estimate, flight, truth),
+            **landing_row(p, estimate, flight, truth, streams),
             **motion_row(estimate.details, flight, pair),
             **map_row(p, estimate, flight, truth),
             **conditions(p, world, flight, pair, measurements, truth),

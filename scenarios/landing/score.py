@@ -26,6 +26,10 @@ from sim.sensor import height_above_ground
 NAN = float("nan")
 #: Pixels that a track may be off the true place and still count as right.
 RIGHT_PX = 1.0
+#: Share of the features that both pictures show for tracking to be good.
+WELL = 0.9
+#: Changes between pictures that tracking bears (section II.A): about the optical axis, about the others, of height.
+MOST_ROLL_DEG, MOST_TILT_DEG, MOST_CLIMB = 10.0, 20.0, 0.2
 
 
 def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict[str, Scalar]:
@@ -86,6 +90,8 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
         "motion_residual_px", "points", "matched_share", "map_rows", "map_columns", "cell_m",
     )  # fmt: skip
     row: dict[str, Scalar] = dict.fromkeys(names, NAN)
+    row["tracked_well"] = False
+    row["within_limits"] = _within_limits(true_motion(flight, pair), flight, pair.axis_range_m)
     if not isinstance(details, HdaDetails):
         return row
     if details.tracks is not None:
@@ -111,6 +117,15 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
         rows, columns = details.ground.elevation.elevation_m.shape
         row |= {"map_rows": rows, "map_columns": columns, "cell_m": details.ground.elevation.cell_m}
     return row
+
+
+def _within_limits(true: RigidTransform, flight: Flight, range_m: float) -> bool:
+    """Whether the pictures changed by less than the paper says tracking bears (section II.A)."""
+    pitch, yaw, roll = np.degrees(np.abs(true.rotation.as_rotvec()))
+    climb = abs(float(flight.states[1].position_m[2] - flight.states[0].position_m[2]))
+    return bool(
+        roll < MOST_ROLL_DEG + 0.5 and max(pitch, yaw) < MOST_TILT_DEG + 0.5 and climb < (MOST_CLIMB + 0.01) * range_m
+    )
 
 
 def _apart(one: RigidTransform, other: RigidTransform) -> float:
@@ -142,6 +157,7 @@ def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Sc
         "features_in_view": int(inside.sum()),
         "tracks_right": int(right.sum()),
         "tracked_share": float(right.sum() / inside.sum()) if np.any(inside) else NAN,
+        "tracked_well": bool(np.any(inside) and right.sum() >= WELL * inside.sum()),
         "tracks_wrong_share": float(np.mean(~right[tracks.accepted])) if accepted else NAN,
     }
 

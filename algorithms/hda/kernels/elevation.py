@@ -149,3 +149,37 @@ def footprint_planes(
             planes[a, b, 1] = by_x
             planes[a, b, 2] = by_y
     return planes
+
+
+@njit(cache=True)
+def under_lander(
+    elevation: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], offsets: NDArray[np.int64],
+    fitted: NDArray[np.int64], least: int, triples: Array, refine: bool,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Slope per cell of the robust plane through a footprint about each cell, and the farthest that a cell is off it.
+
+    `offsets` are a footprint's cells from its middle (row, column), `fitted` those that the plane is laid through. NaN
+    where fewer than `least` of the latter are known.
+    """
+    count = rows.size
+    slopes, roughness = np.full(count, np.nan), np.full(count, np.nan)
+    n = fitted.shape[0]
+    x, y, z = np.empty(n), np.empty(n), np.empty(n)
+    for k in range(count):
+        known = 0
+        for m in range(n):
+            i, j = rows[k] + fitted[m, 0], columns[k] + fitted[m, 1]
+            if 0 <= i < elevation.shape[0] and 0 <= j < elevation.shape[1] and not math.isnan(elevation[i, j]):
+                x[known], y[known], z[known] = fitted[m, 1], fitted[m, 0], elevation[i, j]
+                known += 1
+        if known < least:
+            continue
+        value, by_x, by_y = robust_plane(x[:known], y[:known], z[:known], triples, refine)
+        most = 0.0
+        for m in range(offsets.shape[0]):
+            i, j = rows[k] + offsets[m, 0], columns[k] + offsets[m, 1]
+            if 0 <= i < elevation.shape[0] and 0 <= j < elevation.shape[1] and not math.isnan(elevation[i, j]):
+                most = max(most, abs(elevation[i, j] - value - by_x * offsets[m, 1] - by_y * offsets[m, 0]))
+        slopes[k] = math.hypot(by_x, by_y)
+        roughness[k] = most
+    return slopes, roughness
