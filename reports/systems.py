@@ -12,10 +12,11 @@ import pandas as pd
 from reports.dimes.shown import DIMES
 from reports.shown import CaseView, System
 from reports.stored import StoredRun
+from reports.vtt.shown import VTT
 from reports.wording import NOTHING
 
 #: Those whose products are looked for in a case, in this order.
-SYSTEMS: tuple[System, ...] = (DIMES,)
+SYSTEMS: tuple[System, ...] = (DIMES, VTT)
 #: Kept cases whose pictures go into the page; each takes about half a megabyte.
 _MOST_SHOWN = 2
 
