@@ -126,7 +126,7 @@ def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
     rows = [_figures(stop, error) for stop, error in zip(run.stops, errors, strict=True)]
     names = (
         "range_m", "azimuth_deg", "elevation_deg", "magnification", "roll_change_deg", "azimuth_change_deg",
-        "match_score", "stereo_score", "correction_px", "error_px", "position_error_m",
+        "match_score", "stereo_score", "correction_px", "error_px", "position_error_m", "leg", "time_s",
     )  # fmt: skip
     return {name: np.array([row[name] for row in rows], dtype=np.float64) for name in names}
 
@@ -139,6 +139,8 @@ def _figures(stop: Stop, error_px: Float64[np.ndarray, "2"]) -> dict[str, float]
         "elevation_deg": float(np.degrees(stop.angles_rad[1])),
         "error_px": float(np.hypot(*error_px)),
         "position_error_m": float(np.linalg.norm(stop.error_m())),
+        "leg": float(stop.leg),
+        "time_s": stop.time_s,
     }
     details = stop.details
     match, change = (None, None) if details is None else (details.match, details.change)
@@ -215,6 +217,7 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "bearing_deg": float(np.degrees(p.bearing_rad)) % _FULL_TURN_DEG,
         "visual_odometry": any(leg.visual_odometry for leg in p.legs),
         "autonav": any(leg.autonav for leg in p.legs),
+        "map_by": next((leg.map_by for leg in p.legs if leg.autonav), "none"),
         "roll_compensated": p.vtt.roll and p.algorithm != "pure-ncc",
         "roll_ignored": not p.vtt.roll or p.algorithm == "pure-ncc",
         "clear_sky": p.clouds is None or p.clouds.cover == 0.0,
