@@ -1,6 +1,6 @@
 """Hazard detection and avoidance from one moving camera (Johnson, Montgomery & Matthies, sections II and III)."""
 
-from algorithms.hda.details import Ground, HdaDetails, hda_products
+from algorithms.hda.details import STAGES, Ground, HdaDetails, hda_products
 from algorithms.hda.elevation import ElevationMap
 from algorithms.hda.estimator import HdaEstimator
 from algorithms.hda.hazards import HazardMaps, Safety, hazard_maps, safe_site
@@ -10,6 +10,7 @@ from algorithms.hda.structure import Matches
 from algorithms.hda.tracking import Tracks
 
 __all__ = [
+    "STAGES",
     "ElevationMap",
     "Ground",
     "HazardMaps",

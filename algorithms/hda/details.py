@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,9 @@ from algorithms.hda.motion import Motion
 from algorithms.hda.structure import Matches
 from algorithms.hda.tracking import Tracks
 from algorithms.hda.view import View, points_at, undistorted
+
+#: The stages of Table I, in order; the scale belongs to motion, the elevation map to hazards.
+STAGES = ("tracking", "motion", "structure", "hazards")
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,8 @@ class HdaDetails:
         The dense matches.
     ground
         Maps and site.
+    ends_s
+        Processor time at the start, and at the end of every stage of `STAGES` that was reached.
     """
 
     views: tuple[View, View]
@@ -70,6 +77,17 @@ class HdaDetails:
     motion: Motion | None = None
     matches: Matches | None = None
     ground: Ground | None = None
+    ends_s: tuple[float, ...] = field(default_factory=lambda: (time.process_time(),))
+
+    def ended(self, **found: Any) -> HdaDetails:
+        """These details with what a stage found, which ends now."""
+        return replace(self, **found, ends_s=(*self.ends_s, time.process_time()))
+
+    @property
+    def times_s(self) -> Mapping[str, float]:
+        """Processor time that each stage took; those alone that were reached."""
+        lengths = np.diff(self.ends_s)
+        return {name: float(length) for name, length in zip(STAGES, lengths, strict=False)}
 
 
 def hda_products(details: HdaDetails) -> dict[str, Any]:

@@ -67,7 +67,7 @@ def find_site(
     tracks = track_features(
         seen.views[0].counts, seen.views[1].counts, features, expected_pixels(seen, features, options), options
     )
-    details = replace(details, tracks=tracks)
+    details = details.ended(tracks=tracks)
     if np.count_nonzero(tracks.accepted) < options.min_tracks:
         return _unconverged(SiteOutcome.NO_TRACKS, seen, details)
     motion = solve_motion(seen, tracks, options)
@@ -80,8 +80,9 @@ def find_site(
     if not (np.isfinite(factor) and factor > 0.0):
         return _unconverged(SiteOutcome.NO_MOTION, seen, details)
     motion = motion.scaled(factor)
+    details = details.ended(motion=motion)
     matches = solve_structure(seen, motion, options)
-    details = replace(details, motion=motion, matches=matches)
+    details = details.ended(matches=matches)
     if len(matches.points) < options.min_points:
         return _unconverged(SiteOutcome.NO_STRUCTURE, seen, details)
     resolution = map_resolution(motion, seen.views[0].focal_px, options)
@@ -89,8 +90,9 @@ def find_site(
     if ground is None:
         return _unconverged(SiteOutcome.NO_STRUCTURE, seen, details)
     site = site_world(seen, ground)
+    details = details.ended(ground=ground)
     outcome = SiteOutcome.NO_SAFE_SITE if site is None else SiteOutcome.SAFE_SITE
-    return SiteEstimate(outcome, site, replace(details, ground=ground))
+    return SiteEstimate(outcome, site, details)
 
 
 def _unconverged(outcome: SiteOutcome, seen: Sighting, details: HdaDetails) -> SiteEstimate:

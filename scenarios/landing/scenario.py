@@ -6,14 +6,14 @@ import time
 
 from pydantic import BaseModel
 
-from scenarios.estimators import site_estimator
+from scenarios.estimators import LANDING
 from scenarios.interface import CaseResult
 from scenarios.landing.descent import landing_row
 from scenarios.landing.flight import Flight
 from scenarios.landing.measurement import measure
 from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.landing.pictures import take_pictures
-from scenarios.landing.score import conditions, map_row, motion_row, products, provenance, site_row
+from scenarios.landing.score import conditions, map_row, motion_row, products, provenance, site_row, times_row
 from scenarios.landing.truth import GroundTruth
 from scenarios.landing.world import World, camera_optics
 from sim.streams import Streams
@@ -43,7 +43,7 @@ class LandingScenario:
         pair = take_pictures(p, world, flight, camera_optics(p.camera), streams)
         measurements = measure(p, flight, pair, streams)
         started = time.process_time()
-        estimate = site_estimator(p.algorithm, p.hda).estimate(measurements)
+        estimate = LANDING.make(p.algorithm, p.hda, p.executable).estimate(measurements)
         taken = time.process_time() - started
         truth = GroundTruth.of(world, flight, pair, p.lander.limits)
         row = {
@@ -53,13 +53,14 @@ class LandingScenario:
             **map_row(p, estimate, flight, truth),
             **conditions(p, world, flight, pair, measurements, truth),
             "estimation_time_s": taken,
+            **times_row(estimate.details),
             **provenance(p, pair),
         }
         return CaseResult(
             outcome=estimate.outcome.name,
             answered=estimate.outcome.converged,
             row=row,
-            products=products(estimate, flight, pair, truth),
+            products=products(p, estimate, flight, pair, truth),
         )
 
 

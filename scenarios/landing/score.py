@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.hda import HdaDetails, hda_products
+from algorithms.hda import STAGES, HdaDetails, hda_products
 from algorithms.hda.view import camera_pose
 from algorithms.interface import SiteEstimate, SiteOutcome
 from scenarios.interface import Scalar
@@ -162,6 +162,12 @@ def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Sc
     }
 
 
+def times_row(details: object) -> dict[str, Scalar]:
+    """Processor time of the stages of Table I; NaN for those that were not reached."""
+    taken = details.times_s if isinstance(details, HdaDetails) else {}
+    return {f"{stage}_time_s": taken.get(stage, NAN) for stage in STAGES}
+
+
 def map_row(
     p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth
 ) -> dict[str, Scalar]:
@@ -187,7 +193,7 @@ def conditions(
     states, poses = flight.states, flight.poses
     heights = height_above_ground(world.ground.surface, np.stack([state.position_m for state in states]))
     moved = states[1].position_m - states[0].position_m
-    turned = (states[1].attitude * states[0].attitude.inv()).magnitude()
+    turned = (states[0].attitude.inv() * states[1].attitude).as_rotvec(degrees=True)
     errors = [
         (pose.world_from_body.rotation * state.attitude.inv()).as_rotvec()
         for pose, state in zip(poses, states, strict=True)
@@ -208,7 +214,11 @@ def conditions(
         "height_m": float(heights[0]),
         "baseline_m": float(np.linalg.norm(moved)),
         "height_change_share": float(moved[2] / heights[0]),
-        "turned_deg": float(np.degrees(turned)),
+        "baseline_share": float(np.hypot(*moved[:2]) / heights[0]),
+        "turned_deg": float(np.linalg.norm(turned)),
+        "pitch_deg": float(turned[0]),
+        "yaw_deg": float(turned[1]),
+        "roll_deg": float(turned[2]),
         "off_nadir_deg": float(np.degrees(np.arccos(np.clip(upright[2], -1.0, 1.0)))),
         "exposure_s": pair.images[0].calibration.exposure_s,
         "picture_median_dn": float(np.median(pair.counts[0])),
@@ -222,6 +232,10 @@ def conditions(
         "pose_turn_error_deg": float(np.degrees(np.linalg.norm(errors[1] - errors[0]))),
         "covered_m2": float(covered.sum() * truth.step_m**2),
         "true_slope_median_deg": _median_deg(truth, covered),
+        "texture": p.texture,
+        "grid_px": p.hda.grid_px,
+        "max_slope_deg": float(np.degrees(p.hda.max_slope_rad)),
+        "max_roughness_m": p.hda.max_roughness_m,
         "rocks_abundance": 0.0 if p.terrain.rocks is None else p.terrain.rocks.abundance,
     }
 
@@ -243,7 +257,9 @@ def provenance(p: LandingScenarioParameters, pair: Pair) -> dict[str, Scalar]:
     }
 
 
-def products(estimate: SiteEstimate, flight: Flight, pair: Pair, truth: GroundTruth) -> dict[str, Any]:
+def products(
+    p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, pair: Pair, truth: GroundTruth
+) -> dict[str, Any]:
     """Arrays from which the case's figures are drawn.
 
     Those of `algorithms.hda.hda_products` (Figs. 1-5 and 7), and
@@ -253,6 +269,7 @@ def products(estimate: SiteEstimate, flight: Flight, pair: Pair, truth: GroundTr
     - `true_places`, `true_slope`, `true_roughness`, `true_safe`, `true_covered`: the truth's lattice, world axes;
     - `true_heights`, `true_corner`, `true_spacing`: exact heights, world axes (row i at y = corner[1] + i spacing);
     - `camera_true`, `camera_believed`: poses of the body at the first picture (4 x 4), true and on board;
+    - `limits`: the algorithm's limits of slope (radians) and roughness (metres), and the lander's diameter;
     - `site_true`: world x, y to which the handed-over coordinates lead (see `site_row`).
     """
     kept: dict[str, Any] = {"image_1": pair.counts[0], "image_2": pair.counts[1]}
@@ -272,6 +289,7 @@ def products(estimate: SiteEstimate, flight: Flight, pair: Pair, truth: GroundTr
         "true_spacing": np.array([truth.relief.spacing_m]),
         "camera_true": flight.states[0].world_from_body.as_matrix(),
         "camera_believed": flight.poses[0].world_from_body.as_matrix(),
+        "limits": np.array([p.hda.max_slope_rad, p.hda.max_roughness_m, truth.limits.diameter_m]),
     }
     if estimate.site_world is not None:
         kept["site_true"] = (estimate.site_world - flight.position_error_m)[:2]
