@@ -26,6 +26,12 @@ from reports.stored import StoredRun, read_run
 from reports.systems import shown_cases
 from reports.tables import error_summaries, outcome_counts
 from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overall
+from reports.vtt.beside import beside_section
+from reports.vtt.goal import goal_section
+from reports.vtt.kinds import regression_section, terrains_section
+from reports.vtt.steps import steps_section
+from reports.vtt.table_1 import table_1_section
+from reports.vtt.updates import updates_section
 from reports.wording import number
 
 #: Version of the layout of `report.json`.
@@ -34,6 +40,13 @@ SCHEMA = 1
 #: Sections that a page has where the rows hold their columns, in the page's order.
 FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
     field_test_section,
+    table_1_section,
+    beside_section,
+    updates_section,
+    steps_section,
+    terrains_section,
+    regression_section,
+    goal_section,
     answers_section,
     faults_section,
     carried_section,

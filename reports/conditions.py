@@ -32,6 +32,11 @@ CONDITIONS = (
     "rms_slope",
     "sun_elevation",
     "horizontal_speed",
+    "camera",
+    "rock_diameter",
+    "slip_mean",
+    "tilt_max",
+    "pose_error_share",
 )
 #: Kinds up to this many are told one by one if each has so many cases on average; numbers of more values are cut into
 #: bins.

@@ -26,7 +26,7 @@ from reports.svg import (
     in_page_style,
     new_axes,
 )
-from reports.tables import outcome_counts
+from reports.tables import answered_outcomes, outcome_counts
 from reports.verdicts import ENGINE_FAILURES
 
 #: Errors beyond this many times the bound are drawn at the edge, or one of them would hide all others.
@@ -178,12 +178,13 @@ def outcome_bars(frame: pd.DataFrame) -> Figure | None:
     counts = outcome_counts(frame)
     if not counts:
         return None
+    answered = answered_outcomes(frame)
     figure, axes = new_axes(6.4, 0.75 + 0.36 * len(counts))
     styles: Mapping[str, Any]
     for place, (name, count) in enumerate(counts):
         if name in ENGINE_FAILURES:
             styles = {"color": "none", "edgecolor": REQUIREMENT, "hatch": "xxxx"}
-        elif name == "VALID":
+        elif name in answered:
             styles = {"color": SERIES[0]}
         else:
             styles = {"color": "none", "edgecolor": SERIES[1], "hatch": "////"}

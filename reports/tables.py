@@ -15,7 +15,7 @@ from rich.text import Text
 
 from reports.columns import axis_columns, label, numbers
 from reports.statistics import ErrorSummary, summarize
-from reports.verdicts import ENGINE_FAILURES, Status, Verdict
+from reports.verdicts import ENGINE_FAILURES, Status, Verdict, is_flag, members
 from reports.wording import NOTHING, asked_text, interval, number, percent, stated
 
 _STYLES = {Status.PASS: "bold green", Status.FAIL: "bold red", Status.INSUFFICIENT: "bold yellow"}
@@ -46,12 +46,20 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
 
 
 def outcome_counts(frame: pd.DataFrame) -> list[tuple[str, int]]:
-    """Outcomes and how many cases ended so: VALID first, the engine's failures last, the others by number."""
+    """Outcomes and how many cases ended so: those with an answer first, the engine's failures last, by number."""
     if "outcome" not in frame:
         return []
     counts = frame["outcome"].astype("object").fillna("(none)").astype(str).value_counts()
     pairs = [(str(name), int(count)) for name, count in counts.items()]
-    return sorted(pairs, key=lambda pair: (pair[0] in ENGINE_FAILURES, pair[0] != "VALID", -pair[1], pair[0]))
+    answered = answered_outcomes(frame)
+    return sorted(pairs, key=lambda pair: (pair[0] in ENGINE_FAILURES, pair[0] not in answered, -pair[1], pair[0]))
+
+
+def answered_outcomes(frame: pd.DataFrame) -> set[str]:
+    """Outcomes of cases that gave an answer; VALID where rows do not tell which did."""
+    if "outcome" not in frame or not is_flag(frame, "answered"):
+        return {"VALID"}
+    return {str(name) for name in frame.loc[members(frame, "valid"), "outcome"].dropna().unique()}
 
 
 def outcome_table(frame: pd.DataFrame) -> Table:

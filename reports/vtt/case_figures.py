@@ -18,6 +18,7 @@ from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Rectangle
 from scipy import ndimage
 
@@ -51,8 +52,8 @@ def draw_stops(products: Mapping[str, Any], most: int | None = None) -> Figure:
         raise ValueError("the products hold no picture of a stop")
     columns = min(_COLUMNS, len(stops))
     rows = -(-len(stops) // columns)
-    figure = Figure(figsize=(_CELL[0] * columns, _CELL[1] * rows), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.06, wspace=0.02, hspace=0.02)  # type: ignore[union-attr]
+    layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.06, wspace=0.02, hspace=0.02)
+    figure = Figure(figsize=(_CELL[0] * columns, _CELL[1] * rows), layout=layout)
     grid = figure.add_gridspec(rows, columns)
     for place, stop in enumerate(stops):
         _draw_stop(figure, grid[place // columns, place % columns], stop, side)
@@ -75,6 +76,7 @@ def draw_way(products: Mapping[str, Any]) -> Figure:
     above, close = figure.subplots(1, 2)
     _draw_above(above, way)
     _draw_close(close, way)
+    figure.legend(loc="outside lower center", ncols=3)
     return figure
 
 
@@ -125,7 +127,7 @@ def _words(stop: StopPictures) -> list[str]:
         "magnification": "× {:.3f}", "roll_change_deg": "roll {:+.1f}°", "match_score": "NCC {:.2f}",
         "stereo_score": "stereo {:.2f}", "error_px": "off by {:.1f} px",
     }  # fmt: skip
-    values = {name: stop.figure(name) + 0.0 for name in kinds}
+    values = {name: 0.0 if abs(stop.figure(name)) < 0.05 else stop.figure(name) for name in kinds}  # no minus nought
     said = {name: kinds[name].format(value).replace("-", "−") for name, value in values.items() if np.isfinite(value)}
     lines = (
         ("range_m", "azimuth_deg"),
@@ -191,8 +193,9 @@ def _frame(axes: Axes, colour: str) -> None:
 def _draw_above(axes: Axes, way: Way) -> None:
     """The way, north up."""
     for number, (east, north, diameter) in enumerate(way.rocks):
-        style = {"facecolor": GRID, "edgecolor": MUTED, "linewidth": 0.8, "hatch": "" if number == 0 else "////"}
-        axes.add_patch(Circle((east, north), 0.5 * diameter, **style))
+        rock = Circle((east, north), 0.5 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8)
+        rock.set_hatch("" if number == 0 else "////")
+        axes.add_patch(rock)
     axes.plot(*way.path.T, "-", color=SERIES[0], linewidth=1.6, label="way driven")
     axes.plot(*way.stops.T, "o", color=SERIES[0], markersize=5, label="stops")
     axes.plot(*way.believed.T, "x", color=SERIES[1], markersize=5.5, markeredgewidth=1.3, label="stops as believed")
@@ -204,7 +207,6 @@ def _draw_above(axes: Axes, way: Way) -> None:
         axes.plot(*np.column_stack([place, place + direction]), "-", color=MUTED, linewidth=1.1, zorder=1)
     for number in _numbered(way.stops, width):
         _number(axes, way.stops[number], number + 1)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2)
 
 
 def _draw_close(axes: Axes, way: Way) -> None:
@@ -214,16 +216,21 @@ def _draw_close(axes: Axes, way: Way) -> None:
     for east, north, diameter in way.rocks[:1]:
         middle = 100.0 * (np.array([east, north]) - way.target)
         axes.add_patch(Circle((middle[0], middle[1]), 50.0 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8))
-    axes.plot(*offsets[known].T, "-", color=SERIES[1], linewidth=1.0)
-    axes.plot(*offsets[known].T, "o", color=SERIES[1], markersize=5, label="target as estimated at each stop")
-    axes.plot(0.0, 0.0, "*", color=INK, markersize=12, label="designated target")
     moved = float(np.linalg.norm(offsets[known[-1]] - offsets[known[0]])) if known.size else 0.0
+    axes.plot(*offsets[known].T, "-", color=SERIES[1], linewidth=1.0)
+    axes.plot(
+        *offsets[known].T,
+        "o",
+        color=SERIES[1],
+        markersize=5,
+        label=f"target as estimated ({moved:.0f} cm from first to last)",
+    )
+    axes.plot(0.0, 0.0, "*", color=INK, markersize=12)
     axes.set(xlabel="east of the target (cm)", ylabel="north of the target (cm)")
-    axes.set_title(f"The target as estimated: {moved:.0f} cm from first to last")
+    axes.set_title("The target as estimated")
     width = _limits(axes, np.vstack([offsets[known], np.zeros((1, 2))]), 2.0)
     for place in _numbered(offsets[known], width):
         _number(axes, offsets[known[place]], int(known[place]) + 1)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2)
 
 
 def _numbered(points: Float[np.ndarray, "n 2"], width: float) -> list[int]:
@@ -236,7 +243,7 @@ def _numbered(points: Float[np.ndarray, "n 2"], width: float) -> list[int]:
 
 
 def _number(axes: Axes, place: Float[np.ndarray, "2"], number: int) -> None:
-    offset = {"xytext": (5, 4), "textcoords": "offset points"}
+    offset: dict[str, Any] = {"xytext": (5, 4), "textcoords": "offset points"}
     rim = [patheffects.withStroke(linewidth=2.0, foreground="#ffffff")]
     axes.annotate(str(number), (float(place[0]), float(place[1])), fontsize=8, color=INK, path_effects=rim, **offset)
 

@@ -128,7 +128,9 @@ def way_of(products: Mapping[str, Any]) -> Way | None:
     target = numbers(products.get("target_m"))
     stops, believed = _places(products.get("rover_true_m")), _places(products.get("rover_believed_m"))
     estimates = _places(products.get("target_believed_m"))
-    if target is None or target.shape != (3,) or not stops.size or stops.shape != estimates.shape != believed.shape:
+    if target is None or target.shape != (3,) or not stops.size:
+        return None
+    if not stops.shape == estimates.shape == believed.shape:
         return None
     path, rocks = _places(products.get("path_true_m")), numbers(products.get("rocks_m"))
     if rocks is None or rocks.ndim != 2 or rocks.shape[1] != 3:

@@ -32,9 +32,11 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     """A tracking case."""
     stops = stops_of(products)
     told = f"{count(min(len(stops), _MOST_STOPS), 'stop')} of {len(stops)}" if len(stops) > _MOST_STOPS else "All stops"
-    plates = [plate(draw_stops(products, _MOST_STOPS), f"{key}stops", f"{told}.")]
+    plates = [plate(draw_stops(products, _MOST_STOPS), f"{key}stops", f"{told}.", wide=True)]
     if way_of(products) is not None:
-        plates.append(plate(draw_way(products), f"{key}way", "The way from above, and the target as estimated."))
+        plates.append(
+            plate(draw_way(products), f"{key}way", "The way from above, and the target as estimated.", wide=True)
+        )
     names = [name for name in _QUANTITIES if any(name in stop.figures for stop in stops)]
     rows = [
         TableRow(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
+from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -198,7 +199,7 @@ def step_figure(found: Sequence[StepCell], motion: Motion) -> Figure:
         steps, shares = [one.step for one in ours], [one.good.share for one in ours]
         below = [one.good.share - one.good.lower for one in ours]
         above = [one.good.upper - one.good.share for one in ours]
-        style = {"color": SERIES[place], "marker": MARKERS[place]}
+        style: dict[str, Any] = {"color": SERIES[place], "marker": MARKERS[place]}
         axes.errorbar(
             steps, shares, [below, above], capsize=2.5, elinewidth=0.9, markersize=5.5, label=line or "tracked", **style
         )

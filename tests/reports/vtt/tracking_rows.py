@@ -1,0 +1,94 @@
+"""Made-up rows and products of tracking cases, with known contents."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from reports.section import Block, Section, Subject
+from reports.stored import StoredRun
+
+
+def rows(cases: int, **columns: Any) -> pd.DataFrame:
+    """Completed, tracked runs from 10 m to 2 m at selectable targets; `columns` change them."""
+    own: dict[str, Any] = {
+        "case": np.arange(cases),
+        "outcome": "COMPLETED",
+        "answered": True,
+        "tracked": True,
+        "not_tracked": False,
+        "true_track": True,
+        "selectable": True,
+        "position_error_m": 0.004,
+        "range_error_m": 0.003,
+        "cross_error_m": 0.002,
+        "drift_px": 2.0,
+        "losses": "none",
+        "lost_range_m": np.nan,
+        "camera": "research-navcam",
+        "incline": "flat ground",
+        "azimuth_change_max_deg": 3.0,
+        "clear_sky": True,
+        "slip_max": 0.1,
+        "range_start_m": 10.0,
+        "range_end_m": 2.0,
+        "designation_error_m": 0.1,
+        "designation_3_sigma_m": 0.388,
+        "pose_error_m": 0.05,
+        "visual_odometry": False,
+        "autonav": False,
+        "autonav_updates": 0,
+        "rock_height_m": 0.4,
+    }
+    return pd.DataFrame(own | columns, index=range(cases))
+
+
+def subject(frame: pd.DataFrame, name: str = "a-campaign", legs: list[Mapping[str, Any]] | None = None) -> Subject:
+    """A report's subject of these rows, as of a campaign of this name whose shared drive has these legs."""
+    parameters = {"drive": {"legs": legs}} if legs else {}
+    record = {"name": name, "configuration": {"parameters": parameters}}
+    return Subject(StoredRun(Path("run"), frame, record, ()), "position_error_m", 0.03)
+
+
+def table(section: Section | None, block: int = 0) -> list[dict[str, str]]:
+    """The rows of a section's table, each by its headings; the first column is called by its own name or ''."""
+    assert section is not None
+    grids = [one.grid for one in section.blocks if isinstance(one, Block) and one.grid is not None]
+    return [dict(zip(grids[block].head, row, strict=True)) for row in grids[block].rows]
+
+
+def products(stops: int = 3) -> dict[str, Any]:
+    """A case whose target is at (80, 70) of subframes of 161 px that begin at (400, 300); lost at the last stop."""
+    rng = np.random.default_rng(3)
+    kept: dict[str, Any] = {"template_px": 21}
+    for number in range(1, stops + 1):
+        lost = number == stops
+        kept[f"stop_{number}_left"] = rng.integers(500, 3000, (161, 161)).astype(np.uint16)
+        kept[f"stop_{number}_right"] = rng.integers(500, 3000, (105, 161)).astype(np.uint16)
+        kept[f"stop_{number}_corners"] = np.array([[400.0, 300.0], [380.0, 302.0]])
+        kept[f"stop_{number}_window"] = np.array([410.0, 310.0, 141.0, 141.0])
+        kept[f"stop_{number}_found"] = np.full((2, 2), np.nan) if lost else np.array([[480.0, 370.0], [450.0, 371.0]])
+        kept[f"stop_{number}_point"] = np.array([481.5, 369.0])
+    east = np.linspace(0.0, 8.0, stops)
+    rover = np.column_stack([east, np.zeros(stops), np.zeros(stops)])
+    believed = np.full((stops, 3), np.nan)
+    believed[:-1] = np.column_stack([10.0 + 0.03 * np.arange(stops - 1), np.zeros(stops - 1), np.zeros(stops - 1)])
+    return kept | {
+        "figures": {
+            "range_m": 10.0 - east,
+            "azimuth_deg": np.full(stops, -0.04),
+            "match_score": np.array([np.nan] + [0.9] * (stops - 1)),
+        },
+        "states": ["NORMAL"] * (stops - 1) + ["LOST"],
+        "rover_true_m": rover,
+        "rover_believed_m": rover + 0.05,
+        "heading_deg": np.full(stops, 90.0),
+        "target_m": np.array([10.0, 0.0, 0.2]),
+        "target_believed_m": believed,
+        "path_true_m": rover[:, :2],
+        "rocks_m": np.array([[10.1, 0.0, 0.4]]),
+    }
