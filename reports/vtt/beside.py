@@ -163,11 +163,11 @@ class Mode:
 
 
 TABLE_IV = (
-    Mode("seed at 3 m", 2, 2, (-1, 0)),
-    Mode("turn in place by 10 deg", 7, 10, (1,)),
-    Mode("back from 4 to 7 m", 10, 11, (2, 3)),
-    Mode("with visual odometry over 2.1 m", 4, 15, (4, 5)),
-    Mode("with the navigator over 1.4 m", 4, 28, (6,)),
+    Mode("seed at 3 m", 2, 2.0, (-1, 0)),
+    Mode("turn in place by 10 deg", 7, 10.0, (1,)),
+    Mode("back from 4 to 7 m", 10, 11.0, (2, 3)),
+    Mode("with visual odometry over 2.1 m", 4, 15.0, (4, 5)),
+    Mode("with the navigator over 1.4 m", 4, 28.0, (6,)),
 )
 _TABLE_IV_NOTE = (
     "The paper's 5 minutes for the first map stand with the navigator's 23, as the map is begun on the way back in "
