@@ -41,11 +41,15 @@ class VelocityEstimate:
         picture; None unless the outcome is VALID.
     details
         The algorithm's intermediate products for figures and diagnosis; None where it keeps none.
+    covariance_m2_s2
+        Covariance of the velocity's error as the algorithm has it, (east, north), m2/s2; None where it states none.
+        Errors are then held against it as well.
     """
 
     outcome: VelocityOutcome
     velocity_m_s: Float[np.ndarray, "2"] | None
     details: object | None = None
+    covariance_m2_s2: Float[np.ndarray, "2 2"] | None = None
 
 
 class VelocityEstimator(Protocol):

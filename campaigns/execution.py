@@ -161,14 +161,17 @@ def _plain_text(text: str) -> str:
 
 def _scored(case: int, result: CaseResult) -> Row:
     """The row of a case that came to an end, in plain Python values."""
-    if result.outcome in UNFINISHED:
+    failure = result.failure
+    if (result.outcome in UNFINISHED) != (failure is not None):
         raise ValueError(f"the outcome {result.outcome} is kept for cases that do not come to an end")
     clashes = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(result.row))
     if clashes:
         raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(clashes)}")
     columns = {str(name): _plain(str(name), value) for name, value in result.row.items()}
     head: Row = {"case": case, "outcome": str(result.outcome), "answered": bool(result.answered)}
-    return {**head, **columns, "error": "", "traceback": ""}
+    if failure is None:
+        return {**head, **columns, "error": "", "traceback": ""}
+    return {**head, **columns, "error": _plain_text(failure.error), "traceback": _plain_text(failure.trace)}
 
 
 def _plain(column: str, value: Any) -> Scalar:

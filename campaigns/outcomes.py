@@ -1,4 +1,7 @@
-"""Outcomes that the engine gives: cases that did not come to an end. No scenario may use these names."""
+"""Outcomes of cases that did not come to an end, or whose algorithm failed to answer (`algorithms.faults.Fault`).
+
+No estimate may use these names.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,16 @@ OUT_OF_MEMORY = "OUT_OF_MEMORY"
 #: The case wrote more to its standard output and error than its limit.
 TOO_MUCH_OUTPUT = "TOO_MUCH_OUTPUT"
 
+#: The algorithm's answer was not of the form that its interface states.
+BAD_ANSWER = "BAD_ANSWER"
+
 #: All of them, in the words of the command line.
 RETRYABLE: Mapping[str, str] = {
     "crashed": CRASHED,
     "timed-out": TIMED_OUT,
     "out-of-memory": OUT_OF_MEMORY,
     "too-much-output": TOO_MUCH_OUTPUT,
+    "bad-answer": BAD_ANSWER,
 }
 
 #: Cases with these outcomes count as failures of requirements on all cases, and make the exit status 1.

@@ -1,25 +1,117 @@
-"""The algorithms under test that campaign files can name: those that ship with Marsyard, and a user's own."""
+"""The algorithms under test: those that ship with Marsyard, those installed by other packages, and a user's own.
+
+An algorithm is named by
+
+- a name that ships with Marsyard (`dimes`), or that an installed package gives it in the entry point group
+  `marsyard.algorithms`; where both have it Marsyard's own is meant;
+- ``module:Class``, or ``module:function``: what is found there is called without arguments and gives the algorithm. The
+  module may lie in the current folder;
+- ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: a program of its own (docs/own-algorithms.md).
+"""
 
 from __future__ import annotations
 
 import difflib
-import importlib
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Any
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, Generic, TypeVar, cast
 
+from algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
 from algorithms.dimes import DimesEstimator, DimesOptions
+from algorithms.exchange import (
+    Command,
+    ExecutableLimits,
+    ExecutableSiteEstimator,
+    ExecutableVelocityEstimator,
+    command_of,
+)
 from algorithms.hda import HdaEstimator, HdaOptions
 from algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
 from algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
+from scenarios.dotted import found_at
 
-#: Where each velocity estimator's class is found; it is made without arguments, but for DIMES, which takes its options.
-ESTIMATORS: Mapping[str, str] = {
-    "dimes": "algorithms.dimes:DimesEstimator",
-    "phase-correlation": "algorithms.baselines:PhaseCorrelationEstimator",
-    "homography": "algorithms.baselines:HomographyEstimator",
-}
+#: Entry points of other packages' algorithms.
+GROUP = "marsyard.algorithms"
+
+Algorithm = TypeVar("Algorithm")
+Options = TypeVar("Options")
+
+
+@dataclass(frozen=True)
+class Task(Generic[Algorithm, Options]):
+    """One of the three systems' tasks, and the algorithms that there are for it.
+
+    Attributes
+    ----------
+    name
+        As the command line and the exchange with programs have it.
+    what
+        An algorithm for it, in words.
+    methods
+        What an algorithm for it must have.
+    shipped
+        How each algorithm that ships is made from the options of the paper's own.
+    executable
+        How a program becomes one; None where programs cannot.
+    """
+
+    name: str
+    what: str
+    methods: tuple[str, ...]
+    shipped: Mapping[str, Callable[[Options], Algorithm]]
+    executable: Callable[[Command, ExecutableLimits], Algorithm] | None
+
+    def check(self, spec: str) -> None:
+        """Raises ValueError where there is no algorithm of this name for the task; the message says what is allowed."""
+        if spec in self.shipped or self._command(spec) is not None:
+            return
+        found = self._class(spec)
+        missing = [method for method in self.methods if not hasattr(found, method)]
+        if not callable(found):
+            raise ValueError(f"'{spec}' is no {self.what}: it is a {type(found).__name__}, not a class or function")
+        if missing and isinstance(found, type):
+            raise ValueError(f"'{spec}' is no {self.what}: it has no {', '.join(missing)}")
+
+    def make(self, spec: str, options: Options, limits: ExecutableLimits) -> Algorithm:
+        """The algorithm of a name. Raises ValueError where there is none, and whatever making a user's own raises."""
+        if spec in self.shipped:
+            return self.shipped[spec](options)
+        command = self._command(spec)
+        if command is not None and self.executable is not None:
+            return self.executable(command, limits)
+        return cast(Algorithm, self._class(spec)())
+
+    def _command(self, spec: str) -> Command | None:
+        command = command_of(spec)
+        if command is not None and self.executable is None:
+            raise ValueError(f"'{spec}': a {self.what} cannot be a program; allowed: a class, as 'module:Class'")
+        return command
+
+    def _class(self, spec: str) -> Any:
+        """What stands under a name of another package, or at a path."""
+        if ":" in spec:
+            try:
+                return found_at(spec)
+            except ImportError as error:
+                raise ValueError(f"no algorithm at '{spec}': {error}") from error
+        if spec not in installed():
+            raise ValueError(self._unknown(spec))
+        try:
+            return installed()[spec].load()
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"algorithm '{spec}' cannot be loaded from {installed()[spec].value}: {error}") from error
+
+    def _unknown(self, name: str) -> str:
+        known = [*self.shipped, *installed()]
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        own = "'module:Class'" if self.executable is None else "'module:Class' or 'exec:./program'"
+        return f"unknown algorithm '{name}'{hint}; allowed: {', '.join(known)}, or your own as {own}"
 
 
 def _pure_ncc(options: VttOptions) -> TargetTracker:
@@ -27,93 +119,71 @@ def _pure_ncc(options: VttOptions) -> TargetTracker:
     return VisualTargetTracker(replace(options, scale=PURE_NCC.scale, roll=PURE_NCC.roll, affine=PURE_NCC.affine))
 
 
-#: How each target tracker is made from its options; a user's own class is made without arguments.
-TRACKERS: Mapping[str, Callable[[VttOptions], TargetTracker]] = {
-    "vtt": VisualTargetTracker,
-    "pure-ncc": _pure_ncc,
-    "lucas-kanade": lucas_kanade_tracker,
-}
+VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
+    name="velocity",
+    what="velocity estimator",
+    methods=("estimate",),
+    shipped={
+        "dimes": DimesEstimator,
+        "phase-correlation": lambda _: PhaseCorrelationEstimator(),
+        "homography": lambda _: HomographyEstimator(),
+    },
+    executable=ExecutableVelocityEstimator,
+)
 
-#: How each estimator of landing sites is made from its options; a user's own class is made without arguments.
-SITE_ESTIMATORS: Mapping[str, Callable[[HdaOptions], SiteEstimator]] = {
-    "hda": HdaEstimator,
-    "essential-matrix": EssentialMatrixEstimator,
-    "semi-global": SemiGlobalEstimator,
-}
+TRACKING: Task[TargetTracker, VttOptions] = Task(
+    name="tracking",
+    what="target tracker",
+    methods=("designate", "aim", "update", "clear", "state"),
+    shipped={"vtt": VisualTargetTracker, "pure-ncc": _pure_ncc, "lucas-kanade": lucas_kanade_tracker},
+    executable=None,
+)
+
+LANDING: Task[SiteEstimator, HdaOptions] = Task(
+    name="landing",
+    what="estimator of landing sites",
+    methods=("estimate",),
+    shipped={"hda": HdaEstimator, "essential-matrix": EssentialMatrixEstimator, "semi-global": SemiGlobalEstimator},
+    executable=ExecutableSiteEstimator,
+)
+
+TASKS: Mapping[str, Task[Any, Any]] = {task.name: task for task in (VELOCITY, TRACKING, LANDING)}
 
 
-def velocity_estimator(name: str, dimes: DimesOptions) -> VelocityEstimator:
-    """The estimator of a name, or of a path ``module:Class`` to a class that implements `VelocityEstimator`.
+@cache
+def installed() -> Mapping[str, EntryPoint]:
+    """Algorithms that installed packages name, in the order of their names."""
+    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
 
-    Raises ValueError where there is none.
+
+def check_chosen(task: Task[Any, Any], specs: Sequence[str]) -> None:
+    """Raises ValueError where one of several algorithms is not there, or one is named twice."""
+    for place, spec in enumerate(specs):
+        task.check(spec)
+        if spec in specs[:place]:
+            raise ValueError(f"the algorithm '{spec}' is named twice")
+
+
+def labels(specs: Sequence[str]) -> tuple[str, ...]:
+    """Short names of algorithms, told apart: what stands before the point in the columns of a row.
+
+    >>> labels(["dimes", "phase-correlation", "mypkg.velocity:Estimator", "exec:./mine --fast", "exec:./mine"])
+    ('dimes', 'phase_correlation', 'Estimator', 'mine', 'mine_2')
     """
-    check_estimator(name)
-    kind = _class_at(ESTIMATORS.get(name, name))
-    estimator: VelocityEstimator = DimesEstimator(dimes) if kind is DimesEstimator else kind()
-    return estimator
+    given: list[str] = []
+    for spec in specs:
+        short = _short(spec)
+        number, label = 1, short
+        while label in given:
+            number += 1
+            label = f"{short}_{number}"
+        given.append(label)
+    return tuple(given)
 
 
-def target_tracker(name: str, options: VttOptions) -> TargetTracker:
-    """The tracker of a name, or of a path ``module:Class`` to a class that implements `TargetTracker`.
-
-    Raises ValueError where there is none.
-    """
-    check_tracker(name)
-    if name in TRACKERS:
-        return TRACKERS[name](options)
-    tracker: TargetTracker = _class_at(name)()
-    return tracker
-
-
-def site_estimator(name: str, options: HdaOptions) -> SiteEstimator:
-    """The estimator of a name, or of a path ``module:Class`` to a class that implements `SiteEstimator`.
-
-    Raises ValueError where there is none.
-    """
-    check_site_estimator(name)
-    if name in SITE_ESTIMATORS:
-        return SITE_ESTIMATORS[name](options)
-    estimator: SiteEstimator = _class_at(name)()
-    return estimator
-
-
-def check_estimator(name: str) -> None:
-    """Raises ValueError where there is no velocity estimator of this name; the message says what is allowed."""
-    _check_known(name, ESTIMATORS)
-    path = ESTIMATORS.get(name, name)
-    if not hasattr(_class_at(path), "estimate"):
-        raise ValueError(f"'{path}' is no velocity estimator: it has no method 'estimate'")
-
-
-def check_tracker(name: str) -> None:
-    """Raises ValueError where there is no target tracker of this name; the message says what is allowed."""
-    _check_known(name, TRACKERS)
-    if name in TRACKERS:
-        return
-    missing = [part for part in ("designate", "aim", "update", "clear", "state") if not hasattr(_class_at(name), part)]
-    if missing:
-        raise ValueError(f"'{name}' is no target tracker: it has no {', '.join(missing)}")
-
-
-def check_site_estimator(name: str) -> None:
-    """Raises ValueError where there is no estimator of landing sites of this name; the message says what is allowed."""
-    _check_known(name, SITE_ESTIMATORS)
-    if name not in SITE_ESTIMATORS and not hasattr(_class_at(name), "estimate"):
-        raise ValueError(f"'{name}' is no estimator of landing sites: it has no method 'estimate'")
-
-
-def _check_known(name: str, known: Mapping[str, Any]) -> None:
-    if ":" in name or name in known:
-        return
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f" (did you mean '{near[0]}'?)" if near else ""
-    allowed = ", ".join(known)
-    raise ValueError(f"unknown algorithm '{name}'{hint}; allowed: {allowed}, or your own as 'module:Class'")
-
-
-def _class_at(path: str) -> Any:
-    module, _, kind = path.partition(":")
-    try:
-        return getattr(importlib.import_module(module), kind)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"no algorithm at '{path}': {error}") from error
+def _short(spec: str) -> str:
+    """The last part of a name, as an identifier."""
+    program = re.match(r"(?:exec|serve):\s*(\S+)", spec)
+    last = Path(program[1]).stem if program else spec.rpartition(":")[2]
+    label = re.sub(r"\W", "_", last, flags=re.ASCII)
+    return label if label[:1].isalpha() else f"a_{label}"

@@ -4,14 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from pydantic import BaseModel
 
 from sim.streams import Streams
 
+if TYPE_CHECKING:
+    from scenarios.estimators import Task
+
 #: A value that can stand in a column of the results.
 Scalar = float | int | str | bool
+
+
+@dataclass(frozen=True)
+class Failure:
+    """How the algorithm under test failed to answer, where it did no more than that: the case itself is whole.
+
+    Attributes
+    ----------
+    outcome
+        A name of `algorithms.faults.Fault`.
+    error, trace
+        What is stored as `error` and `traceback`.
+    """
+
+    outcome: str
+    error: str
+    trace: str
 
 
 @dataclass(frozen=True)
@@ -21,7 +41,7 @@ class CaseResult:
     Attributes
     ----------
     outcome
-        The name of the outcome: a member of the estimate's enumeration.
+        The name of the outcome: a member of the estimate's enumeration, or the failure's.
     answered
         Whether the algorithm under test reported an answer (the population `valid` of requirements).
     row
@@ -29,12 +49,15 @@ class CaseResult:
         from the simulated objects. Columns that may differ between two runs of one case have `time` in their name.
     products
         Arrays and texts from which the case's figures are drawn; kept only for cases that the campaign retains.
+    failure
+        How the algorithm under test failed to answer; None where it did not.
     """
 
     outcome: str
     answered: bool
     row: Mapping[str, Scalar]
     products: Mapping[str, Any] = field(default_factory=dict)
+    failure: Failure | None = None
 
 
 class Scenario(Protocol):
@@ -60,4 +83,23 @@ class Scenario(Protocol):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Runs one case with its parameters (dispersions already drawn into them) and its random streams."""
+        ...
+
+
+@runtime_checkable
+class TakesAlgorithms(Protocol):
+    """A scenario whose algorithms under test a campaign chooses.
+
+    Among its parameters are `algorithm` (the one that is judged), `compared` (further ones, run on the same case) and
+    `executable` (limits of those that are programs).
+    """
+
+    @property
+    def task(self) -> Task[Any, Any]:
+        """What the algorithms do."""
+        ...
+
+    @property
+    def algorithm_table(self) -> tuple[str, ...]:
+        """The table in the parameters that holds the three; empty where they stand at its top."""
         ...

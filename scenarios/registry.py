@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import difflib
-import importlib
 from collections.abc import Mapping
 from typing import cast
 
+from scenarios.dotted import found_at
 from scenarios.interface import Scenario
 
 #: Where each scenario's class is found; imported only when asked for.
@@ -49,10 +49,9 @@ def scenario(name: str) -> Scenario:
 
 def _from_path(path: str) -> Scenario:
     """An instance of the class at ``module:Class``."""
-    module_name, _, class_name = path.partition(":")
     try:
-        found = getattr(importlib.import_module(module_name), class_name)
-    except (ImportError, AttributeError, ValueError) as error:
+        found = found_at(path)
+    except ImportError as error:
         raise UnknownScenarioError(f"no scenario at '{path}': {error}") from error
     missing = [part for part in ("parameters_type", "shared_inputs", "prepare", "run") if not hasattr(found, part)]
     if missing:

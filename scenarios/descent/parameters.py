@@ -8,8 +8,9 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from algorithms.dimes import DimesOptions
+from scenarios.chosen import ChosenAlgorithms
 from scenarios.descent.faults import Faults
-from scenarios.estimators import check_estimator
+from scenarios.estimators import VELOCITY
 from sim.dynamics import SwingParameters
 from sim.render.backend import Backend, default_backend
 from sim.sensor import (
@@ -126,7 +127,7 @@ class RenderParameters(BaseModel):
     )
 
 
-class DescentScenarioParameters(BaseModel):
+class DescentScenarioParameters(ChosenAlgorithms):
     """Everything that a descent campaign may set or disperse.
 
     With a `site`, the keys that the table `terrain` sets are changes of the site's own terrain, and light, gravity,
@@ -135,6 +136,8 @@ class DescentScenarioParameters(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    task = VELOCITY
 
     site: Annotated[str | None, Field(description="preset of terrain, light and gravity; none: a plain terrain")] = None
     terrain_site: Annotated[
@@ -148,7 +151,7 @@ class DescentScenarioParameters(BaseModel):
     camera: CameraParameters = CameraParameters()
     faults: Faults = Faults()
     algorithm: Annotated[
-        str, Field(description="estimator under test: dimes, phase-correlation, homography, or your own 'module:Class'")
+        str, Field(description="estimator under test: dimes, phase-correlation, homography, or your own")
     ] = "dimes"
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
     detector: DetectorChoice = DetectorParameters()
@@ -166,12 +169,6 @@ class DescentScenarioParameters(BaseModel):
     def _site_has_a_terrain(cls, name: str | None) -> str | None:
         if name is not None and name not in descent_sites():
             raise ValueError(f"no site for a descent is called '{name}'; allowed: {', '.join(descent_sites())}")
-        return name
-
-    @field_validator("algorithm")
-    @classmethod
-    def _algorithm_is_there(cls, name: str) -> str:
-        check_estimator(name)
         return name
 
     @model_validator(mode="before")

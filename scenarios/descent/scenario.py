@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
-
 from pydantic import BaseModel
 
+from algorithms.answers import checked_velocity
 from scenarios.descent.exposure import expose
 from scenarios.descent.faults import faulty_detector
-from scenarios.descent.flight import flown_descent, picture_states
+from scenarios.descent.flight import flown_descent, mean_velocities, picture_states
 from scenarios.descent.landing import touchdown
 from scenarios.descent.measurement import Instruments, measure
 from scenarios.descent.optics import camera_optics
@@ -22,11 +21,12 @@ from scenarios.descent.score import (
     landing_row,
     products,
     provenance,
-    score,
 )
 from scenarios.descent.world import World
-from scenarios.estimators import velocity_estimator
+from scenarios.estimators import VELOCITY
 from scenarios.interface import CaseResult
+from scenarios.trial import Judged, attempted, case_result
+from scenarios.velocity import consistency_row, velocity_row
 from sim.sensor import Detector
 from sim.streams import Streams
 from sim.terrain import TerrainBank
@@ -37,6 +37,8 @@ class DescentScenario:
 
     name = "descent"
     parameters_type = DescentScenarioParameters
+    task = VELOCITY
+    algorithm_table = ()
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains."""
@@ -60,38 +62,48 @@ class DescentScenario:
         pictures = expose(p, world, states, optics, detector, streams)
         instruments = Instruments.drawn(p, world, descent, streams)
         measurements = measure(p, world, descent, pictures, detector, instruments, streams)
-        started = time.process_time()
-        estimate = velocity_estimator(p.algorithm, p.dimes).estimate(measurements)
-        taken = time.process_time() - started
-        carried = carried_to_firing(estimate, measurements, instruments, at_firing.time_s)
-        landed = touchdown(
-            p.landing,
-            at_firing.velocity_m_s[:2],
-            carried,
-            at_firing.time_s - states[-1].time_s,
-            streams.generator("landing"),
-        )
         camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
         places = room(states, world.surface, camera, detector.calibration, world.sun.direction, p.dimes)
-        row = {
-            **score(estimate, states, carried, at_firing),
+        conditions_row = {
             "room": min(places) > 0,
             "room_first_pair": places[0],
             "room_second_pair": places[1],
             **conditions(p, world, states, at_firing),
             **instrument_conditions(instruments),
             **instrument_errors(world, states, measurements),
-            **landing_row(landed),
-            "estimation_time_s": taken,
             **{f"descent_{name}": value for name, value in descent.parameters.model_dump().items()},
             **provenance(p, pictures),
         }
-        return CaseResult(
-            outcome=estimate.outcome.name,
-            answered=estimate.velocity_m_s is not None,
-            row=row,
-            products=products(pictures, estimate, states),
-        )
+
+        def judge(algorithm: str) -> Judged:
+            attempt = attempted(
+                lambda: VELOCITY.make(algorithm, p.dimes, p.executable).estimate(measurements), checked_velocity
+            )
+            estimate = attempt.answer
+            velocity = None if estimate is None else estimate.velocity_m_s
+            carried = carried_to_firing(velocity, measurements, instruments, at_firing.time_s)
+            landed = touchdown(
+                p.landing,
+                at_firing.velocity_m_s[:2],
+                carried,
+                at_firing.time_s - states[-1].time_s,
+                streams.generator("landing"),
+            )
+            return Judged(
+                outcome=attempt.outcome(lambda answer: answer.outcome.name),
+                answered=velocity is not None,
+                row={
+                    **velocity_row("velocity", velocity, mean_velocities(states)[1, :2]),
+                    **consistency_row(estimate, mean_velocities(states)[1, :2]),
+                    **velocity_row("firing_velocity", carried, at_firing.velocity_m_s[:2]),
+                    **landing_row(landed),
+                    **attempt.row,
+                },
+                products=products(pictures, estimate, states),
+                failure=attempt.failure,
+            )
+
+        return case_result(p.algorithms, judge, conditions_row)
 
 
 def _checked(parameters: BaseModel) -> DescentScenarioParameters:

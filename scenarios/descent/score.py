@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from algorithms.dimes import DimesDetails, dimes_products, propagated
+from algorithms.dimes import propagated
 from algorithms.dimes.binning import altitudes_at_images
 from algorithms.interface import VelocityEstimate
 from scenarios.descent.flight import PICTURES, mean_velocities, off_nadir_deg
@@ -17,6 +17,7 @@ from scenarios.descent.measurement import Instruments
 from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.descent.world import World
 from scenarios.interface import Scalar
+from scenarios.velocity import velocity_products
 from sim.dynamics import State
 from sim.measurements import DescentMeasurements
 from sim.processor import processor_features
@@ -28,36 +29,13 @@ Horizontal = Float64[np.ndarray, "2"]
 
 
 def carried_to_firing(
-    estimate: VelocityEstimate, measurements: DescentMeasurements, instruments: Instruments, firing_s: float
+    velocity: Horizontal | None, measurements: DescentMeasurements, instruments: Instruments, firing_s: float
 ) -> Horizontal | None:
     """The reported velocity, carried on to the thrusters' firing by the inertial unit; None where none was reported."""
-    if estimate.velocity_m_s is None:
+    if velocity is None:
         return None
     now = instruments.navigation.velocity(np.array([firing_s]))[0]
-    return propagated(estimate.velocity_m_s, measurements.interval_velocities_m_s[1, :2], now[:2])
-
-
-def score(
-    estimate: VelocityEstimate, states: Sequence[State], carried: Horizontal | None, at_firing: State
-) -> dict[str, Scalar]:
-    """Errors of the velocity that was reported, and of what the inertial unit made of it by the thrusters' firing.
-
-    The reported one is held against the true mean velocity of the camera between the second and third picture, the
-    carried one against the camera's true velocity when the thrusters fire.
-    """
-    return {
-        **_errors("velocity", estimate.velocity_m_s, mean_velocities(states)[1, :2]),
-        **_errors("firing_velocity", carried, at_firing.velocity_m_s[:2]),
-    }
-
-
-def _errors(name: str, estimated: Horizontal | None, true: Horizontal) -> dict[str, Scalar]:
-    given = np.full(2, np.nan) if estimated is None else estimated
-    error = given - true
-    row: dict[str, Scalar] = {f"{name}_error_m_s": float(np.hypot(*error))}
-    for kind, values in (("error", error), ("estimated", given), ("true", true)):
-        row |= {f"{name}_{kind}_{axis}_m_s": float(value) for axis, value in zip("xy", values, strict=True)}
-    return row
+    return propagated(velocity, measurements.interval_velocities_m_s[1, :2], now[:2])
 
 
 def conditions(
@@ -159,12 +137,6 @@ def provenance(p: DescentScenarioParameters, pictures: Pictures) -> dict[str, Sc
     }
 
 
-def products(pictures: Pictures, estimate: VelocityEstimate, states: Sequence[State]) -> dict[str, object]:
+def products(pictures: Pictures, estimate: VelocityEstimate | None, states: Sequence[State]) -> dict[str, object]:
     """Arrays from which the case's figures are drawn."""
-    kept: dict[str, object] = {f"image_{number}": counts for number, counts in enumerate(pictures, start=1)}
-    if isinstance(estimate.details, DimesDetails):
-        kept.update(dimes_products(estimate.details))
-    kept["velocity_true_m_s"] = mean_velocities(states)[1, :2]
-    if estimate.velocity_m_s is not None:
-        kept["velocity_estimated_m_s"] = estimate.velocity_m_s
-    return kept
+    return velocity_products(pictures, estimate, mean_velocities(states)[1, :2])

@@ -9,8 +9,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from algorithms.hda import HdaOptions, TrackSeed
+from scenarios.chosen import ChosenAlgorithms
 from scenarios.descent.parameters import Place, RenderParameters, SunParameters
-from scenarios.estimators import check_site_estimator
+from scenarios.estimators import LANDING
 from scenarios.landing.faults import Faults
 from scenarios.landing.helicopter import HelicopterParameters
 from scenarios.landing.pair_choice import PairParameters
@@ -84,11 +85,13 @@ class LanderParameters(_Parameters):
         return Limits(self.diameter_m, float(np.radians(self.max_slope_deg)), self.max_roughness_m)
 
 
-class LandingScenarioParameters(_Parameters):
+class LandingScenarioParameters(ChosenAlgorithms):
     """Everything that a campaign of landings may set or disperse.
 
     The keys that the table `terrain` sets are changes of the site's own terrain at the stated scale.
     """
+
+    task = LANDING
 
     site: Annotated[str, Field(description="preset of terrain, light, texture and rocks")] = "heli-hazardous"
     scale: Annotated[Literal["ground", "descent"], Field(description="which of the site's terrains")] = "ground"
@@ -122,7 +125,7 @@ class LandingScenarioParameters(_Parameters):
     lander: LanderParameters = LanderParameters()
     faults: Faults = Faults()
     algorithm: Annotated[
-        str, Field(description="estimator under test: hda, essential-matrix, semi-global, or your own 'module:Class'")
+        str, Field(description="estimator under test: hda, essential-matrix, semi-global, or your own")
     ] = "hda"
     hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions(
         track_seed=TrackSeed.POSE
@@ -142,12 +145,6 @@ class LandingScenarioParameters(_Parameters):
         down = [known for known in PRESETS if preset(known).design.down]
         if name not in down:
             raise ValueError(f"no camera preset that looks down is called '{name}'; allowed: {', '.join(down)}")
-        return name
-
-    @field_validator("algorithm")
-    @classmethod
-    def _algorithm_is_there(cls, name: str) -> str:
-        check_site_estimator(name)
         return name
 
     @model_validator(mode="before")

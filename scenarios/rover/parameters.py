@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from algorithms.vtt import VttOptions
-from scenarios.estimators import check_tracker
+from scenarios.chosen import ChosenAlgorithms
+from scenarios.estimators import TRACKING
 from sim.dynamics import SlipParameters
 from sim.render import CloudParameters
 from sim.render.backend import Backend, default_backend
@@ -230,8 +231,10 @@ class ScoreParameters(_Parameters):
     ] = 0
 
 
-class RoverScenarioParameters(_Parameters):
+class RoverScenarioParameters(ChosenAlgorithms):
     """Everything that a campaign of the rover scenario may set or disperse."""
+
+    task = TRACKING
 
     world: WorldParameters = WorldParameters()
     target: TargetParameters = TargetParameters()
@@ -265,9 +268,3 @@ class RoverScenarioParameters(_Parameters):
     def bearing_rad(self) -> float:
         """Direction from the target to the start, clockwise from north."""
         return float(np.radians(self.start.bearing_deg + self.world.incline.oblique_deg))
-
-    @field_validator("algorithm")
-    @classmethod
-    def _algorithm_is_there(cls, name: str) -> str:
-        check_tracker(name)
-        return name

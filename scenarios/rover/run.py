@@ -11,7 +11,7 @@ import numpy as np
 from algorithms.interface import MastAim, TargetTracker, TrackingState
 from algorithms.navigation import NavigationOutcome
 from algorithms.vtt import GoalReached, HandOffOutcome, hand_off
-from scenarios.estimators import target_tracker
+from scenarios.estimators import TRACKING
 from scenarios.rover.mapping import Mapper
 from scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from scenarios.rover.pictures import Detectors, Photographer, sunlight_of_preset
@@ -78,7 +78,7 @@ def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
         p.exposure,
         streams.generator("detector noise"),
     )
-    tracker = target_tracker(p.algorithm, p.vtt)
+    tracker = TRACKING.make(p.algorithm, p.vtt, p.executable)
     tracker.designate(target.designation, vehicle.estimated)
     run = Run(world, rig, vehicle, target)
     loop = _Loop(p, run, tracker, photographer)

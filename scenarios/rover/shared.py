@@ -22,7 +22,7 @@ from scipy.spatial.transform import RigidTransform
 from algorithms.interface import PixelBox, TrackingState
 from algorithms.vtt import VttOptions
 from algorithms.vtt.pointing import box_around, mast_angles
-from scenarios.estimators import target_tracker
+from scenarios.estimators import TRACKING
 from scenarios.interface import CaseResult, Scalar
 from scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from scenarios.rover.pictures import Detectors, Photographer, StereoPictures, sunlight_of_preset
@@ -115,6 +115,7 @@ class SharedDriveParameters(_Parameters):
                 "target": p.target.model_copy(update=target),
                 "sun": p.sun.model_copy(update=sun),
                 "algorithm": "vtt",
+                "compared": (),
                 "vtt": VttOptions(),
             }
         )
@@ -226,7 +227,7 @@ def tracked(p: SharedDriveParameters, drive: SharedDrive) -> Run:
     point, on_edge, lit = point_on(drive.world, eye, chosen.across, chosen.up, drive.rig.pixel_rad, p.drive.vtt)
     told = told_by_pixel(drive.rig.left, first.world_from_head, point, first.angles_rad)
     run = Run(drive.world, drive.rig, drive.vehicle, rock_of(drive.world, point, told, on_edge, lit))
-    tracker = target_tracker(p.drive.algorithm, p.drive.vtt)
+    tracker = TRACKING.make(p.drive.algorithm, p.drive.vtt, p.drive.executable)
     tracker.designate(told, first.estimated)
     for view in drive.views[:: p.skip + 1]:
         pictures = view.pictures

@@ -1,0 +1,96 @@
+"""Holds what an algorithm answers against the interface: right types, finite numbers, an answer where one is claimed.
+
+What a user's own class or program returns is not to be trusted: a velocity of NaN that is called VALID would otherwise
+be scored as if it were none.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from algorithms.faults import AlgorithmError, Fault
+from algorithms.interface import SiteEstimate, SiteOutcome, TargetUpdate, TrackingState, VelocityEstimate
+from algorithms.interface import VelocityOutcome as Outcome
+
+#: Share of its largest variance by which a covariance may be off symmetry.
+_ROUNDING = 1e-9
+
+
+def checked_velocity(answer: object) -> VelocityEstimate:
+    """The answer, if it is a valid `VelocityEstimate`.
+
+    Raises
+    ------
+    AlgorithmError
+        BAD_ANSWER, and what is wrong with it.
+    """
+    if not isinstance(answer, VelocityEstimate):
+        raise _bad(f"the answer is a {_kind(answer)}; allowed: a VelocityEstimate")
+    if not isinstance(answer.outcome, Outcome):
+        raise _bad(f"outcome is a {_kind(answer.outcome)}; allowed: a VelocityOutcome")
+    if (answer.outcome is Outcome.VALID) != (answer.velocity_m_s is not None):
+        given = "none is given" if answer.velocity_m_s is None else "one is given"
+        raise _bad(f"outcome is {answer.outcome.name}, but of velocity_m_s {given}; allowed: one with VALID alone")
+    if answer.velocity_m_s is not None:
+        _check_numbers("velocity_m_s", answer.velocity_m_s, (2,))
+    if answer.covariance_m2_s2 is not None:
+        if answer.velocity_m_s is None:
+            raise _bad("covariance_m2_s2 is given without a velocity")
+        _check_numbers("covariance_m2_s2", answer.covariance_m2_s2, (2, 2))
+        _check_covariance(answer.covariance_m2_s2)
+    return answer
+
+
+def checked_site(answer: object) -> SiteEstimate:
+    """The answer, if it is a valid `SiteEstimate`; raises as `checked_velocity`."""
+    if not isinstance(answer, SiteEstimate):
+        raise _bad(f"the answer is a {_kind(answer)}; allowed: a SiteEstimate")
+    if not isinstance(answer.outcome, SiteOutcome):
+        raise _bad(f"outcome is a {_kind(answer.outcome)}; allowed: a SiteOutcome")
+    if (answer.outcome is SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
+        given = "none is given" if answer.site_world is None else "one is given"
+        raise _bad(f"outcome is {answer.outcome.name}, but site_world: {given}; allowed: none with NO_SAFE_SITE only")
+    if answer.site_world is not None:
+        _check_numbers("site_world", answer.site_world, (3,))
+    return answer
+
+
+def checked_update(answer: object) -> TargetUpdate:
+    """The answer, if it is a valid `TargetUpdate`; raises as `checked_velocity`."""
+    if not isinstance(answer, TargetUpdate):
+        raise _bad(f"the answer is a {_kind(answer)}; allowed: a TargetUpdate")
+    if not isinstance(answer.state, TrackingState):
+        raise _bad(f"state is a {_kind(answer.state)}; allowed: a TrackingState")
+    if answer.found and answer.position_rover is None:
+        raise _bad("state is NORMAL, but position_rover is None")
+    if answer.position_rover is not None:
+        _check_numbers("position_rover", answer.position_rover, (3,))
+    return answer
+
+
+def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> None:
+    if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+        kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {_kind(value)}"
+        raise _bad(f"{name} is {kind}; allowed: a NumPy array of floats, shape {shape}")
+    if value.shape != shape:
+        raise _bad(f"{name} has the shape {value.shape}; allowed: {shape}")
+    if not np.all(np.isfinite(value)):
+        raise _bad(f"{name} is not finite: {value.tolist()}")
+
+
+def _check_covariance(matrix: np.ndarray) -> None:
+    scale = float(np.abs(matrix).max())
+    if not np.allclose(matrix, matrix.T, rtol=0.0, atol=_ROUNDING * scale):
+        raise _bad(f"covariance_m2_s2 is not symmetric: {matrix.tolist()}")
+    if scale == 0.0 or float(np.linalg.eigvalsh(matrix)[0]) <= 0.0:
+        raise _bad(f"covariance_m2_s2 is not positive definite: {matrix.tolist()}")
+
+
+def _bad(message: str) -> AlgorithmError:
+    return AlgorithmError(Fault.BAD_ANSWER, message)
+
+
+def _kind(value: object) -> str:
+    return type(value).__name__

@@ -1,0 +1,193 @@
+"""One case as files: pictures as 16-bit PGM or PNG, cameras as `.cahvor`, all else in `case.json`.
+
+What is written is read back as it was: counts and the flat field bit for bit, numbers too (JSON carries the shortest
+text that gives the same float64), attitudes to within rounding of a quaternion's norm.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt16
+from scipy.spatial.transform import Rotation
+
+from sim.camera import read_cahvor, write_cahvor
+from sim.frames import rigid
+from sim.measurements import (
+    AltitudeMeasurement,
+    AttitudeMeasurement,
+    DescentMeasurements,
+    DetectorCalibration,
+    DetectorImage,
+    LandingMeasurements,
+    PoseMeasurement,
+)
+
+#: Version of the exchange: of `case.json`, of the answer, and of the lines of a persistent process.
+EXCHANGE = 1
+
+CASE_FILE = "case.json"
+
+#: Form in which pictures are written.
+Pictures = Literal["pgm", "png"]
+
+
+def write_case(
+    folder: Path, measurements: DescentMeasurements | LandingMeasurements, pictures: Pictures = "pgm"
+) -> None:
+    """Writes what instruments delivered into a folder that is there. Raises OSError where that fails."""
+    told = _descent(measurements) if isinstance(measurements, DescentMeasurements) else _landing(measurements)
+    images = _write_images(folder, measurements.images, pictures)
+    outline = {"exchange": EXCHANGE, **told, "images": images}
+    (folder / CASE_FILE).write_text(json.dumps(outline, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
+    """Reads what `write_case` wrote.
+
+    Raises
+    ------
+    ValueError
+        Where the folder holds no case, or one of another version.
+    """
+    path = folder / CASE_FILE
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        if told["exchange"] != EXCHANGE:
+            raise ValueError(f"it has version {told['exchange']} of the exchange; this program reads {EXCHANGE}")
+        images = [_read_image(folder, one) for one in told["images"]]
+        return _read_descent(told, images) if told["task"] == "velocity" else _read_landing(told, images)
+    except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
+        raise ValueError(f"{path} is no case: {error}") from error
+
+
+def _descent(measurements: DescentMeasurements) -> dict[str, Any]:
+    return {
+        "task": "velocity",
+        "attitudes": [
+            {"world_from_body_xyzw": one.world_from_body.as_quat().tolist(), "time_s": one.time_s}
+            for one in measurements.attitudes
+        ],
+        "altitudes": [{"altitude_m": one.altitude_m, "time_s": one.time_s} for one in measurements.altitudes],
+        "interval_velocities_m_s": measurements.interval_velocities_m_s.tolist(),
+        "sun_direction": measurements.sun_direction.tolist(),
+    }
+
+
+def _read_descent(told: Mapping[str, Any], images: Sequence[DetectorImage]) -> DescentMeasurements:
+    attitudes = [
+        AttitudeMeasurement(Rotation.from_quat(one["world_from_body_xyzw"]), one["time_s"]) for one in told["attitudes"]
+    ]
+    altitudes = [AltitudeMeasurement(one["altitude_m"], one["time_s"]) for one in told["altitudes"]]
+    return DescentMeasurements(
+        images=(images[0], images[1], images[2]),
+        attitudes=(attitudes[0], attitudes[1], attitudes[2]),
+        altitudes=(altitudes[0], altitudes[1], altitudes[2]),
+        interval_velocities_m_s=np.array(told["interval_velocities_m_s"], dtype=np.float64),
+        sun_direction=np.array(told["sun_direction"], dtype=np.float64),
+    )
+
+
+def _landing(measurements: LandingMeasurements) -> dict[str, Any]:
+    known = math.isfinite(measurements.slant_range_m)
+    return {
+        "task": "landing",
+        "poses": [
+            {
+                "position_world_m": np.asarray(one.world_from_body.translation).tolist(),
+                "world_from_body_xyzw": one.world_from_body.rotation.as_quat().tolist(),
+                "time_s": one.time_s,
+            }
+            for one in measurements.poses
+        ],
+        "slant_range_m": measurements.slant_range_m if known else None,
+        "up_body": measurements.up_body.tolist(),
+        "apriori_site_world": measurements.apriori_site_world.tolist(),
+    }
+
+
+def _read_landing(told: Mapping[str, Any], images: Sequence[DetectorImage]) -> LandingMeasurements:
+    poses = [
+        PoseMeasurement(
+            rigid(Rotation.from_quat(one["world_from_body_xyzw"]), np.array(one["position_world_m"])), one["time_s"]
+        )
+        for one in told["poses"]
+    ]
+    range_m = told["slant_range_m"]
+    return LandingMeasurements(
+        images=(images[0], images[1]),
+        poses=(poses[0], poses[1]),
+        slant_range_m=math.nan if range_m is None else range_m,
+        up_body=np.array(told["up_body"], dtype=np.float64),
+        apriori_site_world=np.array(told["apriori_site_world"], dtype=np.float64),
+    )
+
+
+def _write_images(folder: Path, images: Sequence[DetectorImage], pictures: Pictures) -> list[dict[str, Any]]:
+    """Writes pictures, cameras and flat fields; a flat field that several pictures share is written once."""
+    written: list[dict[str, Any]] = []
+    fields: list[tuple[str, Float[np.ndarray, "rows columns"]]] = []
+    for number, image in enumerate(images, start=1):
+        name, camera, known = f"image_{number}.{pictures}", f"camera_{number}.cahvor", image.calibration
+        write_picture(folder / name, image.counts)
+        write_cahvor(image.camera, folder / camera)
+        flat = next((path for path, one in fields if np.array_equal(one, known.flat_field)), None)
+        if flat is None:
+            flat = f"flat_field_{len(fields) + 1}.f64"
+            fields.append((flat, known.flat_field))
+            known.flat_field.astype("<f8").tofile(folder / flat)
+        rows, columns = image.counts.shape
+        calibration = {
+            "flat_field": flat,
+            "exposure_s": known.exposure_s,
+            "transfer_row_s": known.transfer_row_s,
+            "clear_row_s": known.clear_row_s,
+            "rows_summed": known.rows_summed,
+            "offset_dn": known.offset_dn,
+            "full_scale_dn": known.full_scale_dn,
+        }
+        size = {"columns": columns, "rows": rows}
+        written.append({"file": name, "camera": camera, "time_s": image.time_s, **size, "calibration": calibration})
+    return written
+
+
+def _read_image(folder: Path, told: Mapping[str, Any]) -> DetectorImage:
+    known, shape = told["calibration"], (told["rows"], told["columns"])
+    flat = np.fromfile(folder / known["flat_field"], dtype="<f8").reshape(shape)
+    return DetectorImage(
+        counts=read_picture(folder / told["file"]),
+        time_s=told["time_s"],
+        camera=read_cahvor(folder / told["camera"]),
+        calibration=DetectorCalibration(
+            flat_field=flat.astype(np.float64),
+            exposure_s=known["exposure_s"],
+            transfer_row_s=known["transfer_row_s"],
+            clear_row_s=known["clear_row_s"],
+            rows_summed=known["rows_summed"],
+            offset_dn=known["offset_dn"],
+            full_scale_dn=known["full_scale_dn"],
+        ),
+    )
+
+
+def write_picture(path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> None:
+    """Writes counts as they are: `.pgm` (P5, two bytes a pixel, the more significant first) or `.png` (16 bits)."""
+    if path.suffix == ".pgm":
+        rows, columns = counts.shape
+        path.write_bytes(b"P5\n%d %d\n65535\n" % (columns, rows) + counts.astype(">u2").tobytes())
+    elif not cv2.imwrite(str(path), counts):
+        raise OSError(f"{path} cannot be written")
+
+
+def read_picture(path: Path) -> UInt16[np.ndarray, "rows columns"]:
+    """Reads what `write_picture` wrote. Raises ValueError where it is no picture of 16 bits."""
+    counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if counts is None or counts.dtype != np.uint16 or counts.ndim != 2:
+        raise ValueError(f"{path} is no picture of one band with 16 bits")
+    return np.asarray(counts, dtype=np.uint16)
