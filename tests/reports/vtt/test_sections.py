@@ -1,0 +1,217 @@
+"""Sections on visual target tracking: ours beside the paper's, against rows whose numbers are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from reports.campaign import FURTHER_SECTIONS
+from reports.vtt.beside import CHECKOUT_3, PAPER, TABLE_IV, beside_section
+from reports.vtt.goal import camera_runs, goal_section, losses_grid
+from reports.vtt.kinds import REGRESSION, TABLE_II, TERRAINS, regression_section, terrains_section
+from reports.vtt.steps import cells, steps_section
+from reports.vtt.table_1 import measured, table_1_section
+from reports.vtt.updates import CHECKOUT_1, TABLE_III, updates_section
+from tests.reports.vtt.tracking_rows import rows, subject, table
+
+
+def test_table_1_is_computed_to_the_printed_digit() -> None:
+    computed = table(table_1_section(subject(rows(4))))
+    for printed, ours in (computed[:2], computed[2:]):
+        assert (printed.pop(""), ours.pop("")) == ("printed", "computed")
+        assert ours == printed
+    assert computed[0]["Designation (cm)"] == "9.7"
+    assert computed[2]["Approach without tracker (cm)"] == "42.0"
+
+
+def test_measured_accuracy_is_three_times_the_rms_by_camera() -> None:
+    frame = rows(8, camera=["research-navcam"] * 4 + ["research-pancam"] * 4)
+    frame.loc[:3, "designation_error_m"] = [0.0, 0.0, 0.0, 0.2]
+    frame.loc[4:, "drift_px"] = [3.0, 4.0, 5.0, 0.0]
+    navcam, pancam = measured(frame)
+    assert navcam.designation_cm == pytest.approx(300.0 * 0.1)
+    assert navcam.disparity_px == pytest.approx(0.1 / 0.388)
+    # Eq. 3: sqrt(0.1^2 + 0.05^2), root mean square.
+    assert navcam.untracked_cm == pytest.approx(300.0 * np.hypot(0.1, 0.05))
+    assert pancam.drift_px == pytest.approx(np.sqrt(12.5))
+    told = table(table_1_section(subject(frame)), 1)
+    # Navcam, 2 px of drift: sqrt(1.6^2 + 0.32^2).
+    assert told[0]["Table I, the same"] == "1.6"
+    # Runs from elsewhere, at unfit targets or not completed do not count.
+    assert measured(frame.assign(range_start_m=7.0)) == []
+    assert measured(frame.assign(selectable=False)) == []
+    assert measured(frame.assign(position_error_m=np.nan)) == []
+
+
+def _shared(skips: int = 5) -> pd.DataFrame:
+    """Two trackers, steps of 1 - 0.95^(n+1), ten targets each: pure NCC tracks fewer with every step."""
+    frames = []
+    for algorithm in ("vtt", "pure-ncc"):
+        for skip in range(skips):
+            tracked = np.arange(10) < (10 if algorithm == "vtt" else 8 - skip)
+            frames.append(rows(10, algorithm=algorithm, skip=skip, step=1.0 - 0.95 ** (skip + 1), tracked=tracked))
+    return pd.concat(frames, ignore_index=True)
+
+
+def test_steps_stand_beside_fig_8() -> None:
+    frame = _shared()
+    frame.loc[0, ["selectable", "tracked", "true_track"]] = False  # a target on the edge counts for nothing
+    found = cells(subject(frame, legs=[{"motion": "approach", "step_share": 0.05}]))
+    at = {(one.line, round(one.step)): one for one in found}
+    assert (at["vtt", 5].good.hits, at["vtt", 5].good.n, at["vtt", 5].paper_percent) == (9, 9, 100.0)
+    assert (at["vtt", 5].all_targets.hits, at["vtt", 5].all_targets.n) == (9, 10)
+    assert at["vtt", 5].false_tracks.hits == 0
+    assert (at["pure-ncc", 23].good.hits, at["pure-ncc", 23].paper_percent) == (4, 15.0)
+    assert at["pure-ncc", 10].paper_percent is None
+    section = steps_section(subject(frame, legs=[{"motion": "approach"}]))
+    assert section is not None
+    assert "Fig. 8" in section.title
+
+
+def test_steps_around_and_in_place_are_degrees() -> None:
+    frame = pd.concat([rows(11, skip=k, step=5.0 * (k + 1), search_px=px) for k in range(3) for px in (200, 600)])
+    frame = frame.reset_index(drop=True)
+    around = cells(subject(frame, legs=[{"motion": "circle"}]))
+    assert [(one.line, one.step) for one in around[:3]] == [("200 px", 5.0), ("200 px", 10.0), ("200 px", 15.0)]
+    assert around[2].paper_percent == pytest.approx(100.0 * 9 / 11)
+    turned = cells(subject(frame, legs=[{"motion": "turn"}]))
+    assert {one.paper_percent for one in turned} == {None}
+    assert steps_section(subject(rows(3))) is None
+
+
+def _with_updates(numbers: int, cases: int = 3) -> pd.DataFrame:
+    frame = rows(cases)
+    for n in range(1, numbers + 1):
+        for name, value in (("range_m", 4.0), ("magnification", 1.0 + 0.01 * n), ("roll_change_deg", -2.0)):
+            frame[f"update_{n}_{name}"] = value
+        for name in ("azimuth_change_deg", "match_score", "stereo_score", "correction_px", "error_px"):
+            frame[f"update_{n}_{name}"] = 0.9
+    return frame
+
+
+def test_table_iii_stands_beside_ours() -> None:
+    frame = _with_updates(8)
+    frame.loc[0, "update_8_match_score"] = 0.5
+    told = table(updates_section(subject(frame, CHECKOUT_1)))
+    scores = next(k for k, row in enumerate(told) if row["Parameter"] == "NCC score")
+    assert (told[scores]["8"], told[scores]["1"]) == ("0.79", "–")
+    assert told[scores + 1]["8"] == "0.90 (0.50 to 0.90)"
+    rolls = next(k for k, row in enumerate(told) if row["Parameter"] == "Roll change (deg)")
+    assert told[rolls + 1]["2"] == "2.00"  # without its sign, as the paper prints it
+    other = table(updates_section(subject(frame, "another")))
+    assert other[7]["NCC score"] == "0.90 (0.50 to 0.90)"
+    assert other[7]["Roll change (deg)"] == "−2.00"
+    assert updates_section(subject(rows(3))) is None
+
+
+def test_table_iii_is_as_printed() -> None:
+    """What the paper's text says of its table holds of ours."""
+    scores = TABLE_III["match_score"].values()
+    assert (min(scores), max(scores)) == (0.79, 0.94)
+    assert (min(TABLE_III["magnification"].values()), max(TABLE_III["magnification"].values())) == (0.97, 1.04)
+    assert (min(TABLE_III["roll_change_deg"].values()), max(TABLE_III["roll_change_deg"].values())) == (0.06, 6.25)
+    # From -3.4 to 50.1 deg; the table's own changes come to as much.
+    assert sum(TABLE_III["azimuth_change_deg"].values()) == pytest.approx(53.5, abs=0.1)
+
+
+def test_facts_of_single_runs() -> None:
+    frame = rows(4, target_moved_m=[0.1, 0.2, 0.3, 0.4], tracked=[True, True, True, False])
+    told = {row[""]: row for row in table(beside_section(subject(frame, "vtt-checkout-2")))}
+    moved = told["target moved, first to last estimate (cm)"]
+    assert (moved["Paper"], moved["Ours"]) == ("36", "25.0 (10.0 to 40.0)")
+    assert told["tracked to the goal"]["Ours"] == "3 of 4: 75.00 %"
+    assert told["largest correction (px)"]["Ours"] == "–"
+    roll = rows(4, roll_compensated=[True, True, False, False], tracked=[True, True, True, False])
+    told = {row[""]: row for row in table(beside_section(subject(roll, "vtt-roll")))}
+    assert told["tracked with compensation"]["Ours"] == "2 of 2: 100 %"
+    assert beside_section(subject(frame, "another")) is None
+
+
+def test_table_iv_by_mode() -> None:
+    frame = rows(2)
+    legs = [leg for mode in TABLE_IV for leg in ([mode.legs[-1]] * mode.updates)]
+    legs[0] = -1
+    for n, leg in enumerate(legs, start=1):
+        frame[f"update_{n}_leg"], frame[f"update_{n}_time_s"] = float(leg), 60.0 * n
+    frame.loc[1, [name for name in frame if "update_27" in str(name)]] = np.nan  # ended a step early
+    told = table(beside_section(subject(frame, CHECKOUT_3)), 1)
+    assert [row["Updates, paper"] for row in told] == ["2", "7", "10", "4", "4"]
+    assert [row["Updates, ours"] for row in told[:4]] == ["2", "7", "10", "4"]
+    assert told[4]["Updates, ours"] == "4 (3 to 4)"
+    assert [row["Minutes, ours"] for row in told[:4]] == ["2.0", "7.0", "10.0", "4.0"]
+
+
+def test_table_iv_is_as_printed() -> None:
+    assert sum(mode.updates for mode in TABLE_IV) == 27
+    assert sum(mode.duration_min for mode in TABLE_IV) == 66
+
+
+def test_terrains_tell_failures_and_causes() -> None:
+    frame = rows(20, incline=["flat ground"] * 8 + ["steep incline"] * 8 + ["a ledge"] * 4)
+    frame.loc[[0, 1, 8, 9, 10], "tracked"] = False
+    frame.loc[0, ["outcome", "azimuth_change_max_deg", "losses"]] = ["LOST", 14.0, "MATCH_SCORE"]
+    frame.loc[1, ["outcome", "clear_sky"]] = ["LOST", False]
+    frame.loc[8, "outcome"] = "STUCK"
+    frame.loc[9, ["outcome", "losses"]] = ["LOST", "STEREO_SCORE"]
+    frame.loc[15, ["selectable", "tracked"]] = False
+    told = {row["Terrain"]: row for row in table(terrains_section(subject(frame, TERRAINS)))}
+    assert list(told) == ["flat ground", "steep incline", "a ledge"]
+    assert told["flat ground"]["Failures, paper"] == "1 of 11"
+    assert told["flat ground"]["Failures, ours"] == "2 of 8: 25.00 %"
+    assert told["flat ground"]["Cause, ours"] == "excessive azimuth change: 1; lighting change: 1"
+    assert told["steep incline"]["Failures, ours"] == "3 of 7: 42.86 %"
+    assert told["steep incline"]["Failures, with unfit targets"] == "4 of 8: 50.00 %"
+    assert set(told["steep incline"]["Cause, ours"].split("; ")) == {"stuck: 1", "stereo score: 1", "drift: 1"}
+    assert terrains_section(subject(frame, "another")) is None
+
+
+def test_table_ii_is_as_printed() -> None:
+    assert sum(row.trials for row in TABLE_II.values()) == 26
+    assert sum(row.failures for row in TABLE_II.values()) == 2
+
+
+def test_regression_runs_one_by_one() -> None:
+    frame = rows(4, visual_odometry=[False, True, False, False], autonav=[False, False, True, True])
+    frame = frame.assign(map_by=["none", "none", "body", "mast"], rock_height_m=[0.09, 0.09, 0.5, 0.5])
+    frame.loc[3, ["tracked", "outcome", "losses"]] = [False, "NO_PATH", "none"]
+    section = regression_section(subject(frame, REGRESSION))
+    told = [(row["Driving"], row["Rock"], row["Tracked to the goal"]) for row in table(section)]
+    assert told == [
+        ("Autonav by body cameras", "large", "1 of 1: 100 %"),
+        ("Autonav by mast cameras", "large", "0 of 1: 0 %"),
+        ("blind", "small", "1 of 1: 100 %"),
+        ("visual odometry", "small", "1 of 1: 100 %"),
+    ]
+    assert table(section, 1)[0]["Outcome"] == "NO_PATH"
+
+
+def test_goal_by_camera() -> None:
+    n = 300
+    frame = rows(2 * n, camera=["research-navcam"] * n + ["research-pancam"] * n)
+    frame.loc[: n - 1, "position_error_m"] = np.linspace(0.0, 0.0399, n)
+    frame.loc[n, ["tracked", "outcome", "position_error_m", "drift_px"]] = [False, "LOST", np.nan, np.nan]
+    frame.loc[n, ["losses", "lost_range_m"]] = ["MATCH_SCORE", 3.5]
+    frame.loc[n + 1, "true_track"] = False
+    navcam, pancam = camera_runs(frame)
+    assert navcam.within.hits == 225  # 0.0399 k / 299 stays within 3 cm up to k = 224
+    assert navcam.median_m == pytest.approx(0.01995)
+    assert navcam.quantile_bound_m > navcam.quantile_m
+    assert (pancam.completed.hits, pancam.completed.n) == (n - 1, n)
+    assert (pancam.within.hits, pancam.within.n) == (n - 1, n - 1)
+    assert pancam.false_tracks.hits == 1
+    assert np.isfinite(pancam.quantile_bound_m)
+    assert losses_grid(frame).rows == [["LOST", "match score", "1", "3.5 to 3.5", "3.0", "0"]]
+    told = table(goal_section(subject(frame)), 1)
+    assert told[1]["Median (mm)"] == "4.000"
+    few = table(goal_section(subject(frame.iloc[:20])), 1)
+    assert few[0]["Its bound (mm)"] == "n too small"
+
+
+def test_other_rows_have_no_section_of_tracking() -> None:
+    """Rows of another system hold none of its columns; rows of crashed cases alone have no numbers."""
+    ours = [make for make in FURTHER_SECTIONS if make.__module__.startswith("reports.vtt.")]
+    assert len(ours) == 7
+    descent = pd.DataFrame({"case": [0, 1], "outcome": "VALID", "answered": True, "velocity_error_m_s": 1.0})
+    for name in ("a-campaign", TERRAINS, REGRESSION, *PAPER):
+        assert [make(subject(descent, name)) for make in ours] == [None] * 7
