@@ -59,7 +59,7 @@ def take_picture(run: Run, state: State, detector: Detector, rng: np.random.Gene
     air = site(run.parameters.site).environment
     brightness = air.direct_share(float(np.arcsin(scene.sun.direction[2]))) * air.solar_irradiance
     counts = detector.expose(frame.radiance * np.float32(brightness), rng, motion)
-    return Picture(counts, frame.points_world()[::GRID_PX, ::GRID_PX])
+    return Picture(counts, frame.points_world(GRID_PX))
 
 
 def cloud_transmittances(
@@ -77,7 +77,8 @@ def sun_at(run: Run, time_s: float) -> Sun:
     return Sun(run.sun(time_s), site(run.parameters.site).environment.sun_radius_rad)
 
 
-@lru_cache(maxsize=2)
+# as many as the paper's field sites, for cases take turns among their runs
+@lru_cache(maxsize=3)
 def site_ground(site_name: str, samples: int, bank_seed: int) -> SiteGround:
     """The ground of a site."""
     preset = site(site_name)
@@ -90,9 +91,21 @@ def site_ground(site_name: str, samples: int, bank_seed: int) -> SiteGround:
 def _scene(key: RunKey, step: int) -> Scene:
     """The site around the middle of the line under the sun of a time; as many are kept as a triple has pictures."""
     run, p = worked_out(key), key.field_test
-    ground = site_ground(run.parameters.site, p.samples, p.bank_seed)
+    sun = sun_at(run, step * p.sun_step_s)
+    return replace(_first_light(key), sun=sun, photometry=_ground(key).photometry(sun))
+
+
+def _ground(key: RunKey) -> SiteGround:
+    """The ground that a run flies over."""
+    p = key.field_test
+    return site_ground(p.runs[key.number].site, p.samples, p.bank_seed)
+
+
+@lru_cache(maxsize=5)
+def _first_light(key: RunKey) -> Scene:
+    """A run's scene as it begins: what stands on the ground stays as the sun moves. Kept for each run of the paper."""
+    run, p = worked_out(key), key.field_test
     pixel_rad = float(np.median(field_optics().rays.pixel_angles))
     east, north, _ = run.flight.origin_m.tolist()
     eye = Eye(east, north, p.helicopter.lowest_m, pixel_rad)
-    scene = site_scene(ground, eye, sun_at(run, step * p.sun_step_s))
-    return replace(scene, clouds=run.clouds)
+    return replace(site_scene(_ground(key), eye, sun_at(run, 0.0)), clouds=run.clouds)

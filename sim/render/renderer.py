@@ -178,12 +178,16 @@ class Frame:
     world_from_body: RigidTransform
     rays: PixelRays
 
-    def points_world(self) -> Float64[np.ndarray, "rows columns 3"]:
-        """World point seen by each pixel, metres; NaN where it sees the sky."""
-        along = np.where(np.isfinite(self.range_m), self.range_m, np.nan).reshape(-1, 1)
-        points_body = self.rays.centre + self.rays.origins + along * self.rays.directions.astype(np.float64)
+    def points_world(self, step_px: int = 1) -> Float64[np.ndarray, "m n 3"]:
+        """World point seen by each pixel of every so many rows and columns, metres; NaN where it sees the sky."""
+        kept = (slice(None, None, step_px), slice(None, None, step_px))
+        distance = self.range_m[kept]
+        origins = self.rays.origins.reshape(*self.range_m.shape, 3)[kept].reshape(-1, 3)
+        directions = self.rays.directions.reshape(*self.range_m.shape, 3)[kept].reshape(-1, 3)
+        along = np.where(np.isfinite(distance), distance, np.nan).reshape(-1, 1)
+        points_body = self.rays.centre + origins + along * directions.astype(np.float64)
         points: Float64[np.ndarray, "pixels 3"] = self.world_from_body.apply(points_body)
-        return points.reshape(*self.radiance.shape, 3)
+        return points.reshape(*distance.shape, 3)
 
 
 class Renderer:
