@@ -7,6 +7,7 @@ import importlib.util
 import json
 import platform
 import re
+import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -14,7 +15,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Self
 
+from algorithms.exchange import command_of
 from campaigns.configuration import CampaignConfiguration
+from scenarios.estimators import installed
+from scenarios.interface import TakesAlgorithms
+from scenarios.registry import UnknownScenarioError, scenario
 
 #: Folders of ours whose code rows depend on; what reports and commands do changes no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")
@@ -34,7 +39,8 @@ class Identity:
     configuration
         Hash of what the configuration states about cases.
     code
-        Hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns` and of the user's own scenario.
+        Hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of the user's own scenario and
+        algorithms.
     versions
         Of Python, Marsyard and the packages that it requires.
     """
@@ -62,7 +68,26 @@ class Identity:
 
 def identity_of(configuration: CampaignConfiguration) -> Identity:
     """The identity of a campaign if it were run now."""
-    return Identity(configuration_hash(configuration), code_hash(configuration.scenario), package_versions())
+    code = code_hash((configuration.scenario, *chosen_algorithms(configuration)))
+    return Identity(configuration_hash(configuration), code, package_versions())
+
+
+def chosen_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
+    """The algorithms under test that a configuration names, those that it disperses over among them."""
+    try:
+        found = scenario(configuration.scenario)
+    except UnknownScenarioError:
+        return ()
+    if not isinstance(found, TakesAlgorithms):
+        return ()
+    table: Any = configuration.parameters
+    for part in found.algorithm_table:
+        table = table.get(part, {})
+    path = ".".join((*found.algorithm_table, "algorithm"))
+    dispersed = configuration.dispersions.get(path)
+    varied = [] if dispersed is None else [str(value) for value in dispersed.extremes()]
+    stated = [table.get("algorithm", ""), *table.get("compared", ()), *varied]
+    return tuple(str(spec) for spec in dict.fromkeys(stated) if spec)
 
 
 def configuration_hash(configuration: CampaignConfiguration) -> str:
@@ -73,10 +98,11 @@ def configuration_hash(configuration: CampaignConfiguration) -> str:
 
 
 @cache
-def code_hash(scenario: str) -> str:
-    """A hash of the sources that rows of a scenario depend on: each file's name and contents."""
+def code_hash(named: tuple[str, ...]) -> str:
+    """A hash of the sources that rows depend on, each file's name and contents; `named` are scenario and algorithms."""
     digest = hashlib.sha256()
-    for name, path in (*_own_sources(), *_foreign_sources(scenario)):
+    foreign = [source for one in named for source in _foreign_sources(one)]
+    for name, path in (*_own_sources(), *foreign):
         contents = path.read_bytes()
         digest.update(f"{name}\0{len(contents)}\0".encode())
         digest.update(contents)
@@ -90,11 +116,21 @@ def _own_sources() -> Iterator[tuple[str, Path]]:
         yield from _named(_HOME, sorted((_HOME / folder).rglob("*.json")))
 
 
-def _foreign_sources(scenario: str) -> Iterator[tuple[str, Path]]:
-    """The sources of the package, or of the module, of a scenario that is given as `module:Class`."""
-    if ":" not in scenario:
+def _foreign_sources(named: str) -> Iterator[tuple[str, Path]]:
+    """The package or module of what is given as `module:Class` or by an entry point; a program's own file."""
+    try:
+        command = command_of(named)
+    except ValueError:
         return
-    top = scenario.partition(":")[0].partition(".")[0]
+    if command is not None:
+        program = shutil.which(command.words[0])
+        words = [Path(word) for word in (program, *command.words[1:]) if word is not None]
+        yield from ((path.name, path) for path in words if path.is_file())
+        return
+    path = installed()[named].value if named in installed() else named
+    if ":" not in path:
+        return
+    top = path.partition(":")[0].partition(".")[0]
     found = importlib.util.find_spec(top)
     if found is None or found.origin is None:
         return

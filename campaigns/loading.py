@@ -16,7 +16,7 @@ from campaigns.configuration import CampaignConfiguration, Key, key_text, proble
 from campaigns.correlation import KINDS
 from campaigns.errors import ConfigurationError, Problem, not_allowed
 from campaigns.sampling import Campaign
-from scenarios.interface import Scenario
+from scenarios.interface import Scenario, TakesAlgorithms
 from scenarios.registry import UnknownScenarioError, scenario
 
 CATALOGUE = Path(__file__).resolve().parent.parent / "scenarios" / "catalogue"
@@ -72,7 +72,11 @@ def find_campaign(name_or_path: str) -> Path:
 
 
 def load_campaign(
-    name_or_path: str, overrides: Sequence[str] = (), cases: int | None = None, seed: int | None = None
+    name_or_path: str,
+    overrides: Sequence[str] = (),
+    cases: int | None = None,
+    seed: int | None = None,
+    algorithms: Sequence[str] = (),
 ) -> Campaign:
     """Reads a campaign and checks it whole.
 
@@ -85,6 +89,8 @@ def load_campaign(
         VALUE in TOML's notation or plain text. A dispersed parameter set so is no longer dispersed.
     cases, seed
         Instead of the file's.
+    algorithms
+        Instead of the file's algorithms: the one that is judged, then those that are compared with it.
 
     Raises
     ------
@@ -96,6 +102,8 @@ def load_campaign(
     overridden: dict[tuple[str, ...], str] = {}
     for override in overrides:
         tables = _override(tables, override, overridden)
+    if algorithms:
+        tables = _choose(tables, algorithms, str(path), overridden)
     for key, option, value in (("cases", "-n", cases), ("seed", "--seed", seed)):
         if value is not None:
             tables[key] = value
@@ -126,6 +134,40 @@ def _override(tables: Mapping[str, Any], override: str, overridden: dict[tuple[s
     first = next(iter(stated))
     if first not in (*_TABLES, *_PLAIN):
         stated = {"parameters": stated}
+    return _put(tables, stated, option, overridden)
+
+
+def _choose(
+    tables: Mapping[str, Any], algorithms: Sequence[str], where: str, overridden: dict[tuple[str, ...], str]
+) -> dict[str, Any]:
+    """The tables with other algorithms put in; as they are where there is no such scenario, which is told later."""
+    options = [f"--algorithm {spec}" for spec in algorithms]
+    name = tables.get("scenario")
+    try:
+        found = scenario(name) if isinstance(name, str) and name else None
+    except UnknownScenarioError:
+        found = None
+    if found is None:
+        return dict(tables)
+    if not isinstance(found, TakesAlgorithms):
+        raise ConfigurationError([Problem(options[0], "", f"the scenario of {where} has no choice of algorithms")])
+    chosen = dict(tables)
+    stated: tuple[tuple[str, Any, str], ...] = (
+        ("algorithm", algorithms[0], options[0]),
+        ("compared", list(algorithms[1:]), " ".join(options[1:]) or options[0]),
+    )
+    for key, value, option in stated:
+        inner: dict[str, Any] = {key: value}
+        for part in reversed(("parameters", *found.algorithm_table)):
+            inner = {part: inner}
+        chosen = _put(chosen, inner, option, overridden)
+    return chosen
+
+
+def _put(
+    tables: Mapping[str, Any], stated: Mapping[str, Any], option: str, overridden: dict[tuple[str, ...], str]
+) -> dict[str, Any]:
+    """The tables with what an option states put over them; what it fixes is no longer dispersed."""
     merged = _merge(tables, stated)
     paths = _paths_set(stated)
     overridden.update(dict.fromkeys(paths, option))

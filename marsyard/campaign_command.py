@@ -44,6 +44,15 @@ SetOption = Annotated[
         help="Instead of the file's value, for example render.backend=egl; a parameter set so is not dispersed.",
     ),
 ]
+AlgorithmOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--algorithm",
+        metavar="NAME",
+        help="The algorithm under test: a name, module:Class, exec:PROGRAM or serve:PROGRAM. Given several times, all "
+        "run on the same cases and are compared; the first is judged.",
+    ),
+]
 JobsOption = Annotated[int | None, typer.Option("--jobs", metavar="J", help="Worker processes; by default one a core.")]
 ClusterOption = Annotated[
     str | None,
@@ -95,6 +104,7 @@ def run(
         bool, typer.Option("--dry-run", help="Estimate time and disk from a few trial cases, and run nothing else.")
     ] = False,
     override: SetOption = None,
+    algorithm: AlgorithmOption = None,
 ) -> None:
     """Run a campaign, judge its requirements, and write its report."""
     from campaigns.engine import run_campaign
@@ -102,7 +112,7 @@ def run(
 
     crew = _crew(jobs, cluster)
     limits = [] if case_time is None else [f"limits.case_time_s={case_time}"]
-    loaded = load_campaign(campaign, [*(override or []), *limits], cases, seed)
+    loaded = load_campaign(campaign, [*(override or []), *limits], cases, seed, algorithm or [])
     if dry_run:
         _print_estimate(loaded, crew)
         return
@@ -118,7 +128,8 @@ def resume(
         typer.Option(
             "--retry",
             metavar="OUTCOME",
-            help="Run these cases again as well: crashed, timed-out, out-of-memory, too-much-output, or all of them.",
+            help="Run these cases again as well: crashed, timed-out, out-of-memory, too-much-output, bad-answer, or "
+            "all of them.",
         ),
     ] = None,
     jobs: JobsOption = None,

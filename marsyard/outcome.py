@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from campaigns import record
 from campaigns.errors import StoreError
@@ -14,6 +16,9 @@ from marsyard.campaign_command import Exit
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Console
+    from rich.table import Table
+
+    from reports.verdicts import Verdict
 
 
 def conclude(directory: Path, console: Console) -> int:
@@ -48,6 +53,8 @@ def conclude(directory: Path, console: Console) -> int:
     except OSError as error:
         raise StoreError(f"the report cannot be written: {error}") from error
     console.print(verdict_table(verdicts))
+    for table in _comparison_tables(how.drawn(frame), stored["requirements"], verdicts):
+        console.print(table)
     lines = [f"verdict: {whole.word}", whole.sentence, f"report: {page}"]
     if not finished:
         lines.insert(
@@ -57,6 +64,34 @@ def conclude(directory: Path, console: Console) -> int:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     # what has been met so far is not met yet
     return status if finished else status or Exit.INSUFFICIENT
+
+
+def _comparison_tables(
+    frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], verdicts: Sequence[Verdict]
+) -> list[Table]:
+    """What algorithms on the same cases did; nothing where there is one only."""
+    from rich import box
+    from rich.table import Table
+
+    from reports.columns import primary_metric
+    from reports.comparison import comparison, comparison_grids
+
+    metric = primary_metric(frame, requirements)
+    bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
+    contenders, differences = comparison(frame, metric, bound)
+    if not contenders:
+        return []
+    tables = []
+    titles = ("Algorithms on the same cases", f"Against {contenders[0].name}")
+    for title, grid in zip(titles, comparison_grids(contenders, differences, metric), strict=True):
+        table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
+        for place, heading in enumerate(grid.head):
+            table.add_column(heading, justify="right" if place else "left", overflow="fold")
+        for row in grid.rows:
+            table.add_row(*row)
+        if grid.rows:
+            tables.append(table)
+    return tables
 
 
 def _how_it_stands(directory: Path, state: str) -> str:

@@ -14,12 +14,15 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from reports import gallery, sections
 from reports.answers import answers_section
 from reports.columns import label, numbers, primary_metric
+from reports.comparison import comparison_section
 from reports.conditions import conditions_section
+from reports.consistency import consistency_section
 from reports.dimes.carried import carried_section
 from reports.dimes.fieldtest import field_test_section
 from reports.dimes.landing import landing_section
 from reports.dimes.sensitivity import sensitivity_section
 from reports.faults import faults_section
+from reports.hda.every import HDA_SECTIONS
 from reports.sampled import sampled
 from reports.section import Section, SectionMaker, Subject
 from reports.stored import StoredRun, read_run
@@ -48,9 +51,12 @@ FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
     regression_section,
     goal_section,
     answers_section,
+    comparison_section,
+    consistency_section,
     faults_section,
     carried_section,
     landing_section,
+    *HDA_SECTIONS,
     sensitivity_section,
     conditions_section,
 )

@@ -34,9 +34,21 @@ _AXES = ("x", "y", "z")
 _BOOKKEEPING = re.compile(
     r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|^place_|estimated|_true_"
     r"|^firing_|^touchdown_|^room|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
+    r"|\.|^algorithm$|^stderr$|^velocity_(?:nees|normalised|sd|correlation)"
 )
 #: Drivers that a review board asks for first: the worst pictures of the paper are the oblique, smeared and high ones.
-_FIRST_DRIVERS = ("off_nadir_max", "attitude_rate_max", "altitude_1", "wind_speed", "horizontal_speed", "sun_elevation")
+_FIRST_DRIVERS = (
+    "off_nadir_max",
+    "attitude_rate_max",
+    "altitude_1",
+    "wind_speed",
+    "horizontal_speed",
+    "sun_elevation",
+    "slip_mean",
+    "pose_error_share",
+    "rock_diameter",
+    "disparity_error_goal",
+)
 _LARGEST_CATEGORY = 6
 
 

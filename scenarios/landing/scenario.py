@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 from pydantic import BaseModel
 
+from algorithms.answers import checked_site
+from algorithms.interface import SiteEstimate, SiteOutcome
 from scenarios.estimators import LANDING
 from scenarios.interface import CaseResult
 from scenarios.landing.descent import landing_row
@@ -16,6 +16,7 @@ from scenarios.landing.pictures import take_pictures
 from scenarios.landing.score import conditions, map_row, motion_row, products, provenance, site_row, times_row
 from scenarios.landing.truth import GroundTruth
 from scenarios.landing.world import World, camera_optics
+from scenarios.trial import Judged, attempted, case_result
 from sim.streams import Streams
 from sim.terrain import TerrainBank
 
@@ -25,6 +26,8 @@ class LandingScenario:
 
     name = "landing"
     parameters_type = LandingScenarioParameters
+    task = LANDING
+    algorithm_table = ()
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains."""
@@ -42,26 +45,32 @@ class LandingScenario:
         flight = Flight.of(p, world.ground.surface, streams)
         pair = take_pictures(p, world, flight, camera_optics(p.camera), streams)
         measurements = measure(p, flight, pair, streams)
-        started = time.process_time()
-        estimate = LANDING.make(p.algorithm, p.hda, p.executable).estimate(measurements)
-        taken = time.process_time() - started
         truth = GroundTruth.of(world, flight, pair, p.lander.limits)
-        row = {
-            **site_row(estimate, flight, truth),
-            **landing_row(p, estimate, flight, truth, streams),
-            **motion_row(estimate.details, flight, pair),
-            **map_row(p, estimate, flight, truth),
-            **conditions(p, world, flight, pair, measurements, truth),
-            "estimation_time_s": taken,
-            **times_row(estimate.details),
-            **provenance(p, pair),
-        }
-        return CaseResult(
-            outcome=estimate.outcome.name,
-            answered=estimate.outcome.converged,
-            row=row,
-            products=products(p, estimate, flight, pair, truth),
-        )
+        # what is left to land on where an algorithm fails to answer
+        nothing = SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
+
+        def judge(algorithm: str) -> Judged:
+            attempt = attempted(
+                lambda: LANDING.make(algorithm, p.hda, p.executable).estimate(measurements), checked_site
+            )
+            estimate = nothing if attempt.answer is None else attempt.answer
+            return Judged(
+                outcome=attempt.outcome(lambda answer: answer.outcome.name),
+                answered=attempt.answer is not None and estimate.outcome.converged,
+                row={
+                    **site_row(estimate, flight, truth),
+                    **landing_row(p, estimate, flight, truth, streams),
+                    **motion_row(estimate.details, flight, pair),
+                    **map_row(p, estimate, flight, truth),
+                    **times_row(estimate.details),
+                    **attempt.row,
+                },
+                products=products(p, estimate, flight, pair, truth),
+                failure=attempt.failure,
+            )
+
+        known = {**conditions(p, world, flight, pair, measurements, truth), **provenance(p, pair)}
+        return case_result(p.algorithms, judge, known)
 
 
 def _checked(parameters: BaseModel) -> LandingScenarioParameters:

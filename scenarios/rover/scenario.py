@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from typing import cast
 
 from pydantic import BaseModel
 
-from scenarios.interface import CaseResult
+from scenarios.estimators import TRACKING
+from scenarios.interface import CaseResult, Scalar
 from scenarios.rover.parameters import RoverScenarioParameters
-from scenarios.rover.run import run_case
+from scenarios.rover.run import Run, run_case
 from scenarios.rover.score import conditions, products, provenance, score, stored_updates, tracking
 from scenarios.rover.stops import RunOutcome
 from scenarios.rover.world import terrain_parameters
+from scenarios.trial import Judged, attempted, case_result
 from sim.streams import Streams
 from sim.terrain import TerrainBank
 
@@ -21,6 +25,8 @@ class RoverScenario:
 
     name = "rover"
     parameters_type = RoverScenarioParameters
+    task = TRACKING
+    algorithm_table = ()
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains."""
@@ -32,25 +38,31 @@ class RoverScenario:
         TerrainBank(terrain_parameters(w), w.bank_seed).terrain(shared_input)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """One run."""
+        """One run; each algorithm that is compared makes one of its own, with the same draws."""
         p = _checked(parameters)
-        started = time.process_time()
-        run = run_case(p, streams)
-        taken = time.process_time() - started
-        row = {
-            **score(p, run),
-            **tracking(run),
-            **conditions(p, run),
-            **stored_updates(run, p.score.stored_updates),
-            "run_time_s": taken,
-            **provenance(p, run),
-        }
-        return CaseResult(
-            outcome=run.outcome.name,
-            answered=run.outcome is RunOutcome.COMPLETED,
-            row=row,
-            products=products(p, run),
-        )
+        run, row = _tracked(p, streams)
+
+        def judge(algorithm: str) -> Judged:
+            if algorithm == p.algorithm:
+                return _judged(run, {**row, **stored_updates(run, p.score.stored_updates)}, products(p, run))
+            mine = p.model_copy(update={"algorithm": algorithm})
+            other = attempted(lambda: _judged(*_tracked(mine, streams)), lambda made: cast(Judged, made))
+            nothing = Judged(other.outcome(lambda made: made.outcome), False, {}, failure=other.failure)
+            return nothing if other.answer is None else other.answer
+
+        return case_result(p.algorithms, judge, {**conditions(p, run), **provenance(p, run)})
+
+
+def _tracked(p: RoverScenarioParameters, streams: Streams) -> tuple[Run, dict[str, Scalar]]:
+    """One run of the closed loop, and its score."""
+    started = time.process_time()
+    run = run_case(p, streams)
+    taken = time.process_time() - started
+    return run, {**score(p, run), **tracking(run), "run_time_s": taken}
+
+
+def _judged(run: Run, row: Mapping[str, Scalar], kept: Mapping[str, object] | None = None) -> Judged:
+    return Judged(run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, kept or {})
 
 
 def _checked(parameters: BaseModel) -> RoverScenarioParameters:
