@@ -102,9 +102,9 @@ def _physics() -> str:
         drift = drift_error_m(GOAL_M, design.focal_px, 1.0)
         said.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
     return (
-        f"By Eqs. 1 and 4 a pixel of disparity and a pixel of drift at {GOAL_M:g} m are: {'; '.join(said)}. Along: "
-        f"of the line of sight. Bound: of the {stated(QUANTILE)} quantile at {stated(CONFIDENCE)} confidence (order "
-        "statistics; it takes 230 runs)."
+        f"By Eqs. 1 and 4 a pixel of disparity and a pixel of drift at {GOAL_M:g} m are, for the paper's cameras: "
+        f"{'; '.join(said)}. Along: of the line of sight. Bound: of the {stated(QUANTILE)} quantile at "
+        f"{stated(CONFIDENCE)} confidence (order statistics; it takes 230 runs)."
     )
 
 
