@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 
 from benchmarks.pictures import descent_scene
+from benchmarks.stages import stages
 from benchmarks.timing import Figure, core_seconds
 from campaigns.loading import load_campaign
 from scenarios.descent import (
@@ -38,7 +39,7 @@ def frame(repeats: int) -> list[Figure]:
 
 
 def case(repeats: int) -> list[Figure]:
-    """Whole cases as the campaign `dimes-gusev` runs them, one after the other, all over one terrain that is built."""
+    """Whole cases as the campaign `dimes-gusev` runs them, all over one terrain that is built, and their stages."""
     campaign = load_campaign("dimes-gusev")
     numbers = itertools.count()
 
@@ -48,7 +49,8 @@ def case(repeats: int) -> list[Figure]:
         campaign.scenario.run(parameters, campaign.streams(number))
 
     return [
-        Figure("dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), bar=1.0)
+        Figure("dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), bar=1.0),
+        *stages(run_next, repeats),
     ]
 
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 import scenarios
-from scenarios.fieldtest import FieldTestParameters, FieldTestScenario
+from scenarios.fieldtest import FieldTestParameters, FieldTestScenario, pictures
 from scenarios.fieldtest.elevation import ElevationModel
 from scenarios.fieldtest.ephemeris import sun_direction
 from scenarios.fieldtest.parameters import ElevationParameters
 from scenarios.fieldtest.run import Run, RunKey, worked_out
 from scenarios.fieldtest.scenario import case_order
 from scenarios.fieldtest.triples import Category
+from scenarios.views import Eye, site_scene
 from sim.streams import Streams
 from sim.terrain import Surface
 
@@ -133,6 +134,23 @@ def test_a_run_is_worked_out_the_same_again() -> None:
     assert again is not kept
     assert np.array_equal(again.attitudes.as_quat(), kept.attitudes.as_quat())
     assert again.triples == kept.triples
+
+
+def test_the_sun_moves_over_rocks_that_stay() -> None:
+    """Lava's rocks take core-seconds to build: a run builds them once, whatever its pictures' times."""
+    key = RunKey(stated(), 0, 5, "test")
+    run, step_s = worked_out(key), key.field_test.sun_step_s
+    early, late = pictures._scene(key, 0), pictures._scene(key, 30)
+    assert len(early.objects) > 0
+    assert late.objects is early.objects
+    east, north, _ = run.flight.origin_m.tolist()
+    pixel_rad = float(np.median(pictures.field_optics().rays.pixel_angles))
+    eye = Eye(east, north, key.field_test.helicopter.lowest_m, pixel_rad)
+    alone = site_scene(pictures._ground(key), eye, pictures.sun_at(run, 30 * step_s))
+    assert np.array_equal(late.sun.direction, alone.sun.direction)
+    assert late.photometry == alone.photometry
+    assert np.array_equal(late.objects.triangles, alone.objects.triangles)
+    assert late.bounds_m == alone.bounds_m
 
 
 def test_too_many_triples_are_refused() -> None:

@@ -1,0 +1,62 @@
+"""Where the core-seconds of a whole `dimes-gusev` case go, stage by stage."""
+
+from __future__ import annotations
+
+import cProfile
+import time
+from collections.abc import Callable
+
+from benchmarks.timing import Figure
+
+#: Stages by their functions: the end of the file's name, and the function. What a stage calls counts as its own.
+STAGES: dict[str, tuple[tuple[str, str], ...]] = {
+    "terrain, its rocks": (("descent/world.py", "of"), ("descent/exposure.py", "_scene")),
+    "flight": (("descent/flight.py", "flown_descent"),),
+    "mesh and OpenGL": (("render/renderer.py", "_load"), ("render/renderer.py", "_draw")),
+    "what rays meet": (("kernels/sight.py", "look"),),
+    "shadow of the ground": (("render/renderer.py", "_ground_shadow"),),
+    "shading": (("kernels/shading.py", "shade"),),
+    "pixels with edges, but for their shading": (
+        ("render/edges.py", "edge_pixels"),
+        ("render/edges.py", "rays_within"),
+        ("render/edges.py", "look_within"),
+    ),
+    "detector": (("sensor/detector.py", "drawn"), ("sensor/detector.py", "expose"), ("sensor/motion.py", "seen")),
+    "instruments": (("descent/measurement.py", "drawn"), ("descent/measurement.py", "measure")),
+    "DIMES": (("dimes/estimator.py", "estimate"),),
+    "room for templates": (("descent/room.py", "room"),),
+}
+
+#: What belongs to no stage.
+REST = "all else"
+
+
+def stages(run: Callable[[], object], repeats: int) -> list[Figure]:
+    """Core-seconds of every stage of each of some runs, and of what belongs to none, after one that is not counted.
+
+    They are taken by Python's profiler, which slows stages of many small calls, the flight and the instruments, by up
+    to a half.
+    """
+    run()
+    found: dict[str, list[float]] = {name: [] for name in (*STAGES, REST)}
+    for _ in range(repeats):
+        profile = cProfile.Profile(time.process_time)
+        profile.runcall(run)
+        for name, seconds in _of_each_stage(profile).items():
+            found[name].append(seconds)
+    return [Figure(f"  of a case, profiled: {name}", values) for name, values in found.items()]
+
+
+def _of_each_stage(profile: cProfile.Profile) -> dict[str, float]:
+    """Seconds in the functions of each stage and all that they call, and in all else."""
+    entries = profile.getstats()
+    seconds = dict.fromkeys(STAGES, 0.0)
+    for entry in entries:
+        if isinstance(entry.code, str):
+            continue
+        for name, functions in STAGES.items():
+            if any(
+                entry.code.co_name == function and entry.code.co_filename.endswith(file) for file, function in functions
+            ):
+                seconds[name] += entry.totaltime
+    return seconds | {REST: sum(entry.inlinetime for entry in entries) - sum(seconds.values())}
