@@ -98,6 +98,7 @@ def test_world_points_lie_on_the_plane_and_on_their_rays(renderer, descent_camer
     points = frame.points_world()
     assert np.isfinite(points).all()
     assert np.abs((points[..., 2] + 3.0) / frame.range_m).max() < 1e-5
+    np.testing.assert_allclose(frame.points_world(100), points[::100, ::100], rtol=0.0, atol=1e-9)
     pixels, visible = camera.moved(pose).project(points)
     assert visible.all()
     # rays are kept in single precision: 6e-8 rad is 1e-4 px
