@@ -204,5 +204,5 @@ def error_figure(frame: pd.DataFrame) -> Figure:
     axes.axvline(100.0 * WITHIN_M, color=REQUIREMENT, linewidth=1.5, linestyle="--")
     axes.set(xlim=(0.0, 102.0 * edge), ylim=(0.0, 1.03), xlabel="position error at the goal (cm)")
     axes.set_ylabel("fraction of completed runs")
-    axes.legend(loc="lower right")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
     return figure

@@ -215,6 +215,6 @@ def step_figure(found: Sequence[StepCell], motion: Motion) -> Figure:
             )
     axes.set(ylim=(-0.03, 1.05), ylabel="targets tracked")
     axes.set_xlabel("step (% of the target's distance)" if motion.per_cent else "step (deg)")
-    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
     return figure
