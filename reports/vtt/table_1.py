@@ -72,9 +72,10 @@ def table_1_section(subject: Subject) -> Section | None:
     )
     measured_note = (
         f"Selectable targets of completed runs from {START_M:g} m to {GOAL_M:g} m: three times the root mean square. "
-        "Without tracker: by Eq. 3 from the measured errors of designation and pose, whatever odometry the runs had; the "
-        "paper's is visual. Table I, the same: its last column for the drift measured. The paper takes 1 px as the "
-        "disparity error of 3 sigma; the error, calibration included, that Eq. 1 makes of the designation stands beside."
+        "Without tracker: by Eq. 3 from the measured errors of designation and pose, whatever odometry the runs "
+        "had; the paper's is visual. Table I, the same: its last column for the drift measured. The paper takes 1 "
+        "px as the disparity error of 3 sigma; the error, calibration included, that Eq. 1 makes of the designation "
+        "stands beside."
     )
     blocks = [
         Block(heading="Computed", grid=Grid(head, rows), note=note),
