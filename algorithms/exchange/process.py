@@ -99,7 +99,9 @@ class Child:
         self._close_input()
         self._read(lambda: False)
         self._wait()
-        return self._said(bytes(self._output), started)
+        said = self._said(bytes(self._output), started)
+        self._kill()
+        return said
 
     def line(self, asked: str | None = None) -> Said:
         """The next line that the program writes, after a line that it is given."""

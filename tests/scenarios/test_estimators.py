@@ -1,0 +1,101 @@
+"""Algorithms by name, by path and by entry point; several of them in one case."""
+
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from algorithms.baselines import HomographyEstimator
+from algorithms.dimes import DimesOptions
+from algorithms.exchange import ExecutableLimits, ExecutableVelocityEstimator
+from algorithms.interface import VelocityEstimate, VelocityOutcome
+from scenarios import estimators
+from scenarios.descent.parameters import DescentScenarioParameters
+from scenarios.estimators import LANDING, TRACKING, VELOCITY, check_chosen, labels
+from scenarios.trial import Judged, attempted, case_result
+from scenarios.velocity import consistency_row
+
+LIMITS = ExecutableLimits()
+
+
+def test_an_algorithm_in_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "lying_here.py").write_text("class Mine:\n    def estimate(self, measurements): ...\n")
+    monkeypatch.chdir(tmp_path)
+    VELOCITY.check("lying_here:Mine")
+    assert type(VELOCITY.make("lying_here:Mine", DimesOptions(), LIMITS)).__name__ == "Mine"
+    with pytest.raises(ValueError, match="is no target tracker: it has no designate, aim, update, clear, state"):
+        TRACKING.check("lying_here:Mine")
+
+
+def test_a_module_that_raises_is_told_and_not_a_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "broken_here.py").write_text("1 / 0\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="no algorithm at 'broken_here:Mine': ZeroDivisionError"):
+        VELOCITY.check("broken_here:Mine")
+
+
+def test_an_entry_point_is_named_like_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    group = estimators.GROUP
+    points = [EntryPoint(name, "algorithms.baselines:HomographyEstimator", group) for name in ("theirs", "dimes")]
+    monkeypatch.setattr(estimators, "installed", lambda: {point.name: point for point in points})
+    assert isinstance(VELOCITY.make("theirs", DimesOptions(), LIMITS), HomographyEstimator)
+    assert not isinstance(VELOCITY.make("dimes", DimesOptions(), LIMITS), HomographyEstimator)
+    with pytest.raises(ValueError, match=r"did you mean 'theirs'.*dimes, phase-correlation, homography, theirs"):
+        VELOCITY.check("their")
+
+
+def test_programs_estimate_and_do_not_track() -> None:
+    made = VELOCITY.make("exec:cat --number", DimesOptions(), LIMITS)
+    assert isinstance(made, ExecutableVelocityEstimator)
+    assert made.command.words == ("cat", "--number")
+    LANDING.check("serve:cat")
+    with pytest.raises(ValueError, match="a target tracker cannot be a program"):
+        TRACKING.check("exec:cat")
+
+
+def test_labels_tell_algorithms_apart_and_are_names_of_columns() -> None:
+    given = labels(["dimes", "phase-correlation", "a.b:Mine", "exec:./x/mine-1 --fast", "c:Mine", "exec:./7"])
+    assert given == ("dimes", "phase_correlation", "Mine", "mine_1", "Mine_2", "a_7")
+
+
+def test_the_same_algorithm_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="'dimes' is named twice"):
+        check_chosen(VELOCITY, ["dimes", "dimes"])
+    with pytest.raises(ValueError, match="'dimes' is named twice"):
+        DescentScenarioParameters.model_validate({"compared": ["dimes"]})
+
+
+def test_what_one_algorithm_does_wrong_does_not_touch_the_others() -> None:
+    def judge(spec: str) -> Judged:
+        def ask() -> float:
+            return 1.0 / float(spec)
+
+        tried = attempted(ask, lambda answer: answer)
+        return Judged(
+            tried.outcome(lambda _: "VALID"), tried.answer is not None, {"error_m": 0.5}, failure=tried.failure
+        )
+
+    case = case_result(["2", "0"], judge, {"altitude_m": 7.0})
+    assert (case.outcome, case.answered, case.failure) == ("VALID", True, None)
+    assert case.row["algorithm"] == "a_2"
+    assert case.row["a_0.outcome"] == "CRASHED"
+    assert case.row["a_0.answered"] is False
+    assert case.row["a_0.error"] == "ZeroDivisionError: float division by zero"
+    assert "a_0.altitude_m" not in case.row
+    other = case_result(["0", "2"], judge, {"altitude_m": 7.0})
+    assert other.failure is not None
+    assert other.outcome == other.failure.outcome == "CRASHED"
+    assert other.row["altitude_m"] == 7.0
+    assert other.row["a_2.outcome"] == "VALID"
+
+
+def test_an_error_in_units_of_its_covariance() -> None:
+    # sd 3 and 2, correlation 0.5, error (3, 2): (1 + 1 - 2 * 0.5) / (1 - 0.25) = 4 / 3
+    covariance = np.array([[9.0, 3.0], [3.0, 4.0]])
+    estimate = VelocityEstimate(VelocityOutcome.VALID, np.array([3.0, 2.0]), covariance_m2_s2=covariance)
+    row = consistency_row(estimate, np.zeros(2))
+    assert row["velocity_nees"] == pytest.approx(4.0 / 3.0)
+    assert (row["velocity_normalised_x"], row["velocity_normalised_y"]) == (1.0, 1.0)
+    assert row["velocity_correlation"] == pytest.approx(0.5)
+    assert consistency_row(VelocityEstimate(VelocityOutcome.VALID, np.zeros(2)), np.zeros(2)) == {}
