@@ -22,6 +22,7 @@ from reports.dimes.fieldtest import field_test_section
 from reports.dimes.landing import landing_section
 from reports.dimes.sensitivity import sensitivity_section
 from reports.faults import faults_section
+from reports.hda.every import HDA_SECTIONS
 from reports.sampled import sampled
 from reports.section import Section, SectionMaker, Subject
 from reports.stored import StoredRun, read_run
@@ -55,6 +56,7 @@ FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
     faults_section,
     carried_section,
     landing_section,
+    *HDA_SECTIONS,
     sensitivity_section,
     conditions_section,
 )

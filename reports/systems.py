@@ -10,13 +10,14 @@ from typing import Any
 import pandas as pd
 
 from reports.dimes.shown import DIMES
+from reports.hda.shown import HDA
 from reports.shown import CaseView, System
 from reports.stored import StoredRun
 from reports.vtt.shown import VTT
 from reports.wording import NOTHING
 
 #: Those whose products are looked for in a case, in this order.
-SYSTEMS: tuple[System, ...] = (DIMES, VTT)
+SYSTEMS: tuple[System, ...] = (DIMES, VTT, HDA)
 #: Kept cases whose pictures go into the page; each takes about half a megabyte.
 _MOST_SHOWN = 2
 

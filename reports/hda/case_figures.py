@@ -1,0 +1,390 @@
+"""Pictures of one landing as Figs. 1 to 5 and 7 of `papers/vision-guided-landing.txt` show theirs.
+
+The colours are those that the paper's text gives: first and second camera red and green, features white; structure
+pixels red, segments green, matches blue; maps green, yellow and red; the a-priori site a black X, the safe site a
+purple plus. Their tones are apart for colour-blind readers too, and nothing is told by colour alone. The paper gives no
+colours for Fig. 1. The true maps beside Fig. 5 and the true motion in Fig. 2 are ours to show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.colors import LightSource, LinearSegmentedColormap, ListedColormap, to_rgb
+from matplotlib.figure import Figure
+
+from reports.hda.products import (
+    EpipolarMatches,
+    LandingMaps,
+    SolvedMotion,
+    TrackedFeatures,
+    epipolar_matches,
+    landing_maps,
+    pictures,
+    solved_motion,
+    tracked_features,
+    true_ground,
+)
+from reports.svg import INK, MUTED, in_page_style
+
+T = TypeVar("T")
+
+#: Green, yellow and red that readers with any colour vision tell apart (after Okabe & Ito).
+GREEN, YELLOW, RED = "#009e73", "#f0e442", "#c83a12"
+BLUE, PURPLE, BLACK, WHITE = "#3da5ff", "#8f1fb0", "#000000", "#ffffff"
+FOUND, LOST = "#f0a202", "#c9d1d9"
+#: Full at half of the limit, yellow up to the limit, red beyond; the scale ends at twice the limit.
+HAZARD_COLOURS = LinearSegmentedColormap.from_list(
+    "hazard", [(0.0, GREEN), (0.2, GREEN), (0.42, YELLOW), (0.5, YELLOW), (0.5, RED), (1.0, "#7d1f06")]
+).with_extremes(bad="#8a929b")
+SAFETY_COLOURS = ListedColormap([GREEN, YELLOW, RED])
+#: Dark is high, bright is low.
+ELEVATION_COLOURS = "gray_r"
+#: Structure pixels drawn at most: Table I has 600.
+_MOST_MATCHES = 600
+#: Cells of a terrain's longer side as drawn.
+_DRAWN_CELLS = 90
+_BACKGROUND = "#15191e"
+
+
+@in_page_style
+def draw_tracks(products: Mapping[str, Any]) -> Figure:
+    """Fig. 1: features in the first picture, their tracks in the second.
+
+    Raises
+    ------
+    ValueError
+        As all figures here: where the products do not hold what it shows.
+    """
+    shown, tracks = _known(pictures(products), "pictures"), _known(tracked_features(products), "tracks")
+    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _show(left, shown[0])
+    _show(right, shown[1])
+    _draw_features(left, tracks.first, tracks)
+    moved = np.stack([tracks.first, tracks.second], axis=1)[tracks.accepted]
+    right.plot(*np.moveaxis(moved, -1, 0).transpose(0, 2, 1), color=FOUND, linewidth=0.8, alpha=0.9)
+    _draw_features(right, tracks.second, tracks, lost=False)
+    left.set_title(f"First picture: {len(tracks.first)} features", fontsize=9)
+    right.set_title(f"Second picture: {int(tracks.accepted.sum())} tracks", fontsize=9)
+    left.legend(loc="lower left", labelcolor=WHITE, frameon=True, facecolor=BLACK, framealpha=0.5, fontsize=8)
+    return figure
+
+
+@in_page_style
+def draw_motion(products: Mapping[str, Any]) -> Figure:
+    """Fig. 2: three views of motion and structure, orthographic."""
+    motion = _known(solved_motion(products), "motion")
+    maps = landing_maps(products)
+    # Without a map there is no vertical: the first camera's axis stands for it.
+    upright = np.diag([1.0, -1.0, -1.0]) if maps is None else maps.surface_from_camera
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained", facecolor="none")
+    views = (("from above", 0, 1), ("along y", 0, 2), ("along x", 1, 2))
+    for axes, (name, across, up) in zip(figure.subplots(1, 3), views, strict=True):
+        _draw_motion_view(axes, motion, upright, (across, up))
+        axes.set_title(f"Seen {name}", fontsize=9)
+    figure.axes[0].legend(loc="upper left", fontsize=7, labelcolor=WHITE)
+    return figure
+
+
+@in_page_style
+def draw_epipolar(products: Mapping[str, Any]) -> Figure:
+    """Fig. 3: structure pixels in the first picture, their segments and matches in the second."""
+    shown, matches = _known(pictures(products), "pictures"), _known(epipolar_matches(products), "matches")
+    chosen = _thinned(matches)
+    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _show(left, shown[0])
+    _show(right, shown[1])
+    _draw_squares(left, matches.grid[chosen], "#ff4b3e")
+    segments = np.stack([matches.starts, matches.ends], axis=1)[chosen]
+    right.plot(*np.moveaxis(segments, -1, 0).transpose(0, 2, 1), color="#35d46b", linewidth=0.8)
+    found = matches.matched[chosen][matches.accepted[chosen]]
+    _draw_squares(right, found, BLUE)
+    told = "" if len(chosen) == len(matches.grid) else f", {len(chosen)} shown"
+    left.set_title(f"First picture: {len(matches.grid):,} structure pixels{told}", fontsize=9)
+    right.set_title(f"Second: segments, {int(matches.accepted.sum()):,} matches", fontsize=9)
+    return figure
+
+
+@in_page_style
+def draw_elevation(products: Mapping[str, Any]) -> Figure:
+    """Fig. 4: two views of the elevation map."""
+    maps = _known(landing_maps(products), "maps")
+    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
+    for place, azimuth in enumerate((-115.0, -25.0)):
+        axes = figure.add_subplot(1, 2, place + 1, projection="3d", computed_zorder=False)
+        _draw_terrain(axes, maps, np.broadcast_to(np.array(to_rgb("#b9bec4")), (*maps.elevation_m.shape, 3)), azimuth)
+    return figure
+
+
+@in_page_style
+def draw_maps(products: Mapping[str, Any]) -> Figure:
+    """Fig. 5 (A): elevation, roughness, slope and safe landing map; below, the truth in the same coordinates."""
+    maps, truth = _known(landing_maps(products), "maps"), _known(true_ground(products), "truth")
+    figure = Figure(figsize=(11.0, 5.6), layout="constrained")
+    upper, lower = figure.subplots(2, 4)
+    degrees, limits = np.degrees(maps.slope_rad), maps.limits
+    middle = np.nanmedian(maps.elevation_m)
+    reach = float(np.nanquantile(np.abs(maps.elevation_m - middle), 0.99)) or 1.0
+    at = maps.cells(truth.away_m)
+    covered = np.where(truth.covered, 1.0, np.nan)
+    planes: list[tuple[str, np.ndarray, np.ndarray, float | None]] = [
+        ("elevation (m)", maps.elevation_m - middle, truth.elevation_m - middle, None),
+        ("roughness (m)", maps.roughness_m, truth.roughness_m * covered, float(limits[1])),
+        ("slope (deg)", degrees, np.degrees(truth.slope_rad) * covered, float(np.degrees(limits[0]))),
+    ]
+    for above, below, (name, ours, true, limit) in zip(upper, lower, planes, strict=False):
+        scale = {"vmin": -reach, "vmax": reach, "cmap": ELEVATION_COLOURS}
+        if limit is not None:
+            scale = {"vmin": 0.0, "vmax": 2.0 * limit, "cmap": HAZARD_COLOURS}
+        image = above.imshow(ours, interpolation="nearest", **scale)
+        below.pcolormesh(at[..., 1], at[..., 0], true, shading="nearest", rasterized=True, **scale)
+        bar = figure.colorbar(image, ax=[above, below], orientation="horizontal", shrink=0.9, pad=0.02, aspect=30)
+        bar.outline.set_visible(False)
+        bar.ax.tick_params(labelsize=7)
+        above.set_title(f"Map: {name}", fontsize=9)
+        below.set_title("Truth of footprints" if limit is not None else "Truth", fontsize=9)
+    _draw_safety(upper[3], maps)
+    true_safety = np.where(truth.covered, np.where(truth.safe, 0.0, 2.0), 1.0)
+    lower[3].pcolormesh(
+        at[..., 1], at[..., 0], true_safety, shading="nearest", rasterized=True, vmin=0, vmax=2, cmap=SAFETY_COLOURS
+    )
+    upper[3].set_title("Safe landing map", fontsize=9)
+    lower[3].set_title("Truth: a lander's middle", fontsize=9)
+    _safety_legend(lower[3])
+    for axes in (*upper, *lower):
+        _mark_sites(axes, maps)
+        rows, columns = maps.elevation_m.shape
+        axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
+        axes.set_facecolor("#8a929b")
+        axes.grid(visible=False)
+    return figure
+
+
+@in_page_style
+def draw_site(products: Mapping[str, Any]) -> Figure:
+    """Fig. 7 and Fig. 5 (B): the first picture, the safe landing map and the site on the picture and on the terrain."""
+    shown, maps = _known(pictures(products), "pictures"), _known(landing_maps(products), "maps")
+    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
+    grid = figure.add_gridspec(1, 3)
+    plain, over = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
+    for axes in (plain, over):
+        _show(axes, shown[0])
+    limits = over.get_xlim(), over.get_ylim()
+    if np.isfinite(maps.pixels).all():
+        known = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
+        over.pcolormesh(
+            maps.pixels[..., 0], maps.pixels[..., 1], known, shading="nearest", alpha=0.38,
+            vmin=0, vmax=2, cmap=SAFETY_COLOURS, rasterized=True, linewidth=0.0,
+        )  # fmt: skip
+    over.set(xlim=limits[0], ylim=limits[1])
+    for axes in (plain, over):
+        for name, cell in (("apriori", maps.apriori), ("site", maps.site)):
+            pixel = _at_cell(maps.pixels, cell)
+            if pixel is not None:
+                _mark(axes, pixel, name)
+    plain.set_title("First picture", fontsize=9)
+    over.set_title("Safe landing map on it", fontsize=9)
+    terrain = figure.add_subplot(grid[2], projection="3d", computed_zorder=False)
+    colours = SAFETY_COLOURS(np.clip(np.nan_to_num(maps.safety, nan=1.0), 0, 2).astype(np.int64))[..., :3]
+    _draw_terrain(terrain, maps, colours, -115.0)
+    terrain.set_title("On the terrain", fontsize=9)
+    return figure
+
+
+#: The figures by the names of their files, in the paper's order.
+FIGURES: Mapping[str, Callable[[Mapping[str, Any]], Figure]] = {
+    "fig1-tracks": draw_tracks,
+    "fig2-motion": draw_motion,
+    "fig3-epipolar": draw_epipolar,
+    "fig4-elevation": draw_elevation,
+    "fig5-maps": draw_maps,
+    "fig7-site": draw_site,
+}
+
+
+def figures_reached(products: Mapping[str, Any]) -> list[str]:
+    """Names of the figures that a case can show: those of the stages that it reached."""
+    reached = {
+        "fig1-tracks": tracked_features(products) is not None,
+        "fig2-motion": solved_motion(products) is not None,
+        "fig3-epipolar": epipolar_matches(products) is not None,
+    }
+    mapped = landing_maps(products) is not None
+    return [name for name in FIGURES if reached.get(name, mapped)]
+
+
+def write_hda_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
+    """Writes the figures of the stages that a case reached into a folder; returns their paths.
+
+    Raises
+    ------
+    OSError
+        Where they cannot be written.
+    """
+    written = []
+    for name in figures_reached(products):
+        path = directory / f"{name}.png"
+        FIGURES[name](products).savefig(path, dpi=130, facecolor="#ffffff", metadata={"Software": None})
+        written.append(path)
+    return written
+
+
+def _known(part: T | None, name: str) -> T:
+    if part is None:
+        raise ValueError(f"the products hold no {name}")
+    return part
+
+
+def _show(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
+    """A picture in grey, its contrast stretched between the 1 % and the 99 % quantile."""
+    finite = picture[np.isfinite(picture)]
+    low, high = np.quantile(finite, (0.01, 0.99)) if finite.size else (0.0, 1.0)
+    axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="antialiased")
+    axes.set(xticks=[], yticks=[], facecolor=INK)
+    axes.autoscale(enable=False)
+    axes.grid(visible=False)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def _draw_features(axes: Axes, pixels: Float[np.ndarray, "n 2"], tracks: TrackedFeatures, *, lost: bool = True) -> None:
+    kept = pixels[tracks.accepted]
+    axes.plot(*kept.T, "s", markersize=5.5, markerfacecolor="none", color=FOUND, markeredgewidth=1.3, label="tracked")
+    if lost and not tracks.accepted.all():
+        gone = pixels[~tracks.accepted]
+        axes.plot(*gone.T, "x", markersize=5.0, color=LOST, markeredgewidth=1.2, label="not tracked")
+
+
+def _draw_squares(axes: Axes, pixels: Float[np.ndarray, "n 2"], colour: str) -> None:
+    axes.plot(*pixels.T, "s", markersize=2.6, markerfacecolor="none", color=colour, markeredgewidth=0.9)
+
+
+def _draw_motion_view(
+    axes: Axes, motion: SolvedMotion, upright: Float[np.ndarray, "3 3"], pair: tuple[int, int]
+) -> None:
+    """One orthographic view along the axis that `pair` leaves out, in an upright frame at the first camera."""
+    chosen = list(pair)
+    depth = float(np.median(motion.points[:, 2]))
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        return np.asarray((points @ upright.T)[..., chosen])
+
+    axes.plot(*seen(motion.points).T, "o", color=WHITE, markersize=2.2, label="features")
+    poses = (
+        (np.eye(3), np.zeros(3), "#ff4b3e", "-", "first camera"),
+        (motion.rotation, motion.translation, "#35d46b", "-", "second camera"),
+        (motion.true_rotation, motion.true_translation, WHITE, ":", "second, true"),
+    )
+    for number, (rotation, translation, colour, line, name) in enumerate(poses):
+        middle = -rotation.T @ translation
+        rays = motion.corner_rays[min(number, 1)] * depth
+        field = middle + rays @ rotation
+        axes.plot(*seen(field[[0, 1, 2, 3, 0]]).T, color=colour, linestyle=line, linewidth=1.1, label=name)
+        if line == "-":
+            for corner in field:
+                axes.plot(*seen(np.array([middle, corner])).T, color=colour, linewidth=0.5, alpha=0.5)
+            for axis in 0.12 * depth * rotation:
+                axes.plot(*seen(np.array([middle, middle + axis])).T, color=colour, linewidth=1.8)
+    axes.set_facecolor(_BACKGROUND)
+    axes.grid(visible=False)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.tick_params(labelsize=7)
+    axes.set_xlabel("xyz"[pair[0]] + " (m)", fontsize=8)
+    axes.set_ylabel("xyz"[pair[1]] + " (m)", fontsize=8)
+
+
+def _thinned(matches: EpipolarMatches) -> np.ndarray:
+    """Indices of matches on a coarser grid, so that no more than `_MOST_MATCHES` are drawn."""
+    every = 1
+    ranks = [np.unique(matches.grid[:, k], return_inverse=True)[1] for k in (1, 0)]
+    chosen = np.arange(len(matches.grid))
+    while len(chosen) > _MOST_MATCHES:
+        every += 1
+        chosen = np.flatnonzero((ranks[0] % every == every // 2) & (ranks[1] % every == every // 2))
+    return chosen
+
+
+def _draw_terrain(
+    axes: Any, maps: LandingMaps, colours: Float[np.ndarray, "rows columns 3"], azimuth_deg: float
+) -> None:
+    """The elevation map as a lit surface in these colours, with the sites on it; the axes are three-dimensional."""
+    rows, columns = maps.elevation_m.shape
+    step = max(1, round(max(rows, columns) / _DRAWN_CELLS))
+    x = maps.corner_m[0] + maps.cell_m * np.arange(columns)
+    y = maps.corner_m[1] - maps.cell_m * np.arange(rows)
+    heights = maps.elevation_m - np.nanmedian(maps.elevation_m)
+    lit = LightSource(315.0, 45.0).shade_rgb(
+        np.asarray(colours), np.nan_to_num(heights), vert_exag=1.0, dx=maps.cell_m, dy=maps.cell_m, blend_mode="soft"
+    )
+    pick = np.s_[::step, ::step]
+    axes.plot_surface(
+        *(one[pick] for one in np.meshgrid(x, y)), heights[pick], facecolors=lit[pick], rcount=200, ccount=200,
+        shade=False, antialiased=False, linewidth=0.0, rasterized=True, zorder=1,
+    )  # fmt: skip
+    lift = 0.02 * max(rows, columns) * maps.cell_m
+    for name, cell in (("apriori", maps.apriori), ("site", maps.site)):
+        height = _at_cell(heights[..., None], cell)
+        if height is not None and np.isfinite(height).all():
+            place = maps.corner_m + maps.cell_m * cell[::-1] * np.array([1.0, -1.0])
+            axes.plot([place[0]], [place[1]], [float(height[0]) + lift], **_SITE_MARKS[name], zorder=5)
+    reach = float(np.nanmax(heights) - np.nanmin(heights))
+    sides = maps.cell_m * np.array([columns, rows])
+    axes.set_box_aspect((sides[0], sides[1], max(reach, 0.05 * sides.max())), zoom=1.25)
+    axes.view_init(elev=38.0, azim=azimuth_deg)
+    axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
+    axes.tick_params(labelsize=6, pad=-2, colors=MUTED)
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.label.set_size(7)
+        axis.labelpad = -6
+        axis.set_pane_color((0.0, 0.0, 0.0, 0.0))
+    axes.locator_params(nbins=4)
+
+
+def _draw_safety(axes: Axes, maps: LandingMaps) -> None:
+    axes.imshow(maps.safety, interpolation="nearest", vmin=0, vmax=2, cmap=SAFETY_COLOURS)
+    if (maps.safety > 1.5).any() and (maps.safety < 1.5).any():
+        axes.contourf(maps.safety, levels=[1.5, 2.5], colors="none", hatches=["////"])
+
+
+def _safety_legend(axes: Axes) -> None:
+    for name, colour in (("safe", GREEN), ("unknown", YELLOW), ("hazard", RED)):
+        axes.plot([], [], "s", color=colour, label=name)
+    for name in _SITE_MARKS:
+        axes.plot([], [], **_SITE_MARKS[name], label={"apriori": "a-priori site", "site": "safe site"}[name])
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, fontsize=7, columnspacing=1.0)
+
+
+_SITE_MARKS: Mapping[str, Mapping[str, Any]] = {
+    "apriori": {"marker": "x", "color": BLACK, "markersize": 8, "markeredgewidth": 2.0, "linestyle": ""},
+    "site": {"marker": "+", "color": PURPLE, "markersize": 11, "markeredgewidth": 2.6, "linestyle": ""},
+}
+_RIM = [patheffects.Stroke(linewidth=3.6, foreground=WHITE), patheffects.Normal()]
+
+
+def _mark_sites(axes: Axes, maps: LandingMaps) -> None:
+    rows, columns = maps.elevation_m.shape
+    for name, (row, column) in (("apriori", maps.apriori), ("site", maps.site)):
+        if 0 <= row <= rows - 1 and 0 <= column <= columns - 1:
+            _mark(axes, np.array([column, row]), name)
+
+
+def _mark(axes: Axes, place: Float[np.ndarray, "2"], name: str) -> None:
+    axes.plot([place[0]], [place[1]], **_SITE_MARKS[name], path_effects=_RIM, zorder=6)
+
+
+def _at_cell(values: Float[np.ndarray, "rows columns k"], cell: Float[np.ndarray, "2"]) -> np.ndarray | None:
+    """Values at the nearest cell; None outside."""
+    if not np.isfinite(cell).all():
+        return None
+    row, column = (int(part) for part in np.rint(cell))
+    inside = 0 <= row < values.shape[0] and 0 <= column < values.shape[1]
+    found = values[row, column] if inside else None
+    return found if found is not None and np.isfinite(found).all() else None

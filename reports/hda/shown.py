@@ -1,0 +1,85 @@
+"""What the page shows of a landing's case: the paper's figures, and what became of the site."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from reports.hda.case_figures import FIGURES, figures_reached, write_hda_figures
+from reports.hda.products import (
+    LandingMaps,
+    SolvedMotion,
+    epipolar_matches,
+    is_hda_case,
+    landing_maps,
+    solved_motion,
+    tracked_features,
+)
+from reports.plates import plate
+from reports.shown import CaseView, System, TableRow
+from reports.wording import number
+
+_CAPTIONS: Mapping[str, str] = {
+    "fig2-motion": "Fig. 2: motion and structure from three sides.",
+    "fig3-epipolar": "Fig. 3: structure pixels (red), epipolar segments (green), matches (blue).",
+    "fig4-elevation": "Fig. 4: two views of the elevation map.",
+    "fig5-maps": "Fig. 5: elevation, roughness, slope and safe landing map; below, the truth.",
+    "fig7-site": "Fig. 7: first picture, and the safe landing map on it and on the terrain.",
+}
+#: Its pictures are those of Fig. 3: the page leaves them out, `marsyard replay` draws them.
+_LEFT_OUT = "fig1-tracks"
+_LEGEND = (
+    "As the paper's Figs. 2 to 5 and 7; marsyard replay draws Fig. 1 as well. Elevation: dark is high, bright is low. "
+    "Roughness and slope: green well below "
+    "the limit, yellow towards it, red beyond; the scale ends at twice the limit, grey is not known. Safe landing map: "
+    "green safe, red hazard (hatched), yellow unknown; a black X marks the a-priori site, a purple plus the safe site. "
+    "The truth is of the footprint of a lander whose middle stands there, and is not grown by its diameter; yellow: "
+    "not all of the footprint is seen by both pictures."
+)
+
+
+def view(products: Mapping[str, Any], key: str) -> CaseView:
+    """A landing's case."""
+    names = [name for name in figures_reached(products) if name != _LEFT_OUT]
+    plates = [plate(FIGURES[name](products), f"{key}{name[:4]}", _CAPTIONS[name], wide=True) for name in names]
+    return CaseView(
+        [("Figures", ", ".join(name.split("-")[0] for name in names) or "none")], plates, *_stages(products)
+    )
+
+
+HDA = System(is_hda_case, view, write_hda_figures, _LEGEND)
+
+
+def _stages(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]:
+    """The stages as a table: what each gave, and whether it was reached."""
+    tracks, motion = tracked_features(products), solved_motion(products)
+    matches, maps = epipolar_matches(products), landing_maps(products)
+    told = [
+        ("Features and tracks", None if tracks is None else f"{tracks.accepted.sum()} of {len(tracks.first)} tracked"),
+        ("Motion", None if motion is None else _motion_text(motion)),
+        ("Structure", None if matches is None else f"{matches.accepted.sum():,} of {len(matches.grid):,} matched"),
+        ("Map", None if maps is None else _map_text(maps)),
+        ("Site", None if maps is None else _site_text(maps)),
+    ]
+    return ["Stage", "Result"], [TableRow([name, text or "not reached"], text is not None) for name, text in told]
+
+
+def _motion_text(motion: SolvedMotion) -> str:
+    turned = motion.rotation @ motion.true_rotation.T
+    angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(turned) - 1.0), -1.0, 1.0)))
+    off = float(np.linalg.norm(motion.translation - motion.true_translation))
+    baseline = float(np.linalg.norm(motion.true_translation))
+    return f"baseline {number(baseline)} m, off by {number(off)} m; rotation off by {number(float(angle))} deg"
+
+
+def _map_text(maps: LandingMaps) -> str:
+    rows, columns = maps.elevation_m.shape
+    return f"{rows} x {columns} cells of {number(maps.cell_m)} m"
+
+
+def _site_text(maps: LandingMaps) -> str:
+    if not np.isfinite(maps.site).all():
+        return "no safe site"
+    return f"row {maps.site[0]:.0f}, column {maps.site[1]:.0f}"
