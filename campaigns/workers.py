@@ -239,9 +239,12 @@ class _Worker:
 
     def stop(self, *, kill: bool) -> None:
         """Ends the process and waits until it is gone."""
-        if kill:
+        begun = self._board.read().process != 0
+        if kill and begun:
             self._kill()
-        self._executor.shutdown(wait=True, kill_workers=kill)
+        # a process that has begun is dead by now: having loky kill it as well, beside tasks that wait, would raise in
+        # loky's thread (KeyError in `add_call_item_to_queue`)
+        self._executor.shutdown(wait=True, kill_workers=kill and not begun)
         self._board.close()
 
 

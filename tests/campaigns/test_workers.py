@@ -217,12 +217,12 @@ def test_memory_counts_what_is_the_processs_own(tmp_path: Path) -> None:
 
 
 def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
-    batches = Batches(range(100), 100, 2)
+    batches = Batches(range(400), 400, 2)
     sizes = []
     while batch := batches.next():
         sizes.append(len(batch))
         batches.took(len(batch), 0.05 * len(batch))
-    assert sum(sizes) == 100
+    assert sum(sizes) == 400
     assert sizes[:5] == [1, 2, 4, 8, 16]
     assert max(sizes) == 20
     assert sizes[-1] == 1
