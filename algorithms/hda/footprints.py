@@ -89,10 +89,9 @@ def checked(
         ground.elevation_m, rows, columns, offsets, fitted, max(len(fitted) // 2, 4), triples, options.refine_planes
     )
     steepest = options.max_slope_rad - options.margin_deviations * options.level_error_rad
+    roughest = roughness_limit_m(resolution, ground.cell_m, options)
     with np.errstate(invalid="ignore"):
-        good = (np.arctan(slopes / ground.cell_m) <= steepest) & (
-            roughness <= roughness_limit_m(resolution, ground.cell_m, options)
-        )
+        good = (np.arctan(slopes / ground.cell_m) <= steepest) & (roughness <= roughest) & (roughest > 0.0)
     fails = np.zeros_like(lattice)
     fails[rows[~good], columns[~good]] = True
     result = safety.copy()
