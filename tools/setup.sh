@@ -94,6 +94,9 @@ install_gl_libraries() {
     fi
 }
 
+# The tests build an example in C.
+install_compiler() { command -v cc >/dev/null || need gcc libc6-dev || true; }
+
 # --- the environment --------------------------------------------------------------------------------------------------
 
 make_venv() {
@@ -147,6 +150,7 @@ else
     install_gl_libraries "$python"
     make_venv "$python"
 fi
+install_compiler
 install_packages
 check_rendering
 rm -f "$unfinished"
