@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.raycast import Ground, meet_triangles
@@ -73,50 +72,6 @@ def test_shadows_of_rocks(renderer) -> None:
     agree, in_shadow = _agreement(frame, scene, 3000, 0.02)
     assert in_shadow > 0.02
     assert agree >= BAR
-
-
-def _ball(centre: np.ndarray, radius: float, subdivisions: int) -> Objects:
-    """An icosphere with the normals of the sphere that it stands for."""
-    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
-    outwards = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
-    faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
-    return Objects.of_mesh(centre + radius * outwards, outwards, faces, np.zeros(len(faces), np.int32), ALBEDO)
-
-
-@pytest.mark.parametrize("elevation_deg", [10.0, 35.0])
-def test_light_on_a_coarse_ball_ends_where_it_does_on_a_sphere(renderer, elevation_deg: float) -> None:
-    """Its 320 flat triangles, 17 deg across, shade nothing that the sun reaches on the sphere of their normals.
-
-    Where a small ball between it and the sun casts its shadow it is dark all the same.
-    """
-    sun = Sun(direction(np.radians(110.0), np.radians(elevation_deg)))
-    towards = np.asarray(sun.direction)
-    middle, small = np.array([32.0, 32.0, 3.0]), 0.3
-    between = middle + 2.5 * towards + np.array([0.0, 0.0, 0.35])
-    balls = Objects.joined([_ball(middle, 1.0, 2), _ball(between, small, 3)])
-    samples = np.stack([np.zeros((64, 64)), np.full((64, 64), ALBEDO)], axis=-1).astype(np.float32)
-    ground = Surface.from_samples(samples, 1.0)
-    camera = Cahv.from_field_of_view(
-        horizontal_rad=0.26,
-        size=(192, 192),
-        centre=np.zeros(3),
-        axis=np.array([0.0, 0.0, -1.0]),
-        right=np.array([1.0, 0.0, 0.0]),
-    )
-    scene = Scene(ground, (32.0, 32.0), sun, LAMBERT, balls, mesh_finest_m=0.5, mesh_reach_m=1000.0, edge_rays=1)
-    frame = renderer.render(scene, PixelRays.of(camera), rigid(Rotation.identity(), np.array([32.0, 32.0, 12.0])))
-    on_ball = frame.body == 0
-    outwards = frame.points_world()[on_ball] - middle
-    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
-    facing = outwards @ towards
-    away = between - (middle + outwards)
-    beside = np.linalg.norm(away - (away @ towards)[:, None] * towards, axis=1)
-    light = frame.radiance[on_ball] / ALBEDO
-    # the small ball's outline is that of its triangles, and the large one's surface lies up to 0.03 off the sphere
-    clear, covered = beside > small + 0.04, beside < small - 0.04
-    assert np.mean(covered & (facing > 0.0)) > 0.01
-    np.testing.assert_array_equal(light[covered], 0.0)
-    np.testing.assert_allclose(light[clear], np.maximum(facing[clear], 0.0), atol=1e-3)
 
 
 def test_penumbra_of_a_ridge(renderer, descent_camera) -> None:
