@@ -44,32 +44,6 @@ def _brightness(law: Array, cos_i: float, cos_e: float, cos_g: float) -> float:
 
 
 @njit(cache=True, inline="always")
-def _on_smooth_shape(
-    triangles: Array, normals: Array, n: int, second: float, third: float, x: float, y: float, z: float
-) -> tuple[float, float, float]:
-    """Where a place on a flat triangle lies on the smooth shape that the normals at its corners tell of.
-
-    The place is put onto the corners' tangent planes and the results are mixed by its weights, as Phong tessellation
-    does; never inwards. A ray to the sun that begins on the flat triangle instead meets its neighbours where the smooth
-    shape is lit. Hanika, "Hacking the shadow terminator", in Ray Tracing Gems II (2021), listing 4-1.
-    """
-    out_x, out_y, out_z = 0.0, 0.0, 0.0
-    for corner in range(3):
-        weight = 1.0 - second - third if corner == 0 else (second if corner == 1 else third)
-        nx = normals[n, corner, 0]
-        ny = normals[n, corner, 1]
-        nz = normals[n, corner, 2]
-        above = (x - triangles[n, corner, 0]) * nx
-        above += (y - triangles[n, corner, 1]) * ny
-        above += (z - triangles[n, corner, 2]) * nz
-        below = weight * max(-above, 0.0)
-        out_x += below * nx
-        out_y += below * ny
-        out_z += below * nz
-    return x + out_x, y + out_y, z + out_z
-
-
-@njit(cache=True, inline="always")
 def _in_reach(reach: Reach, x: float, y: float) -> bool:
     """Whether a thing may hide the sun from the ground at this place."""
     cells, west, south, per_metre = reach
@@ -253,14 +227,9 @@ def shade(
                         finest, inverse_spacing, shadow, shadow_spacing, row_m, x, y, z, sun, sun_radius, highest
                     )
             if lit > 0.0 and things and (triangle >= 0 or _in_reach(reach, x, y)):
-                from_x, from_y, from_z = x, y, z
-                if triangle >= 0:
-                    from_x, from_y, from_z = _on_smooth_shape(
-                        tree[0], normals, triangle, weights[n, 0], weights[n, 1], x, y, z
-                    )
                 # lifted off its own facet, so that this and those beside do not shade it by rounding
                 lift = 1e-4 + (0.05 * t * pixel_angles[n] if triangle >= 0 else 0.0)
-                if anything_hit(tree, from_x + lift * nx, from_y + lift * ny, from_z + lift * nz, sun, 0.0):
+                if anything_hit(tree, x + lift * nx, y + lift * ny, z + lift * nz, sun, 0.0):
                     lit = 0.0
             cos_g = min(max(-(dx * sun[0] + dy * sun[1] + dz * sun[2]), -1.0), 1.0)
             if caster > 0.0 and cos_g > 0.9:
