@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import datetime as dt
 import json
 import os
@@ -23,6 +24,7 @@ PACKAGES = ("marsyard", "numpy", "numba", "pyrender2", "opencv-python-headless")
 
 def main() -> None:
     """Measures, prints and keeps."""
+    argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__).parse_args()
     cv2.setNumThreads(1)
     figures = [
         # first, while nothing else has grown the process
