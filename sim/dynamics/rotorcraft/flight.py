@@ -52,6 +52,11 @@ class Air:
         sizes = np.array([p.gust_m_s, p.gust_m_s, p.vertical_gust_m_s])
         return cls(np.array([p.east_m_s, p.north_m_s, 0.0]), sizes * lfilter([1.0], [1.0, -kept], shocks, axis=0))
 
+    def check_lasts(self, knots: int) -> None:
+        """Raises ValueError where there are gusts for fewer knots than a flight may take."""
+        if len(self.gusts_m_s) < knots:
+            raise ValueError(f"there are gusts for {len(self.gusts_m_s)} knots; the flight may take {knots}")
+
 
 @dataclass(frozen=True)
 class GroundPatch:
@@ -158,9 +163,15 @@ def transit_flight(
         Directions of flight and nose, counterclockwise from east.
     rng
         Phases of the vibration.
+
+    Raises
+    ------
+    ValueError
+        If the air is known for less than the flight takes, `TAIL_S` after the last picture included.
     """
     p, step = transit, craft.step_s
     count = int(np.ceil((p.lead_s + p.pictures_s + TAIL_S) / step - 1e-9)) + 1
+    air.check_lasts(count)
     times = -p.lead_s + step * np.arange(count)
     along = np.array([np.cos(course_rad), np.sin(course_rad), 0.0])
     reference = np.concatenate([np.multiply.outer(one, along) for one in _run_up(p, times)], axis=1)
@@ -196,9 +207,17 @@ def landing_flight(
     errors
         Believed less true position, velocity and angles (yaw, pitch, roll) at the knots from the flight's start on; the
         last row is held after them.
+
+    Raises
+    ------
+    ValueError
+        If the air or the laser's noise is known for less than the flight may take.
     """
     step, before = craft.step_s, len(flown.path.rows)
     count = before + int(np.ceil((guidance.wait_s + guidance.longest_s) / step))
+    air.check_lasts(count)
+    if len(laser.noise_m) < count:
+        raise ValueError(f"the laser's noise is known for {len(laser.noise_m)} knots; the flight may take {count}")
     rows = np.concatenate([flown.path.rows, np.zeros((count - before, SIZE))])
     phases = np.concatenate([flown.phases, np.full(count - before, Phase.WAIT.value)])
     held = np.concatenate([errors, np.repeat(errors[-1:], max(count - len(errors), 0), axis=0)])

@@ -20,6 +20,7 @@ from sim.dynamics.rotorcraft import (
     landing_flight,
     transit_flight,
 )
+from sim.dynamics.rotorcraft.flight import TAIL_S
 
 GRAVITY, COURSE, HEADING = 9.8, 0.3, 1.0
 OVER, SITE = np.array([100.0, 50.0, 12.0]), np.array([103.0, 52.0])
@@ -29,7 +30,7 @@ SMOOTH = RotorcraftParameters(vibration=VibrationParameters(acceleration_m_s2=0.
 
 
 def _air(seed: int, **changes: float) -> Air:
-    span = TRANSIT.lead_s + TRANSIT.pictures_s + GUIDANCE.wait_s + GUIDANCE.longest_s
+    span = TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S + GUIDANCE.wait_s + GUIDANCE.longest_s
     return Air.drawn(AirParameters.model_validate(changes), CRAFT.step_s, span, np.random.default_rng(seed))
 
 
@@ -53,6 +54,13 @@ def _landing(
     ground = GroundPatch(SITE - 25.0, 0.5, heights)
     laser = LandingLaser(1.0, np.zeros(len(air.gusts_m_s)), stuck_m)
     return landing_flight(flown, craft, GUIDANCE, SITE, errors, air, ground, laser)
+
+
+def test_an_air_that_ends_too_soon_is_refused() -> None:
+    """The kernels would read past its end."""
+    air = Air.drawn(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="the flight may take"):
+        _transit(air)
 
 
 def _touchdown(flight: RotorcraftFlight) -> np.ndarray:

@@ -17,6 +17,7 @@ from sim.dynamics.rotorcraft import (
     TransitParameters,
     transit_flight,
 )
+from sim.dynamics.rotorcraft.flight import TAIL_S
 from sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
 from sim.sensor.navigation.kernels import GPS_PLACE, GPS_SPEED
@@ -31,7 +32,7 @@ RTK, COMPASS = RtkParameters(), TiltCompassParameters()
 @cache
 def _path(seed: int) -> FlownPath:
     rng = np.random.default_rng(seed)
-    air = Air.drawn(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s, rng)
+    air = Air.drawn(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S, rng)
     over, heading = np.array([100.0, 50.0, 10.0]), rng.uniform(0.0, 2.0 * np.pi)
     return transit_flight(CRAFT, TRANSIT, over, 0.3, heading, GRAVITY, air, rng).path
 
