@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 TEMPLATE = Path(__file__).parent / "template.md"
 DOCUMENT = ROOT / "docs" / "validation.md"
 RESULTS = ROOT / "benchmarks" / "results" / "validation.json"
-SPEED = ROOT / "benchmarks" / "results" / "descent.json"
+SPEED = ROOT / "benchmarks" / "results" / "benchmarks.json"
 #: Versions that a figure can depend on.
 PACKAGES = ("marsyard", "numpy", "scipy", "numba", "pyrender2", "trimesh")
 
@@ -94,7 +94,7 @@ def _environments(checks: Sequence[Check], kept: dict[str, dict]) -> str:
 def _speed() -> str:
     if not SPEED.exists():
         return "Not measured yet."
-    rows = ["| what | core-seconds |", "|---|---|"]
-    for name, seconds in json.loads(SPEED.read_text())["core_seconds"].items():
-        rows.append(f"| {name} | {figure(seconds)} |")
+    rows = ["| what | asked | median |", "|---|---|---|"]
+    for name, kept in json.loads(SPEED.read_text())["figures"].items():
+        rows.append(f"| {name} | {kept['asked']} | {kept['median']:.3g} |")
     return "\n".join(rows)
