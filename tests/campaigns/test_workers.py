@@ -106,8 +106,8 @@ def test_memory_of_what_is_to_do_is_flat() -> None:
         for number, _ in enumerate(run(workers, partial(nap, 0.0), items())):  # type: ignore[arg-type]
             if number == 10:
                 break
-    # eleven that ended, and for each of two workers a batch that is at most twice as large as what ended before
-    assert taken < 60
+    # batches double as they end: after 1, 2, 4 and 8 there may be one of 16 and one of 32 under way, hardly more
+    assert taken < 200
 
 
 def hurt(folder: str, item: int) -> int:
