@@ -41,7 +41,7 @@ class BusyScenario:
         return ()
 
     def prepare(self, parameters: BusyParameters, shared_input: int) -> None:
-        raise NotImplementedError
+        """Nothing: there are no shared inputs."""
 
     def run(self, parameters: BusyParameters, streams: Streams) -> CaseResult:
         end = time.process_time() + parameters.busy_s

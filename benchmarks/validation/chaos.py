@@ -40,7 +40,7 @@ class ChaosScenario:
         return ()
 
     def prepare(self, parameters: ChaosParameters, shared_input: int) -> None:
-        raise NotImplementedError
+        """Nothing: there are no shared inputs."""
 
     def run(self, parameters: ChaosParameters, streams: Streams) -> CaseResult:
         end = time.process_time() + parameters.work_s

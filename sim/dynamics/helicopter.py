@@ -173,15 +173,7 @@ class HelicopterFlight:
 
     def state(self, time_s: float) -> State:
         """Truth at a time. Raises ValueError outside of the span."""
-        motion = self.motion(np.array([time_s]))
-        return State(
-            time_s=time_s,
-            position_m=motion.positions_m[0],
-            velocity_m_s=motion.velocities_m_s[0],
-            attitude=motion.attitudes[0],
-            body_rate_rad_s=motion.body_rates_rad_s[0],
-            specific_force_m_s2=motion.specific_forces_m_s2[0],
-        )
+        return self.motion(np.array([time_s])).state(0)
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Truth at many times. Raises ValueError outside of the span."""

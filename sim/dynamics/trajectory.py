@@ -37,6 +37,17 @@ class Motion:
     body_rates_rad_s: Float64[np.ndarray, "n 3"]
     specific_forces_m_s2: Float64[np.ndarray, "n 3"]
 
+    def state(self, row: int) -> State:
+        """Truth at one of the instants."""
+        return State(
+            time_s=float(self.times_s[row]),
+            position_m=self.positions_m[row],
+            velocity_m_s=self.velocities_m_s[row],
+            attitude=self.attitudes[row],
+            body_rate_rad_s=self.body_rates_rad_s[row],
+            specific_force_m_s2=self.specific_forces_m_s2[row],
+        )
+
 
 @runtime_checkable
 class Trajectory(Protocol):

@@ -25,9 +25,7 @@ class Flown:
     span_s: tuple[float, float] = (-np.inf, np.inf)
 
     def state(self, time_s: float) -> State:
-        one = self.motion(np.array([time_s]))
-        rows = one.positions_m[0], one.velocities_m_s[0], one.attitudes[0], one.body_rates_rad_s[0]
-        return State(time_s, *rows, one.specific_forces_m_s2[0])
+        return self.motion(np.array([time_s])).state(0)
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         nothing = np.zeros((times_s.size, 3))
