@@ -4,7 +4,8 @@ A requirement asks that `metric <= bound` (in magnitude), or a column of true an
 a population of cases, at a stated confidence. Its status follows from one-sided Clopper-Pearson bounds of the success
 rate, as for independent cases; or from the rate alone where the requirement is decided by the estimate. Where cases
 share terrains they are not independent: the verdict then says so and carries the bounds that hold nevertheless. Where
-they are no random draws at all (Latin hypercube, Sobol, grids) the rate is told, and nothing is decided by it.
+they are no random draws at all (Latin hypercube, Sobol, grids) no bounds are told and no confidence can be had: only a
+requirement that is decided by the estimate is then decided, by the rate of these very cases, and the verdict says so.
 """
 
 from __future__ import annotations
@@ -151,8 +152,8 @@ def judge_campaign(
     requirements
         As the campaign states them.
     how
-        How the cases were drawn. Where they are not independent random draws every requirement stays INSUFFICIENT: its
-        rate is told, without bounds.
+        How the cases were drawn. Where they are not independent random draws rates are told without bounds, and
+        requirements that ask for a confidence stay INSUFFICIENT; those decided by the estimate are decided by the rate.
     """
     return [_judge(how.drawn(frame), requirement, how) for requirement in requirements]
 
@@ -166,7 +167,7 @@ def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = IND
         return Overall(None, crashed, "The campaign asks for no requirement." + tail)
     worst = next((status for status in (Status.FAIL, Status.INSUFFICIENT) if status in statuses), Status.PASS)
     if not how.independent:
-        return Overall(worst, crashed, how.no_probability + tail)
+        return Overall(worst, crashed, _by_rates(verdicts) + how.no_probability + tail)
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.FAIL: f"{statuses.count(Status.FAIL)} of {count(len(statuses), 'requirement')} not met.",
@@ -176,6 +177,14 @@ def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = IND
         ),
     }[worst]
     return Overall(worst, crashed, sentence + tail)
+
+
+def _by_rates(verdicts: Sequence[Verdict]) -> str:
+    """How many requirements the rates of a designed campaign's own cases meet; empty where none is decided by them."""
+    statuses = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
+    if not statuses:
+        return ""
+    return f"{statuses.count(Status.PASS)} of {count(len(statuses), 'requirement')} met by the rate of these cases. "
 
 
 def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
@@ -258,16 +267,19 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
 
 
 def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
-    """The verdict by cases that carry no probability: how many succeeded, and why that decides nothing."""
+    """The verdict by cases that carry no probability: the rate seen, which decides where the estimate is to."""
     success = succeeded(chosen, verdict.metric, verdict.bound)
     groups = terrain_groups(chosen)
+    rate = float(success.mean())
+    decided = verdict.decide_by == ESTIMATE
     return replace(
         verdict,
+        status=_status(rate, rate, verdict.probability) if decided else verdict.status,
         n=success.size,
         failures=int((~success).sum()),
-        estimate=float(success.mean()),
+        estimate=rate,
         terrains=None if groups is None else int(chosen["terrain"].nunique()),
-        reason=how.no_probability,
+        reason=f"Decided by the rate of these cases. {how.no_probability}" if decided else how.no_probability,
     )
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
@@ -38,11 +39,11 @@ def test_what_states_no_design_is_drawn_independently(odd: dict[str, Any]) -> No
 
 
 @pytest.mark.parametrize(("configuration", "said"), DESIGNED)
-def test_designs_tell_rates_and_decide_nothing(
+def test_designs_tell_rates_and_decide_nothing_at_a_confidence(
     make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], said: str
 ) -> None:
     frame, how = make_rows(2000), sampled(configuration)
-    asked = [{**velocity, "decide_by": how_decided} for how_decided in ("confidence", "estimate")]
+    asked = [{**velocity, "probability": probability} for probability in (0.5, velocity["probability"])]
     for verdict, plain in zip(judge_campaign(frame, asked, how), judge_campaign(frame, asked), strict=True):
         assert verdict.status is Status.INSUFFICIENT
         assert (verdict.n, verdict.failures, verdict.estimate) == (plain.n, plain.failures, plain.estimate)
@@ -59,6 +60,30 @@ def test_designs_tell_rates_and_decide_nothing(
     Console(file=printed, width=200).print(verdict_table(verdicts))
     assert printed.getvalue().count("No probability statement") == 1
     assert "Clopper" not in printed.getvalue()
+
+
+@pytest.mark.parametrize(("configuration", "said"), DESIGNED)
+def test_the_rate_of_a_design_decides_where_the_estimate_is_to(
+    make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], said: str
+) -> None:
+    """Of 1,000 cases a rate of 0.98 meets 0.98 but not 0.99; no bounds are told, and the verdict says what it is."""
+    frame, how = make_rows(1000), sampled(configuration)
+    frame["answered"], frame["velocity_error_m_s"] = True, np.where(np.arange(1000) % 50, 0.1, 99.0)
+    asked = [{**velocity, "probability": least, "decide_by": "estimate"} for least in (0.98, 0.99)]
+    met, missed = judge_campaign(frame, asked, how)
+    assert (met.status, missed.status) == (Status.PASS, Status.FAIL)
+    assert (met.n, met.failures, met.estimate) == (1000, 20, 0.98)
+    assert math.isnan(met.lower)
+    assert met.note.startswith("Decided by the rate of these cases. No probability statement: ")
+    assert said in met.note
+    assert exit_code([met], crashed=False) == 0
+    assert exit_code([met, missed], crashed=False) == 1
+    whole = overall([met, missed], frame, how)
+    assert whole.word == "FAIL"
+    assert whole.sentence.startswith("1 of 2 requirements met by the rate of these cases. No probability statement: ")
+    empty = judge_campaign(frame.assign(answered=False), [{**asked[0], "population": "valid"}], how)
+    assert empty[0].status is Status.INSUFFICIENT
+    assert not overall(empty, frame, how).sentence.startswith("0 of")
 
 
 def test_a_design_without_requirements_has_no_verdict(make_rows: Rows) -> None:
