@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.pictures import descent_scene
 from benchmarks.stages import stages
 from benchmarks.timing import Figure, core_seconds
-from campaigns.loading import load_campaign
+from campaigns.definition.loading import load_campaign
 from scenarios.descent import (
     CameraParameters,
     DescentScenarioParameters,

@@ -12,12 +12,12 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict
 
 from benchmarks.timing import Figure
-from campaigns.configuration import CampaignConfiguration, Retain
-from campaigns.crew import Crew
-from campaigns.engine import run_campaign
-from campaigns.sampling import Campaign
-from campaigns.store import RowStore, create_store
-from campaigns.table import write_table
+from campaigns.definition.campaign import Campaign
+from campaigns.definition.configuration import CampaignConfiguration, Retain
+from campaigns.execution.crew import Crew
+from campaigns.running.engine import run_campaign
+from campaigns.store.rows import RowStore, create_store
+from campaigns.store.table import write_table
 from scenarios.interface import CaseResult
 from sim.streams import Streams
 

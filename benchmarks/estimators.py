@@ -13,7 +13,7 @@ from algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
 from algorithms.dimes import DimesEstimator, DimesOptions
 from algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
 from benchmarks.timing import Figure
-from campaigns.loading import load_campaign
+from campaigns.definition.loading import load_campaign
 from sim.measurements import DescentMeasurements
 
 #: By name: what is compared.

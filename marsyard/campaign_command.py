@@ -16,10 +16,10 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from campaigns.crew import Crew
-    from campaigns.engine import Watch
-    from campaigns.replay import Replay
-    from campaigns.sampling import Campaign
+    from campaigns.definition.campaign import Campaign
+    from campaigns.execution.crew import Crew
+    from campaigns.running.engine import Watch
+    from campaigns.running.replay import Replay
 
 
 class Exit(IntEnum):
@@ -107,8 +107,8 @@ def run(
     algorithm: AlgorithmOption = None,
 ) -> None:
     """Run a campaign, judge its requirements, and write its report."""
-    from campaigns.engine import run_campaign
-    from campaigns.loading import load_campaign
+    from campaigns.definition.loading import load_campaign
+    from campaigns.running.engine import run_campaign
 
     crew = _crew(jobs, cluster)
     limits = [] if case_time is None else [f"limits.case_time_s={case_time}"]
@@ -138,7 +138,7 @@ def resume(
     allow_changed: ChangedOption = False,
 ) -> None:
     """Run the cases that an interrupted or killed campaign still lacks, and judge it; finished cases stay."""
-    from campaigns.engine import resume_campaign
+    from campaigns.running.engine import resume_campaign
 
     crew, words = _crew(jobs, cluster), _outcomes(retry or [])
 
@@ -157,7 +157,7 @@ def append(
     allow_changed: ChangedOption = False,
 ) -> None:
     """Add a block of cases to a finished campaign, run them, and judge all; the cases that are there stay."""
-    from campaigns.engine import append_cases
+    from campaigns.running.engine import append_cases
 
     crew = _crew(jobs, cluster)
     _carry_out(directory, lambda watch: append_cases(directory, cases, crew, watch, allow_changed=allow_changed))
@@ -183,9 +183,9 @@ def replay(
     ] = False,
 ) -> None:
     """Run one case again, keep and draw its intermediate results, and compare its row with the stored one."""
-    from campaigns.products import PackedProducts, save_packed, unpack_products
-    from campaigns.replay import replay as run_again
-    from campaigns.retention import case_directory
+    from campaigns.running.replay import replay as run_again
+    from campaigns.store.products import PackedProducts, save_packed, unpack_products
+    from campaigns.store.retention import case_directory
     from marsyard.steps import write_steps
     from reports.systems import write_case_figures
 
@@ -231,9 +231,9 @@ def console(*, stderr: bool = False) -> Console:
 
 def _crew(jobs: int | None, cluster: str | None) -> Crew:
     """Who runs a campaign, as the options say."""
-    from campaigns.crew import Crew
     from campaigns.errors import CampaignError
-    from campaigns.workers import available_cores
+    from campaigns.execution.crew import Crew
+    from campaigns.execution.workers import available_cores
 
     if jobs is not None and jobs < 1:
         raise CampaignError(f"--jobs {jobs}: at least one worker process is needed")
@@ -256,7 +256,7 @@ def _outcomes(words: Sequence[str]) -> list[str]:
 def _carry_out(directory: Path, work: Callable[[Watch], None]) -> None:
     """Does a campaign's work and judges it; where it is interrupted says how to go on."""
     from campaigns.errors import CampaignError
-    from campaigns.record import read
+    from campaigns.store.record import read
     from marsyard.outcome import conclude
     from marsyard.progress import campaign_progress
 
@@ -293,7 +293,7 @@ def _stopped_by_signals() -> Iterator[None]:
 
 def _print_estimate(campaign: Campaign, crew: Crew) -> None:
     """Prints what a campaign would take."""
-    from campaigns.estimate import estimate
+    from campaigns.running.estimate import estimate
 
     workers = crew.jobs if crew.cluster is None else os.cpu_count() or 1
     found = estimate(campaign, workers)

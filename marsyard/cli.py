@@ -47,7 +47,7 @@ app.command()(gallery)
 @says_what_is_wrong
 def list_campaigns() -> None:
     """List the campaigns of the catalogue."""
-    from campaigns.loading import catalogue
+    from campaigns.definition.loading import catalogue
     from marsyard.showing import catalogue_table
 
     console().print(catalogue_table(catalogue()))
@@ -68,8 +68,8 @@ def show(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with every value that was drawn.")] = False,
 ) -> None:
     """Show a campaign: its parameters, its dispersions with their sources, and its requirements; or what it draws."""
+    from campaigns.definition.loading import load_campaign
     from campaigns.errors import CampaignError
-    from campaigns.loading import load_campaign
     from marsyard.showing import described, show_campaign, show_draws, write_draws_figure
 
     if figure is not None and draw is None:

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from campaigns import record
 from campaigns.errors import StoreError
-from campaigns.lock import is_locked
-from campaigns.table import TABLE_FILE, refresh_table
+from campaigns.store import record
+from campaigns.store.lock import is_locked
+from campaigns.store.table import TABLE_FILE, refresh_table
 from marsyard.campaign_command import Exit
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from campaigns.configuration import CampaignConfiguration, description_at
-from campaigns.design import said_of
-from campaigns.dispersions import Dispersion
+from campaigns.definition.campaign import Campaign, leaves, value_at
+from campaigns.definition.configuration import CampaignConfiguration, description_at
 from campaigns.errors import CampaignError
-from campaigns.sampling import Campaign, leaves, value_at
+from campaigns.sampling.design import said_of
+from campaigns.sampling.dispersion import Dispersion
 from reports.columns import split_unit
 from reports.wording import asked_text, count
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from campaigns.design import said_of
+from campaigns.sampling.design import said_of
 from reports.stored import table
 
 #: The design of cases that are drawn independently.

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from campaigns.errors import StoreError
-from campaigns.products import load_products
+from campaigns.store.products import load_products
 
 TABLE_FILE = "cases.parquet"
 RECORD_FILE = "campaign.json"

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from benchmarks.validation.records import Check, Measure
-from campaigns.loading import load_campaign
+from campaigns.definition.loading import load_campaign
 from sim.streams import stream_key
 
 #: NumPy's `SeedSequence`, whose algorithm is fixed: constants of numpy/random/bit_generator.pyx.

@@ -1,0 +1,162 @@
+"""What a campaign's rows depend on beside the case's number: configuration, code, and the packages' versions."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import platform
+import re
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Self
+
+from algorithms.exchange import command_of
+from campaigns.definition.configuration import CampaignConfiguration
+from scenarios.estimators import installed
+from scenarios.interface import TakesAlgorithms
+from scenarios.registry import UnknownScenarioError, scenario
+
+#: Folders of ours whose code rows depend on; what reports and commands do changes no row.
+_CODE = ("sim", "algorithms", "scenarios", "campaigns")
+
+#: Keys of a configuration that change no row of a case that comes to its end.
+_OF_NO_EFFECT = frozenset({"appended", "description", "limits", "requirements", "retain"})
+
+_HOME = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What must be the same for two runs of a case to give the same row, on one machine.
+
+    Attributes
+    ----------
+    configuration
+        Hash of what the configuration states about cases.
+    code
+        Hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of the user's own scenario and
+        algorithms.
+    versions
+        Of Python, Marsyard and the packages that it requires.
+    """
+
+    configuration: str
+    code: str
+    versions: Mapping[str, str]
+
+    def plain(self) -> dict[str, Any]:
+        """As it stands in the record."""
+        return asdict(self)
+
+    @classmethod
+    def read(cls, stored: Mapping[str, Any]) -> Self:
+        """The identity in a record."""
+        return cls(str(stored["configuration"]), str(stored["code"]), dict(stored["versions"]))
+
+    def differences(self, other: Identity) -> list[str]:
+        """In what another identity differs from this one, each in a few words."""
+        pairs = {what: (getattr(self, what)[:12], getattr(other, what)[:12]) for what in ("configuration", "code")}
+        for name in sorted({*self.versions, *other.versions}):
+            pairs[name] = (str(self.versions.get(name)), str(other.versions.get(name)))
+        return [f"{what} ({before}, now {now})" for what, (before, now) in pairs.items() if before != now]
+
+
+def identity_of(configuration: CampaignConfiguration) -> Identity:
+    """The identity of a campaign if it were run now."""
+    code = code_hash((configuration.scenario, *chosen_algorithms(configuration)))
+    return Identity(configuration_hash(configuration), code, package_versions())
+
+
+def chosen_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
+    """The algorithms under test that a configuration names, those that it disperses over among them."""
+    try:
+        found = scenario(configuration.scenario)
+    except UnknownScenarioError:
+        return ()
+    if not isinstance(found, TakesAlgorithms):
+        return ()
+    table: Any = configuration.parameters
+    for part in found.algorithm_table:
+        table = table.get(part, {})
+    path = ".".join((*found.algorithm_table, "algorithm"))
+    dispersed = configuration.dispersions.get(path)
+    varied = [] if dispersed is None else [str(value) for value in dispersed.extremes()]
+    stated = [table.get("algorithm", ""), *table.get("compared", ()), *varied]
+    return tuple(str(spec) for spec in dict.fromkeys(stated) if spec)
+
+
+def configuration_hash(configuration: CampaignConfiguration) -> str:
+    """A hash of what a configuration states about cases."""
+    stated = configuration.model_dump(mode="json")
+    kept = {name: value for name, value in stated.items() if name not in _OF_NO_EFFECT}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+@cache
+def code_hash(named: tuple[str, ...]) -> str:
+    """A hash of the sources that rows depend on, each file's name and contents; `named` are scenario and algorithms."""
+    digest = hashlib.sha256()
+    foreign = [source for one in named for source in _foreign_sources(one)]
+    for name, path in (*_own_sources(), *foreign):
+        contents = path.read_bytes()
+        digest.update(f"{name}\0{len(contents)}\0".encode())
+        digest.update(contents)
+    return digest.hexdigest()
+
+
+def _own_sources() -> Iterator[tuple[str, Path]]:
+    """Our code, and the constants that lie beside it."""
+    for folder in _CODE:
+        yield from _named(_HOME, sorted((_HOME / folder).rglob("*.py")))
+        yield from _named(_HOME, sorted((_HOME / folder).rglob("*.json")))
+
+
+def _foreign_sources(named: str) -> Iterator[tuple[str, Path]]:
+    """The package or module of what is given as `module:Class` or by an entry point; a program's own file."""
+    try:
+        command = command_of(named)
+    except ValueError:
+        return
+    if command is not None:
+        program = shutil.which(command.words[0])
+        words = [Path(word) for word in (program, *command.words[1:]) if word is not None]
+        yield from ((path.name, path) for path in words if path.is_file())
+        return
+    path = installed()[named].value if named in installed() else named
+    if ":" not in path:
+        return
+    top = path.partition(":")[0].partition(".")[0]
+    found = importlib.util.find_spec(top)
+    if found is None or found.origin is None:
+        return
+    origin = Path(found.origin)
+    if found.submodule_search_locations:
+        yield from _named(origin.parent.parent, sorted(origin.parent.rglob("*.py")))
+    else:
+        yield origin.name, origin
+
+
+def _named(base: Path, paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
+    for path in paths:
+        yield path.relative_to(base).as_posix(), path
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of Python, of Marsyard and of the packages that it requires."""
+    try:
+        requirements = metadata.requires("marsyard") or []
+    except metadata.PackageNotFoundError:
+        requirements = []
+    names = {re.split(r"[^A-Za-z0-9._-]", text)[0] for text in requirements if "extra ==" not in text}
+    versions = {"python": platform.python_version()}
+    for name in sorted({"marsyard", *names}):
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions

@@ -1,0 +1,178 @@
+"""How one case runs in a worker process: the only place where a scenario is called."""
+
+from __future__ import annotations
+
+import re
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+from campaigns.definition.campaign import Campaign
+from campaigns.definition.configuration import CampaignConfiguration, Limits
+from campaigns.execution.worker_process import LOADING_S, Done, settle, start_clock
+from campaigns.execution.workers import Workers, WorkLimits, limit_threads
+from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
+from campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
+from campaigns.store.products import PackedProducts, pack_products
+from campaigns.store.retention import Keep
+from scenarios.interface import CaseResult, Scalar
+from scenarios.registry import scenario
+
+
+@dataclass(frozen=True)
+class CompletedCase:
+    """A case's row and, where they are kept, the products of the scenario.
+
+    `note` is why products that were to be kept could not be.
+    """
+
+    row: Row
+    products: PackedProducts | None = None
+    note: str = ""
+
+
+def configuration_text(configuration: CampaignConfiguration) -> str:
+    """The configuration as it travels to the workers and into `campaign.json`."""
+    return configuration.model_dump_json()
+
+
+@lru_cache(maxsize=1)
+def _campaign(configuration: str) -> Campaign:
+    """The campaign that a worker works on; a pure function of its text, kept because reading it takes time."""
+    start_clock(grace_s=LOADING_S)
+    stated = CampaignConfiguration.model_validate_json(configuration)
+    found = scenario(stated.scenario)
+    limit_threads()
+    settle()
+    start_clock()
+    return Campaign(stated, found)
+
+
+def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
+    """Runs one case; whatever it raises becomes part of its row.
+
+    Parameters
+    ----------
+    configuration
+        From `configuration_text`.
+    keep
+        Whether the scenario's products come back with the row.
+    case
+        The case's number.
+    """
+    wall, cpu = time.perf_counter(), time.process_time()
+    products: Mapping[str, Any] = {}
+    try:
+        campaign = _campaign(configuration)
+        wall, cpu = time.perf_counter(), time.process_time()
+        result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
+        row = _scored(case, result)
+        products = result.products
+    except BaseException as error:
+        outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
+        row = unfinished_row(case, outcome, f"{type(error).__name__}: {error}", traceback.format_exc())
+    times = {"wall_time_s": time.perf_counter() - wall, "cpu_time_s": time.process_time() - cpu}
+    row = {**row, **times}
+    if not products or not keep.wants(row):
+        return CompletedCase(row)
+    try:
+        return CompletedCase(row, pack_products(products))
+    except TypeError as error:
+        return CompletedCase(row, None, f"the products of case {case} could not be kept: {error}")
+
+
+def prepare_input(configuration: str, shared_input: int) -> None:
+    """Builds one input that many cases share."""
+    campaign = _campaign(configuration)
+    campaign.scenario.prepare(campaign.base_parameters(), shared_input)
+
+
+def run_cases(
+    workers: Workers,
+    configuration: CampaignConfiguration,
+    cases: Iterable[int],
+    *,
+    keep: Keep,
+    total: int | None = None,
+) -> Iterator[list[CompletedCase]]:
+    """Runs cases, and yields them as they end; one that takes its worker down, or must be ended, has a row as well."""
+    task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), keep)
+    for ended in workers.run(task, cases, case_limits(configuration.limits), total):
+        yield [_completed(done) for done in ended]
+
+
+def case_limits(limits: Limits) -> WorkLimits:
+    """What one case may use."""
+    memory = None if limits.memory_gb is None else limits.memory_gb * 1e9
+    return WorkLimits(limits.case_time_s, memory, limits.output_mb * 1e6)
+
+
+def prepare_limits(limits: Limits) -> WorkLimits:
+    """What building one shared input may use."""
+    return WorkLimits(limits.prepare_time_s, case_limits(limits).memory_bytes, limits.output_mb * 1e6)
+
+
+def _completed(done: Done[CompletedCase]) -> CompletedCase:
+    """What became of a case, as a row in any event."""
+    if done.result is not None:
+        return done.result
+    error = done.error
+    times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
+    if isinstance(error, CaseEndedError):
+        return CompletedCase({**unfinished_row(done.item, error.outcome, str(error), _above(error.trace)), **times})
+    return CompletedCase({**unfinished_row(done.item, CRASHED, f"{type(error).__name__}: {error}", ""), **times})
+
+
+def unfinished_row(case: int, outcome: str, error: str, trace: str) -> Row:
+    """The row of a case that did not come to an end."""
+    return {
+        "case": case,
+        "outcome": outcome,
+        "answered": False,
+        "error": _plain_text(error),
+        "traceback": _plain_text(trace),
+    }
+
+
+def _above(trace: str) -> str:
+    """A dump of frames without those above the one in which the engine called the scenario."""
+    lines = trace.splitlines()
+    called = next((place for place, line in enumerate(lines) if line.endswith(" in run_case")), None)
+    if called is None:
+        return trace
+    after = next((k for k in range(called + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines))
+    return "\n".join([*lines[: called + 1], *lines[after:]])
+
+
+def _plain_text(text: str) -> str:
+    """Text that any file takes, without the addresses of objects, which change from run to run."""
+    text = re.sub(r"\b0x[0-9a-fA-F]{4,}\b", "0x...", text)
+    return text.encode("utf-8", errors="replace").decode("utf-8")
+
+
+def _scored(case: int, result: CaseResult) -> Row:
+    """The row of a case that came to an end, in plain Python values."""
+    failure = result.failure
+    if (result.outcome in UNFINISHED) != (failure is not None):
+        raise ValueError(f"the outcome {result.outcome} is kept for cases that do not come to an end")
+    clashes = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(result.row))
+    if clashes:
+        raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(clashes)}")
+    columns = {str(name): _plain(str(name), value) for name, value in result.row.items()}
+    head: Row = {"case": case, "outcome": str(result.outcome), "answered": bool(result.answered)}
+    if failure is None:
+        return {**head, **columns, "error": "", "traceback": ""}
+    return {**head, **columns, "error": _plain_text(failure.error), "traceback": _plain_text(failure.trace)}
+
+
+def _plain(column: str, value: Any) -> Scalar:
+    """A value as one of Python's own; NumPy's scalars are unwrapped."""
+    plain = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
+    if type(plain) in (float, int, bool):
+        return plain  # type: ignore[no-any-return]
+    if type(plain) is str:
+        return plain.encode("utf-8", errors="replace").decode("utf-8")
+    raise TypeError(f"column {column} holds a {type(value).__name__}; allowed: float, int, str, bool")

@@ -1,0 +1,1 @@
+"""Campaigns run, gone on with and estimated; single cases run again."""

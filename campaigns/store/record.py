@@ -1,0 +1,202 @@
+"""`campaign.json`: what was run, by which program, on which machine, and how far it came."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from campaigns.definition.configuration import CampaignConfiguration
+from campaigns.definition.identity import Identity
+from campaigns.errors import StoreError
+
+#: Version of the layout of a campaign's folder.
+SCHEMA = 1
+
+RECORD_FILE = "campaign.json"
+
+#: What a campaign writes into its folder; a folder with any of it is never written to again.
+OWN_FILES = (RECORD_FILE, "cases.parquet", "cases.sqlite", "report.html", "report.json", "cases")
+
+
+def utc_now() -> str:
+    """The time, to the second, as ISO 8601 writes it."""
+    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def claim(directory: Path) -> None:
+    """Makes a folder for a campaign.
+
+    Raises
+    ------
+    StoreError
+        Where it holds a campaign, or cannot be written.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        held = [name for name in OWN_FILES if (directory / name).exists()]
+    except FileExistsError as error:
+        raise StoreError(f"{directory} is taken; choose another folder with --out") from error
+    except OSError as error:
+        raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
+    if held:
+        raise StoreError(f"{directory} already holds a campaign ({held[0]}); choose another folder with --out")
+
+
+def begin(directory: Path, configuration: CampaignConfiguration, identity: Identity, crew: str) -> None:
+    """Writes the record of a campaign that begins; `crew` says who runs it."""
+    stated = configuration.model_dump(mode="json")
+    write(
+        directory,
+        {
+            "schema": SCHEMA,
+            "name": configuration.name,
+            "state": "running",
+            "exit_code": None,
+            "started_utc": utc_now(),
+            "finished_utc": None,
+            "cases": configuration.total_cases,
+            "cases_finished": 0,
+            "cases_crashed": 0,
+            "seed": configuration.seed,
+            "requirements": stated["requirements"],
+            "configuration": stated,
+            "identity": identity.plain(),
+            "sessions": [session("run", crew, 0)],
+            "changes": [],
+            "showcase": None,
+            "versions": dict(identity.versions),
+            "git_commit": git_commit(),
+            "environment": machine(),
+        },
+    )
+
+
+def session(command: str, crew: str, cases_before: int) -> dict[str, Any]:
+    """One stretch of work on a campaign, as it stands in the record."""
+    return {
+        "command": command,
+        "started_utc": utc_now(),
+        "workers": crew,
+        "cases_before": cases_before,
+        "environment": machine(),
+    }
+
+
+def update(directory: Path, changes: Mapping[str, Any]) -> None:
+    """Writes changes into a campaign's record, whole or not at all."""
+    write(directory, {**read(directory), **changes})
+
+
+def write(directory: Path, record: Mapping[str, Any]) -> None:
+    """Writes a campaign's record, whole or not at all.
+
+    Raises
+    ------
+    StoreError
+        Where that fails; the record that was there stays.
+    """
+    path = directory / RECORD_FILE
+    partial = path.with_suffix(".partial")
+    try:
+        with partial.open("w", encoding="utf-8") as file:
+            file.write(_text(record))
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError as error:
+        raise StoreError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _text(record: Mapping[str, Any]) -> str:
+    return json.dumps(record, indent=2, ensure_ascii=False) + "\n"
+
+
+def read(directory: Path) -> dict[str, Any]:
+    """A campaign's record.
+
+    Raises
+    ------
+    StoreError
+        Where the folder holds none, or one of another version.
+    """
+    path = directory / RECORD_FILE
+    if not directory.is_dir():
+        raise StoreError(f"{directory}: no such folder")
+    if not path.is_file():
+        raise StoreError(f"{directory} does not hold a campaign: it has no {RECORD_FILE}")
+    try:
+        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        schema = record["schema"]
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"{path} is damaged: {error}") from error
+    if schema != SCHEMA:
+        raise StoreError(f"{path} has schema {schema}; this version of Marsyard reads {SCHEMA}")
+    return record
+
+
+def stored_configuration(directory: Path) -> CampaignConfiguration:
+    """The configuration with which a stored campaign was run."""
+    try:
+        return CampaignConfiguration.model_validate(read(directory)["configuration"])
+    except (ValueError, KeyError) as error:
+        raise StoreError(f"{directory / RECORD_FILE} is damaged: {error}") from error
+
+
+def git_commit() -> str | None:
+    """The commit that is checked out where the program runs from, with ``+changes`` if it was edited; or None."""
+    git = shutil.which("git")
+    if git is None:
+        return None
+    home = Path(__file__).resolve().parent
+
+    def ask(*arguments: str) -> str:
+        command = [git, "-C", str(home), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()  # noqa: S603
+
+    try:
+        commit = ask("rev-parse", "HEAD")
+        tracked = ask("ls-files", Path(__file__).name)
+        edited = ask("status", "--porcelain", "--untracked-files=no")
+    except (subprocess.SubprocessError, OSError):
+        return None
+    if not tracked:
+        return None
+    return f"{commit}+changes" if edited else commit
+
+
+def machine() -> dict[str, Any]:
+    """Python, the platform, and the processor with its features: rows are equal bit for bit where these are."""
+    model, features = _processor()
+    return {
+        "python": platform.python_version(),
+        "implementation": platform.python_implementation(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "processor": model,
+        "processor_features": features,
+        "variables": {name: value for name, value in sorted(os.environ.items()) if name.startswith("MARSYARD_")},
+    }
+
+
+def _processor() -> tuple[str, str | None]:
+    """The processor's model and a hash of its list of features, where Linux tells."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return platform.processor(), None
+    model = re.search(r"^(?:model name|CPU part)\s*:\s*(.*)$", text, re.MULTILINE)
+    features = re.search(r"^(?:flags|Features)\s*:\s*(.*)$", text, re.MULTILINE)
+    listed = " ".join(sorted(features[1].split())) if features else None
+    digest = hashlib.sha256(listed.encode()).hexdigest()[:16] if listed else None
+    return (model[1] if model else platform.processor()), digest

@@ -1,0 +1,261 @@
+"""Rows as they are stored while a campaign runs and for good: one SQLite file, written by one process.
+
+The file is the campaign's memory: the Parquet table is made from it and can be made again. A row is a list of values in
+JSON; which columns they are is stored once a layout.
+
+Durability: the journal is a write-ahead log with `synchronous = FULL`, so that a transaction that was committed
+outlives a killed program, and a machine that loses its power as far as the disk keeps what it was told to. That costs
+one `fsync` a batch, some milliseconds for a second of work.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from campaigns.errors import StoreError
+from campaigns.outcomes import UNFINISHED
+from campaigns.store.columns import Row
+
+ROWS_FILE = "cases.sqlite"
+
+#: Version of the tables below, kept as `PRAGMA user_version`.
+STORE_VERSION = 2
+
+#: Marks the file as ours (`PRAGMA application_id`): "Mars".
+_APPLICATION = int.from_bytes(b"Mars", "big")
+
+_TABLES = f"""
+PRAGMA journal_mode = DELETE;
+PRAGMA application_id = {_APPLICATION};
+PRAGMA user_version = {STORE_VERSION};
+BEGIN;
+CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE layouts (layout INTEGER PRIMARY KEY, names TEXT NOT NULL UNIQUE);
+CREATE TABLE kinds (name TEXT NOT NULL, kind TEXT NOT NULL, PRIMARY KEY (name, kind));
+CREATE TABLE cases (
+    case_number INTEGER PRIMARY KEY, outcome TEXT NOT NULL, layout INTEGER NOT NULL, row TEXT NOT NULL
+);
+COMMIT;
+"""
+
+
+def create_store(path: Path, about: Mapping[str, str]) -> None:
+    """Makes an empty store, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        Where nothing may be yet.
+    about
+        What the rows belong to; see `RowStore.about`.
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        partial.unlink(missing_ok=True)
+        connection = sqlite3.connect(partial, isolation_level=None)
+        try:
+            connection.executescript(_TABLES)
+            connection.executemany("INSERT INTO about VALUES (?, ?)", about.items())
+        finally:
+            connection.close()
+        partial.rename(path)
+    except (sqlite3.Error, OSError) as error:
+        raise StoreError(f"{path} cannot be written: {error}") from error
+
+
+class RowStore:
+    """The rows of a campaign, as a context.
+
+    Parameters
+    ----------
+    path
+        A file made by `create_store`.
+    thorough
+        Whether every page is held against its neighbours first, as is due before more is written.
+
+    Raises
+    ------
+    StoreError
+        Where there is no such file, it is damaged, or of another version. Nothing is written to it then.
+    """
+
+    def __init__(self, path: Path, *, thorough: bool = False) -> None:
+        self._path = path
+        if not path.is_file():
+            raise StoreError(f"{path}: no such file; the rows of this campaign cannot be added to")
+        try:
+            self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, isolation_level=None)
+        except sqlite3.Error as error:
+            raise StoreError(f"{path} cannot be opened: {error}") from error
+        try:
+            self._check(thorough)
+            self._connection.execute("PRAGMA journal_mode = WAL")
+            self._connection.execute("PRAGMA synchronous = FULL")
+            self._layouts = {
+                tuple(json.loads(names)): layout
+                for layout, names in self._connection.execute("SELECT layout, names FROM layouts")
+            }
+            self._kinds = set(self._connection.execute("SELECT name, kind FROM kinds"))
+        except BaseException as error:
+            self._connection.close()
+            if isinstance(error, sqlite3.Error):
+                raise self._failed(error) from error
+            raise
+
+    def _check(self, thorough: bool) -> None:
+        """Refuses what is not ours, not of this version, or not whole."""
+        (application,) = self._connection.execute("PRAGMA application_id").fetchone()
+        (version,) = self._connection.execute("PRAGMA user_version").fetchone()
+        if application != _APPLICATION:
+            raise StoreError(f"{self._path} is damaged, or no store of this version: it does not say that it is one")
+        if version != STORE_VERSION:
+            raise StoreError(f"{self._path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
+        if thorough:
+            found = [text for (text,) in self._connection.execute("PRAGMA quick_check(1)")]
+            if found != ["ok"]:
+                raise StoreError(f"{self._path} is damaged: {' '.join(found)}; nothing was written to it")
+
+    def _failed(self, error: sqlite3.Error) -> StoreError:
+        """What went wrong, in one sentence that says what to do."""
+        text = str(error)
+        if "full" in text:
+            return StoreError(f"{self._path}: the disk is full; the rows before that are safe: make room and resume")
+        if "malformed" in text or "not a database" in text:
+            return StoreError(f"{self._path} is damaged: {text}; nothing was written to it")
+        return StoreError(f"{self._path}: {text}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # Closing clears the log up, which may fail where writing did; the log then stays and is read the next time.
+        with suppress(sqlite3.Error):
+            self._connection.close()
+
+    @property
+    def about(self) -> dict[str, str]:
+        """What was said of the rows when the store was made."""
+        return dict(self._connection.execute("SELECT key, value FROM about"))
+
+    def add(self, rows: Iterable[Row]) -> None:
+        """Stores rows in one transaction; a case that has a row gets the new one.
+
+        Raises
+        ------
+        StoreError
+            Where that fails; then none of them is stored.
+        """
+        try:
+            self._connection.execute("BEGIN IMMEDIATE")
+            try:
+                self._connection.executemany(
+                    "INSERT OR REPLACE INTO cases VALUES (?, ?, ?, ?)", [self._entry(row) for row in rows]
+                )
+                self._connection.execute("COMMIT")
+            except BaseException:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+                raise
+        except sqlite3.Error as error:
+            raise self._failed(error) from error
+
+    def _entry(self, row: Row) -> tuple[Any, ...]:
+        names = tuple(row)
+        layout = self._layouts.get(names)
+        if layout is None:
+            layout = len(self._layouts)
+            self._connection.execute("INSERT INTO layouts VALUES (?, ?)", (layout, json.dumps(names)))
+            self._layouts[names] = layout
+        for name, value in row.items():
+            kind = (name, kind_of(value))
+            if kind not in self._kinds:
+                self._connection.execute("INSERT INTO kinds VALUES (?, ?)", kind)
+                self._kinds.add(kind)
+        return row["case"], row["outcome"], layout, json.dumps(list(row.values()))
+
+    def count(self) -> int:
+        """Cases that have a row."""
+        (number,) = self._ask("SELECT count(*) FROM cases").fetchone()
+        return int(number)
+
+    def outcomes(self) -> dict[str, int]:
+        """How many cases came to each outcome."""
+        return dict(self._ask("SELECT outcome, count(*) FROM cases GROUP BY outcome"))
+
+    def unfinished(self) -> int:
+        """Cases that did not come to their end."""
+        return sum(number for outcome, number in self.outcomes().items() if outcome in UNFINISHED)
+
+    def missing(self, total: int) -> list[range]:
+        """The cases below `total` that have no row."""
+        ends = [-1, *(number for (number,) in self._ask("SELECT case_number FROM cases ORDER BY 1")), total]
+        return [range(before + 1, after) for before, after in pairwise(ends) if after > before + 1]
+
+    def with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
+        """The cases that came to any of some outcomes."""
+        asked = sorted(outcomes)
+        marks = ", ".join("?" * len(asked))
+        query = f"SELECT case_number FROM cases WHERE outcome IN ({marks}) ORDER BY 1"  # noqa: S608 (marks only)
+        return [number for (number,) in self._ask(query, asked)]
+
+    def first_completed(self) -> int | None:
+        """The first case that came to its end; None where none did."""
+        marks = ", ".join("?" * len(UNFINISHED))
+        query = f"SELECT min(case_number) FROM cases WHERE outcome NOT IN ({marks})"  # noqa: S608 (marks only)
+        (found,) = self._ask(query, sorted(UNFINISHED)).fetchone()
+        return None if found is None else int(found)
+
+    def row(self, case: int) -> Row | None:
+        """The row of a case; None where it has none."""
+        found = self._ask("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
+        return None if found is None else dict(zip(self.names()[found[0]], json.loads(found[1]), strict=True))
+
+    def rows(self) -> Iterator[Row]:
+        """The rows in the order of their cases."""
+        names = self.names()
+        for layout, text in self._ask("SELECT layout, row FROM cases ORDER BY case_number"):
+            yield dict(zip(names[layout], json.loads(text), strict=True))
+
+    def names(self) -> dict[int, tuple[str, ...]]:
+        """The columns of each layout, in the order in which the layouts come with the cases."""
+        order = self._ask("SELECT layout FROM cases GROUP BY layout ORDER BY min(case_number)")
+        known = {layout: names for names, layout in self._layouts.items()}
+        return {layout: known[layout] for (layout,) in order}
+
+    def kinds(self) -> dict[str, set[str]]:
+        """What each column holds: any of `bool`, `int`, `big` (beyond 64 bits), `float`, `str`."""
+        found: dict[str, set[str]] = {}
+        for name, kind in self._kinds:
+            found.setdefault(name, set()).add(kind)
+        return found
+
+    def chunks(self, size: int) -> Iterator[list[tuple[int, list[Any]]]]:
+        """Layouts and values of all rows in the order of their cases, so many at a time."""
+        cursor = self._ask("SELECT layout, row FROM cases ORDER BY case_number")
+        while found := cursor.fetchmany(size):
+            # one text for all: half the time of reading them one by one
+            values = json.loads(f"[{','.join(text for _, text in found)}]")
+            yield [(layout, row) for (layout, _), row in zip(found, values, strict=True)]
+
+    def _ask(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
+        try:
+            return self._connection.execute(query, values)
+        except sqlite3.Error as error:
+            raise self._failed(error) from error
+
+
+def kind_of(value: Any) -> str:
+    """What a value is, in the words of `RowStore.kinds`."""
+    kind = type(value)
+    if kind is int and not -(2**63) <= value < 2**63:
+        return "big"
+    return kind.__name__

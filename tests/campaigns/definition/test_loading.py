@@ -1,0 +1,322 @@
+"""Whatever is wrong with a campaign is said by file or option, key, and what is allowed; all of it at once."""
+
+from __future__ import annotations
+
+import contextlib
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from campaigns.definition.loading import catalogue, find_campaign, load_campaign
+from campaigns.errors import ConfigurationError
+
+CampaignFile = Callable[..., Path]
+
+
+def refusal(path: Path | str, *overrides: str, cases: int | None = None, seed: int | None = None) -> str:
+    with pytest.raises(ConfigurationError) as caught:
+        load_campaign(str(path), overrides, cases, seed)
+    return str(caught.value)
+
+
+def test_parameters_come_complete_with_their_defaults(campaign_file: CampaignFile) -> None:
+    campaign = load_campaign(str(campaign_file("altitude_m = 1500")))
+    assert campaign.configuration.parameters["altitude_m"] == 1500.0
+    assert campaign.configuration.parameters["wind"] == {"east_m_s": 0.0, "north_m_s": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ("altitud_m = 3", "parameters.altitud_m: unknown key (did you mean 'altitude_m'?); allowed: aborting"),
+        (
+            "wind = {est_m_s = 3}",
+            "parameters.wind.est_m_s: unknown key (did you mean 'east_m_s'?); allowed: east",
+        ),
+        ("altitude_m = -10", "parameters.altitude_m: input should be greater than 0, got -10"),
+        ("altitude_m = 'high'", "parameters.altitude_m: input should be a valid number"),
+        ("heights_m = [1]", "parameters.heights_m[1]: required, but missing"),
+        ("lowest_altitude_m = 2100.0", "parameters: altitude_m must be above lowest_altitude_m"),
+        ("wind = 3", "parameters.wind: input should be a valid dictionary"),
+    ],
+)
+def test_parameters(campaign_file: CampaignFile, parameters: str, said: str) -> None:
+    path = campaign_file(parameters, dispersions="")
+    text = refusal(path)
+    assert text.startswith(f"{path}: ")
+    assert said in text
+
+
+@pytest.mark.parametrize(
+    ("dispersion", "said"),
+    [
+        ("altitud_m = {distribution='uniform', low=1, high=2}", "dispersions.altitud_m: unknown parameter 'altitud_m'"),
+        ("wind = {distribution='uniform', low=1, high=2}", "dispersions.wind: is a table; disperse one of its values"),
+        ("altitude_m = {distribution='unifrom', low=1, high=2}", "(did you mean 'uniform'?); allowed: uniform, normal"),
+        ("altitude_m = {distribution='uniform', low=1, hgh=2}", "altitude_m.hgh: unknown key (did you mean 'high'?)"),
+        ("altitude_m = {distribution='uniform', low=1}", "dispersions.altitude_m.high: required, but missing"),
+        ("altitude_m = {distribution='uniform', low=2, high=1}", "low = 2.0 must be below high = 1.0"),
+        ("altitude_m = {distribution='uniform', low=nan, high=1}", "altitude_m.low: input should be a finite number"),
+        ("altitude_m = {distribution='uniform', low=true, high=1}", "altitude_m.low: input should be a valid number"),
+        ("altitude_m = {distribution='normal', mean=5, sd=0}", "altitude_m.sd: input should be greater than 0"),
+        ("altitude_m = {distribution='normal', mean=5, sd=1, truncate=[9,8]}", "the first limit must be below"),
+        ("altitude_m = {distribution='normal', mean=5, sd=1, truncate=[90,95]}", "no probability between the limits"),
+        (
+            "altitude_m = {distribution='normal', mean=500, sd=100}",
+            "which the parameter does not take: altitude_m",
+        ),
+        ("altitude_m = {distribution='cauchy', loc=2000}", "which the parameter does not take"),
+        ("altitude_m = {distribution='gamma', scale=2}", "parameter 'a' is missing; gamma takes a, loc, scale"),
+        ("altitude_m = {distribution='gamma', a=1, scal=2}", "unknown parameter 'scal' (did you mean 'scale'?)"),
+        ("altitude_m = {distribution='gamma', a=-1}", "gamma is not defined for a = -1.0"),
+        (
+            "altitude_m = {distribution='gamma', a='x'}",
+            "dispersions.altitude_m.a: unknown parameter 'x'; allowed: abort",
+        ),
+        ("altitude_m = {distribution='gamma', a=[1]}", "altitude_m.a: input should be a valid number"),
+        ("altitude_m = 'uniform'", "dispersions.altitude_m: input should be a valid dictionary"),
+        ("altitude_m = {low = 1}", "dispersions.altitude_m.distribution: required, but missing"),
+        ("terrain = {distribution='integer', low=0, high=12}", "reaches 12, which the parameter does not take"),
+        ("terrain = {distribution='integer', low=0.5, high=2}", "terrain.low: input should be a valid integer"),
+        ("terrain = {distribution='integer', low=3, high=2}", "low = 3 must not be above high = 2"),
+        ("terrain = {distribution='uniform', low=0, high=3}", "input should be a valid integer"),
+        (
+            "wind = {distribution='choice', values=[{}, {est_m_s=3}]}",
+            "reaches {'est_m_s': 3}, which the parameter does not take: wind.est_m_s: unknown key",
+        ),
+        ("wind = {distribution='choice', values=[{}, 3]}", "reaches 3, which the parameter does not take"),
+        ("kind = {distribution='choice', values=['a', 'B']}", "reaches 'B', which the parameter does not take"),
+        ("kind = {distribution='choice', values=['a'], weights=[1, 2]}", "2 weights for 1 values"),
+        ("kind = {distribution='choice', values=[]}", "kind.values: list should have at least 1 item"),
+        (
+            "kind = {distribution='choice', values=['a'], weights=[0]}",
+            "kind.weights[0]: input should be greater",
+        ),
+    ],
+)
+def test_dispersions(campaign_file: CampaignFile, dispersion: str, said: str) -> None:
+    path = campaign_file(dispersions=f"[dispersions]\n{dispersion}")
+    text = refusal(path)
+    assert text.startswith(f"{path}: dispersions.")
+    assert said in text
+
+
+def test_draws_that_are_refused_only_together(campaign_file: CampaignFile) -> None:
+    dispersions = """
+    [dispersions]
+    altitude_m = {distribution = "uniform", low = 1000, high = 2000}
+    """
+    text = refusal(campaign_file("altitude_m = 2000\nlowest_altitude_m = 1500", dispersions=dispersions))
+    assert "altitude_m must be above lowest_altitude_m" in text
+
+
+@pytest.mark.parametrize(
+    ("head", "said"),
+    [
+        (
+            "name='a'\nscenario='descnt'\ncases=1",
+            "unknown scenario 'descnt' (did you mean 'descent'?)",
+        ),
+        ("name='a'\nscenario='no_such_module:X'\ncases=1", "scenario: no scenario at 'no_such_module:X': No module"),
+        ("name='a'\nscenario='fake_scenario:Wind'\ncases=1", "is not a scenario: it has no parameters_type"),
+        ("name='a b'\nscenario='fake_scenario:FakeScenario'\ncases=1", "name: string should match pattern"),
+        ("scenario='fake_scenario:FakeScenario'\ncases=1", "name: required, but missing"),
+        (
+            "name='a'\nscenario='fake_scenario:FakeScenario'\ncases=0",
+            "cases: input should be greater",
+        ),
+        ("name='a'\nscenario='fake_scenario:FakeScenario'\ncases=true", "cases: input should be a valid integer"),
+        ("name='a'\nscenario='fake_scenario:FakeScenario'\ncases=1\nseed=-1", "seed: input should be greater than or"),
+        ("name='a'\nscenario='fake_scenario:FakeScenario'\ncases=1\nsed=1", "sed: unknown key (did you mean 'seed'?)"),
+        ("name='a'\nscenario='fake_scenario:FakeScenario'\ncases=1\nx=", "not valid TOML"),
+    ],
+)
+def test_the_campaign_itself(campaign_file: CampaignFile, head: str, said: str) -> None:
+    path = campaign_file(head=head)
+    text = refusal(path)
+    assert text.startswith(f"{path}: ")
+    assert said in text
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("bound = 'x'", "requirements[0].bound: input should be a valid number, got 'x'"),
+        ("bound = inf", "requirements[0].bound: input should be a finite number"),
+        ("probability = 1.0", "requirements[0].probability: input should be less than 1, got 1.0"),
+        ("confidence = 90", "requirements[0].confidence: input should be less than 1, got 90"),
+        (
+            "population = 'valid or not'",
+            "requirements[0].population: string should match pattern",
+        ),
+        ("decide_by = 'luck'", "requirements[0].decide_by: input should be 'confidence' or 'estimate', got 'luck'"),
+        ("metrik = 'x'", "requirements[0].metrik: unknown key (did you mean 'metric'?); allowed: bound, confidence"),
+    ],
+)
+def test_requirements(campaign_file: CampaignFile, change: str, said: str) -> None:
+    key = change.split(" ")[0]
+    base = {"id": "'a'", "metric": "'m'", "bound": "1", "probability": "0.9", "confidence": "0.9"}
+    lines = [f"{name} = {value}" for name, value in base.items() if name != key]
+    path = campaign_file(requirement="[[requirements]]\n" + "\n".join([*lines, change]))
+    assert said in refusal(path)
+
+
+def test_requirements_are_told_apart(campaign_file: CampaignFile) -> None:
+    one = "[[requirements]]\nid='a'\nmetric='m'\nbound=1\nprobability=0.9\nconfidence=0.9\n"
+    assert "requirements share an id: a" in refusal(campaign_file(requirement=one + one))
+
+
+def test_every_problem_is_listed(campaign_file: CampaignFile) -> None:
+    path = campaign_file(
+        "altitude_m = -1\nwnd = 3", more="[retain]\nshowcase = 'best'", dispersions="[dispersions]\nkind = 3"
+    )
+    with pytest.raises(ConfigurationError) as caught:
+        load_campaign(str(path), [], cases=0)
+    keys = {problem.key for problem in caught.value.problems}
+    assert keys == {"cases", "parameters.altitude_m", "parameters.wnd", "retain.showcase", "dispersions.kind"}
+
+
+def test_files_that_are_not_there(tmp_path: Path) -> None:
+    assert refusal(tmp_path / "no.toml") == f"{tmp_path / 'no.toml'}: no such file"
+    assert refusal(tmp_path) == f"{tmp_path}: is a folder"
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
+    assert "not valid TOML" in refusal(tmp_path / "bytes.toml")
+    (tmp_path / "deep.toml").write_text("x = " + "[" * 100_000)
+    assert "not valid TOML" in refusal(tmp_path / "deep.toml")
+
+
+def test_unknown_campaigns_are_answered_with_the_known_ones() -> None:
+    text = refusal("dimes-smok")
+    assert "unknown campaign 'dimes-smok'" in text
+    assert "path of a TOML file" in text
+    for name in catalogue():
+        assert name in text
+
+
+def test_the_catalogue_is_found_by_name_and_loads() -> None:
+    for name, path in catalogue().items():
+        assert find_campaign(name) == path
+        configuration = load_campaign(name).configuration
+        assert configuration.name == name
+        assert [path for path, one in configuration.dispersions.items() if not one.source] == []
+
+
+def test_the_example_of_the_documentation_loads(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[3] / "docs" / "sampling.md").read_text()
+    example = text.partition("```toml\n")[2].partition("```")[0]
+    path = tmp_path / "example.toml"
+    path.write_text(f"name = 'example'\nscenario = 'descent'\ncases = 41\n{example}")
+    campaign = load_campaign(str(path))
+    assert [campaign.draws(case)["descent.altitude_first_m"] for case in (1, 2, 40)] == [1400.0, 1700.0, 2600.0]
+
+
+def test_overrides(campaign_file: CampaignFile) -> None:
+    path = str(campaign_file())
+    stated = ["altitude_m=1500", "wind.east_m_s = 3", "kind=smooth", "retain.showcase=none", "heights_m=[3, 4.5]"]
+    configuration = load_campaign(path, stated, cases=7, seed=9).configuration
+    assert (configuration.cases, configuration.seed, configuration.retain.showcase) == (7, 9, "none")
+    assert configuration.parameters["altitude_m"] == 1500.0
+    assert configuration.parameters["kind"] == "smooth"
+    assert configuration.parameters["heights_m"] == [3.0, 4.5]
+    # A value that is set is the value of every case.
+    assert set(configuration.dispersions) == {"terrain"}
+    quoted = load_campaign(path, ['dispersions."wind.east_m_s".low=-5', "cases=3", "parameters.kind=x"]).configuration
+    assert quoted.dispersions["wind.east_m_s"].quantile(1e-9) == pytest.approx(-5.0)
+    assert quoted.cases == 3
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("altitude_m=-3", "parameters.altitude_m: input should be greater than 0, got -3"),
+        ("altitud_m=3", "parameters.altitud_m: unknown key (did you mean 'altitude_m'?)"),
+        ("cases=many", "cases: input should be a valid integer, got 'many'"),
+        ("wind=3", "parameters.wind: input should be a valid dictionary"),
+        ("wind.east_m_s.x=3", "parameters.wind.east_m_s: input should be a valid number"),
+        ("altitude_m", "expected KEY=VALUE"),
+        ("=3", "expected KEY=VALUE"),
+        ("a b=3", "is not a dotted key"),
+        ("a..b=3", "is not a dotted key"),
+        ("a=1\nb=2", "expected KEY=VALUE"),
+        ("dispersions.terrain.high=99", "dispersions.terrain: integer(low=0, high=99) reaches 99"),
+    ],
+)
+def test_overrides_are_named_where_they_are_wrong(campaign_file: CampaignFile, override: str, said: str) -> None:
+    text = refusal(campaign_file(), override)
+    assert text.startswith(f"--set {override}: ".replace("\n", "\\n"))
+    assert said in text
+
+
+_WORDS = """
+name scenario cases seed parameters dispersions requirements retain wind altitude_m wind.east_m_s distribution uniform
+low high choice values truncate norm gamma id
+"""
+_words = st.sampled_from(_WORDS.split())
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, str):
+        return '"' + "".join(f"\\u{ord(letter):04x}" for letter in value) + '"'
+    return str(value).lower()
+
+
+_values = st.recursive(
+    st.booleans() | st.integers(-(10**6), 10**6) | st.floats() | _words,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_words, inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@given(changes=st.dictionaries(_words, _values, min_size=1, max_size=3))
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_file_ends_in_a_traceback(tmp_path: Path, changes: dict[str, object]) -> None:
+    base: dict[str, object] = {"name": "fake", "scenario": "fake_scenario:FakeScenario", "cases": 3}
+    text = "\n".join(f"{_toml(key)} = {_toml(value)}" for key, value in {**base, **changes}.items())
+    path = tmp_path / "fuzzed.toml"
+    path.write_text(text)
+    tomllib.loads(text)
+    with contextlib.suppress(ConfigurationError):
+        load_campaign(str(path))
+
+
+@given(override=st.text(max_size=20) | st.builds("{}={}".format, _words, st.text(max_size=8)))
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_override_ends_in_a_traceback(campaign_file: CampaignFile, override: str) -> None:
+    with contextlib.suppress(ConfigurationError):
+        load_campaign(str(campaign_file()), [override])
+
+
+def test_a_choice_between_tables_draws_whole_tables(campaign_file: CampaignFile) -> None:
+    """What a table does not set has its default, whatever the campaign's own parameters say."""
+    choice = "[dispersions]\nwind = {distribution='choice', values=[{}, {east_m_s=3}, {north_m_s=-4, east_m_s=5}]}"
+    path = str(campaign_file("wind = {north_m_s = 20}", dispersions=choice))
+    campaign = load_campaign(path)
+    drawn = {tuple(campaign.parameters(case).wind.model_dump().values()) for case in range(40)}  # type: ignore[attr-defined]
+    assert drawn == {(0.0, 0.0), (3.0, 0.0), (5.0, -4.0)}
+    # a value set within the table is not drawn over
+    fixed = load_campaign(path, ["wind.east_m_s=7"])
+    assert fixed.configuration.dispersions == {}
+
+
+@pytest.mark.parametrize(
+    ("path", "allowed"),
+    [
+        ("wnd.est_m_s", "aborting_cases, altitude_m, "),
+        ("wind.est_m_s", "wind.east_m_s, wind.north_m_s"),
+        ("wind.east_m_s.x", "wind.east_m_s, wind.north_m_s"),
+    ],
+)
+def test_unknown_parameters_are_told_their_neighbours(campaign_file: CampaignFile, path: str, allowed: str) -> None:
+    """Of a scenario's hundreds only those of the innermost table that there is."""
+    dispersion = f'[dispersions]\n"{path}" = {{distribution="uniform", low=1, high=2}}'
+    text = refusal(campaign_file(dispersions=dispersion))
+    assert f"allowed: {allowed}" in text
+    assert ("wind.*" in text) == path.startswith("wnd")

@@ -1,0 +1,183 @@
+"""Groups are correlated as stated, their members keep their distributions, and what is no correlation is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from scipy import stats
+
+from campaigns.definition.campaign import Campaign
+from campaigns.definition.loading import load_campaign
+from campaigns.errors import ConfigurationError
+from campaigns.sampling.correlation import Correlation
+
+CampaignFile = Callable[..., Path]
+CASES = 4000
+HEAD = 'name = "fake"\nscenario = "fake_scenario:FakeScenario"\nseed = 5\ncases = {cases}\n'
+#: Standard errors that a right sampler stays within but for one seed in 16,000 for each figure.
+BAND = 4.0
+
+SKEWED = """
+[dispersions]
+"wind.east_m_s" = {distribution = "gamma", a = 2.0, scale = 3.0, truncate = [0.0, 40.0]}
+"wind.north_m_s" = {distribution = "uniform", low = -10, high = 10}
+altitude_m = {distribution = "normal", mean = 2000, sd = 100, truncate = [1700, 2100]}
+terrain = {distribution = "integer", low = 0, high = 3}
+[[correlations]]
+parameters = ["wind.east_m_s", "wind.north_m_s", "altitude_m"]
+rank = [[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]]
+"""
+NORMAL = """
+[dispersions]
+"wind.east_m_s" = {{distribution = "normal", mean = 1{east}}}
+"wind.north_m_s" = {{distribution = "normal", mean = -2{north}}}
+[[correlations]]
+parameters = ["wind.east_m_s", "wind.north_m_s"]
+{matrix}
+"""
+
+
+def campaign(file: CampaignFile, dispersions: str, design: str = "random", cases: int = CASES) -> Campaign:
+    text = f'[design]\nkind = "{design}"\n{dispersions}'
+    return load_campaign(str(file(head=HEAD.format(cases=cases), dispersions=text)))
+
+
+def table(of: Campaign, cases: int = CASES) -> np.ndarray:
+    return np.array([list(of.draws(case).values()) for case in range(cases)], dtype=np.float64)
+
+
+def rank_error(rank: float, cases: int) -> float:
+    """Standard error of Spearman's coefficient: sqrt((1 + r^2 / 2) (1 - r^2)^2 / (n - 3)) bounds it from above.
+
+    Fisher's z of Pearson's coefficient has variance 1 / (n - 3) for normal numbers; that of Spearman's is (1 + r^2 / 2)
+    times as large (Bonett & Wright 2000, Psychometrika 65, 23-28), and dr/dz = 1 - r^2.
+    """
+    return float(np.sqrt((1.0 + 0.5 * rank**2) / (cases - 3)) * (1.0 - rank**2))
+
+
+@pytest.mark.parametrize(("design", "cases"), [("random", CASES), ("latin-hypercube", CASES), ("sobol", 4096)])
+def test_ranks_correlate_as_stated_whatever_the_distributions(
+    campaign_file: CampaignFile, design: str, cases: int
+) -> None:
+    group = campaign(campaign_file, SKEWED, design, cases)
+    drawn = table(group, cases)
+    found = stats.spearmanr(drawn).statistic
+    stated = group.configuration.correlations[0].rank
+    assert stated is not None
+    for row in range(3):
+        for column in range(row):
+            rank = stated[row][column]
+            assert abs(found[row, column] - rank) < BAND * rank_error(rank, cases), (row, column)
+    # the one outside of the group is left alone
+    assert np.abs(found[3, :3]).max() < BAND / np.sqrt(cases - 1)
+
+
+@pytest.mark.parametrize("design", ["random", "latin-hypercube"])
+def test_members_keep_their_distributions(campaign_file: CampaignFile, design: str) -> None:
+    drawn = table(campaign(campaign_file, SKEWED, design))
+    gamma, low, high = stats.gamma(2, scale=3), *stats.norm(2000, 100).cdf([1700, 2100])
+    shapes = [
+        lambda x: gamma.cdf(x) / gamma.cdf(40),
+        stats.uniform(-10, 20).cdf,
+        lambda x: (stats.norm(2000, 100).cdf(x) - low) / (high - low),
+    ]
+    for column, shape in enumerate(shapes):
+        assert stats.kstest(drawn[:, column], shape).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("east", "north", "matrix"),
+    [
+        ("", "", "covariance = [[4.0, -4.5], [-4.5, 9.0]]"),
+        (", sd = 2", ", sd = 3", "correlation = [[1.0, -0.75], [-0.75, 1.0]]"),
+    ],
+)
+def test_normal_groups_have_their_covariance(campaign_file: CampaignFile, east: str, north: str, matrix: str) -> None:
+    """The whitened draws are independent standard normal numbers, tested as such: no tolerance of ours is in it."""
+    drawn = table(campaign(campaign_file, NORMAL.format(east=east, north=north, matrix=matrix)))
+    covariance = np.array([[4.0, -4.5], [-4.5, 9.0]])
+    white = np.linalg.solve(np.linalg.cholesky(covariance), (drawn - [1.0, -2.0]).T)
+    for row in (*white, (white[0] + white[1]) / np.sqrt(2), (white[0] - white[1]) / np.sqrt(2)):
+        assert stats.kstest(row, stats.norm.cdf).pvalue > 1e-3
+    assert stats.kstest((white**2).sum(axis=0), stats.chi2(2).cdf).pvalue > 1e-3
+    # Wishart: the variance of an entry s_ij is (c_ij^2 + c_ii c_jj) / (n - 1)
+    variances = np.diag(covariance)
+    error = np.sqrt((covariance**2 + np.outer(variances, variances)) / (CASES - 1))
+    assert np.all(np.abs(np.cov(drawn.T) - covariance) < BAND * error)
+
+
+def test_the_conversion_of_ranks_is_exact() -> None:
+    """2 sin(pi/6 rho_s) against Spearman's coefficient of a bivariate normal, by integration: 6/pi asin(rho / 2)."""
+    group = Correlation(parameters=("a", "b"), rank=((1.0, 0.4), (0.4, 1.0)))
+    rho = group.of_normals[0, 1]
+    nodes, weights = np.polynomial.hermite_e.hermegauss(80)
+    x, y = np.meshgrid(nodes, nodes)
+    weight = np.outer(weights, weights) / (2 * np.pi)
+    spearman = 12 * np.sum(weight * stats.norm.cdf(x) * stats.norm.cdf(rho * x + np.sqrt(1 - rho**2) * y)) - 3
+    assert spearman == pytest.approx(0.4, abs=1e-9)
+
+
+def test_a_member_added_at_the_end_changes_none_before_it(campaign_file: CampaignFile) -> None:
+    before = campaign(campaign_file, SKEWED).draws(7)
+    longer = SKEWED.replace('"altitude_m"]', '"altitude_m", "heights_m.0"]').replace(
+        "rank = [[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]]",
+        "rank = [[1.0, 0.6, -0.3, 0.1], [0.6, 1.0, 0.2, 0.1], [-0.3, 0.2, 1.0, 0.1], [0.1, 0.1, 0.1, 1.0]]",
+    )
+    longer = longer.replace("[dispersions]", '[dispersions]\n"heights_m.0" = {distribution = "uniform", low=0, high=1}')
+    after = campaign(campaign_file, longer).draws(7)
+    assert after.pop("heights_m.0") != before["altitude_m"]
+    assert after == before
+
+
+def test_a_member_that_is_set_leaves_its_group(campaign_file: CampaignFile) -> None:
+    path = str(campaign_file(dispersions=SKEWED))
+    (group,) = load_campaign(path, ["wind.north_m_s=3"]).configuration.correlations
+    assert (group.parameters, group.rank) == (("wind.east_m_s", "altitude_m"), ((1.0, -0.3), (-0.3, 1.0)))
+    gone = load_campaign(path, ["wind={}", "altitude_m=1800"])
+    assert gone.configuration.correlations == ()
+
+
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        ({}, "one of covariance, correlation, rank is needed, got none"),
+        ({"rank": [[1, 0], [0, 1]], "correlation": [[1, 0], [0, 1]]}, "got correlation, rank"),
+        ({"rank": [[1, 0.5]]}, "rank must have 2 rows of 2 numbers"),
+        ({"rank": [[1, 0.5], [0.4, 1]]}, "rank is not symmetric"),
+        ({"rank": [[2, 0.5], [0.5, 1]]}, "rank must be 1 along its diagonal"),
+        ({"rank": [[1, 5.5], [5.5, 1]]}, "rank has an entry that is not between -1 and 1"),
+        ({"correlation": [[1, 1], [1, 1]]}, "not positive definite"),
+        ({"covariance": [[1, 2], [2, 1]]}, "not positive definite"),
+        ({"covariance": [[0, 0], [0, 1]]}, "a variance that is not above 0"),
+        ({"covariance": [[1, float("nan")], [0, 1]]}, "finite number"),
+    ],
+)
+def test_what_is_no_correlation(stated: dict[str, object], said: str) -> None:
+    with pytest.raises(ValidationError) as caught:
+        Correlation.model_validate({"parameters": ["a", "b"], **stated})
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("dispersions", "said"),
+    [
+        (NORMAL.format(east=", sd=2", north="", matrix="covariance=[[4,1],[1,4]]"), "has an sd, which the covariance"),
+        (NORMAL.format(east=", sd=2", north="", matrix="correlation=[[1,0],[0,1]]"), 'm_s".sd: required, but missing'),
+        (NORMAL.format(east="", north=", truncate=[0,1]", matrix="covariance=[[4,1],[1,4]]"), "state the group's rank"),
+        (SKEWED.replace('"altitude_m"]', '"terrain"]'), "correlations[0].parameters[2]: 'terrain' has no density"),
+        (SKEWED.replace('"altitude_m"]', '"altitud_m"]'), "is not dispersed (did you mean 'altitude_m'?)"),
+        (SKEWED.replace('"altitude_m"]', '"wind.east_m_s"]'), "named twice: wind.east_m_s"),
+        (SKEWED.replace("mean = 2000", 'mean = "2000 + terrain"'), "'altitude_m' has a formula"),
+        (SKEWED + '[[correlations]]\nparameters=["altitude_m"]\nrank=[[1.0]]', "is in correlations[0] already"),
+        (SKEWED + "x = 1", "correlations[0].x: unknown key; allowed: correlation, covariance, parameters, rank"),
+        ("[correlations]\nx = 1", "correlations: input should be a valid tuple"),
+    ],
+)
+def test_groups_that_cannot_be(campaign_file: CampaignFile, dispersions: str, said: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load_campaign(str(campaign_file(dispersions=dispersions)))
+    assert said in str(caught.value)

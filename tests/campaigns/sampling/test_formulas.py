@@ -1,0 +1,118 @@
+"""Formulas are arithmetic over parameters: right where they are that, refused in one sentence where they are not."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from campaigns.sampling.formulas import LONGEST, formula
+
+VALUES = {"altitude_m": 2000.0, "wind.east_m_s": -3.0, "heights_m.1": 4, "on": True, "site": "gusev"}
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("0.04 * altitude_m", 80.0),
+        ("-wind.east_m_s + heights_m[1]", 7.0),
+        ("hypot(wind.east_m_s, heights_m[1])", 5.0),
+        ("2 ** 3 ** 2", 512.0),
+        ("max(1, min(altitude_m, 30), 2)", 30.0),
+        ("degrees(atan2(1, 1)) / (pi / pi)", 45.0),
+        (" 7 ", 7.0),
+        ("1e3", 1000.0),
+    ],
+)
+def test_values(text: str, value: float) -> None:
+    assert formula(text).value(VALUES) == pytest.approx(value, rel=1e-15)
+
+
+def test_names_are_paths() -> None:
+    assert formula("a.b_m * heights_m[1] + a.b_m + pi").names == ("a.b_m", "heights_m.1")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os').system('true')",
+        "().__class__",
+        "altitude_m.__class__()",
+        "[x for x in (1, 2)]",
+        "lambda: 1",
+        "'a'",
+        "1j",
+        "True",
+        "a if b else c",
+        "a < b",
+        "a[b]",
+        "a[1.5]",
+        "a[-1]",
+        "a['b']",
+        "a and b",
+        "a // b",
+        "a % b",
+        "a @ b",
+        "~a",
+        "(1, 2)",
+        "a := 3",
+        "f'{a}'",
+        "max(*a)",
+        "sqrt(x=1)",
+        "sqrt(1, 2)",
+        "eval(1)",
+        "",
+        "a b",
+        "1; 2",
+        "a\x00",
+        "(" * 100,
+        "9" * (LONGEST + 1),
+        "[" * 200 + "1" + "]" * 200,
+    ],
+)
+def test_what_is_no_arithmetic_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"is neither a number nor a formula|has at most"):
+        formula(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1 / (altitude_m - 2000)", "has no value where altitude_m = 2000: "),
+        ("sqrt(wind.east_m_s)", "has no value where wind.east_m_s = -3: "),
+        ("wind.east_m_s ** 0.5", "has no value"),
+        ("9.0 ** 9 ** 9", "has no value"),
+        ("1e308 * 10", "it comes to inf"),
+        ("site + 1", "reckons with site, which is 'gusev' and no number"),
+        ("on + 1", "reckons with on, which is True and no number"),
+    ],
+)
+def test_formulas_without_a_value_say_where(text: str, said: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(said)):
+        formula(text).value(VALUES)
+
+
+@given(text=st.text(max_size=40) | st.text("ab.[]()+-*/0123456789e ,", max_size=40))
+def test_no_text_does_anything_else_than_be_read_or_refused(text: str) -> None:
+    try:
+        read = formula(text)
+        value = read.value(dict.fromkeys(read.names, 1.5))
+    except ValueError:
+        return
+    assert math.isfinite(value)
+
+
+@given(st.recursive(
+    st.floats(-1e3, 1e3).map(repr) | st.sampled_from(["a", "t.b"]),
+    lambda inner: st.builds("({} {} {})".format, inner, st.sampled_from("+-*"), inner) | inner.map("(-{})".format),
+    max_leaves=8,
+))  # fmt: skip
+def test_formulas_are_worked_out_as_python_does(text: str) -> None:
+    if len(text) > LONGEST:
+        return
+    there = type("Table", (), {"b": -0.75})
+    expected = eval(text, {"a": 2.5, "t": there})  # noqa: S307
+    assert formula(text).value({"a": 2.5, "t.b": -0.75}) == expected
