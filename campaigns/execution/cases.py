@@ -12,8 +12,8 @@ from typing import Any
 
 from campaigns.definition.campaign import Campaign
 from campaigns.definition.configuration import CampaignConfiguration, Limits
-from campaigns.execution.worker_process import LOADING_S, Done, settle, start_clock
-from campaigns.execution.workers import Workers, WorkLimits, limit_threads
+from campaigns.execution.work import Work, Workers, WorkLimits
+from campaigns.execution.worker_process import LOADING_S, Done, limit_threads, settle, start_clock
 from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
 from campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from campaigns.store.products import PackedProducts, pack_products
@@ -100,7 +100,7 @@ def run_cases(
 ) -> Iterator[list[CompletedCase]]:
     """Runs cases, and yields them as they end; one that takes its worker down, or must be ended, has a row as well."""
     task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), keep)
-    for ended in workers.run(task, cases, case_limits(configuration.limits), total):
+    for ended in workers.run(Work(task, cases, case_limits(configuration.limits), total)):
         yield [_completed(done) for done in ended]
 
 

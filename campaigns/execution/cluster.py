@@ -14,16 +14,18 @@ import multiprocessing.process
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from campaigns.definition.identity import code_hash, package_versions
 from campaigns.errors import CampaignError
 from campaigns.execution.batches import Batches
+from campaigns.execution.work import Work
 from campaigns.execution.worker_process import Done
-from campaigns.execution.workers import UNLIMITED, LocalWorkers, WorkLimits
+from campaigns.execution.workers import LocalWorkers
 from campaigns.outcomes import CRASHED, CaseEndedError
 
 Result = TypeVar("Result")
@@ -98,22 +100,18 @@ class ClusterWorkers:
         if self._cluster is not None:
             self._cluster.close()
 
-    def run(
-        self,
-        task: Callable[[int], Result],
-        items: Iterable[int],
-        limits: WorkLimits = UNLIMITED,
-        total: int | None = None,
-    ) -> Iterator[list[Done[Result]]]:
-        """See `campaigns.execution.workers.Workers.run`."""
+    def run(self, work: Work[Result]) -> Iterator[list[Done[Result]]]:
+        """See `Workers.run`."""
         threads = sum(self._client.nthreads().values())
         sharers = self._threads_of_the_fullest_machine()
-        batches = Batches(items, total, threads)
+        batches = Batches(work.items, work.total, threads)
         coming = self._distributed.as_completed(loop=self._client.loop)
         sent: dict[Any, Sequence[int]] = {}
 
         def send(batch: Sequence[int]) -> None:
-            future = self._client.submit(_watch_batch, task, tuple(batch), limits, sharers, pure=False)
+            future = self._client.submit(
+                _watch_batch, replace(work, items=tuple(batch), total=len(batch)), sharers, pure=False
+            )
             sent[future] = batch
             coming.add(future)
 
@@ -184,12 +182,10 @@ def _code_and_versions() -> tuple[str, dict[str, str]]:
     return code_hash(""), package_versions()
 
 
-def _watch_batch(
-    task: Callable[[int], Result], batch: Sequence[int], limits: WorkLimits, sharers: int
-) -> tuple[float, list[Done[Result]]]:
+def _watch_batch(work: Work[Result], sharers: int) -> tuple[float, list[Done[Result]]]:
     """Runs a batch beside a Dask worker, in a process that belongs to the thread that this is called in."""
     began = time.perf_counter()
-    done = [one for ended in _own_workers(sharers).run(task, batch, limits, len(batch)) for one in ended]
+    done = [one for ended in _own_workers(sharers).run(work) for one in ended]
     return time.perf_counter() - began, done
 
 

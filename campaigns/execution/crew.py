@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from campaigns.execution.workers import LocalWorkers, Workers
+from campaigns.execution.work import Workers
+from campaigns.execution.workers import LocalWorkers
 
 
 @dataclass(frozen=True)

@@ -169,3 +169,14 @@ def settle() -> None:
     """Spares what is loaded by now from every later search for garbage, which would cost some 5 % of short cases."""
     gc.collect()
     gc.freeze()
+
+
+def limit_threads() -> None:
+    """Keeps the numerical libraries that are loaded by now to one thread; the environment does so for later ones."""
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(1)
+    if "numba" in sys.modules:
+        sys.modules["numba"].set_num_threads(1)

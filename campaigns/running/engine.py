@@ -18,7 +18,7 @@ from campaigns.definition.identity import Identity, identity_of
 from campaigns.errors import CampaignError, ConfigurationError, Problem, StoreError, not_allowed
 from campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, prepare_limits, run_cases
 from campaigns.execution.crew import Crew, hire
-from campaigns.execution.workers import Workers
+from campaigns.execution.work import Work, Workers
 from campaigns.outcomes import RETRYABLE, UNFINISHED
 from campaigns.running.replay import replay_with
 from campaigns.store import record
@@ -302,7 +302,7 @@ def _prepare(work: _Work, workers: Workers) -> None:
         return
     watch.begin("preparing", len(inputs))
     task = partial(prepare_input, configuration_text(configuration))
-    for ended in workers.run(task, inputs, prepare_limits(configuration.limits), len(inputs)):
+    for ended in workers.run(Work(task, inputs, prepare_limits(configuration.limits), len(inputs))):
         for done in ended:
             if done.error is not None:
                 said = f"{type(done.error).__name__}: {done.error}"

@@ -12,7 +12,7 @@ from campaigns.definition.campaign import Campaign
 from campaigns.definition.configuration import CampaignConfiguration
 from campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, prepare_limits, run_cases
 from campaigns.execution.crew import Crew, hire
-from campaigns.execution.workers import Workers
+from campaigns.execution.work import Work, Workers
 from campaigns.outcomes import UNFINISHED
 from campaigns.store.retention import KEEP_ALL
 
@@ -66,7 +66,7 @@ def estimate(campaign: Campaign, jobs: int) -> Estimate:
         began = time.monotonic()
         if inputs:
             task = partial(prepare_input, configuration_text(configuration))
-            list(workers.run(task, inputs[:1], prepare_limits(configuration.limits)))
+            list(workers.run(Work(task, inputs[:1], prepare_limits(configuration.limits))))
         input_s = time.monotonic() - began
         trials = _trials(configuration, workers)
     times = [seconds for _, seconds in (trials[1:] or trials)]

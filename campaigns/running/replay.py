@@ -10,7 +10,8 @@ from campaigns.definition.configuration import CampaignConfiguration
 from campaigns.definition.identity import Identity, identity_of
 from campaigns.errors import CampaignError
 from campaigns.execution.cases import run_cases
-from campaigns.execution.workers import LocalWorkers, Workers
+from campaigns.execution.work import Workers
+from campaigns.execution.workers import LocalWorkers
 from campaigns.outcomes import UNFINISHED
 from campaigns.store.columns import Row
 from campaigns.store.products import PackedProducts

@@ -15,7 +15,7 @@ if HERE not in sys.path:
     sys.path.append(HERE)
     os.environ["PYTHONPATH"] = os.pathsep.join([*filter(None, [os.environ.get("PYTHONPATH")]), HERE])
 
-from fake_campaign import Silence, write_campaign  # noqa: E402
+from fake_campaign import TROUBLE, Silence, run, write_campaign  # noqa: E402
 
 
 @pytest.fixture
@@ -27,3 +27,10 @@ def campaign_file(tmp_path: Path) -> Callable[..., Path]:
 @pytest.fixture
 def watch() -> Silence:
     return Silence()
+
+
+@pytest.fixture(scope="session")
+def troubled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign in which one case raises, two abort their process and one has no answer; to be left as it is."""
+    folder = tmp_path_factory.mktemp("campaign")
+    return run(write_campaign(folder, TROUBLE), folder / "troubled", Silence())

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+from campaigns.definition.loading import load_campaign
+from campaigns.execution.crew import Crew
+from campaigns.running.engine import run_campaign
+from campaigns.store.table import read_rows
 
 HEAD = """
 name = "fake"
@@ -28,6 +35,8 @@ bound = 5.0
 probability = 0.99
 confidence = 0.9
 """
+#: A case that raises, two that abort their process, one without an answer.
+TROUBLE = "raising_cases = [3]\naborting_cases = [5, 6]\nsilent_cases = [2]"
 
 
 def write_campaign(
@@ -61,3 +70,12 @@ class Silence:
 
     def note(self, text: str) -> None:
         self.notes.append(text)
+
+
+def run(path: Path, directory: Path, watch: Silence, *overrides: str, jobs: int = 2) -> Path:
+    run_campaign(load_campaign(str(path), overrides), directory, Crew(jobs), watch)
+    return directory
+
+
+def rows_of(directory: Path) -> list[Mapping[str, Any]]:
+    return read_rows(directory / "cases.parquet")

@@ -18,8 +18,10 @@ import pytest
 
 from campaigns.errors import CampaignError
 from campaigns.execution.batches import MOST_CASES, Batches
+from campaigns.execution.watched import used_memory
+from campaigns.execution.work import UNLIMITED, Work, WorkLimits
 from campaigns.execution.worker_process import Board, Done, Standing
-from campaigns.execution.workers import UNLIMITED, LocalWorkers, WorkLimits, used_memory
+from campaigns.execution.workers import LocalWorkers
 from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
@@ -28,7 +30,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 def run(
     workers: LocalWorkers, task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits = UNLIMITED
 ) -> Iterator[Done[Any]]:
-    return chain.from_iterable(workers.run(task, items, limits))
+    return chain.from_iterable(workers.run(Work(task, items, limits)))
 
 
 def process_number(_: int) -> int:
@@ -200,9 +202,9 @@ def leave(*_: object) -> None:
 
 def test_a_worker_that_cannot_begin_is_an_error_of_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
     with LocalWorkers(1) as workers:
-        monkeypatch.setattr("campaigns.execution.workers.run_batch", leave)
+        monkeypatch.setattr("campaigns.execution.watched.run_batch", leave)
         with pytest.raises(CampaignError, match="worker processes die before they begin a case"):
-            list(workers.run(process_number, range(3)))
+            list(workers.run(Work(process_number, range(3))))
 
 
 def test_memory_counts_what_is_the_processs_own(tmp_path: Path) -> None:

@@ -1,0 +1,95 @@
+"""A finished campaign is added to and run again in part, and only by the program that ran it, unless told."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_campaign import Silence, rows_of, run
+
+from campaigns.definition.identity import package_versions
+from campaigns.errors import CampaignError, StoreError
+from campaigns.execution.crew import Crew
+from campaigns.running.engine import append_cases, resume_campaign
+from campaigns.running.replay import differing_columns, replay
+from campaigns.store import record
+from campaigns.store.lock import folder_lock
+
+CampaignFile = Callable[..., Path]
+
+
+@pytest.fixture
+def done(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> Path:
+    """A small finished campaign, to be spoilt."""
+    return run(campaign_file("raising_cases = [2]"), tmp_path / "done", watch, "cases=4", jobs=1)
+
+
+def test_cases_are_added_behind_those_there_are(
+    done: Path, campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+) -> None:
+    before = [str(row) for row in rows_of(done)]
+    append_cases(done, 3, Crew(1), watch)
+    append_cases(done, 1, Crew(2), watch)
+    rows = rows_of(done)
+    assert [str(row) for row in rows[:4]] == before
+    stored = record.read(done)
+    assert (stored["cases"], stored["state"], stored["configuration"]["appended"]) == (8, "finished", [3, 1])
+    # Independent draws: what is added is what a larger campaign has had from the start.
+    whole = rows_of(run(campaign_file("raising_cases = [2]"), tmp_path / "whole", watch, "cases=8", jobs=1))
+    assert [differing_columns(*pair) for pair in zip(rows, whole, strict=True)] == [()] * 8
+    assert replay(done, 7).differing == ()
+    with pytest.raises(CampaignError, match="0 cases cannot be added"):
+        append_cases(done, 0, Crew(1), watch)
+
+
+def test_crashed_cases_are_run_again_on_request(done: Path, watch: Silence) -> None:
+    times = {row["case"]: row["wall_time_s"] for row in rows_of(done)}
+    resume_campaign(done, Crew(1), watch)
+    assert {row["case"]: row["wall_time_s"] for row in rows_of(done)} == times
+    resume_campaign(done, Crew(1), watch, retry=["crashed"])
+    again = {row["case"]: row["wall_time_s"] for row in rows_of(done)}
+    assert [case for case in times if again[case] != times[case]] == [2]
+
+
+def test_other_programs_do_not_go_on_unasked(done: Path, watch: Silence, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = package_versions()
+    monkeypatch.setattr("campaigns.definition.identity.package_versions", lambda: {**real, "numpy": "0.9"})
+    before = {path: path.read_bytes() for path in done.glob("c*.*")}
+    said = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo go on nevertheless.*--allow-changed"
+    for act in (lambda: resume_campaign(done, Crew(1), watch), lambda: append_cases(done, 2, Crew(1), watch)):
+        with pytest.raises(CampaignError, match=said):
+            act()
+    assert {path: path.read_bytes() for path in before} == {
+        **before,
+        done / "campaign.lock": before[done / "campaign.lock"],
+    }
+    append_cases(done, 2, Crew(1), watch, allow_changed=True)
+    (change,) = record.read(done)["changes"]
+    assert (change["cases_before"], change["in"]) == (4, [f"numpy ({np.__version__}, now 0.9)"])
+    assert record.read(done)["identity"]["versions"]["numpy"] == "0.9"
+
+
+def test_a_changed_configuration_is_no_longer_the_campaigns(done: Path, watch: Silence) -> None:
+    text = (done / "campaign.json").read_text()
+    (done / "campaign.json").write_text(text.replace('"altitude_m": 2000.0', '"altitude_m": 2001.0'))
+    with pytest.raises(CampaignError, match="configuration \\("):
+        resume_campaign(done, Crew(1), watch)
+
+
+def test_a_store_of_another_campaign_is_refused(
+    done: Path, campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+) -> None:
+    other = run(campaign_file(""), tmp_path / "other", watch, "cases=1", "seed=77", jobs=1)
+    shutil.copy(other / "cases.sqlite", done / "cases.sqlite")
+    with pytest.raises(StoreError, match="belong to different campaigns"):
+        resume_campaign(done, Crew(1), watch)
+
+
+def test_two_runners_do_not_share_a_folder(done: Path, watch: Silence) -> None:
+    with folder_lock(done):
+        for act in (lambda: resume_campaign(done, Crew(1), watch), lambda: append_cases(done, 2, Crew(1), watch)):
+            with pytest.raises(StoreError, match="is in use"):
+                act()

@@ -1,0 +1,29 @@
+"""A case run again is held against its stored row."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from campaigns.errors import CampaignError, StoreError
+from campaigns.running.replay import replay
+
+CampaignFile = Callable[..., Path]
+
+
+def test_replay_says_what_differs(troubled: Path, tmp_path: Path) -> None:
+    troubled = shutil.copytree(troubled, tmp_path / "copy")
+    frame = pd.read_parquet(troubled / "cases.parquet")
+    frame.loc[4, "altitude_m"] = np.nextafter(frame.loc[4, "altitude_m"], np.inf)
+    frame.to_parquet(troubled / "cases.parquet")
+    (troubled / "cases.sqlite").unlink()
+    assert replay(troubled, 4).differing == ("altitude_m",)
+    with pytest.raises(CampaignError, match="has no case 12; allowed: 0 to 11"):
+        replay(troubled, 12)
+    with pytest.raises(StoreError, match="does not hold a campaign"):
+        replay(troubled / "cases", 0)

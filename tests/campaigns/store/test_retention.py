@@ -1,0 +1,102 @@
+"""Products are kept of the cases that were asked for, and of the one that is shown."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_campaign import Silence, rows_of, run
+
+from campaigns.definition.loading import load_campaign
+from campaigns.running.replay import differing_columns
+from campaigns.store import record
+from campaigns.store.products import load_products
+from campaigns.store.rows import RowStore, create_store
+from campaigns.store.table import write_table
+from campaigns.store.worst import showcase_case, worst_cases
+
+CampaignFile = Callable[..., Path]
+
+pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
+
+
+def test_the_worst_answered_case_is_kept_for_show(troubled: Path) -> None:
+    rows = rows_of(troubled)
+    worst = max((row for row in rows if row["answered"]), key=lambda row: row["velocity_error_m_s"])["case"]
+    assert record.read(troubled)["showcase"] == worst
+    kept = troubled / "cases" / str(worst)
+    assert differing_columns(json.loads((kept / "row.json").read_text()), rows[worst]) == ()
+    products = load_products(kept)
+    assert products["picture"].dtype == np.uint16
+    assert products["picture"].tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert np.array_equal(products["nested"][0]["x"], np.eye(2))
+    assert products["title"] == "a"
+
+
+def test_which_case_is_shown(campaign_file: CampaignFile, tmp_path: Path) -> None:
+    rows: list[dict[str, Any]] = [
+        {"case": 0, "outcome": "CRASHED", "answered": False},
+        {"case": 1, "outcome": "SILENT", "answered": False, "velocity_error_m_s": math.nan},
+        {"case": 2, "outcome": "VALID", "answered": True, "velocity_error_m_s": 1.0},
+        {"case": 3, "outcome": "VALID", "answered": True, "velocity_error_m_s": -2.0},
+    ]
+    create_store(tmp_path / "cases.sqlite", {})
+    with RowStore(tmp_path / "cases.sqlite") as store:
+        table = tmp_path / "cases.parquet"
+        store.add(rows[:1])
+        write_table(table, store, ["velocity_error_m_s"])
+        worst = load_campaign(str(campaign_file()), ["retain.worst=9"]).configuration
+        first = load_campaign(str(campaign_file()), ["retain.showcase=first"]).configuration
+        none = load_campaign(str(campaign_file()), ["retain.showcase=none"]).configuration
+        unasked = load_campaign(str(campaign_file(requirement=""))).configuration
+        assert showcase_case(worst, table, store) is None
+        store.add(rows[1:2])
+        write_table(table, store)
+        assert showcase_case(worst, table, store) == 1
+        store.add(rows[2:])
+        write_table(table, store)
+        assert [showcase_case(asked, table, store) for asked in (worst, first, none, unasked)] == [3, 1, None, 1]
+    assert [worst_cases(asked, table) for asked in (worst, unasked)] == [[3, 2], []]
+
+
+def test_products_that_cannot_be_kept_stop_nothing(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> None:
+    directory = run(campaign_file(), tmp_path / "run", watch, "products=bad", "cases=2", jobs=1)
+    assert record.read(directory)["state"] == "finished"
+    assert "products.thing is a object; allowed" in watch.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("kept", "cases"),
+    [
+        (["retain.products=all"], [0, 1, 3, 4, 5]),
+        (["retain.products=every", "retain.every=3"], [0, 3]),
+        (["retain.products=failed"], [1]),
+        (["retain.products=worst", "retain.worst=2"], None),
+        (["retain.products=all", "retain.budget_gb=1e-6"], [0]),
+    ],
+)
+def test_products_are_kept_as_asked(
+    campaign_file: CampaignFile, tmp_path: Path, watch: Silence, kept: list[str], cases: list[int] | None
+) -> None:
+    path = campaign_file("silent_cases = [1]\nraising_cases = [2]")
+    directory = run(path, tmp_path / "run", watch, "cases=6", "retain.showcase=none", *kept, jobs=1)
+    rows = rows_of(directory)
+    if cases is None:
+        answered = [row for row in rows if row["answered"]]
+        cases = sorted(row["case"] for row in sorted(answered, key=lambda row: -row["velocity_error_m_s"])[:2])
+    found = sorted(int(path.name) for path in (directory / "cases").iterdir())
+    assert found == cases
+    for case in found:
+        assert load_products(directory / "cases" / str(case))["title"] == "a"
+        kept_row = json.loads((directory / "cases" / str(case) / "row.json").read_text())
+        assert differing_columns(kept_row, rows[case]) == ()
+    assert [note for note in watch.notes if "budget" in note] == (
+        ["the budget for kept products (retain.budget_gb) is used up: none is kept from case 1 on"]
+        if "retain.budget_gb=1e-6" in kept
+        else []
+    )
