@@ -79,7 +79,7 @@ class Objects:
         numbers = [part.body_of_triangle + np.int32(body) for part, body in zip(parts, bodies, strict=False)]
         if starts[-1] > MOST_TRIANGLES:
             raise ValueError(f"{starts[-1]} triangles; at most {MOST_TRIANGLES} can be drawn at once")
-        return cls(
+        whole = cls(
             triangles=np.concatenate([part.triangles for part in parts]),
             normals=np.concatenate([part.normals for part in parts]),
             body_of_triangle=np.concatenate(numbers).astype(np.int32),
@@ -87,6 +87,9 @@ class Objects:
             albedo=np.concatenate([part.albedo for part in parts]),
             names=np.concatenate([part.names for part in parts]),
         )
+        # a body keeps its sphere: a scene's thousands of rocks are not gone through again for the rover that joins them
+        whole.__dict__["spheres"] = np.concatenate([part.spheres for part in parts])
+        return whole
 
     @classmethod
     def none(cls) -> Objects:
@@ -127,8 +130,10 @@ def _spheres(
     """Spheres about the middle of each body's bounding box."""
     if first.size == 1:
         return np.empty((0, 4))
-    low = np.minimum.reduceat(triangles.min(axis=1), first[:-1])
-    high = np.maximum.reduceat(triangles.max(axis=1), first[:-1])
+    corners, starts = np.ascontiguousarray(triangles.reshape(-1, 3).T), 3 * first[:-1]
+    low, high = np.minimum.reduceat(corners, starts, axis=1), np.maximum.reduceat(corners, starts, axis=1)
     middle = 0.5 * (low + high)
-    away = np.linalg.norm(triangles - np.repeat(middle, np.diff(first), axis=0)[:, None], axis=2).max(axis=1)
-    return np.column_stack([middle, np.maximum.reduceat(away, first[:-1])])
+    corners -= np.repeat(middle, 3 * np.diff(first), axis=1)
+    corners *= corners
+    farthest = np.maximum.reduceat(corners[0] + corners[1] + corners[2], starts)
+    return np.column_stack([*middle, np.sqrt(farthest)])

@@ -11,10 +11,11 @@ from jaxtyping import Float32, Float64, UInt8
 from sim.camera import CameraModel
 from sim.render.backend import RenderingError
 
-#: Samples along each side of the pinhole views of full frames (a 1024 x 1024 camera of 45 deg is drawn at about its own
-#: resolution), and of cameras of no more than `SMALL_CAMERA_PX` pixels along a side.
-VIEW_SIDE_PX, SMALL_VIEW_SIDE_PX = 1088, 288
-SMALL_CAMERA_PX = 268
+#: Samples along each side of the pinhole views: a camera takes the first that leaves `_SPARE_PX` of them beside its own
+#: pixels, and the last where none does (full frames of 1024 x 1024 and 45 deg are drawn at about their own resolution).
+VIEW_SIDES_PX = (288, 544, 1088)
+VIEW_SIDE_PX = VIEW_SIDES_PX[-1]
+_SPARE_PX = 20
 #: Samples left free around the pixels' field in a view.
 MARGIN_PX = 2.0
 #: Widest angle from its axis that a view is given; a wider field is cut into quarters.
@@ -97,7 +98,7 @@ class PixelRays:
         origins = np.broadcast_to(origins, directions.shape)
         if not np.isfinite(directions).all():
             raise RenderingError("the camera model has pixels without a ray")
-        side = SMALL_VIEW_SIDE_PX if max(columns, rows) <= SMALL_CAMERA_PX else VIEW_SIDE_PX
+        side = next((one for one in VIEW_SIDES_PX if max(columns, rows) <= one - _SPARE_PX), VIEW_SIDE_PX)
         view_of_pixel = np.zeros((rows, columns), dtype=np.uint8)
         axes: list[Float64[np.ndarray, "3 3"]] = []
         focal: list[float] = []

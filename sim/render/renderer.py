@@ -12,7 +12,6 @@ import ctypes
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 from scipy.spatial.transform import RigidTransform
@@ -23,7 +22,7 @@ from sim.render.edges import Sight, edge_pixels, look_within, rays_within
 from sim.render.kernels.ground import height_range
 from sim.render.kernels.shading import Clouds, Reach, shade
 from sim.render.kernels.sight import look
-from sim.render.kernels.sun import Shadow, sweep_shadow
+from sim.render.kernels.sun import Shadow, heights_in_rows, sweep_shadow
 from sim.render.mesh import graded_offsets, ground_mesh, lines_in_view
 from sim.render.objects import Objects
 from sim.render.photometry import Photometry, Sun, Texture
@@ -34,7 +33,7 @@ from sim.terrain import Surface
 NO_TEXTURE = Texture()
 #: Most posts along a side of the grid on which the ground's shadow is swept.
 SHADOW_SIDE = 4096
-NO_SHADOW = ((np.full((1, 1), -np.inf, dtype=np.float32), np.zeros((1, 1), dtype=np.uint8)), 1.0, 0)
+NO_SHADOW = ((np.full((1, 1), -np.inf, dtype=np.float32), np.zeros((1, 1), dtype=np.uint8), False), 1.0, 0)
 NO_CLOUDS = (no_cover(), np.zeros(5))
 
 #: Direction of the sun, the numbers of the law and of the sky, and clouds, as the kernel takes them.
@@ -137,18 +136,16 @@ def _ground_shadow(surface: Surface, sun: Sun, height_range_m: tuple[float, floa
     """Sweeps the shadow along whichever axis the sun's azimuth is nearer to."""
     level = int(np.argmax([one.shape[0] <= SHADOW_SIDE for one in surface.levels]))
     spacing = surface.spacing_m * 2.0**level
-    height = np.ascontiguousarray(surface.levels[level][..., 0])
     east, north, up = sun.direction
-    along_y = abs(north) >= abs(east)
-    main, side = (north, east) if along_y else (east, north)
+    along_x = abs(east) > abs(north)
+    main, side = (east, north) if along_x else (north, east)
     if main == 0.0:
         return NO_SHADOW
     drop = spacing * up / abs(main)
-    reach = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, height.shape[0]))
-    # OpenCV transposes by blocks, some five times faster than a copy of NumPy's view
-    rows_towards_sun = height if along_y else cv2.transpose(height)
-    swept, away = sweep_shadow(rows_towards_sun, float(np.sign(main)), drop, side / abs(main), reach)
-    return ((swept, away) if along_y else (cv2.transpose(swept), cv2.transpose(away))), spacing, level
+    reach = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, len(surface.levels[level])))
+    height = heights_in_rows(surface.levels[level], along_x)
+    swept, away = sweep_shadow(height, float(np.sign(main)), drop, side / abs(main), reach)
+    return (swept, away, along_x), spacing, level
 
 
 @dataclass(frozen=True)

@@ -39,12 +39,24 @@ def _jumps(before: float, here: float, there: float, after: float) -> bool:
 
     A plane's inverse range is linear over the picture.
     """
+    if not abs(there - here) > JUMP * max(here, there):
+        return False
     q0 = 1.0 / before
     q1 = 1.0 / here
     q2 = 1.0 / there
     q3 = 1.0 / after
     step = abs(q2 - q1)
-    return bool(step > JUMP * max(q1, q2) and step > STEEPER * max(abs(q1 - q0), abs(q3 - q2)))
+    return bool(step > STEEPER * max(abs(q1 - q0), abs(q3 - q2)))
+
+
+@njit(cache=True)
+def _differ(line: Array32, beside: Array32, shift: int, differs: NDArray[np.bool_]) -> None:
+    """Whether pixels of a line differ enough for an edge from those `shift` columns on in the line beside; few do."""
+    for j in range(line.size - shift):
+        here = line[j]
+        there = beside[j + shift]
+        brighter = here if here > there else there
+        differs[j] = abs(there - here) >= np.float32(EDGE_CONTRAST) * brighter
 
 
 @njit(cache=True)
@@ -59,20 +71,21 @@ def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: NDArray[n
         Output of that shape, all False before.
     """
     rows, columns = radiance.shape
+    differs = np.empty(columns, dtype=np.bool_)
     for i in range(rows):
-        for j in range(columns):
-            here = radiance[i, j]
-            for side in range(2):
-                i2 = i + side
+        for side in range(2):
+            i2 = i + side
+            if i2 >= rows:
+                continue
+            last = columns - 1 + side
+            _differ(radiance[i], radiance[i2], 1 - side, differs)
+            for j in range(last):
+                if not differs[j]:
+                    continue
                 j2 = j + 1 - side
-                if i2 >= rows or j2 >= columns:
-                    continue
+                here = radiance[i, j]
                 there = radiance[i2, j2]
-                difference = abs(there - here)
-                brighter = max(here, there)
-                if difference < EDGE_CONTRAST * brighter:
-                    continue
-                edge = body[i, j] != body[i2, j2] or difference > LIGHT_CONTRAST * brighter
+                edge = body[i, j] != body[i2, j2] or abs(there - here) > LIGHT_CONTRAST * max(here, there)
                 if not edge:
                     i0 = max(i - side, 0)
                     j0 = max(j - 1 + side, 0)

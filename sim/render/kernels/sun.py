@@ -11,16 +11,38 @@ from numpy.typing import NDArray
 from sim.render.kernels.ground import Array32
 from sim.terrain.kernels import Array, Level, sample
 
-#: Height and reach of the ground's shadow on the posts of a grid (`sweep_shadow`).
-Shadow = tuple[Array32, NDArray[np.uint8]]
+#: Height and reach of the ground's shadow on the posts of a grid (`sweep_shadow`), and whether its rows run along x.
+Shadow = tuple[Array32, NDArray[np.uint8], bool]
 #: Rows of the grid that one unit of a shadow's stored reach stands for.
 REACH_ROWS = 4
 #: Height over a shadow's edge, in spacings of its grid, within which the grid is not believed.
 UNSURE = 0.3
 
 
+#: Posts along a side of the blocks in which a grid is turned: both sides of a block stay in the nearest cache.
+BLOCK = 32
+
+
 @njit(cache=True)
-def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach: int) -> Shadow:
+def heights_in_rows(field: Level, along_x: bool) -> Array32:
+    """Control values of height, their rows along y or along x."""
+    side = field.shape[0]
+    heights = np.empty((side, side), dtype=np.float32)
+    if not along_x:
+        heights[:] = field[:, :, 0]
+        return heights
+    for top in range(0, side, BLOCK):
+        for left in range(0, side, BLOCK):
+            for j in range(left, min(left + BLOCK, side)):
+                for i in range(top, min(top + BLOCK, side)):
+                    heights[j, i] = field[i, j, 0]
+    return heights
+
+
+@njit(cache=True)
+def sweep_shadow(
+    height: Array32, along: float, drop: float, slip: float, reach: int
+) -> tuple[Array32, NDArray[np.uint8]]:
     """Height of the shadow over every post of a periodic grid: below it the ground hides the sun's middle.
 
     The sun stands towards growing rows. A shadow falls by `drop` and shifts by `-slip` columns from one row to the one
@@ -77,10 +99,10 @@ def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach:
 @njit(cache=True, inline="always")
 def shadow_clearance(shadow: Shadow, inverse_spacing: float, x: float, y: float, z: float) -> tuple[float, float]:
     """How far a place lies above the ground's shadow, metres, and how many rows away what casts the shadow is."""
-    height, away = shadow
+    height, away, along_x = shadow
     row_mask = height.shape[0] - 1
-    gx = x * inverse_spacing
-    gy = y * inverse_spacing
+    gx = (y if along_x else x) * inverse_spacing
+    gy = (x if along_x else y) * inverse_spacing
     j = math.floor(gx)
     i = math.floor(gy)
     fx = gx - j
