@@ -84,12 +84,12 @@ def aligned(
 ) -> Float[np.ndarray, "2"] | None:
     """Pixel (u, v) in the second picture of a place (row, column) in the first, aligned from where it was found.
 
-    The template may be stretched. None where the alignment is not believed or leaves too low a correlation.
+    The template may be stretched. None where the alignment is not believed or its correlation is too low.
     """
     half = options.template_half_px
     row, column = place
     template = first[row - half : row + half + 1, column - half : column + half + 1]
     match = registered(template, second, found[::-1] - half, stretch=True, limits=ALIGNMENT)
-    if match is None or match.score < options.min_track_correlation:
+    if match is None or match.score < options.min_aligned_correlation:
         return None
     return np.asarray(match.corner[::-1] + half)
