@@ -51,8 +51,8 @@ class HdaOptions:
     align
         Whether the top of the biquadratic (all that the paper has) is followed by Gauss-Newton alignment over an affine
         warp. The biquadratic leans towards whole pixels, by up to 0.09 px, and knows nothing of rotation and scale. A
-        track that cannot be aligned is not accepted: of 276 such tracks over rocks, at small changes, 6 were right; of 1,199 that could be
-        4 were wrong and the others right to 0.2 px, with a median of 0.004 px.
+        track that cannot be aligned is not accepted: over rocks, at small changes, 6 of 276 such tracks were right; of
+        1,199 that could be 4 were wrong and the others right to 0.2 px, with a median of 0.004 px.
     min_tracks
         Least number of tracks: five are needed for a motion; more make outliers stand out.
     robust_px
