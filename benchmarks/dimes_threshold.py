@@ -15,7 +15,7 @@ import numpy as np
 
 import algorithms.dimes.threshold as derivation
 from algorithms.dimes.options import DimesOptions
-from reports.statistics import quantile_bounds
+from reports.statistics.samples import quantile_bounds
 
 STORED = Path(derivation.__file__).with_name("imu_threshold.json")
 #: Raised when the derivation changes in a way that its inputs do not tell.

@@ -10,11 +10,11 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
-from reports.clusters import clustered_evidence
 from reports.columns import split_unit
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.statistics import Interval, proportion_interval
+from reports.statistics.clusters import clustered_evidence
+from reports.statistics.proportions import Interval, proportion_interval
 from reports.verdicts import is_flag, members, succeeded, terrain_groups
 from reports.wording import NOTHING, percent, stated
 

@@ -38,7 +38,7 @@ from reports.vtt.updates import updates_section
 from reports.wording import number
 
 #: Version of the layout of `report.json`.
-SCHEMA = 1
+SCHEMA = 2
 
 #: Sections that a page has where the rows hold their columns, in the page's order.
 FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
@@ -110,7 +110,7 @@ def page_context(
         "run": run,
         "description": str(run.said("description") or ""),
         "whole": whole,
-        "cautions": [*sections.cautions(verdicts, whole), *sampling_cautions(run, metric)],
+        "cautions": [*sections.cautions(whole), *sampling_cautions(run, metric)],
         "interrupted": run.said("state") not in (None, "finished"),
         "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
         "metric": metric,
@@ -173,8 +173,8 @@ def summary(
             {
                 **asdict(verdict),
                 "note": verdict.note,
-                "clustered_status": verdict.clustered_status,
-                "further_terrains": verdict.further_terrains,
+                "plain_status": verdict.plain_status,
+                "margin": verdict.margin,
             }
             for verdict in verdicts
         ],

@@ -16,7 +16,7 @@ from reports.answers import CONFIDENCE, Share, share_of
 from reports.columns import axis_columns, label, numbers, split_unit
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.statistics import quantile_bounds
+from reports.statistics.samples import quantile_bounds
 from reports.verdicts import is_flag, members, terrain_groups
 from reports.wording import number, percent, stated
 

@@ -18,7 +18,7 @@ from reports.columns import numbers
 from reports.comparison import compared_names, own_frame
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.statistics import proportion_interval
+from reports.statistics.proportions import proportion_interval
 from reports.wording import number, percent
 
 #: The column, and the parts that the error behind it has.

@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from campaigns.sampling.design import said_of
+from reports.statistics.sequential import looks_of, spent_share
 from reports.stored import table
 
 #: The design of cases that are drawn independently.
@@ -27,11 +28,14 @@ class Sampled:
         Paths of the parameters that were swept as a grid.
     nominal
         Whether case 0 is the nominal one, which nothing was drawn for.
+    most_cases
+        Cases of the last look at a campaign that stops itself when it is decided; None where it does not.
     """
 
     design: str = RANDOM
     grids: tuple[str, ...] = ()
     nominal: bool = False
+    most_cases: int | None = None
 
     @property
     def independent(self) -> bool:
@@ -53,6 +57,10 @@ class Sampled:
             "independent random draws carry one."
         )
 
+    def risk_share(self, cases: int) -> float:
+        """Which share of the risk that a confidence leaves may be spent on a judgement of so many cases."""
+        return 1.0 if self.most_cases is None else spent_share(looks_of(self.most_cases), cases)
+
     def drawn(self, frame: pd.DataFrame) -> pd.DataFrame:
         """The rows of the cases that were drawn: all but the nominal one."""
         if not self.nominal or "case" not in frame:
@@ -69,4 +77,6 @@ def sampled(configuration: Mapping[str, Any]) -> Sampled:
     design = table(configuration.get("design"))
     dispersions = table(configuration.get("dispersions"))
     grids = tuple(str(path) for path, one in dispersions.items() if table(one).get("distribution") == "grid")
-    return Sampled(str(design.get("kind") or RANDOM), grids, design.get("nominal") is True)
+    most = configuration.get("most_cases")
+    most_cases = most if isinstance(most, int) and not isinstance(most, bool) and most > 0 else None
+    return Sampled(str(design.get("kind") or RANDOM), grids, design.get("nominal") is True, most_cases)

@@ -97,17 +97,11 @@ def _strip(verdict: Verdict) -> Strip | None:
     return Strip(f"{100.0 * left:.3g} %", *places)
 
 
-def cautions(verdicts: Sequence[Verdict], whole: Overall) -> list[str]:
-    """What the headline alone would hide: crashed cases, and verdicts that shared terrains put in question."""
-    said = []
-    if whole.crashed:
-        said.append(f"{count(whole.crashed, 'case')} crashed: the campaign is not in order, whatever its verdict.")
-    changed = [verdict for verdict in verdicts if verdict.clustered_status not in (None, verdict.status)]
-    return said + [
-        f"{verdict.requirement_id} is {verdict.status} only if cases on one terrain are independent; allowing for "
-        f"{count(verdict.terrains or 0, 'shared terrain')} it is {verdict.clustered_status}."
-        for verdict in changed
-    ]
+def cautions(whole: Overall) -> list[str]:
+    """What the headline alone would hide: crashed cases."""
+    if not whole.crashed:
+        return []
+    return [f"{count(whole.crashed, 'case')} crashed: the campaign is not in order, whatever its verdict."]
 
 
 def statistics_grid(frame: pd.DataFrame, metric: str) -> Grid:

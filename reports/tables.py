@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from reports.columns import axis_columns, label, numbers
-from reports.statistics import ErrorSummary, summarize
+from reports.statistics.samples import ErrorSummary, summarize
 from reports.verdicts import ENGINE_FAILURES, Status, Verdict, is_flag, members
 from reports.wording import NOTHING, asked_text, interval, number, percent, stated
 
@@ -101,6 +101,7 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
         ["mean", *(number(s.mean) for s in summaries)],
         [f"mean, {confidence} interval", *(interval(s.mean_lower, s.mean_upper) for s in summaries)],
         ["standard deviation", *(number(s.sd) for s in summaries)],
+        [f"standard deviation, {confidence} interval", *(interval(s.sd_lower, s.sd_upper) for s in summaries)],
         ["robust standard deviation", *(number(s.robust_sd) for s in summaries)],
         ["root mean square", *(number(s.rms) for s in summaries)],
     ]

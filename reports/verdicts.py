@@ -2,10 +2,12 @@
 
 A requirement asks that `metric <= bound` (in magnitude), or a column of true and false, holds for a stated fraction of
 a population of cases, at a stated confidence. Its status follows from one-sided Clopper-Pearson bounds of the success
-rate, as for independent cases; or from the rate alone where the requirement is decided by the estimate. Where cases
-share terrains they are not independent: the verdict then says so and carries the bounds that hold nevertheless. Where
-they are no random draws at all (Latin hypercube, Sobol, grids) no bounds are told and no confidence can be had: only a
-requirement that is decided by the estimate is then decided, by the rate of these very cases, and the verdict says so.
+rate; or from the rate alone where the requirement is decided by the estimate. Where cases share terrains they are not
+independent: the bounds then are those that hold nevertheless (`reports.statistics.clusters`), and the verdict says
+what independent cases would have shown. Where a campaign stops itself when it is decided, each look at it has its share
+of the risk (`reports.statistics.sequential`). Where cases are no random draws at all (Latin hypercube, Sobol, grids) no
+bounds are told and no confidence can be had: only a requirement that is decided by the estimate is then decided, by the
+rate of these very cases, and the verdict says so.
 """
 
 from __future__ import annotations
@@ -21,9 +23,10 @@ import pandas as pd
 from jaxtyping import Bool, Int
 
 from campaigns.outcomes import UNFINISHED
-from reports.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
 from reports.sampled import INDEPENDENT, Sampled
-from reports.statistics import further_cases_needed, proportion_lower, proportion_upper
+from reports.statistics.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
+from reports.statistics.proportions import further_cases_needed, proportion_lower, proportion_upper
+from reports.statistics.sequential import confidence_at
 from reports.wording import count, percent, stated
 
 #: Outcomes of cases that the engine could not finish; the algorithm under test may be innocent of them.
@@ -55,16 +58,21 @@ class Verdict:
     n, failures
         Cases of the population, and those that did not succeed (a metric that is missing or NaN is a failure).
     estimate, lower, upper
-        Success rate and its one-sided Clopper-Pearson bounds, each at the confidence; NaN for an empty population,
+        Success rate and the one-sided bounds that decide, each at `bounds_confidence`; NaN for an empty population,
         bounds also where the cases are not independent random draws.
     further_cases
-        Cases still needed if no more fail, where that can be said; None for PASS and FAIL.
+        Cases still needed if no more fail, each on a terrain of its own where whole terrains are counted; None for PASS
+        and FAIL, and where it cannot be said.
     reason
         Why nothing could be judged; empty where it could.
     terrains
         Distinct terrains behind the population; None where the rows do not say.
     clustered
         What the cases show when terrains are shared between them; None where none is.
+    plain_lower, plain_upper
+        The bounds as they would be for independent cases; NaN where there are none.
+    bounds_confidence
+        The confidence of the bounds: the requirement's, or higher at a look of a campaign that stops itself.
     """
 
     requirement_id: str
@@ -85,42 +93,52 @@ class Verdict:
     reason: str = ""
     terrains: int | None = None
     clustered: ClusteredEvidence | None = None
+    plain_lower: float = math.nan
+    plain_upper: float = math.nan
+    bounds_confidence: float = math.nan
 
     @property
-    def clustered_status(self) -> Status | None:
-        """The status by the bounds for shared terrains; None where none is shared or the estimate decides."""
+    def plain_status(self) -> Status | None:
+        """The status as it would be for independent cases; None where no terrain is shared or the estimate decides."""
         if self.clustered is None or self.decide_by == ESTIMATE:
             return None
-        return _status(self.clustered.lower, self.clustered.upper, self.probability)
+        return status_of(self.plain_lower, self.plain_upper, self.probability)
 
     @property
-    def further_terrains(self) -> int | None:
-        """Terrains still needed where whole terrains are counted and no more fail; None where none is to be said."""
-        shared = self.clustered
-        counted = shared is not None and shared.method is ClusterMethod.TERRAIN_COUNT
-        if shared is None or not counted or self.clustered_status is not Status.INSUFFICIENT:
-            return None
-        return further_cases_needed(shared.terrains, shared.failed_terrains, self.probability, self.confidence)
+    def margin(self) -> float:
+        """By how much the bound that decides is on the right side: of the rate asked; NaN where there are no bounds."""
+        decisive = self.estimate if self.decide_by == ESTIMATE else self.lower
+        return decisive - self.probability
 
     @property
     def note(self) -> str:
         """What a reader must know before trusting the verdict; empty where there is nothing to say."""
         if self.reason:
             return self.reason
-        if self.clustered is None:
-            return ""
-        shared = self.clustered
-        verdict = "" if self.clustered_status is None else f": {self.clustered_status}"
-        return (
-            f"{count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} and so are not independent, as the "
-            f"bounds take them to be. Allowing for that ({shared.method}, effective n {shared.effective_n:.4g}), the "
-            f"success rate is at least {percent(shared.lower)} at {stated(self.confidence)} confidence"
-            f"{verdict}.{self._more_terrains()}"
-        )
+        return " ".join(part for part in (self._sharing(), self._look()) if part)
 
-    def _more_terrains(self) -> str:
-        further = self.further_terrains
-        return "" if further is None else f" {count(further, 'further terrain')} would do if no case fails on them."
+    def _sharing(self) -> str:
+        shared = self.clustered
+        if shared is None:
+            return ""
+        effect = "" if math.isnan(shared.design_effect) else f", design effect {shared.design_effect:.3g}"
+        said = (
+            f"{count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} and so are not independent; "
+            f"the bounds allow for that ({shared.method}, effective n {shared.effective_n:.4g}{effect})."
+        )
+        if self.plain_status is not None and self.plain_status is not self.status:
+            said += f" Independent cases would show at least {percent(self.plain_lower)}: {self.plain_status}."
+        if shared.method is ClusterMethod.TERRAIN_COUNT and self.further_cases:
+            said += f" {count(self.further_cases, 'further terrain')} would do if no case fails on them."
+        return said
+
+    def _look(self) -> str:
+        if math.isnan(self.bounds_confidence) or self.bounds_confidence == self.confidence:
+            return ""
+        return (
+            f"The campaign stops itself when it is decided: its bounds are at {100.0 * self.bounds_confidence:.4g} % "
+            f"confidence, so that all looks together keep {stated(self.confidence)}."
+        )
 
 
 @dataclass(frozen=True)
@@ -263,7 +281,9 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
         further = further_cases_needed(0, 0, *asked) if how.independent else None
         reason = f"No case belongs to the population '{open_verdict.population}'."
         return replace(open_verdict, reason=reason, further_cases=further)
-    return _weighed(open_verdict, chosen) if how.independent else _described(open_verdict, chosen, how)
+    if not how.independent:
+        return _described(open_verdict, chosen, how)
+    return _weighed(open_verdict, chosen, how.risk_share(len(frame)))
 
 
 def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
@@ -274,7 +294,7 @@ def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
     decided = verdict.decide_by == ESTIMATE
     return replace(
         verdict,
-        status=_status(rate, rate, verdict.probability) if decided else verdict.status,
+        status=status_of(rate, rate, verdict.probability) if decided else verdict.status,
         n=success.size,
         failures=int((~success).sum()),
         estimate=rate,
@@ -283,19 +303,21 @@ def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
     )
 
 
-def _weighed(verdict: Verdict, chosen: pd.DataFrame) -> Verdict:
-    """The verdict by the cases of its population, of which there is at least one."""
+def _weighed(verdict: Verdict, chosen: pd.DataFrame, share: float) -> Verdict:
+    """The verdict by the cases of its population, of which there is at least one; `share` of the risk may be spent."""
     success = succeeded(chosen, verdict.metric, verdict.bound)
     n, failures = success.size, int((~success).sum())
-    lower = proportion_lower(n - failures, n, verdict.confidence)
-    upper = proportion_upper(n - failures, n, verdict.confidence)
-    estimate = (n - failures) / n
-    bounds = (estimate, estimate) if verdict.decide_by == ESTIMATE else (lower, upper)
-    status = _status(*bounds, verdict.probability)
-    undecided = status is Status.INSUFFICIENT
+    confidence = confidence_at(verdict.confidence, share)
+    plain = proportion_lower(n - failures, n, confidence), proportion_upper(n - failures, n, confidence)
     groups = terrain_groups(chosen)
-    shared = groups is not None and int(groups.max()) + 1 < n
-    return replace(
+    shared = None
+    if groups is not None and int(groups.max()) + 1 < n:
+        shared = clustered_evidence(success, groups, confidence)
+    lower, upper = plain if shared is None else (shared.lower, shared.upper)
+    estimate = (n - failures) / n
+    decisive = (estimate, estimate) if verdict.decide_by == ESTIMATE else (lower, upper)
+    status = status_of(*decisive, verdict.probability)
+    judged = replace(
         verdict,
         status=status,
         n=n,
@@ -303,13 +325,30 @@ def _weighed(verdict: Verdict, chosen: pd.DataFrame) -> Verdict:
         estimate=estimate,
         lower=lower,
         upper=upper,
-        further_cases=further_cases_needed(n, failures, verdict.probability, verdict.confidence) if undecided else None,
         terrains=None if groups is None else int(chosen["terrain"].nunique()),
-        clustered=clustered_evidence(success, groups, verdict.confidence) if shared and groups is not None else None,
+        clustered=shared,
+        plain_lower=plain[0],
+        plain_upper=plain[1],
+        bounds_confidence=confidence,
     )
+    return replace(judged, further_cases=_further_cases(judged)) if status is Status.INSUFFICIENT else judged
 
 
-def _status(lower: float, upper: float, probability: float) -> Status:
+def _further_cases(verdict: Verdict) -> int:
+    """How many more cases would show the requirement met if none of them fails."""
+    asked = (verdict.probability, verdict.bounds_confidence)
+    shared = verdict.clustered
+    if shared is None:
+        return further_cases_needed(verdict.n, verdict.failures, *asked)
+    if shared.method is ClusterMethod.TERRAIN_COUNT:
+        return further_cases_needed(shared.terrains, shared.failed_terrains, *asked)
+    worth = shared.effective_n / verdict.n
+    effective = further_cases_needed(math.floor(shared.effective_n), math.ceil(verdict.failures * worth), *asked)
+    return math.ceil(effective / worth)
+
+
+def status_of(lower: float, upper: float, probability: float) -> Status:
+    """What bounds of a success rate say of the rate that is asked."""
     if lower >= probability:
         return Status.PASS
     return Status.FAIL if upper < probability else Status.INSUFFICIENT
@@ -373,5 +412,10 @@ def _sentence(text: str) -> str:
 
 def _further(verdicts: Sequence[Verdict]) -> str:
     """How many cases would decide what is open, where that can be said."""
-    needed = [verdict.further_cases for verdict in verdicts if verdict.further_cases is not None]
-    return f" {count(max(needed), 'further case')} would do if no more fail." if needed else ""
+    needed = [verdict for verdict in verdicts if verdict.further_cases is not None]
+    if not needed:
+        return ""
+    most = max(needed, key=lambda verdict: verdict.further_cases or 0)
+    counted = most.clustered is not None and most.clustered.method is ClusterMethod.TERRAIN_COUNT
+    where = ", each on a terrain of its own," if counted else ""
+    return f" {count(most.further_cases or 0, 'further case')}{where} would do if no more fail."

@@ -11,7 +11,7 @@ from reports.columns import numbers
 from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.statistics import quantile_bounds
+from reports.statistics.samples import quantile_bounds
 from reports.svg import SERIES, in_page_style, new_axes
 from reports.verdicts import is_flag, members
 from reports.wording import number, percent, stated

@@ -17,7 +17,7 @@ from reports.hda.rows import Rate, flag, interval_text, is_landing, rate, rate_t
 from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.statistics import quantile_bounds
+from reports.statistics.samples import quantile_bounds
 from reports.svg import MARKERS, SERIES, in_page_style, new_axes
 from reports.wording import number, stated
 from scenarios.landing.confusion import CLASS_NAMES, CLASSES

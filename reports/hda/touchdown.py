@@ -16,7 +16,7 @@ from reports.hda.rows import flag, interval_text, is_landing, share_text
 from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.statistics import mean_interval
+from reports.statistics.samples import mean_interval
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from reports.wording import NOTHING, number, stated
 

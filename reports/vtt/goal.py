@@ -16,7 +16,7 @@ from reports.columns import numbers
 from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.statistics import quantile_bounds
+from reports.statistics.samples import quantile_bounds
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from reports.vtt.rows import flag_share, interval_text, is_closed_loop, known, selectable, share_text
 from reports.wording import NOTHING, number, stated

@@ -125,6 +125,7 @@ def test_the_page_and_its_twin_say_how_cases_were_drawn(make_rows: Rows, make_ru
         "design": "latin-hypercube",
         "grids": [],
         "nominal": True,
+        "most_cases": None,
         "independent": False,
         "text": "Latin hypercube; case 0 is the nominal one",
     }

@@ -1,10 +1,13 @@
-"""Intervals and sample sizes of success rates, and what a sample of errors says: numbers in, numbers out.
+"""What a sample of numbers says: quantiles, mean, spread, each with bounds.
 
-Success rates are bounded by the exact binomial interval of Clopper & Pearson ("The use of confidence or fiducial limits
-illustrated in the case of the binomial", Biometrika 26, 1934). Quantiles are bounded by order statistics, free of any
-assumption about the distribution (Wilks, "Determination of sample sizes for setting tolerance limits", Ann. Math.
-Statist. 12, 1941). Means are bounded by the BCa bootstrap (Efron, "Better bootstrap confidence intervals", J. Amer.
-Statist. Assoc. 82, 1987) as SciPy has it.
+Quantiles are bounded by order statistics, free of any assumption about the distribution (Wilks, "Determination of
+sample sizes for setting tolerance limits", Ann. Math. Statist. 12, 1941; as Hanson & Beard use them for a stated
+consumer risk, NASA/TP-2010-216447). Means and spreads are bounded by the BCa bootstrap (Efron, "Better bootstrap
+confidence intervals", J. Amer. Statist. Assoc. 82, 1987) as SciPy has it, with two corrections for small samples, in
+which BCa alone covers too little: its level is that of Student's t instead of the normal distribution (Hesterberg,
+"What teachers should know about the bootstrap", Amer. Statist. 69, 2015), and a spread's interval reaches at least as
+far as Bonett's ("Approximate confidence interval for standard deviation of nonnormal distributions", Comput. Statist.
+Data Anal. 50, 2006). `python -m benchmarks.validation --only intervals` measures their coverage.
 """
 
 from __future__ import annotations
@@ -12,106 +15,21 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-#: Above this many values the bootstrap's interval of a mean equals the central limit theorem's in what is printed.
+from reports.statistics.proportions import Interval, check_confidence
+
+#: Above this many values the bootstrap's interval equals the large-sample one in what is printed.
 _BOOTSTRAP_LARGEST_SAMPLE = 2000
 _BOOTSTRAP_RESAMPLES = 2000
 #: The bootstrap of a report draws from a fixed seed: the same rows give the same page.
 _BOOTSTRAP_SEED = 19340401
-_LARGEST_SAMPLE_SIZE = 2**40
-
-#: A lower and an upper bound.
-Interval = tuple[float, float]
-
-
-def _check_confidence(confidence: float) -> None:
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"the confidence is {confidence}; it must lie between 0 and 1, both excluded")
-
-
-def _check_counts(successes: float | int, n: float | int) -> None:
-    if not 0 <= successes <= n:
-        raise ValueError(f"{successes} successes of {n} cases; there can be none to all")
-
-
-def proportion_lower(successes: float | int, n: float | int, confidence: float) -> float:
-    """The one-sided lower Clopper-Pearson bound of a success rate.
-
-    Parameters
-    ----------
-    successes, n
-        Successes and cases; need not be whole (an effective sample size is not).
-    confidence
-        Probability, at least, that the bound lies below the true rate.
-
-    Raises
-    ------
-    ValueError
-        Where the counts or the confidence are out of range.
-
-    Notes
-    -----
-    Clopper & Pearson 1934, by the quantile of the beta distribution. With no cases the bound is 0.
-    """
-    _check_confidence(confidence)
-    _check_counts(successes, n)
-    if successes <= 0:
-        return 0.0
-    return float(stats.beta.ppf(1.0 - confidence, successes, n - successes + 1.0))
-
-
-def proportion_upper(successes: float | int, n: float | int, confidence: float) -> float:
-    """The one-sided upper Clopper-Pearson bound of a success rate; see `proportion_lower`. With no cases it is 1."""
-    _check_confidence(confidence)
-    _check_counts(successes, n)
-    return 1.0 - proportion_lower(n - successes, n, confidence)
-
-
-def proportion_interval(successes: float | int, n: float | int, confidence: float) -> Interval:
-    """The two-sided Clopper-Pearson interval with equal tails; see `proportion_lower`."""
-    _check_confidence(confidence)
-    one_sided = 0.5 * (1.0 + confidence)
-    return proportion_lower(successes, n, one_sided), proportion_upper(successes, n, one_sided)
-
-
-def minimum_sample_size(reliability: float, confidence: float, failures: int = 0) -> int:
-    """The fewest cases that show a reliability at a confidence although so many of them failed.
-
-    Notes
-    -----
-    The smallest n whose one-sided lower Clopper-Pearson bound with `failures` failures reaches `reliability`: for no
-    failures the textbook ln(1 - confidence) / ln(reliability), rounded up.
-
-    Raises
-    ------
-    ValueError
-        Where the reliability or the confidence does not lie strictly between 0 and 1, or the failures are negative.
-    """
-    _check_confidence(confidence)
-    if not 0.0 < reliability < 1.0:
-        raise ValueError(f"the reliability is {reliability}; it must lie between 0 and 1, both excluded")
-    if failures < 0:
-        raise ValueError(f"{failures} failures; there cannot be fewer than none")
-    enough = failures + 1
-    while proportion_lower(enough - failures, enough, confidence) < reliability:
-        enough *= 2
-        if enough > _LARGEST_SAMPLE_SIZE:
-            raise ValueError(f"no sample of practical size shows a reliability of {reliability}")
-    too_few = failures
-    while enough - too_few > 1:
-        middle = (enough + too_few) // 2
-        shown = proportion_lower(middle - failures, middle, confidence) >= reliability
-        enough, too_few = (middle, too_few) if shown else (enough, middle)
-    return enough
-
-
-def further_cases_needed(n: int, failures: int, reliability: float, confidence: float) -> int:
-    """How many more cases show the reliability at the confidence if none of them fails; 0 when it is shown."""
-    return max(0, minimum_sample_size(reliability, confidence, failures) - n)
+#: Fewest values that say anything of their spread.
+_FEWEST_OF_SPREAD = 8
 
 
 def quantile_bounds(sample: Float[np.ndarray, " n"], quantile: float, confidence: float) -> Interval:
@@ -128,7 +46,7 @@ def quantile_bounds(sample: Float[np.ndarray, " n"], quantile: float, confidence
     Wilks 1941. The r-th smallest of n values lies at or above the quantile q with probability
     P(Bin(n, q) <= r - 1): the upper bound is the smallest such value with that probability at the confidence.
     """
-    _check_confidence(confidence)
+    check_confidence(confidence)
     ordered = np.sort(np.asarray(sample, dtype=np.float64))
     n = ordered.size
     if n == 0:
@@ -150,7 +68,7 @@ def mean_interval(sample: Float[np.ndarray, " n"], confidence: float) -> Interva
 
     NaN for fewer than two values; the value itself where all are equal.
     """
-    _check_confidence(confidence)
+    check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
     if values.size < 2:
         return math.nan, math.nan
@@ -160,17 +78,52 @@ def mean_interval(sample: Float[np.ndarray, " n"], confidence: float) -> Interva
     if values.size > _BOOTSTRAP_LARGEST_SAMPLE:
         half = float(stats.norm.ppf(0.5 * (1.0 + confidence))) * spread / math.sqrt(values.size)
         return mean - half, mean + half
-    return _bootstrap_mean(values, confidence)
+    return _bootstrap(values, np.mean, confidence)
 
 
-def _bootstrap_mean(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
+def spread_interval(sample: Float[np.ndarray, " n"], confidence: float) -> Interval:
+    """Two-sided interval of the standard deviation: BCa bootstrap and Bonett's, whichever reaches further.
+
+    NaN for fewer than eight values; 0 where all are equal. In large samples Bonett's alone.
+    """
+    check_confidence(confidence)
+    values = np.asarray(sample, dtype=np.float64)
+    if values.size < _FEWEST_OF_SPREAD:
+        return math.nan, math.nan
+    if np.ptp(values) == 0.0:
+        return 0.0, 0.0
+    lower, upper = _bonett(values, confidence)
+    if values.size > _BOOTSTRAP_LARGEST_SAMPLE:
+        return lower, upper
+    resampled = _bootstrap(values, _deviation, confidence)
+    return float(np.fmin(lower, resampled[0])), float(np.fmax(upper, resampled[1]))
+
+
+def _deviation(values: Float[np.ndarray, " *n"], axis: int = -1) -> Any:
+    return np.std(values, axis=axis, ddof=1)
+
+
+def _bonett(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
+    """Bonett 2006, equation 8, with Student's t for the normal quantile."""
+    n = values.size
+    quantile = float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1))
+    trimmed = float(stats.trim_mean(values, min(0.49, 0.5 / math.sqrt(n - 4.0))))
+    squares = float(((values - values.mean()) ** 2).sum())
+    kurtosis = n * float(((values - trimmed) ** 4).sum()) / squares**2
+    correction = n / (n - quantile)
+    error = correction * math.sqrt(max((kurtosis - (n - 3.0) / n) / (n - 1.0), 0.0))
+    middle = math.log(correction * squares / (n - 1.0))
+    return math.exp(0.5 * (middle - quantile * error)), math.exp(0.5 * (middle + quantile * error))
+
+
+def _bootstrap(values: Float[np.ndarray, " n"], statistic: Any, confidence: float) -> Interval:
     with warnings.catch_warnings():
         # A degenerate bootstrap distribution (two values, say) is answered by NaN bounds, which the caller prints.
         warnings.simplefilter("ignore")
         result = stats.bootstrap(
             (values,),
-            np.mean,
-            confidence_level=confidence,
+            statistic,
+            confidence_level=_widened(confidence, values.size),
             n_resamples=_BOOTSTRAP_RESAMPLES,
             batch=200,
             vectorized=True,
@@ -178,6 +131,13 @@ def _bootstrap_mean(values: Float[np.ndarray, " n"], confidence: float) -> Inter
             rng=np.random.default_rng(_BOOTSTRAP_SEED),
         )
     return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def _widened(confidence: float, n: int) -> float:
+    """The level at which the normal quantile is Student's, times sqrt(n / (n - 1)): Hesterberg 2015, section 5."""
+    quantile = float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1)) * math.sqrt(n / (n - 1.0))
+    # below 1, which the bootstrap does not take
+    return min(2.0 * float(stats.norm.cdf(quantile)) - 1.0, 1.0 - 1e-6)
 
 
 @dataclass(frozen=True)
@@ -200,8 +160,10 @@ class ErrorSummary:
         Finite values, and those that were not finite (no answer was reported).
     mean, mean_lower, mean_upper
         Mean and its two-sided interval at `confidence`.
-    sd, rms, median
-        Standard deviation (n - 1), root mean square about zero, median.
+    sd, sd_lower, sd_upper
+        Standard deviation (n - 1) and its two-sided interval at `confidence`.
+    rms, median
+        Root mean square about zero, median.
     robust_sd
         Median absolute deviation about the median times 1.4826: the standard deviation of a normal core.
     largest
@@ -218,6 +180,8 @@ class ErrorSummary:
     mean_lower: float
     mean_upper: float
     sd: float
+    sd_lower: float
+    sd_upper: float
     rms: float
     median: float
     robust_sd: float
@@ -240,6 +204,7 @@ def summarize(
     n, missing = finite.size, values.size - finite.size
     median = float(np.median(finite)) if n else math.nan
     mean_lower, mean_upper = mean_interval(finite, confidence)
+    sd_lower, sd_upper = spread_interval(finite, confidence)
     return ErrorSummary(
         n=n,
         missing=missing,
@@ -247,6 +212,8 @@ def summarize(
         mean_lower=mean_lower,
         mean_upper=mean_upper,
         sd=float(finite.std(ddof=1)) if n > 1 else math.nan,
+        sd_lower=sd_lower,
+        sd_upper=sd_upper,
         rms=float(np.sqrt(np.mean(finite**2))) if n else math.nan,
         median=median,
         robust_sd=1.4826 * float(np.median(np.abs(finite - median))) if n else math.nan,

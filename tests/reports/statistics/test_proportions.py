@@ -8,15 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from reports.statistics import (
+from reports.statistics.proportions import (
     further_cases_needed,
-    mean_interval,
     minimum_sample_size,
     proportion_interval,
     proportion_lower,
     proportion_upper,
-    quantile_bounds,
-    summarize,
 )
 
 #: `design.md`, "Minimum number of cases for a reliability at a confidence, by failures seen (binomial)".
@@ -130,65 +127,3 @@ def test_further_cases() -> None:
     assert further_cases_needed(24, 0, 0.99, 0.9) == 230 - 24
     assert further_cases_needed(24, 1, 0.99, 0.9) == 388 - 24
     assert further_cases_needed(500, 0, 0.99, 0.9) == 0
-
-
-@pytest.mark.parametrize(("quantile", "confidence", "n"), [(0.95, 0.95, 59), (0.99, 0.9, 230), (0.99, 0.95, 299)])
-def test_wilks_sample_size_is_the_first_to_bound_a_quantile(quantile: float, confidence: float, n: int) -> None:
-    # Wilks 1941: the largest of n values bounds the quantile q from above once q ** n <= 1 - confidence.
-    sample = np.arange(float(n))
-    assert quantile_bounds(sample, quantile, confidence)[1] == n - 1
-    assert quantile_bounds(sample[:-1], quantile, confidence)[1] == math.inf
-
-
-def test_quantile_bounds_cover() -> None:
-    # 1,500 samples: one standard deviation of the coverage is 0.8 %.
-    rng = np.random.default_rng(5)
-    truth = stats.norm.ppf(0.9)
-    bounds = np.array([quantile_bounds(rng.standard_normal(80), 0.9, 0.9) for _ in range(1500)])
-    assert np.mean(bounds[:, 0] <= truth) >= 0.9 - 0.024
-    assert np.mean(bounds[:, 1] >= truth) >= 0.9 - 0.024
-
-
-def test_mean_interval_covers() -> None:
-    # BCa on 40 exponential values: its coverage is below nominal by about 2 % (Efron 1987); 250 samples: sd 1.4 %.
-    rng = np.random.default_rng(6)
-    intervals = np.array([mean_interval(rng.exponential(size=40), 0.95) for _ in range(250)])
-    assert np.mean((intervals[:, 0] <= 1.0) & (intervals[:, 1] >= 1.0)) >= 0.95 - 0.02 - 3 * 0.014
-
-
-def test_mean_interval_of_a_large_sample() -> None:
-    values = np.random.default_rng(7).normal(3.0, 2.0, 10000)
-    # 1.96 * 2 / sqrt(10000) = 0.039
-    lower, upper = mean_interval(values, 0.95)
-    assert upper - lower == pytest.approx(2 * 0.0392, rel=0.03)
-    assert lower < 3.0 < upper
-
-
-def test_mean_interval_of_few_values() -> None:
-    assert all(math.isnan(bound) for bound in mean_interval(np.array([1.0]), 0.9))
-    assert mean_interval(np.full(5, 2.5), 0.9) == (2.5, 2.5)
-    assert len(mean_interval(np.array([1.0, 2.0]), 0.9)) == 2
-
-
-def test_summary_of_known_values() -> None:
-    summary = summarize(np.array([3.0, -4.0, math.nan, 0.0, math.inf]))
-    assert (summary.n, summary.missing, summary.median, summary.largest) == (3, 2, 0.0, 4.0)
-    assert summary.mean == pytest.approx(-1 / 3)
-    assert summary.rms == pytest.approx(math.sqrt(25 / 3))
-    assert summary.robust_sd == pytest.approx(1.4826 * 3.0)
-
-
-@pytest.mark.parametrize("sample", [[], [math.nan], [2.0]])
-def test_summary_of_next_to_nothing(sample: list[float]) -> None:
-    summary = summarize(np.array(sample, dtype=np.float64))
-    assert summary.n == (sample == [2.0])
-    assert math.isnan(summary.sd)
-    assert all(quantile.upper == math.inf for quantile in summary.quantiles)
-
-
-def test_circular_error_of_a_normal_scatter() -> None:
-    # For two independent normal parts of unit deviation the median radius is sqrt(2 ln 2) = 1.1774.
-    rng = np.random.default_rng(8)
-    summary = summarize(np.hypot(*rng.standard_normal((2, 20000))))
-    assert summary.quantiles[0].estimate == pytest.approx(math.sqrt(2 * math.log(2)), abs=0.03)
-    assert summary.quantiles[1].estimate == pytest.approx(math.sqrt(2 * math.log(20)), abs=0.05)

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reports.clusters import ClusterMethod, clustered_evidence
-from reports.statistics import proportion_lower, proportion_upper
+from reports.statistics.clusters import ClusterMethod, clustered_evidence
+from reports.statistics.proportions import proportion_lower, proportion_upper
 
 SIZE = 8
 

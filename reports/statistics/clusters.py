@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from reports.statistics import proportion_lower, proportion_upper
+from reports.statistics.proportions import proportion_lower, proportion_upper
 
 #: Fewest terrains, and fewest terrains with a failure (and with a success), for which the design effect is estimated.
-#: Chosen by simulation (`tests/reports/test_clusters.py`): with these the bounds keep their confidence.
+#: Chosen by simulation (`tests/reports/statistics/test_clusters.py`): with these the bounds keep their confidence.
 FEWEST_TERRAINS = 50
 FEWEST_MIXED_TERRAINS = 10
 
