@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.dynamics import State, Trajectory
+from sim.dynamics import Resting, State, Trajectory
 from sim.dynamics.rotorcraft import (
     Air,
     AirParameters,
@@ -61,10 +61,10 @@ class HelicopterParameters(BaseModel):
         ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005)
     )
     averaging_after_s: Annotated[
-        float, Field(ge=0.0, le=60.0, description="from the touchdown to the first averaged solution, s (assumed)")
-    ] = 1.0
+        float, Field(ge=2.0, le=3600.0, description="from the touchdown to the first averaged solution, s (assumed)")
+    ] = 2.0
     averaging_s: Annotated[
-        float, Field(gt=0.0, le=60.0, description="for which solutions are averaged, s: the paper has dozens")
+        float, Field(gt=0.0, le=600.0, description="for which solutions are averaged, s: the paper has dozens")
     ] = 5.0
 
     @property
@@ -72,6 +72,12 @@ class HelicopterParameters(BaseModel):
         """From the flight's start to the latest end that it can have."""
         last = self.transit.pictures_s + self.guidance.wait_s + self.guidance.longest_s + self.guidance.rest_s
         return -self.transit.lead_s, last + 1.0
+
+    @property
+    def received_s(self) -> tuple[float, float]:
+        """From the flight's start to the latest solution that is averaged on the ground."""
+        start, end = self.span_s
+        return start, end + self.averaging_after_s + self.averaging_s
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,7 @@ class Instruments:
         """The units of a case."""
         return cls(
             Imu.drawn(p.imu, p.span_s, streams.generator("inertial unit")),
-            RtkReceiver.drawn(p.rtk, p.span_s, streams.generator("receiver")),
+            RtkReceiver.drawn(p.rtk, p.received_s, streams.generator("receiver")),
             TiltCompass.drawn(p.compass, streams.generator("compass")),
             NavigationFilter(p.navigation, p.imu, p.rtk, p.compass, gravity_m_s2),
         )
@@ -315,7 +321,7 @@ def land(
     time = flight.first(Phase.ON_GROUND)
     if time is None:
         return None
-    return _touchdown(p, flight, navigated, time, turns, moved)
+    return _touchdown(transit, flight, navigated, time, turns, moved, streams)
 
 
 def _landing_laser(
@@ -333,12 +339,17 @@ def _at_knots(
 
 
 def _touchdown(
-    p: HelicopterParameters, flight: RotorcraftFlight, navigated: Navigated, time: float, turns: int, moved: float
+    transit: Transit,
+    flight: RotorcraftFlight,
+    navigated: Navigated,
+    time: float,
+    turns: int,
+    moved: float,
+    streams: Streams,
 ) -> Touchdown:
-    first = time + p.averaging_after_s
-    standing = (navigated.fix_times_s >= first) & (navigated.fix_times_s < first + p.averaging_s)
-    standing &= np.isfinite(navigated.solutions.positions_m[:, 0])
-    count = int(np.count_nonzero(standing))
+    solutions = _standing(transit, flight, time, streams)
+    known = np.isfinite(solutions.positions_m[:, 0])
+    count = int(np.count_nonzero(known))
     unknown = np.full(3, np.nan)
     last = int(np.searchsorted(navigated.boundaries_s, time, side="right")) - 1
     return Touchdown(
@@ -347,9 +358,19 @@ def _touchdown(
         time_s=time,
         state=flight.path.state(time),
         believed_m=navigated.solution.positions_m[last],
-        gps_m=navigated.solutions.positions_m[standing].mean(axis=0) if count else unknown,
-        gps_deviation_m=navigated.solutions.reported_m[standing].mean(axis=0) if count else unknown,
+        gps_m=solutions.positions_m[known].mean(axis=0) if count else unknown,
+        gps_deviation_m=solutions.reported_m[known].mean(axis=0) if count else unknown,
         gps_solutions=count,
         turns=turns,
         moved_m=moved,
     )
+
+
+def _standing(transit: Transit, flight: RotorcraftFlight, time: float, streams: Streams) -> RtkSolutions:
+    """The receiver's solutions that are averaged, while the helicopter stands where it came to rest."""
+    p, receiver, path = transit.parameters, transit.instruments.receiver, flight.path
+    end = path.state(path.span_s[1])
+    standing = Resting(end.position_m, end.attitude, path.gravity_m_s2)
+    first = time + p.averaging_after_s
+    times = receiver.sampling.within(first, first + p.averaging_s)
+    return receiver.measure(standing, times, streams.generator("receiver's noise, standing"))

@@ -6,7 +6,7 @@ from sim.dynamics.relief import RockyGround
 from sim.dynamics.rover import MER, ROCKY_8, Ground, RoverParameters, Stance, settle
 from sim.dynamics.state import State
 from sim.dynamics.swing import SwingDescent
-from sim.dynamics.trajectory import Motion, Trajectory
+from sim.dynamics.trajectory import Motion, Resting, Trajectory
 from sim.dynamics.wind import Wind, WindParameters
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "DrivenPart",
     "Ground",
     "Motion",
+    "Resting",
     "RockyGround",
     "RoverParameters",
     "SlipParameters",

@@ -65,3 +65,43 @@ class Trajectory(Protocol):
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Truth at many times. Raises ValueError outside of the span."""
         ...
+
+
+@dataclass(frozen=True)
+class Resting:
+    """A body that does not move.
+
+    Attributes
+    ----------
+    position_m, attitude
+        Of the body, world axes.
+    gravity_m_s2
+        Acceleration of gravity.
+    """
+
+    position_m: Float64[np.ndarray, "3"]
+    attitude: Rotation
+    gravity_m_s2: float
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """All times."""
+        return -np.inf, np.inf
+
+    def state(self, time_s: float) -> State:
+        """Truth at a time."""
+        return self.motion(np.array([time_s])).state(0)
+
+    def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
+        """Truth at many times."""
+        count = times_s.size
+        still = np.zeros((count, 3))
+        force = self.attitude.inv().apply(np.array([0.0, 0.0, self.gravity_m_s2]))
+        return Motion(
+            times_s=times_s,
+            positions_m=np.tile(self.position_m, (count, 1)),
+            velocities_m_s=still,
+            attitudes=Rotation.concatenate([self.attitude] * count) if count else Rotation.from_quat(np.zeros((0, 4))),
+            body_rates_rad_s=still,
+            specific_forces_m_s2=np.tile(force, (count, 1)),
+        )

@@ -6,7 +6,8 @@ thrust follows with a lag. The autopilot commands speed by distance, acceleratio
 with a trim against steady wind, on the state a little earlier.
 
 The flight for pictures is flown on true states: how far off its path it is matters to nobody. The landing is flown on
-what is believed, so that navigation's errors become errors of the touchdown.
+what is believed, so that navigation's errors become errors of the touchdown; below the height of the flare it only
+stops its drift, and gusts carry it off.
 
 Left out: the inflow near the ground, sliding or tipping after the touchdown (the skids stay where they first touch
 and level out), and any wind that depends on place.

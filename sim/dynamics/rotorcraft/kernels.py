@@ -253,10 +253,10 @@ def land(
                 reading = landing.laser_stuck_m
             if reading < landing.flare_range_m:
                 phase = FLARE
-        # waiting it comes to rest; then a place to go to, approached no faster than commanded
+        # waiting, and when it lands, it comes to rest where it is; else a place to go to, no faster than commanded
         goal[2] = landing.hover_m
         speed[2] = 0.0
-        if phase == WAIT:
+        if phase in (WAIT, FLARE):
             goal[0], goal[1] = believed[0], believed[1]
         else:
             east, north = _limited(off_east, off_north, landing.approach_m_s / c.place_gain)

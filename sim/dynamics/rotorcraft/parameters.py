@@ -120,7 +120,9 @@ class TransitParameters(BaseModel):
 class LandingGuidance(BaseModel):
     """From the pictures to the ground (paper, V).
 
-    The distances of 2 m and 1.5 m are the paper's, the wait is its run time; the rest is assumed.
+    The distances of 2 m and 1.5 m are the paper's, the wait is its run time; the rest is assumed. The paper says of the
+    descent that it goes on reducing the distance from the site, and of what follows below 1.5 m only that the blades'
+    pitch is slowly changed: there it stops its drift, but goes for the site no more.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -132,4 +134,4 @@ class LandingGuidance(BaseModel):
     flare_range_m: Annotated[Positive, Field(le=20.0, description="laser range below which it lands, m")] = 1.5
     flare_m_s: Annotated[Positive, Field(le=5.0, description="commanded speed of sinking when it lands, m/s")] = 0.3
     longest_s: Annotated[Positive, Field(le=600.0, description="after which it has not landed, s")] = 60.0
-    rest_s: Annotated[NonNegative, Field(le=60.0, description="known after touchdown, s")] = 7.0
+    rest_s: Annotated[NonNegative, Field(le=60.0, description="known after touchdown, s")] = 2.0
