@@ -134,4 +134,4 @@ class LandingGuidance(BaseModel):
     flare_range_m: Annotated[Positive, Field(le=20.0, description="laser range below which it lands, m")] = 1.5
     flare_m_s: Annotated[Positive, Field(le=5.0, description="commanded speed of sinking when it lands, m/s")] = 0.3
     longest_s: Annotated[Positive, Field(le=600.0, description="after which it has not landed, s")] = 60.0
-    rest_s: Annotated[NonNegative, Field(le=60.0, description="known after touchdown, s")] = 2.0
+    rest_s: Annotated[NonNegative, Field(le=60.0, description="known after touchdown, s")] = 7.0
