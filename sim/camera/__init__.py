@@ -10,8 +10,10 @@ from sim.camera.base import CameraModel
 from sim.camera.cahv import Cahv
 from sim.camera.cahvor import Cahvor
 from sim.camera.cahvore import Cahvore
+from sim.camera.calibrations import Calibration, read_calibrations
 from sim.camera.files import read_camera, read_cameras
-from sim.camera.opencv import OpenCVIntrinsics, Residual, from_opencv, to_opencv
+from sim.camera.opencv import OpenCVIntrinsics, Residual, from_opencv, from_opencv_fisheye, to_opencv
+from sim.camera.pds4_labels import read_pds4
 from sim.camera.pds_labels import read_pds3
 from sim.camera.text_files import read_cahvor, write_cahvor
 
@@ -19,15 +21,19 @@ __all__ = [
     "Cahv",
     "Cahvor",
     "Cahvore",
+    "Calibration",
     "CameraFileError",
     "CameraModel",
     "OpenCVIntrinsics",
     "Residual",
     "from_opencv",
+    "from_opencv_fisheye",
     "read_cahvor",
+    "read_calibrations",
     "read_camera",
     "read_cameras",
     "read_pds3",
+    "read_pds4",
     "to_opencv",
     "write_cahvor",
 ]

@@ -15,6 +15,10 @@ from sim.camera.cahvore import Cahvore
 from sim.camera.vectors import Real
 
 
+#: Labels of several megabytes are there; camera files are small.
+_MOST_BYTES = 1 << 23
+
+
 class CameraFileError(ValueError):
     """A camera file that cannot be used. The message names the file, the field and what is allowed."""
 
@@ -35,15 +39,18 @@ class Source:
         Raises
         ------
         CameraFileError
-            If it cannot be read.
+            If it cannot be read, or is larger than any camera file is.
         """
-        return self.head(None).decode("latin-1")
+        contents = self.head(_MOST_BYTES + 1)
+        if len(contents) > _MOST_BYTES:
+            raise self.error("file", f"is larger than {_MOST_BYTES >> 20} MiB", "a camera file or label, not a picture")
+        return contents.decode("latin-1")
 
-    def head(self, count: int | None) -> bytes:
-        """The file's first bytes; all of it for None."""
+    def head(self, count: int) -> bytes:
+        """The file's first bytes."""
         try:
             with Path(self.path).open("rb") as file:
-                return file.read(-1 if count is None else count)
+                return file.read(count)
         except OSError as fault:
             raise self.error("file", f"cannot be read ({fault.strerror})", "a readable camera file") from fault
 

@@ -6,26 +6,46 @@ from pathlib import Path
 
 from sim.camera.assembly import CameraFileError, Source
 from sim.camera.base import CameraModel
+from sim.camera.calibrations import is_calibration, read_calibrations
+from sim.camera.pds4_labels import is_xml, read_pds4
 from sim.camera.pds_labels import is_pds3, read_pds3
 from sim.camera.text_files import read_cahvor
 
 __all__ = ["CameraFileError", "read_camera", "read_cameras"]
 
+#: So much of a file tells what it is.
+_HEAD = 4096
 
-def read_cameras(path: str | Path) -> tuple[CameraModel, ...]:
-    """Every camera model of a file: of a PDS3 label or product (`read_pds3`), or of a JPL text file (`read_cahvor`).
+
+def read_cameras(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
+    """Every camera model of a file, whichever of these it is.
+
+    A PDS3 label or product (`read_pds3`), a PDS4 label (`read_pds4`), a JPL text file (`read_cahvor`), or a calibration
+    of OpenCV, ROS, Kalibr or EuRoC in YAML (`read_calibrations`, which says how near the models are).
+
+    Parameters
+    ----------
+    path
+        The file.
+    subframe_folded_in
+        Of PDS labels: takes the model of a subframe, or of averaged pixels, to describe the stored picture.
 
     Raises
     ------
     CameraFileError
         If the file cannot be read or is wrong; it names file, field and what is allowed.
     """
-    if is_pds3(Source(str(path)).head(4096)):
-        return read_pds3(path)
+    head = Source(str(path)).head(_HEAD)
+    if is_pds3(head):
+        return read_pds3(path, subframe_folded_in=subframe_folded_in)
+    if is_xml(head):
+        return read_pds4(path, subframe_folded_in=subframe_folded_in)
+    if is_calibration(head):
+        return tuple(one.camera for one in read_calibrations(path))
     return (read_cahvor(path),)
 
 
-def read_camera(path: str | Path) -> CameraModel:
+def read_camera(path: str | Path, *, subframe_folded_in: bool = False) -> CameraModel:
     """The one camera model of a file, as `read_cameras`.
 
     Raises
@@ -33,7 +53,7 @@ def read_camera(path: str | Path) -> CameraModel:
     CameraFileError
         Also if the file holds several.
     """
-    cameras = read_cameras(path)
+    cameras = read_cameras(path, subframe_folded_in=subframe_folded_in)
     if len(cameras) != 1:
-        raise Source(str(path)).error("GEOMETRIC_CAMERA_MODEL", f"{len(cameras)} of them", "one, or use read_cameras")
+        raise Source(str(path)).error("camera models", f"{len(cameras)} of them", "one, or use read_cameras")
     return cameras[0]

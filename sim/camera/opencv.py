@@ -6,9 +6,10 @@ about the direction z with k1, k2, k3 (radial) and p1, p2 (tangential):
     r^2 = x^2 + y^2        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
                            y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-and its fisheye moves a ray at the angle theta from z to the distance theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 +
+(its rational model divides the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6), and its fisheye moves a ray at the angle theta from z to the distance theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 +
 k4 theta^8) (Kannala & Brandt 2006). CAHVOR about O = A is the pinhole camera with k3 = p1 = p2 = 0. When O differs from
-A (the image plane is not square to the lens), or CAHVORE's lens is meant, OpenCV can only be fitted.
+A (the image plane is not square to the lens), or CAHVORE's lens is meant, OpenCV can only be fitted. The fisheye with
+k3 = k4 = 0 is CAHVORE about O = A with the linearity 0 and a resting pupil.
 """
 
 from __future__ import annotations
@@ -121,14 +122,14 @@ def from_opencv(
 ) -> tuple[Cahvor, Residual]:
     """The CAHVOR camera nearest to OpenCV's pinhole camera, and how near it is over the frame.
 
-    Exact when k3, p1 and p2 vanish; otherwise fitted by least squares.
+    Exact where all coefficients but k1 and k2 vanish; otherwise fitted by least squares.
 
     Parameters
     ----------
     matrix
         Camera matrix, pixels, shape (3, 3); may have a skew.
     distortion
-        None, (k1, k2, p1, p2) or (k1, k2, p1, p2, k3).
+        None, (k1, k2, p1, p2), (k1, k2, p1, p2, k3) or (k1, k2, p1, p2, k3, k4, k5, k6).
     size
         (columns, rows).
     camera_from_world
@@ -139,13 +140,12 @@ def from_opencv(
     ValueError
         If the matrix is no camera matrix, there are other coefficients, or the distortion folds over within the frame.
     """
-    coefficients = _five_coefficients(distortion)
+    coefficients = _eight_coefficients(distortion)
     linear = _linear(matrix, size, RigidTransform.identity() if camera_from_world is None else camera_from_world)
     pixels = _frame_samples(size)
     axes = np.stack([_perpendicular(linear.a), np.cross(linear.a, _perpendicular(linear.a)), linear.a])
     points = _undistorted(_normalised(pixels, matrix), coefficients)
-    inverse = RigidTransform.identity() if camera_from_world is None else camera_from_world.inv()
-    directions = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ inverse.as_matrix()[:3, :3].T
+    directions = _in_world(np.concatenate([points, np.ones((len(points), 1))], axis=1), camera_from_world)
     start = Cahvor.from_cahv(linear, r=(0.0, coefficients[0], coefficients[1]))
     camera, residual = start, _residual(_far_pixels(start, directions) - pixels)
     if not residual.max_px <= _EXACT_PX:
@@ -156,6 +156,52 @@ def from_opencv(
             return np.nan_to_num(there - pixels, nan=_BLIND_PX).ravel()
 
         camera = _varied(start, axes, _fitted(differences, scales))
+        residual = _residual(_far_pixels(camera, directions) - pixels)
+    return camera, residual
+
+
+def from_opencv_fisheye(
+    matrix: Float[np.ndarray, "3 3"],
+    distortion: Float[np.ndarray, "coefficients"],
+    size: tuple[int, int],
+    camera_from_world: RigidTransform | None = None,
+) -> tuple[Cahvore, Residual]:
+    """The CAHVORE camera nearest to OpenCV's fisheye (Kannala & Brandt), and how near it is over the frame.
+
+    Exact when k3 and k4 vanish; otherwise scale, radial terms and linearity are fitted by least squares.
+
+    Parameters
+    ----------
+    matrix
+        Camera matrix, pixels, shape (3, 3); may have a skew.
+    distortion
+        (k1, k2, k3, k4).
+    size, camera_from_world
+        As in `from_opencv`.
+
+    Raises
+    ------
+    ValueError
+        If the matrix is no camera matrix, there are other coefficients, or the distortion folds over within the frame.
+    """
+    if len(distortion) != 4 or not np.all(np.isfinite(distortion)):
+        raise ValueError(f"distortion of a fisheye must be (k1, k2, k3, k4), finite, not {distortion}")
+    linear = _linear(matrix, size, RigidTransform.identity() if camera_from_world is None else camera_from_world)
+    pixels = _frame_samples(size)
+    directions = _in_world(_fisheye_directions(_normalised(pixels, matrix), distortion), camera_from_world)
+    start = Cahvore.from_cahv(linear, r=(0.0, distortion[0], distortion[1]), linearity=0.0)
+    camera, residual = start, _residual(_far_pixels(start, directions) - pixels)
+    if not residual.max_px <= _EXACT_PX:
+
+        def differences(change: Array) -> Array:
+            there = _far_pixels(_relensed(start, change), directions)
+            return np.nan_to_num(there - pixels, nan=_BLIND_PX).ravel()
+
+        limits = np.array([0.5, 10.0, 10.0, 1.0])
+        fit = least_squares(
+            differences, np.zeros(4), bounds=(-limits, limits), x_scale=[1e-3, 1e-3, 1e-3, 1e-1], xtol=1e-14, ftol=1e-14
+        )
+        camera = _relensed(start, np.asarray(fit.x))
         residual = _residual(_far_pixels(camera, directions) - pixels)
     return camera, residual
 
@@ -202,9 +248,7 @@ class _Candidate:
         else:
             across = np.hypot(x, y)
             theta = np.arctan2(across, z)
-            square = theta * theta
-            k1, k2, k3, k4 = self.distortion
-            gain = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
+            gain = _fisheye_gain(theta, self.distortion)[0]
             ratio = np.divide(theta * gain, across, out=np.ones_like(theta), where=across > 0)
             distorted = np.stack([x * ratio, y * ratio], axis=-1)
         pixels: Array = self.scale_centre[:2] * distorted + self.scale_centre[2:]
@@ -214,10 +258,13 @@ class _Candidate:
 # ----- from OpenCV -----
 
 
-def _five_coefficients(distortion: Array) -> Array:
-    if len(distortion) not in (0, 4, 5) or not np.all(np.isfinite(distortion)):
-        raise ValueError(f"distortion must be none, (k1, k2, p1, p2) or (k1, k2, p1, p2, k3), finite, not {distortion}")
-    return np.concatenate([distortion, np.zeros(5 - len(distortion))])
+def _eight_coefficients(distortion: Array) -> Array:
+    if len(distortion) not in (0, 4, 5, 8) or not np.all(np.isfinite(distortion)):
+        raise ValueError(
+            f"distortion must be none, (k1, k2, p1, p2), (k1, k2, p1, p2, k3) or (k1, k2, p1, p2, k3, k4, k5, k6), "
+            f"finite, not {distortion}"
+        )
+    return np.concatenate([distortion, np.zeros(8 - len(distortion))])
 
 
 def _linear(matrix: Array, size: tuple[int, int], camera_from_world: RigidTransform) -> Cahv:
@@ -243,6 +290,38 @@ def _varied(start: Cahvor, axes: Array, change: Array) -> Cahvor:
         start.r + np.array([0.0, *rho]),
         start.size,
     )
+
+
+def _relensed(start: Cahvore, change: Array) -> Cahvore:
+    """A fisheye near `start`: its scale, rho1, rho2 and linearity changed."""
+    scale, rho1, rho2, linearity = (float(one) for one in change)
+    (hc, vc), a = start.image_centre, start.a
+    h, v = start.h + scale * (start.h - hc * a), start.v + scale * (start.v - vc * a)
+    r = start.r + np.array([0.0, rho1, rho2])
+    return Cahvore(start.c, a, h, v, start.o, r, start.e, linearity=linearity, size=start.size)
+
+
+def _fisheye_directions(points: Array, coefficients: Array) -> Array:
+    """Directions (z along the axis) that OpenCV's fisheye takes to (x, y), shape (n, 2); by Newton's method."""
+    distance = np.hypot(points[:, 0], points[:, 1])
+    theta = np.minimum(distance, np.pi)
+    for _ in range(50):
+        gain, slope = _fisheye_gain(theta, coefficients)
+        step = (theta * gain - distance) / slope
+        theta = np.clip(theta - step, 0.0, np.pi)
+        if np.max(np.abs(step)) < 1e-14:
+            break
+    angles = np.linspace(0.0, float(theta.max()), 1000)
+    there = theta * _fisheye_gain(theta, coefficients)[0]
+    if not (np.max(np.abs(there - distance)) < 1e-9 and np.all(_fisheye_gain(angles, coefficients)[1] > 0)):
+        raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
+    across = np.divide(np.sin(theta), distance, out=np.ones_like(theta), where=distance > 0)
+    return np.stack([points[:, 0] * across, points[:, 1] * across, np.cos(theta)], axis=-1)
+
+
+def _in_world(directions: Array, camera_from_world: RigidTransform | None) -> Array:
+    """Directions in OpenCV's axes, in those of the frame that the camera is put into."""
+    return directions if camera_from_world is None else directions @ camera_from_world.as_matrix()[:3, :3]
 
 
 def _far_pixels(camera: CameraModel, directions: Array) -> Array:
@@ -280,11 +359,13 @@ def _fitted(differences: Callable[[Array], Array], scales: Array) -> Array:
 
 def _distorted(points: Array, coefficients: Array) -> tuple[Array, Array]:
     """OpenCV's pinhole distortion of (x, y), shape (n, 2), and its derivative, shape (n, 2, 2)."""
-    k1, k2, p1, p2, k3 = coefficients
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.concatenate([coefficients, np.zeros(8 - len(coefficients))])
     x, y = points.T
     square = x * x + y * y
-    gain = 1 + square * (k1 + square * (k2 + square * k3))
-    slope = k1 + square * (2 * k2 + square * 3 * k3)
+    over = 1 + square * (k1 + square * (k2 + square * k3))
+    under = 1 + square * (k4 + square * (k5 + square * k6))
+    gain = over / under
+    slope = (k1 + square * (2 * k2 + square * 3 * k3) - gain * (k4 + square * (2 * k5 + square * 3 * k6))) / under
     across = 2 * (x * y * slope + p1 * x + p2 * y)
     distorted = np.stack(
         [x * gain + 2 * p1 * x * y + p2 * (square + 2 * x * x), y * gain + p1 * (square + 2 * y * y) + 2 * p2 * x * y],
@@ -298,6 +379,14 @@ def _distorted(points: Array, coefficients: Array) -> tuple[Array, Array]:
         axis=-2,
     )
     return distorted, derivative
+
+
+def _fisheye_gain(theta: Array, coefficients: Array) -> tuple[Array, Array]:
+    """OpenCV's fisheye: distance over angle, and the derivative of the distance."""
+    k1, k2, k3, k4 = coefficients
+    square = theta * theta
+    gain = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
+    return gain, 1 + square * (3 * k1 + square * (5 * k2 + square * (7 * k3 + square * 9 * k4)))
 
 
 def _frame_samples(size: tuple[int, int]) -> Array:

@@ -178,7 +178,7 @@ def test_skew_of_the_matrix_is_kept() -> None:
 @pytest.mark.parametrize(
     ("matrix", "distortion", "fault"),
     [
-        (MATRIX, np.zeros(8), "distortion must be none"),
+        (MATRIX, np.zeros(12), "distortion must be none"),
         (MATRIX, np.array([np.nan, 0, 0, 0]), "finite"),
         (-MATRIX, np.zeros(5), "matrix must be"),
         (MATRIX + np.eye(3), np.zeros(5), "matrix must be"),

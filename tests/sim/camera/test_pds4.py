@@ -1,0 +1,169 @@
+"""PDS4 labels: the camera model of a Mars 2020 navcam's label as it is, and every fault named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim.camera import Cahv, Cahvor, Cahvore, CameraFileError, read_camera, read_cameras, read_pds4
+
+#: Of NLF_0629_0722782785_631ECM_N0301344NCAM00427_06_095J01 (NASA PDS, mars2020_navcam_ops_raw): its camera model, the
+#: pointing and the fields of view that the label itself derives, the subframe and the axes; all else left out.
+LABEL = """<?xml version="1.0" encoding="UTF-8"?>
+<Product_Observational
+    xmlns="http://pds.nasa.gov/pds4/pds/v1"
+    xmlns:geom="http://pds.nasa.gov/pds4/geom/v1"
+    xmlns:img="http://pds.nasa.gov/pds4/img/v1">
+  <Observation_Area><Discipline_Area>
+      <geom:Geometry><geom:Geometry_Lander>
+          <geom:Camera_Model_Parameters>
+            <geom:model_type>CAHVORE</geom:model_type>
+            <geom:calibration_source_id>1</geom:calibration_source_id>
+            <geom:CAHVORE_Model>
+              <geom:Vector_Center>
+                <geom:x_position unit="m">0.955584</geom:x_position>
+                <geom:y_position unit="m">0.764515</geom:y_position>
+                <geom:z_position unit="m">-1.95254</geom:z_position>
+              </geom:Vector_Center>
+              <geom:Vector_Axis>
+                <geom:x_unit>-0.35631</geom:x_unit>
+                <geom:y_unit>0.916392</geom:y_unit>
+                <geom:z_unit>0.182443</geom:z_unit>
+              </geom:Vector_Axis>
+              <geom:Vector_Horizontal>
+                <geom:x_pixel>-3229.43</geom:x_pixel>
+                <geom:y_pixel>141.993</geom:y_pixel>
+                <geom:z_pixel>229.563</geom:z_pixel>
+              </geom:Vector_Horizontal>
+              <geom:Vector_Vertical>
+                <geom:x_pixel>-168.067</geom:x_pixel>
+                <geom:y_pixel>400.716</geom:y_pixel>
+                <geom:z_pixel>3088.89</geom:z_pixel>
+              </geom:Vector_Vertical>
+              <geom:Vector_Optical>
+                <geom:x_unit>-0.357624</geom:x_unit>
+                <geom:y_unit>0.915861</geom:y_unit>
+                <geom:z_unit>0.182539</geom:z_unit>
+              </geom:Vector_Optical>
+              <geom:Radial_Terms>
+                <geom:c0>1.736e-06</geom:c0>
+                <geom:c1>0.0501396</geom:c1>
+                <geom:c2>-0.0171254</geom:c2>
+              </geom:Radial_Terms>
+              <geom:Entrance_Terms>
+                <geom:c0>-8.0e-09</geom:c0>
+                <geom:c1>1.0e-08</geom:c1>
+                <geom:c2>-2.9e-08</geom:c2>
+              </geom:Entrance_Terms>
+              <geom:cahvore_model_type>2</geom:cahvore_model_type>
+              <geom:cahvore_model_parameter>0.0</geom:cahvore_model_parameter>
+            </geom:CAHVORE_Model>
+          </geom:Camera_Model_Parameters>
+      </geom:Geometry_Lander></geom:Geometry>
+      <img:Imaging>
+        <img:Downsampling>
+          <img:Pixel_Averaging_Dimensions>
+            <img:height_pixels unit="pixel">1</img:height_pixels>
+            <img:width_pixels unit="pixel">1</img:width_pixels>
+          </img:Pixel_Averaging_Dimensions>
+        </img:Downsampling>
+        <img:Subframe>
+          <img:first_line>953</img:first_line>
+          <img:first_sample>1273</img:first_sample>
+          <img:lines>976</img:lines>
+          <img:samples>1296</img:samples>
+          <img:line_fov unit="deg">18.6047</img:line_fov>
+          <img:sample_fov unit="deg">24.7326</img:sample_fov>
+        </img:Subframe>
+      </img:Imaging>
+  </Discipline_Area></Observation_Area>
+  <File_Area_Observational>
+    <Array_3D_Image>
+      <axes>3</axes>
+      <Axis_Array><axis_name>Band</axis_name><elements>3</elements></Axis_Array>
+      <Axis_Array><axis_name>Line</axis_name><elements>976</elements></Axis_Array>
+      <Axis_Array><axis_name>Sample</axis_name><elements>1296</elements></Axis_Array>
+    </Array_3D_Image>
+  </File_Area_Observational>
+</Product_Observational>
+"""
+WHOLE = LABEL.replace(">953<", ">1<").replace(">1273<", ">1<")
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "label.xml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_navcam_of_mars_2020(tmp_path: Path) -> None:
+    camera = read_camera(written(tmp_path, LABEL), subframe_folded_in=True)
+    assert isinstance(camera, Cahvore)
+    assert camera.size == (1296, 976)
+    assert camera.linearity == 0.0
+    assert np.array_equal(camera.c, [0.955584, 0.764515, -1.95254])
+    assert np.array_equal(camera.h, [-3229.43, 141.993, 229.563])
+    assert np.array_equal(camera.r, [1.736e-06, 0.0501396, -0.0171254])
+    assert np.array_equal(camera.e, [-8.0e-09, 1.0e-08, -2.9e-08])
+    # the label states what its subframe sees: both fields of view follow from the model, to what it counts as a width
+    middle = np.array([647.5, 487.5])
+    for ends, stated_deg in (([[-0.5, 487.5], [1295.5, 487.5]], 24.7326), ([[647.5, -0.5], [647.5, 975.5]], 18.6047)):
+        first, last = camera.rays(np.array(ends))[1]
+        assert np.degrees(np.arccos(first @ last)) == pytest.approx(stated_deg, rel=0.02)
+    assert np.all(np.isfinite(camera.rays(middle)[1]))
+    # folded in: with the subframe's first sample the image centre lies near the middle of a detector of 5120 x 3840
+    hc, vc = camera.image_centre
+    assert hc + 1272 == pytest.approx(2560, rel=0.02)
+    assert vc + 952 == pytest.approx(1920, rel=0.02)
+
+
+def test_subframes_are_refused_unless_folded_in(tmp_path: Path) -> None:
+    with pytest.raises(CameraFileError, match=r"Subframe.first_line: 953.*subframe_folded_in = true"):
+        read_cameras(written(tmp_path, LABEL))
+    binned = WHOLE.replace('<img:height_pixels unit="pixel">1', '<img:height_pixels unit="pixel">2')
+    with pytest.raises(CameraFileError, match=r"Downsampling.height_pixels: 2"):
+        read_cameras(written(tmp_path, binned))
+    assert read_cameras(written(tmp_path, WHOLE))[0].size == (1296, 976)
+
+
+def test_prefixes_do_not_matter(tmp_path: Path) -> None:
+    other = WHOLE.replace("geom:", "g:").replace("xmlns:g:", "xmlns:g").replace('xmlns:geom="', 'xmlns:g="')
+    assert read_camera(written(tmp_path, other)) == read_camera(written(tmp_path, WHOLE))
+
+
+def test_cahvor_and_cahv(tmp_path: Path) -> None:
+    for name, kind in (("CAHVOR", Cahvor), ("CAHV", Cahv)):
+        text = WHOLE.replace(">CAHVORE<", f">{name}<").replace("CAHVORE_Model", f"{name}_Model")
+        camera = read_camera(written(tmp_path, text))
+        assert isinstance(camera, kind)
+        assert np.array_equal(camera.v, [-168.067, 400.716, 3088.89])
+
+
+FAULTS = [
+    ("geom:Camera_Model_Parameters", "geom:Other", "Camera_Model_Parameters: missing"),
+    (">CAHVORE<", ">PSPH<", "model_type: 'PSPH'; allowed: CAHV, CAHVOR, CAHVORE"),
+    ("geom:CAHVORE_Model", "geom:CAHVOR_Model", "CAHVORE_Model: missing"),
+    ("<geom:y_pixel>141.993</geom:y_pixel>", "", r"Vector_Horizontal \(H\).y_pixel: missing"),
+    ("141.993", "N/A", r"y_pixel: 'N/A' is not a number"),
+    ("141.993", "NaN", "h must be finite"),
+    ('unit="m">0.955584', 'unit="mm">0.955584', "x_position: is in 'mm'; allowed: metres"),
+    ("geom:Entrance_Terms", "geom:Entrance", r"Entrance_Terms \(E\): missing"),
+    ("<geom:cahvore_model_type>2", "<geom:cahvore_model_type>4", "CAHVORE's type is 4"),
+    ("0.916392", "0.816392", "A: a must be a unit vector"),
+    ("<axis_name>Line<", "<axis_name>Row<", "Axis_Array: names .*Sample.*allowed: the axes Line and Sample"),
+    ("<elements>976<", "<elements>-976<", "elements: '-976'; allowed: a positive integer"),
+    ("Array_3D_Image", "Array_3D", "Array_2D_Image: missing"),
+    ("</Product_Observational>", "", "cannot be parsed"),
+    ("<Product_Observational", '<!DOCTYPE p [<!ENTITY a "b">]><Product_Observational', "declares entities"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "fault"), FAULTS, ids=[f"{old!r} {new!r}" for old, new, _ in FAULTS])
+def test_faults_are_named(tmp_path: Path, old: str, new: str, fault: str) -> None:
+    assert old in WHOLE
+    with pytest.raises(CameraFileError, match=fault) as raised:
+        read_pds4(written(tmp_path, WHOLE.replace(old, new)))
+    assert "label.xml" in str(raised.value)
+    assert "allowed" in str(raised.value)
