@@ -1,4 +1,4 @@
-"""`marsyard run`, `resume`, `append`, `report` and `replay`: campaigns and their folders."""
+"""`marsyard run`, `resume`, `append` and `replay`: campaigns and their folders."""
 
 from __future__ import annotations
 
@@ -161,14 +161,6 @@ def append(
 
     crew = _crew(jobs, cluster)
     _carry_out(directory, lambda watch: append_cases(directory, cases, crew, watch, allow_changed=allow_changed))
-
-
-@says_what_is_wrong
-def report(directory: DirectoryArgument) -> None:
-    """Judge a campaign, also one that was interrupted or killed, and write its report, from the stored rows alone."""
-    from marsyard.outcome import conclude
-
-    raise typer.Exit(conclude(directory, console()))
 
 
 @says_what_is_wrong

@@ -18,13 +18,13 @@ from marsyard.campaign_command import (
     append,
     console,
     replay,
-    report,
     resume,
     run,
     says_what_is_wrong,
 )
 from marsyard.gallery_command import gallery
 from marsyard.render_command import render
+from marsyard.report_command import compare, report
 from marsyard.terrain_command import app as terrain
 
 app = typer.Typer(
@@ -37,7 +37,7 @@ app = typer.Typer(
     "2 the command or a file is wrong; 3 not enough cases to say, or no independent random draws.",
 )
 app.add_typer(terrain, name="terrain")
-for command in (run, resume, append, report, replay):
+for command in (run, resume, append, report, compare, replay):
     app.command()(command)
 app.command()(render)
 app.command()(gallery)

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from reports.verdicts import Verdict
 
 
-def conclude(directory: Path, console: Console) -> int:
+def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[str, Any]] | None = None) -> int:
     """Judges a campaign, writes its report, prints both, and returns the exit status.
 
     Of a campaign that is not finished the rows are judged that it has so far, with a status that is never 0, and the
-    record is left alone.
+    record is left alone. `requirements` stand in for the campaign's own; the record then keeps its status as well.
 
     Raises
     ------
@@ -43,17 +43,18 @@ def conclude(directory: Path, console: Console) -> int:
         refresh_table(directory)
     frame = read_frame(directory)
     how = sampled(stored["configuration"])
-    verdicts = judge_campaign(frame, stored["requirements"], how)
+    asked = stored["requirements"] if requirements is None else requirements
+    verdicts = judge_campaign(frame, asked, how)
     whole = overall(verdicts, frame, how)
     status = exit_code(verdicts, bool(whole.crashed))
-    if finished:
+    if finished and requirements is None:
         record.update(directory, {"exit_code": status})
     try:
-        page = write_report(directory)
+        page = write_report(directory, requirements)
     except OSError as error:
         raise StoreError(f"the report cannot be written: {error}") from error
     console.print(verdict_table(verdicts))
-    for table in _comparison_tables(how.drawn(frame), stored["requirements"], verdicts):
+    for table in _comparison_tables(how.drawn(frame), asked, verdicts):
         console.print(table)
     lines = [f"verdict: {whole.word}", whole.sentence, f"report: {page}"]
     if not finished:
@@ -70,9 +71,7 @@ def _comparison_tables(
     frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], verdicts: Sequence[Verdict]
 ) -> list[Table]:
     """What algorithms on the same cases did; nothing where there is one only."""
-    from rich import box
-    from rich.table import Table
-
+    from marsyard.showing import grid_table
     from reports.columns import primary_metric
     from reports.comparison import comparison, comparison_grids
 
@@ -84,13 +83,8 @@ def _comparison_tables(
     tables = []
     titles = ("Algorithms on the same cases", f"Against {contenders[0].name}")
     for title, grid in zip(titles, comparison_grids(contenders, differences, metric), strict=True):
-        table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
-        for place, heading in enumerate(grid.head):
-            table.add_column(heading, justify="right" if place else "left", overflow="fold")
-        for row in grid.rows:
-            table.add_row(*row)
         if grid.rows:
-            tables.append(table)
+            tables.append(grid_table(title, grid))
     return tables
 
 

@@ -7,7 +7,7 @@ import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.console import Console
@@ -21,6 +21,9 @@ from campaigns.sampling.design import said_of
 from campaigns.sampling.dispersion import Dispersion
 from reports.columns import split_unit
 from reports.wording import asked_text, count
+
+if TYPE_CHECKING:
+    from reports.sections import Grid
 
 #: Width of a column of drawn values with what sets it apart.
 _VALUE_WIDTH = 12
@@ -256,4 +259,14 @@ def _table(title: str, *headings: str) -> Table:
     table = Table(title=title or None, title_justify="left")
     for heading in headings:
         table.add_column(heading, overflow="fold")
+    return table
+
+
+def grid_table(title: str, grid: Grid) -> Table:
+    """A report's table on the terminal: names to the left, numbers to the right."""
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
+    for place, heading in enumerate(grid.head):
+        table.add_column(heading, justify="right" if place else "left", overflow="fold")
+    for row in grid.rows:
+        table.add_row(*map(Text, row))
     return table

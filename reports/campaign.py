@@ -28,6 +28,7 @@ from reports.section import Section, SectionMaker, Subject
 from reports.stored import StoredRun, read_run
 from reports.systems import shown_cases
 from reports.tables import error_summaries, outcome_counts
+from reports.traceability import evidence_of, junit_xml, verification_csv
 from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overall
 from reports.vtt.beside import beside_section
 from reports.vtt.goal import goal_section
@@ -63,15 +64,19 @@ FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
 
 PAGE_FILE = "report.html"
 TWIN_FILE = "report.json"
+VERIFICATION_FILE = "verification.csv"
+JUNIT_FILE = "junit.xml"
 
 
-def write_report(directory: Path) -> Path:
+def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Path:
     """Writes a campaign's report into its folder, from the files there alone.
 
     Parameters
     ----------
     directory
         The folder of a campaign that was run.
+    requirements
+        By which it is judged; None for its own.
 
     Returns
     -------
@@ -85,6 +90,8 @@ def write_report(directory: Path) -> Path:
         Where the report cannot be written.
     """
     run = read_run(directory)
+    if requirements is not None:
+        run = replace(run, record={**run.record, "requirements": list(requirements)})
     how = sampled(run.configuration)
     verdicts = judge_campaign(run.frame, run.requirements, how)
     whole = overall(verdicts, run.frame, how)
@@ -94,10 +101,12 @@ def write_report(directory: Path) -> Path:
     subject = Subject(drawn, metric, bound)
     further = [section for make in FURTHER_SECTIONS if (section := make(subject)) is not None]
     twin = summary(run, subject, verdicts, whole, further)
-    _write(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
+    write_whole(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
+    write_whole(directory / VERIFICATION_FILE, verification_csv(evidence_of(run.name, verdicts)))
+    write_whole(directory / JUNIT_FILE, junit_xml(run.name, verdicts, whole))
     page = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, whole, further)
-    _write(page, _environment().get_template("report.html.j2").render(context))
+    write_whole(page, _environment().get_template("report.html.j2").render(context))
     return page
 
 
@@ -226,7 +235,7 @@ def _plain(value: Any) -> Any:
     return value if value is None or isinstance(value, str | int | bool) else str(value)
 
 
-def _write(path: Path, text: str) -> None:
+def write_whole(path: Path, text: str) -> None:
     """Writes a file whole or not at all."""
     partial = path.with_suffix(path.suffix + ".partial")
     # Lone surrogates, which JSON can carry, cannot be written as UTF-8.

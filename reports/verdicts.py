@@ -23,6 +23,7 @@ import pandas as pd
 from jaxtyping import Bool, Int
 
 from campaigns.outcomes import UNFINISHED
+from reports.columns import numbers
 from reports.sampled import INDEPENDENT, Sampled
 from reports.statistics.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
 from reports.statistics.proportions import further_cases_needed, proportion_lower, proportion_upper
@@ -49,7 +50,7 @@ class Verdict:
 
     Attributes
     ----------
-    requirement_id, statement, metric, bound, probability, confidence, population, decide_by
+    requirement_id, statement, metric, bound, probability, confidence, population, decide_by, source, kind, scale
         The requirement, as the campaign states it; NaN for a number that is missing or is none. Without a bound the
         metric is a column of true and false.
     status
@@ -96,6 +97,9 @@ class Verdict:
     plain_lower: float = math.nan
     plain_upper: float = math.nan
     bounds_confidence: float = math.nan
+    source: str = ""
+    kind: str = ""
+    scale: float = 1.0
 
     @property
     def plain_status(self) -> Status | None:
@@ -218,12 +222,14 @@ def crashed_cases(frame: pd.DataFrame) -> int:
     return int(_engine_failed(frame).sum())
 
 
-def succeeded(frame: pd.DataFrame, metric: str, bound: float) -> Bool[np.ndarray, " n"]:
-    """Whether |metric| <= bound, or the metric is true where the bound is NaN, case by case; False where missing."""
+def succeeded(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
+    """Whether |scale * metric| <= bound, or the metric is true where the bound is NaN, case by case; False where
+    missing. A metric may be a sum of columns, joined by " + ".
+    """
     if math.isnan(bound):
         return _true(frame, metric)
-    values = pd.to_numeric(frame[metric], errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
-    return np.asarray(np.abs(values) <= bound, dtype=np.bool_)
+    values = sum((numbers(frame, part) for part in metric.split(" + ")), np.zeros(len(frame)))
+    return np.asarray(np.abs(scale * values) <= bound, dtype=np.bool_)
 
 
 def members(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
@@ -288,7 +294,7 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
 
 def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
     """The verdict by cases that carry no probability: the rate seen, which decides where the estimate is to."""
-    success = succeeded(chosen, verdict.metric, verdict.bound)
+    success = succeeded(chosen, verdict.metric, verdict.bound, verdict.scale)
     groups = terrain_groups(chosen)
     rate = float(success.mean())
     decided = verdict.decide_by == ESTIMATE
@@ -305,7 +311,7 @@ def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
 
 def _weighed(verdict: Verdict, chosen: pd.DataFrame, share: float) -> Verdict:
     """The verdict by the cases of its population, of which there is at least one; `share` of the risk may be spent."""
-    success = succeeded(chosen, verdict.metric, verdict.bound)
+    success = succeeded(chosen, verdict.metric, verdict.bound, verdict.scale)
     n, failures = success.size, int((~success).sum())
     confidence = confidence_at(verdict.confidence, share)
     plain = proportion_lower(n - failures, n, confidence), proportion_upper(n - failures, n, confidence)
@@ -371,8 +377,9 @@ def _fault(frame: pd.DataFrame, verdict: Verdict) -> str:
         value = getattr(verdict, name)
         if not 0.0 < value < 1.0:
             return f"The requirement's {name} is {value}; it must lie between 0 and 1, both excluded."
-    if verdict.metric not in frame:
-        return f"The rows have no column '{verdict.metric}', which is the requirement's metric."
+    missing = next((part for part in verdict.metric.split(" + ") if part not in frame), None)
+    if missing is not None:
+        return f"The rows have no column '{missing}', which is the requirement's metric."
     if not math.isfinite(verdict.bound) and not is_flag(frame, verdict.metric):
         return "The requirement states no bound, and its metric is no column of true and false."
     return ""
@@ -389,6 +396,9 @@ def _unjudged(requirement: Mapping[str, Any]) -> Verdict:
         confidence=_number(requirement.get("confidence")),
         population=str(requirement.get("population", "all")),
         decide_by=str(requirement.get("decide_by", "confidence")),
+        source=str(requirement.get("source") or ""),
+        kind=str(requirement.get("kind") or ""),
+        scale=_number(requirement.get("scale", 1.0)),
         status=Status.INSUFFICIENT,
         n=0,
         failures=0,

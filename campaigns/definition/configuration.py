@@ -34,8 +34,10 @@ class Requirement(BaseModel):
     the metric is a column of true and false (`answered`, say) that must be true.
 
     `population` is `all`, `completed`, `valid` (the cases with an answer) or any column of true and false; several are
-    joined by " and ", as in `valid and room`. `decide_by = "estimate"` compares the rate that was seen with the
-    probability, whatever its interval, which is stated beside it: for requirements that are not asked at a confidence.
+    joined by " and ", as in `valid and room`. A metric with a bound may be a sum of columns, joined by " + ", and is
+    multiplied by `scale` before it is held against the bound. `decide_by = "estimate"` compares the rate that was seen
+    with the probability, whatever its interval, which is stated beside it: for requirements that are not asked at a
+    confidence. `source` and `kind` say whose requirement it is.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -48,6 +50,11 @@ class Requirement(BaseModel):
     confidence: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)]
     population: Annotated[str, Field(pattern=r"^[A-Za-z]\w*( and [A-Za-z]\w*)*$")] = "all"
     decide_by: Literal["confidence", "estimate"] = "confidence"
+    source: str = ""
+    kind: Literal["requirement", "observation", "ours"] | None = Field(
+        default=None, description="of a paper: its requirement, or what it observed; or ours"
+    )
+    scale: Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)] = 1.0
 
     @property
     def population_columns(self) -> tuple[str, ...]:
@@ -112,6 +119,11 @@ class CampaignConfiguration(BaseModel):
     requirements: tuple[Requirement, ...] = ()
     retain: Retain = Retain()
     limits: Limits = Limits()
+    most_cases: Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)] | None = Field(
+        default=None,
+        description="cases of the last look at a campaign that stops itself when its verdicts are decided; set by "
+        "--until-decided",
+    )
     appended: tuple[Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)], ...] = Field(
         default=(), strict=False, description="sizes of the blocks of cases that were added behind the first"
     )

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 from campaigns.definition.campaign import Campaign
 from campaigns.definition.checking import sampling_problems
 from campaigns.definition.configuration import CampaignConfiguration, Key, key_text, problems_of
+from campaigns.definition.requirements import completed
 from campaigns.errors import ConfigurationError, Problem, not_allowed
 from campaigns.sampling.correlation import KINDS
 from scenarios.interface import Scenario, TakesAlgorithms
@@ -231,8 +232,11 @@ def _merge(tables: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any
 
 def _checked(document: _Document) -> Campaign:
     """The campaign that a document states, its parameters complete with their defaults."""
-    problems: list[Problem] = []
-    configuration = _validated(CampaignConfiguration, document, document.tables, (), problems)
+    tables, unnamed = completed(document.tables)
+    problems = [document.problem(key, message) for key, message in unnamed]
+    if problems:
+        raise ConfigurationError(problems)
+    configuration = _validated(CampaignConfiguration, document, tables, (), problems)
     found = _scenario(document, problems)
     parameters = None
     if found is not None:

@@ -1,0 +1,101 @@
+"""Requirements as data: one file states them, campaigns name them, and stored rows can be judged by them anew."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from campaigns.definition.configuration import Key, Requirement, key_text, problems_of
+from campaigns.errors import ConfigurationError, Problem, not_allowed
+
+#: The requirements that ship with Marsyard.
+REQUIREMENTS_FILE = Path(__file__).resolve().parents[2] / "scenarios" / "requirements.toml"
+
+#: What a campaign that names a stated requirement may say of it anew.
+RESTATED = ("statement", "population", "probability", "confidence", "decide_by")
+
+
+class StatedRequirement(Requirement):
+    """A requirement in a file of requirements, with the campaigns that show it: patterns of their names."""
+
+    campaigns: Annotated[tuple[str, ...], Field(strict=False)] = ()
+
+    def applies_to(self, campaign: str) -> bool:
+        """Whether a campaign of that name shows it."""
+        return any(fnmatchcase(campaign, pattern) for pattern in self.campaigns)
+
+    def plain(self) -> dict[str, Any]:
+        """As a campaign states it."""
+        return self.model_dump(mode="json", exclude={"campaigns"})
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    requirements: Annotated[tuple[StatedRequirement, ...], Field(strict=False)]
+
+
+def read_requirements(path: Path) -> tuple[StatedRequirement, ...]:
+    """The requirements that a file states.
+
+    Raises
+    ------
+    ConfigurationError
+        Where it cannot be read, or states something that is none; every problem with its key.
+    """
+    try:
+        stated = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
+    except ValidationError as error:
+        found = [Problem(str(path), key_text(key), message) for key, message in problems_of(error, _File)]
+        raise ConfigurationError(found) from error
+    except ValueError as error:
+        raise ConfigurationError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
+    ids = [one.id for one in stated.requirements]
+    repeated = sorted({name for name in ids if ids.count(name) > 1})
+    if repeated:
+        raise ConfigurationError([Problem(str(path), "requirements", f"share an id: {', '.join(repeated)}")])
+    return stated.requirements
+
+
+@cache
+def shipped_requirements() -> Mapping[str, StatedRequirement]:
+    """The requirements that ship with Marsyard, by id."""
+    return {one.id: one for one in read_requirements(REQUIREMENTS_FILE)}
+
+
+def applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:
+    """Those of the requirements that a campaign of that name shows, as campaigns state them."""
+    return [one.plain() for one in stated if one.applies_to(campaign)]
+
+
+def completed(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key, str]]]:
+    """A campaign's tables with the requirements that it names filled in, and what is wrong with how it names them.
+
+    An entry without a metric names a stated requirement by its `id`, and may restate what `RESTATED` lists.
+    """
+    entries = tables.get("requirements")
+    if not isinstance(entries, list):
+        return dict(tables), []
+    problems: list[tuple[Key, str]] = []
+    filled = []
+    for place, entry in enumerate(entries):
+        if not isinstance(entry, Mapping) or "metric" in entry or "id" not in entry:
+            filled.append(entry)
+            continue
+        named = shipped_requirements().get(str(entry["id"]))
+        wrong = [key for key in entry if key not in ("id", *RESTATED)]
+        if named is None:
+            message = not_allowed("requirement", str(entry["id"]), shipped_requirements())
+            problems.append((("requirements", place, "id"), f"{message}; or state a metric"))
+        problems += [(("requirements", place, key), f"is stated in {REQUIREMENTS_FILE.name} already") for key in wrong]
+        if named is not None and not wrong:
+            filled.append({**named.plain(), **entry})
+    return {**tables, "requirements": filled}, problems

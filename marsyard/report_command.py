@@ -1,0 +1,125 @@
+"""`marsyard report` and `compare`: what stored rows show."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marsyard.campaign_command import DirectoryArgument, console, says_what_is_wrong
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+#: Names of a browser that prints pages, in the order in which they are looked for.
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+_PRINTING_S = 120.0
+
+RequirementsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--requirements",
+        metavar="FILE",
+        help="Judge by the requirements of this file that name the campaign, instead of by the campaign's own.",
+    ),
+]
+
+
+@says_what_is_wrong
+def report(
+    directory: DirectoryArgument,
+    requirements: RequirementsOption = None,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Print the page into report.pdf as well; takes Chromium.")] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="Write all rows into cases.csv as well.")] = False,
+) -> None:
+    """Judge a campaign, also one that was interrupted or killed, and write its report, from the stored rows alone."""
+    from marsyard.outcome import conclude
+
+    asked = None if requirements is None else _asked(directory, requirements)
+    status = conclude(directory, console(), asked)
+    if csv:
+        typer.echo(f"rows: {_write_csv(directory)}")
+    if pdf:
+        typer.echo(f"pdf: {_print_page(directory)}")
+    raise typer.Exit(status)
+
+
+@says_what_is_wrong
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a campaign that was run.")],
+    second: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of another.")],
+) -> None:
+    """Set two stored campaigns side by side: success, answers and errors, and whether they differ.
+
+    Exit status 0 in any event: a difference is no verdict.
+    """
+    from marsyard.showing import grid_table
+    from reports.between import contrast_grid, contrasts
+    from reports.stored import read_run
+
+    runs = [read_run(directory) for directory in (first, second)]
+    paired, found = contrasts(*runs)
+    names = [str(run.directory) for run in runs]
+    out = console()
+    out.print(grid_table("Side by side", contrast_grid(["first", "second"], found)))
+    for place, name in zip(("first", "second"), names, strict=True):
+        out.print(f"{place}: {name}", markup=False, highlight=False, soft_wrap=True)
+    how = "the same draws, compared in pairs" if paired else "draws of their own, compared terrain by terrain"
+    out.print(f"Cases: {how}. p: two-sided, corrected for the number of figures (Holm).", soft_wrap=True)
+
+
+def _asked(directory: Path, path: Path) -> Sequence[dict[str, Any]]:
+    """The requirements of a file that a campaign shows."""
+    from campaigns.definition.requirements import applicable, read_requirements
+    from campaigns.errors import CampaignError
+    from campaigns.store import record
+
+    name = str(record.read(directory)["name"])
+    found = applicable(read_requirements(path), name)
+    if not found:
+        raise CampaignError(f"{path}: no requirement names the campaign '{name}' in its campaigns")
+    return found
+
+
+def _write_csv(directory: Path) -> Path:
+    """Writes all rows as CSV, a block of the table at a time, whole or not at all."""
+    import pyarrow.csv as pa_csv
+    import pyarrow.parquet as pq
+
+    from campaigns.errors import StoreError
+    from campaigns.store.table import TABLE_FILE
+
+    path = directory / "cases.csv"
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        table = pq.ParquetFile(directory / TABLE_FILE)
+        with pa_csv.CSVWriter(partial, table.schema_arrow) as writer:
+            for batch in table.iter_batches():
+                writer.write_batch(batch)
+        partial.replace(path)
+    except OSError as error:
+        raise StoreError(f"{path} cannot be written: {error}") from error
+    return path
+
+
+def _print_page(directory: Path) -> Path:
+    """Prints the page into a PDF by a browser without a window."""
+    from campaigns.errors import CampaignError
+
+    browser = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        raise CampaignError(f"--pdf takes a browser, and none is found; install chromium ({', '.join(_BROWSERS)})")
+    target = (directory / "report.pdf").resolve()
+    with tempfile.TemporaryDirectory() as profile:
+        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}"]
+        page = (directory / "report.html").resolve().as_uri()
+        command += ["--no-pdf-header-footer", f"--print-to-pdf={target}", page]
+        try:
+            subprocess.run(command, check=True, capture_output=True, timeout=_PRINTING_S)  # noqa: S603
+        except (subprocess.SubprocessError, OSError) as error:
+            raise CampaignError(f"{browser} did not print {target}: {error}") from error
+    return target

@@ -1,0 +1,46 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+
+from reports.between import Contrast, contrast_grid, contrasts
+from reports.stored import read_run
+
+Rows = Callable[..., pd.DataFrame]
+MakeRun = Callable[..., Path]
+
+
+def _contrasts(first: Path, second: Path) -> tuple[bool, dict[str, Contrast]]:
+    paired, found = contrasts(read_run(first), read_run(second))
+    return paired, {one.name: one for one in found}
+
+
+def test_the_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun) -> None:
+    frame = make_rows(200)
+    worse = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
+    paired, found = _contrasts(make_run(frame), make_run(worse, name="other"))
+    assert paired
+    # Every error has grown by 2 %: pairs show it although the scatter is many times as wide.
+    assert found["velocity error (m/s)"].p_value < 1e-9
+    assert found["answered"].p_value == 1.0
+    assert found["came to an end"].second.level == 1.0
+
+
+def test_draws_of_their_own_are_compared_as_two_samples(make_rows: Rows, make_run: MakeRun) -> None:
+    first = make_run(make_rows(300))
+    paired, found = _contrasts(first, make_run(make_rows(300, seed=2), name="same", seed=8))
+    assert not paired
+    assert min(one.p_value for one in found.values()) > 0.01
+    _, changed = _contrasts(first, make_run(make_rows(300, seed=2, answered=0.6, spread=2.0), name="worse", seed=8))
+    assert changed["answered"].p_value < 1e-6
+    assert changed["velocity error (m/s)"].p_value < 1e-6
+    grid = contrast_grid(["a", "b"], list(changed.values()))
+    assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
+
+
+def test_campaigns_with_nothing_in_common(make_rows: Rows, make_run: MakeRun) -> None:
+    first = make_run(make_rows(20)[["case", "outcome"]], [])
+    _, found = _contrasts(first, make_run(make_rows(20), name="other", seed=8))
+    assert set(found) == {"came to an end"}
