@@ -19,6 +19,7 @@ from sim.sensor import (
     DetectorChoice,
     DetectorParameters,
     ImuParameters,
+    OwnCameraChoice,
     RadarParameters,
 )
 from sim.terrain import Site, TerrainParameters, site, sites
@@ -91,9 +92,16 @@ class LandingParameters(BaseModel):
 
 
 class CameraParameters(BaseModel):
-    """The descent camera: 14.67 mm, 12 um pixels, 45 deg; distortion that of an Opportunity navcam (its PDS label)."""
+    """The descent camera: 14.67 mm, 12 um pixels, 45 deg; distortion that of an Opportunity navcam (its PDS label).
+
+    With `model` it is a user's own, and what is stated here of focal length, pixels and distortion is not used.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    model: Annotated[
+        OwnCameraChoice | None, Field(description="an own camera: the path of its file, or a table with file")
+    ] = None
 
     focal_length_mm: Annotated[float, Field(gt=1.0, le=1000.0)] = 14.67
     pixel_pitch_um: Annotated[float, Field(gt=0.5, le=100.0)] = 12.0
@@ -188,6 +196,15 @@ class DescentScenarioParameters(ChosenAlgorithms):
         """A terrain that was completed for one site must not be lit as another's."""
         if self.terrain_site != self.site:
             raise ValueError(f"site is {self.site}, but the terrain is of {self.terrain_site}; a site is not dispersed")
+        return self
+
+    @model_validator(mode="after")
+    def _rows_can_be_summed(self) -> DescentScenarioParameters:
+        rows = self.camera.rows if self.camera.model is None else self.camera.model.rows
+        if rows % self.detector.rows_summed:
+            raise ValueError(
+                f"detector.rows_summed {self.detector.rows_summed} does not divide the camera's {rows} rows"
+            )
         return self
 
     @property

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from scenarios.landing.faults import outage_errors
+from scenarios.landing.faults import arrived_numbers, faulty_helicopter, faulty_ranges
 from scenarios.landing.helicopter import HelicopterParameters, Transit
 from scenarios.landing.pair_choice import choose_pair
 from scenarios.landing.parameters import LandingScenarioParameters
@@ -16,7 +16,6 @@ from scenarios.views import nadir_pose
 from sim.dynamics import State
 from sim.frames import rigid
 from sim.measurements import PoseMeasurement
-from sim.sensor import preset
 from sim.sensor.laser import range_along
 from sim.sensor.ranging import DOWN, RangingUnit
 from sim.streams import Streams
@@ -71,20 +70,18 @@ def _of_helicopter(
     p: LandingScenarioParameters, helicopter: HelicopterParameters, surface: Surface, streams: Streams
 ) -> Flight:
     """The chosen pair of a helicopter's flight along its pictures' rows' direction or whatever the course is."""
+    helicopter = faulty_helicopter(p.faults, helicopter)
     ground = float(surface.height(p.place.east_m, p.place.north_m))
     over = np.array([p.place.east_m, p.place.north_m, ground + helicopter.transit.height_m])
     heading = -np.radians(p.flown.heading_deg)
     course = np.pi / 2 - np.radians(p.flown.heading_deg + p.flown.course_deg)
     gravity = p.preset.environment.gravity_m_s2
     transit = Transit.flown(helicopter, over, float(course), float(heading), gravity, streams)
-    choice = choose_pair(
-        transit.poses(),
-        _laser_ranges(p, transit, surface, streams),
-        preset(p.camera).cameras()[0],
-        p.pair,
-        helicopter.transit.height_m,
-    )
-    first, second = choice.first, choice.second
+    numbers = arrived_numbers(p.faults, transit.times_s.size, streams.generator("lost pictures"))
+    poses, height = transit.poses(), helicopter.transit.height_m
+    ranges = faulty_ranges(p.faults, _laser_ranges(p, transit, surface, streams), height)
+    choice = choose_pair([poses[number] for number in numbers], ranges[numbers], p.optics, p.pair, height)
+    first, second = int(numbers[choice.first]), int(numbers[choice.second])
     return Flight(
         (transit.state(first), transit.state(second)),
         (transit.pose(first), transit.pose(second)),
@@ -136,9 +133,8 @@ def believed_poses(
     motion = n.motion_m * rng.standard_normal(3)
     tilt, azimuth = np.radians(n.tilt_deg) * rng.standard_normal(2), np.radians(n.azimuth_deg) * rng.standard_normal()
     turn = np.radians(n.turn_deg) * rng.standard_normal(3)
-    drift, drift_motion = outage_errors(p.faults, states[1].time_s, streams.generator("outage"))
     common = Rotation.from_rotvec(np.array([tilt[0], tilt[1], azimuth]))
-    positions = (position + drift, position + motion + drift + drift_motion)
+    positions = (position, position + motion)
     turns = (common, Rotation.from_rotvec(turn) * common)
     first, second = (
         PoseMeasurement(rigid(turned * state.attitude, state.position_m + off), state.time_s)

@@ -16,7 +16,16 @@ from scenarios.landing.faults import Faults
 from scenarios.landing.helicopter import HelicopterParameters
 from scenarios.landing.pair_choice import PairParameters
 from scenarios.landing.relief import Limits
-from sim.sensor import PRESETS, AutoExposureParameters, DetectorChoice, LaserParameters, preset
+from sim.camera import CameraModel
+from sim.sensor import (
+    PRESETS,
+    AutoExposureParameters,
+    DetectorChoice,
+    LaserParameters,
+    NamedOrOwnCamera,
+    OwnCamera,
+    preset,
+)
 from sim.terrain import Site, TerrainParameters, site, sites
 
 Size = Annotated[float, Field(ge=0.0)]
@@ -104,7 +113,9 @@ class LandingScenarioParameters(ChosenAlgorithms):
         Size, Field(le=10.0, description="contrast of ground finer than the terrain, over the site's own")
     ] = 1.0
     sun: SunParameters = SunParameters()
-    camera: Annotated[str, Field(description="camera preset that looks down")] = "xc-55"
+    camera: Annotated[
+        NamedOrOwnCamera, Field(description="camera preset that looks down; or an own camera: a table with file")
+    ] = "xc-55"
     detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
     exposure: Annotated[AutoExposureParameters, Field(description="how the exposure is set")] = AutoExposureParameters()
     flown: Annotated[
@@ -141,7 +152,9 @@ class LandingScenarioParameters(ChosenAlgorithms):
 
     @field_validator("camera")
     @classmethod
-    def _camera_looks_down(cls, name: str) -> str:
+    def _camera_looks_down(cls, name: str | OwnCamera) -> str | OwnCamera:
+        if isinstance(name, OwnCamera):
+            return name
         down = [known for known in PRESETS if preset(known).design.down]
         if name not in down:
             raise ValueError(f"no camera preset that looks down is called '{name}'; allowed: {', '.join(down)}")
@@ -166,9 +179,31 @@ class LandingScenarioParameters(ChosenAlgorithms):
         """A terrain that was completed for one site must not be lit as another's."""
         if getattr(self.preset, self.scale) is None:
             raise ValueError(f"site {self.site} has no terrain at the scale '{self.scale}'")
+        rows = self.optics.size[1]
+        if rows % self.detector.rows_summed:
+            raise ValueError(
+                f"detector.rows_summed {self.detector.rows_summed} does not divide the camera's {rows} rows"
+            )
         if self.terrain_of != self.site:
             raise ValueError(f"site is {self.site}, but the terrain is of {self.terrain_of}; a site is not dispersed")
         return self
+
+    @property
+    def optics(self) -> CameraModel:
+        """The camera in the body frame."""
+        return self.camera.camera() if isinstance(self.camera, OwnCamera) else preset(self.camera).cameras()[0]
+
+    @model_validator(mode="after")
+    def _faults_of_a_flight_are_flown(self) -> LandingScenarioParameters:
+        for name in ("lost_pictures", "gps_outage_s"):
+            if getattr(self.faults, name) and self.helicopter is None:
+                raise ValueError(f"faults.{name} is that of a helicopter's flight; state the table helicopter")
+        return self
+
+    @property
+    def height_m(self) -> float:
+        """The height above the ground at which pictures are commanded to be taken."""
+        return self.flown.height_m if self.helicopter is None else self.helicopter.transit.height_m
 
     @property
     def preset(self) -> Site:

@@ -43,7 +43,7 @@ class LandingScenario:
         p = _checked(parameters)
         world = World.of(p)
         flight = Flight.of(p, world.ground.surface, streams)
-        pair = take_pictures(p, world, flight, camera_optics(p.camera), streams)
+        pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
         measurements = measure(p, flight, pair, streams)
         truth = GroundTruth.of(world, flight, pair, p.lander.limits)
         # what is left to land on where an algorithm fails to answer

@@ -10,9 +10,9 @@ import numpy as np
 from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.optics import Optics
 from scenarios.views import Eye, SiteGround, site_scene
+from sim.camera import CameraModel
 from sim.frames import direction
 from sim.render import Scene, Sun
-from sim.sensor import preset
 from sim.terrain import TerrainBank, TerrainParameters, site
 from sim.terrain.sites import SiteTexture
 
@@ -66,6 +66,6 @@ def site_ground(site_name: str, terrain: TerrainParameters, bank_seed: int, numb
 
 
 @lru_cache(maxsize=4)
-def camera_optics(camera: str) -> Optics:
-    """A camera preset in the body frame: at its origin, looking down, columns along x."""
-    return Optics.of(preset(camera).cameras()[0])
+def camera_optics(camera: CameraModel) -> Optics:
+    """The optics of a camera in the body frame: at its origin, looking down, columns along x."""
+    return Optics.of(camera)

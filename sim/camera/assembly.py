@@ -14,7 +14,6 @@ from sim.camera.cahvor import Cahvor
 from sim.camera.cahvore import Cahvore
 from sim.camera.vectors import Real
 
-
 #: Labels of several megabytes are there; camera files are small.
 _MOST_BYTES = 1 << 23
 

@@ -242,6 +242,16 @@ class CameraModel(ABC):
             )
         return self._with_image_map((1.0, 1.0), (-float(column), -float(row)), size)
 
+    def magnified(self: M, factor: Real) -> M:
+        """The camera with its focal lengths scaled about its image centre."""
+        column, row = self.image_centre
+        h = self.h + (factor - 1.0) * (self.h - column * self.a)
+        return self._with(h=h, v=self.v + (factor - 1.0) * (self.v - row * self.a))
+
+    def recentred(self: M, columns: Real, rows: Real) -> M:
+        """The camera whose pictures are moved by so much to the right and down."""
+        return self._with(h=self.h + columns * self.a, v=self.v + rows * self.a)
+
     @abstractmethod
     def linearized(self, *, inside: bool = False) -> CameraModel:
         """A `Cahv` of the same size that covers the whole view, or with `inside` only what fills its frame.

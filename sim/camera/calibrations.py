@@ -1,9 +1,10 @@
-"""Calibration files of other programs: OpenCV's YAML or JSON, ROS' `camera_info`, Kalibr's camera chain, EuRoC's sensor.
+"""Calibrations by other programs: OpenCV's YAML or JSON, ROS' `camera_info`, Kalibr's camera chain, EuRoC's sensor.
 
 All are YAML, and all state a camera matrix and OpenCV's distortion in OpenCV's axes (z forward, x right, y down, pixels
 counted from the centre of the upper left one). They are read as the nearest camera of the CAHV family (`from_opencv`,
 `from_opencv_fisheye`), which is exact for lenses of k1 and k2 alone, and refused where that is off by more than
-`MOST_RMS_PX` over the frame or `MOST_PX` anywhere in it (docs/adr/0020). Cameras of a chain are given in the axes of its first.
+`MOST_RMS_PX` over the frame or `MOST_PX` anywhere in it (docs/adr/0020). Cameras of a chain are given in the axes of
+its first.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class Calibration:
     residual: Residual
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
     """Plain data, OpenCV's matrices as the mappings they are written as."""
 
 
@@ -204,14 +205,14 @@ class _Reader:
         pair = both if both is not None else [self.data.get("image_width"), self.data.get("image_height")]
         if isinstance(pair, Mapping):
             pair = [pair.get("width"), pair.get("height")]
-        whole = isinstance(pair, list) and len(pair) == 2 and all(type(one) is int and 0 < one < 1e6 for one in pair)
-        if not whole:
-            raise self.error(
-                "image_width, image_height or resolution",
-                "missing" if pair in (None, [None, None]) else f"{pair!r}",
-                "two positive integers, columns and rows",
-            )
-        return int(pair[0]), int(pair[1])
+        match pair:
+            case [int(columns), int(rows)] if 0 < columns < 1e6 and 0 < rows < 1e6:
+                return columns, rows
+        raise self.error(
+            "image_width, image_height or resolution",
+            "missing" if pair in (None, [None, None]) else f"{pair!r}",
+            "two positive integers, columns and rows",
+        )
 
     def numbers(self, names: Sequence[str], allowed: str, missing: list[float] | None = None) -> list[float]:
         """Finite numbers of a list, of nested lists, or of a matrix with `data`."""

@@ -6,9 +6,11 @@ about the direction z with k1, k2, k3 (radial) and p1, p2 (tangential):
     r^2 = x^2 + y^2        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
                            y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-(its rational model divides the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6), and its fisheye moves a ray at the angle theta from z to the distance theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 +
-k4 theta^8) (Kannala & Brandt 2006). CAHVOR about O = A is the pinhole camera with k3 = p1 = p2 = 0. When O differs from
-A (the image plane is not square to the lens), or CAHVORE's lens is meant, OpenCV can only be fitted. The fisheye with
+(its rational model divides the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6), and its fisheye moves a ray at the angle
+theta from z to the distance theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala & Brandt 2006).
+
+CAHVOR about O = A is the pinhole camera with k3 = p1 = p2 = 0. When O differs from A (the image plane is not square to
+the lens), or CAHVORE's lens is meant, OpenCV can only be fitted. The fisheye with
 k3 = k4 = 0 is CAHVORE about O = A with the linearity 0 and a resting pupil.
 """
 

@@ -1,7 +1,7 @@
 """Camera models in PDS4 labels: the `geom:Camera_Model_Parameters` of the geometry dictionary.
 
-Vectors are returned in the frame that the label names (`Coordinate_Space_Reference`), as they are. The picture's size is
-that of the label's image array. Namespaces' prefixes and versions do not matter.
+Vectors are returned in the frame that the label names (`Coordinate_Space_Reference`), as they are. The picture's size
+is that of the label's image array. Namespaces' prefixes and versions do not matter.
 """
 
 from __future__ import annotations

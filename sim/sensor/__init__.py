@@ -2,6 +2,7 @@
 
 from sim.sensor.approach import Approach, ApproachParameters
 from sim.sensor.clock import Clock, ClockParameters
+from sim.sensor.datasheet import Datasheet, read_datasheet
 from sim.sensor.detector import Detector, DetectorParameters
 from sim.sensor.exposure import AutoExposure, AutoExposureParameters, auto_expose
 from sim.sensor.gps import POST_PROCESSED, RTK, STANDALONE, Gps, GpsParameters
@@ -21,6 +22,7 @@ from sim.sensor.mast import (
 from sim.sensor.motion import ImageMotion
 from sim.sensor.odometry import Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
 from sim.sensor.optics import natural_fall_off
+from sim.sensor.own_camera import NamedOrOwnCamera, OwnCamera, OwnCameraChoice, looking_down
 from sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, Preset, preset
 from sim.sensor.radar import RadarAltimeter, RadarParameters
 from sim.sensor.ranging import height_above_ground
@@ -41,6 +43,7 @@ __all__ = [
     "CameraDesign",
     "Clock",
     "ClockParameters",
+    "Datasheet",
     "Detector",
     "DetectorChoice",
     "DetectorParameters",
@@ -56,9 +59,12 @@ __all__ = [
     "LaserParameters",
     "Mast",
     "MastState",
+    "NamedOrOwnCamera",
     "NavigationErrors",
     "Odometer",
     "OdometryParameters",
+    "OwnCamera",
+    "OwnCameraChoice",
     "PointingParameters",
     "PoseEstimate",
     "Preset",
@@ -78,7 +84,9 @@ __all__ = [
     "WarmUp",
     "auto_expose",
     "height_above_ground",
+    "looking_down",
     "natural_fall_off",
     "preset",
+    "read_datasheet",
     "stereo_mast",
 ]

@@ -14,7 +14,7 @@ shows as an error of disparity or across the epipolar lines, by a roll and by it
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -192,7 +192,7 @@ class StereoHead:
             # turned to the right about its rows' normal, a camera sees everything further to the left
             columns, rows = camera.focal_lengths
             turn = camera.down * (-side * disparity / columns) + camera.right * (side * across / rows) + camera.a * roll
-            cameras.append(_rotated(_magnified(camera, float(scale)), Rotation.from_rotvec(turn)))
+            cameras.append(_rotated(camera.magnified(float(scale)), Rotation.from_rotvec(turn)))
         left, right = (camera.moved(rigid(common, np.zeros(3))) for camera in cameras)
         return cls(design, replace(design, left=left, right=right))
 
@@ -233,11 +233,3 @@ C = TypeVar("C", bound=CameraModel)
 def _rotated(camera: C, turn: Rotation) -> C:
     """The camera turned about its own centre."""
     return camera.moved(rigid(turn, camera.c - turn.apply(camera.c.copy())))
-
-
-def _magnified(camera: C, scale: float) -> C:
-    """The camera with its focal length scaled about its image centre."""
-    column, row = camera.image_centre
-    h = camera.h + (scale - 1.0) * (camera.h - column * camera.a)
-    v = camera.v + (scale - 1.0) * (camera.v - row * camera.a)
-    return cast(C, replace(cast(Any, camera), h=h, v=v))

@@ -22,9 +22,10 @@ from pydantic import BeforeValidator
 from scipy.spatial.transform import Rotation
 
 from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from sim.sensor.datasheet import read_datasheet
 from sim.sensor.optics import OpticsParameters
 from sim.sensor.parameters import DetectorParameters
-from sim.sensor.radiometry import DARK_E_S, NG3_FIELD, NG4_FLIGHT, LightPath
+from sim.sensor.radiometry import DARK_E_S, NG3_FIELD, NG4_FLIGHT, LightPath, bright_exposure_s
 
 #: Distance of Mars from the sun at the MER landings (the paper's "1.5 AU": 44 % of Earth's sunlight), AU.
 MARS_AU = 1.5
@@ -32,8 +33,6 @@ MARS_AU = 1.5
 NAVCAM_RADIAL = (0.00096, -0.002183, 0.018547)
 #: Barrel distortion of a small C-mount lens, R of CAHVOR: 1.8 % in the corner of the XC-55's picture; assumed.
 C_MOUNT_RADIAL = (0.0, -0.08, 0.025)
-#: What an exposure is set for where it is not known: a radiance factor of 0.3 fills 60 % of the full well.
-BRIGHT_RADIANCE_FACTOR, BRIGHT_SHARE = 0.3, 0.6
 
 
 @dataclass(frozen=True)
@@ -112,17 +111,9 @@ def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float
     settings = {
         "responsivity_e_s": light.responsivity_e_s(sun_au),
         "dark_e_s": DARK_E_S,
-        "optics": OpticsParameters(diffraction_px=_diffraction_px(light)),
+        "optics": OpticsParameters(diffraction_px=light.diffraction_px()),
     }
     return Preset(design, light, DetectorParameters.model_validate(settings | changes))
-
-
-def _diffraction_px(light: LightPath) -> float:
-    return 1e-3 * light.mean_wavelength_nm() * light.f_number / light.pixel_pitch_um
-
-
-def _bright_exposure_s(full_well_e: float, responsivity_e_s: float) -> float:
-    return BRIGHT_SHARE * full_well_e / (BRIGHT_RADIANCE_FACTOR * responsivity_e_s)
 
 
 _DESCENT = CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, down=True)
@@ -147,7 +138,7 @@ def _mer_descent_field() -> Preset:
 def _mer_rover_camera(design: CameraDesign, f_number: float) -> Preset:
     """Rows are not summed; the temperature is assumed."""
     light = LightPath(f_number, design.pixel_pitch_um, _ROVER_BAND)
-    exposure = _bright_exposure_s(170000.0, light.responsivity_e_s(MARS_AU))
+    exposure = bright_exposure_s(170000.0, light.responsivity_e_s(MARS_AU))
     return _mer(design, light, MARS_AU, exposure_s=exposure, temperature_c=-40.0, rows_summed=1)
 
 
@@ -168,7 +159,7 @@ def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
     light = LightPath(4.0, design.pixel_pitch_um, (400.0, 700.0))
     responsivity = light.responsivity_e_s(1.0)
     detector = DetectorParameters(
-        exposure_s=_bright_exposure_s(full_well_e, responsivity),
+        exposure_s=bright_exposure_s(full_well_e, responsivity),
         responsivity_e_s=responsivity,
         rows_summed=1,
         transfer_row_s=0.0,
@@ -181,7 +172,7 @@ def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
         bits=bits,
         temperature_c=20.0,
         dark_e_s=DARK_E_S * (design.pixel_pitch_um / 12.0) ** 2,
-        optics=OpticsParameters(diffraction_px=_diffraction_px(light)),
+        optics=OpticsParameters(diffraction_px=light.diffraction_px()),
     )
     return Preset(design, light, detector)
 
@@ -236,12 +227,20 @@ def _over(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _chosen(settings: object) -> object:
-    if not isinstance(settings, Mapping) or "preset" not in settings:
+    """Settings with those of a preset or a datasheet put below them, where they name one."""
+    if isinstance(settings, str):
+        settings = {"file": settings} if settings.endswith(".toml") else {"preset": settings}
+    if not isinstance(settings, Mapping) or not ({"preset", "file"} & set(settings)):
         return settings
-    changes = {key: value for key, value in settings.items() if key != "preset"}
+    if {"preset", "file"} <= set(settings):
+        raise ValueError("a detector is a preset or a datasheet's file, not both")
+    changes = {key: value for key, value in settings.items() if key not in ("preset", "file")}
+    if "file" in settings:
+        return _over(read_datasheet(str(settings["file"])).parameters().model_dump(), changes)
     return _over(preset(str(settings["preset"])).detector.model_dump(), changes)
 
 
-#: Detector parameters that a campaign may also state by a preset's name, with what differs from it:
-#: ``[parameters.detector]`` with ``preset = "mer-descent-field"`` and, say, ``temperature_c = 23.0``.
+#: Detector parameters that a campaign may also state by a preset's name or a datasheet's file, with what differs:
+#: ``[parameters.detector]`` with ``preset = "mer-descent-field"`` and, say, ``temperature_c = 23.0``; or
+#: ``file = "sensor.toml"`` (`sim.sensor.datasheet`).
 DetectorChoice = Annotated[DetectorParameters, BeforeValidator(_chosen)]

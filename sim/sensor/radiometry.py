@@ -49,6 +49,15 @@ _QE_NM = np.arange(400.0, 1101.0, 50.0)
 _QE = np.array([15.0, 22.0, 28.0, 33.0, 38.0, 42.0, 43.0, 40.0, 34.0, 27.0, 19.0, 11.0, 5.0, 2.0, 0.0]) / 100.0
 
 
+#: What an exposure is set for where it is not known: a radiance factor of 0.3 fills 60 % of the full well.
+BRIGHT_RADIANCE_FACTOR, BRIGHT_SHARE = 0.3, 0.6
+
+
+def bright_exposure_s(full_well_e: float, responsivity_e_s: float) -> float:
+    """The exposure time at which a bright surface fills most of the full well."""
+    return BRIGHT_SHARE * full_well_e / (BRIGHT_RADIANCE_FACTOR * responsivity_e_s)
+
+
 @dataclass(frozen=True)
 class NeutralDensity:
     """A neutral-density filter.
@@ -92,6 +101,9 @@ class LightPath:
         Filter in front of the lens, or None.
     transmission
         Of the lens.
+    quantum_efficiency
+        Wavelengths, nm, and electrons per photon there, straight between them and none beyond; None for that of a
+        front-illuminated silicon CCD.
     """
 
     f_number: float
@@ -99,6 +111,7 @@ class LightPath:
     band_nm: tuple[float, float]
     neutral_density: NeutralDensity | None = None
     transmission: float = LENS_TRANSMISSION
+    quantum_efficiency: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def responsivity_e_s(self, sun_distance_au: float) -> float:
         """Electrons per second in a pixel on axis that looks at radiance factor 1."""
@@ -118,10 +131,18 @@ class LightPath:
         wavelength_nm, electrons = self._electrons_per_m2()
         return float(np.average(wavelength_nm, weights=electrons * self._filter(wavelength_nm, electrons)))
 
+    def diffraction_px(self) -> float:
+        """Mean wavelength times f-number over the pixel pitch."""
+        return 1e-3 * self.mean_wavelength_nm() * self.f_number / self.pixel_pitch_um
+
     def _electrons_per_m2(self) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
         """Wavelengths, and electrons per second, m2 and nm at 1 AU behind neither lens nor filter."""
         wavelength_nm = np.linspace(*self.band_nm, 281)
-        return wavelength_nm, solar_photons(wavelength_nm) * np.interp(wavelength_nm, _QE_NM, _QE)
+        if self.quantum_efficiency is None:
+            efficiency = np.interp(wavelength_nm, _QE_NM, _QE)
+        else:
+            efficiency = np.interp(wavelength_nm, *self.quantum_efficiency, left=0.0, right=0.0)
+        return wavelength_nm, solar_photons(wavelength_nm) * efficiency
 
     def _filter(
         self, wavelength_nm: Float64[np.ndarray, "n"], weights: Float64[np.ndarray, "n"]

@@ -1,10 +1,16 @@
 """What a descent's parameters take, and what a site makes of them."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from scenarios.descent import DescentScenarioParameters
+from scenarios.descent.optics import calibrated_camera, camera_optics
+from scenarios.descent.parameters import CameraParameters
 from scenarios.descent.world import World
+from sim.sensor import OwnCamera
 from sim.terrain import site
 
 #: A site on Mars and one on Earth.
@@ -67,3 +73,47 @@ def test_a_site_is_lit_as_it_is() -> None:
     assert scene.caster_diameter_m == 10.9
     assert scene.photometry == mars.ground.photometry(mars.sun)
     assert len(scene.objects) > 0
+
+
+def test_own_cameras_stand_in_the_campaign(tmp_path: Path) -> None:
+    calibration, sheet = tmp_path / "camera.yaml", tmp_path / "sensor.toml"
+    calibration.write_text(
+        "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [800, 0, 320, 0, 800, 240, 0, 0, 1]}\n"
+        "distortion_coefficients: {data: [-0.2, 0.05, 0, 0]}\n"
+    )
+    sheet.write_text(
+        "pixel_pitch_um = 4.8\nfull_well_e = 10000\nread_noise_e = 5\nbits = 10\nquantum_efficiency = 0.5\n"
+        "dark_current_e_s = 20\ndark_temperature_c = 20\nrows = 480\nreadout_s = 0.02\n"
+        "[lens]\nf_number = 4\nband_nm = [450, 700]\n"
+    )
+    stated = {"camera": {"model": str(calibration)}, "detector": str(sheet)}
+    p = DescentScenarioParameters.model_validate(stated)
+    assert p.camera.model is not None
+    assert p.camera.model.size == (640, 480)
+    again = DescentScenarioParameters.model_validate(p.model_dump(mode="json", round_trip=True))
+    calibration.unlink()
+    sheet.unlink()
+    assert DescentScenarioParameters.model_validate(again.model_dump(mode="json", round_trip=True)) == p
+    # the camera as calibrated differs by what the errors say: at the corner by at most some of their sum
+    true, believed = camera_optics(p.camera).camera, calibrated_camera(p.camera, np.random.default_rng(1))
+    directions = true.rays(np.array([[0.0, 0.0], [320.0, 240.0], [639.0, 479.0]]))[1]
+    moved = np.linalg.norm(believed.project(directions)[0] - true.project(directions)[0], axis=1)
+    assert 0.0 < moved[1] < 4.0 * p.camera.centre_error_px
+    assert moved.max() < 4.0 * (p.camera.centre_error_px + p.camera.distortion_error_px + 400 * p.camera.focal_error)
+
+
+def test_distortion_errors_of_own_cameras_are_the_corners() -> None:
+    p = CameraParameters(focal_error=0.0, centre_error_px=0.0, distortion_error_px=2.0)
+    own = p.model_copy(update={"model": OwnCamera.of(camera_optics(p).camera)})
+    for one in (p, own):
+        rng = np.random.default_rng(3)
+        drawn = np.random.default_rng(3).standard_normal(4)[3]
+        true, believed = camera_optics(one).camera, calibrated_camera(one, rng)
+        corner = true.rays(np.array([0.0, 0.0]))[1]
+        outwards = np.linalg.norm(believed.project(corner)[0] - 511.5) - np.linalg.norm(true.project(corner)[0] - 511.5)
+        assert outwards == pytest.approx(2.0 * drawn, rel=0.02)
+
+
+def test_rows_that_cannot_be_summed_are_refused() -> None:
+    with pytest.raises(ValidationError, match="rows_summed 4 does not divide the camera's 1023 rows"):
+        DescentScenarioParameters.model_validate({"camera": {"rows": 1023}})

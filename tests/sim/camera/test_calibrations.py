@@ -68,7 +68,8 @@ rectification_matrix:
 projection_matrix:
   rows: 3
   cols: 4
-  data: [1484.120151053405, 0.0, 982.1869163422028, 0.0, 0.0, 1483.296808359715, 543.0569322723705, 0.0, 0.0, 0.0, 1.0, 0.0]
+  data: [1484.120151053405, 0.0, 982.1869163422028, 0.0, 0.0, 1483.296808359715, 543.0569322723705, 0.0,
+    0.0, 0.0, 1.0, 0.0]
 """
 
 #: A wide camera calibrated with a lens model that does not reach its corners (README of a driver for Kodak's PIXPRO).

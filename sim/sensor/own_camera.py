@@ -1,0 +1,134 @@
+"""A user's own camera: its geometry from a camera file, its detector from a datasheet.
+
+A campaign names a camera's file once; what it says is put into the campaign's parameters when it is read, so that a
+campaign's folder holds the camera itself, and a file that changes afterwards changes no case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from sim.camera import Cahv, Cahvor, Cahvore, CameraModel, read_cameras
+
+Vector = tuple[float, float, float]
+_FILES = ("file", "number", "subframe_folded_in")
+
+
+class OwnCamera(BaseModel):
+    """A camera of the CAHV family in the body frame: at its origin, looking along -z, columns along +x.
+
+    Stated as ``{ file = "camera.yaml" }`` (any file that `sim.camera.read_cameras` reads), or the path alone; all else
+    is then filled in. Where a file puts a camera does not matter: it is mounted so that A looks down.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    file: Annotated[str | None, Field(description="camera file that the model was read from")] = None
+    number: Annotated[int, Field(ge=0, description="which of the file's cameras, from 0")] = 0
+    subframe_folded_in: Annotated[
+        bool, Field(description="PDS labels: a subframe's model describes the stored picture")
+    ] = False
+    model: Annotated[Literal["CAHV", "CAHVOR", "CAHVORE"], Field(description="filled in from the file")]
+    columns: Annotated[int, Field(ge=16, le=16384)]
+    rows: Annotated[int, Field(ge=16, le=16384)]
+    h: Annotated[Vector, Field(description="horizontal image vector, pixels")]
+    v: Annotated[Vector, Field(description="vertical image vector, pixels")]
+    o: Annotated[Vector | None, Field(description="optical axis, unit vector")] = None
+    r: Annotated[Vector | None, Field(description="radial distortion")] = None
+    e: Annotated[Vector | None, Field(description="the pupil's motion, m")] = None
+    linearity: Annotated[float | None, Field(description="of CAHVORE")] = None
+
+    @model_validator(mode="after")
+    def _is_a_camera(self) -> OwnCamera:
+        self.camera()
+        return self
+
+    def camera(self) -> CameraModel:
+        """The camera in the body frame. Raises ValueError where the model lacks a vector."""
+        pinhole = Cahv(np.zeros(3), np.array([0.0, 0.0, -1.0]), np.array(self.h), np.array(self.v), self.size)
+        if self.model == "CAHV":
+            return pinhole
+        if self.o is None or self.r is None:
+            raise ValueError(f"{self.model} needs o and r")
+        if self.model == "CAHVOR":
+            return Cahvor.from_cahv(pinhole, r=np.array(self.r), o=np.array(self.o))
+        if self.e is None or self.linearity is None:
+            raise ValueError("CAHVORE needs e and linearity")
+        return Cahvore.from_cahv(
+            pinhole, np.array(self.r), np.array(self.e), linearity=self.linearity, o=np.array(self.o)
+        )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(columns, rows)."""
+        return self.columns, self.rows
+
+    @classmethod
+    def of(cls, camera: CameraModel, **origin: Any) -> OwnCamera:
+        """A camera of any place and pointing, mounted to look down."""
+        mounted = looking_down(camera)
+        length = float(np.linalg.norm(mounted.a))  # labels round A
+        vectors: dict[str, Any] = {
+            letter: tuple((getattr(mounted, letter) / (length if letter in "hv" else 1.0)).tolist())
+            for letter in "hvore"
+            if hasattr(mounted, letter)
+        }
+        return cls(
+            model=type(mounted).__name__.upper(),  # type: ignore[arg-type]  # the classes' names are the models'
+            columns=mounted.size[0],
+            rows=mounted.size[1],
+            linearity=mounted.linearity if isinstance(mounted, Cahvore) else None,
+            **vectors,
+            **origin,
+        )
+
+
+def looking_down(camera: CameraModel) -> CameraModel:
+    """A camera put at the origin and turned so that A is -z and the columns grow along +x.
+
+    Raises
+    ------
+    ValueError
+        If the picture is a mirror image, which no rotation brings there.
+    """
+    if not camera.right_handed:
+        raise ValueError("the camera's picture is mirrored: u right, v down and A forward must be right-handed")
+    axis = camera.a / np.linalg.norm(camera.a)
+    right = camera.right - (camera.right @ axis) * axis
+    right /= np.linalg.norm(right)
+    turn = Rotation.from_matrix(np.stack([right, np.cross(right, axis), -axis]))
+    return camera.moved(RigidTransform.from_components(-turn.apply(camera.c.copy()), turn))
+
+
+def _read(stated: object) -> object:
+    """What stands in a campaign's file, with the camera's file read where it is named and nothing else is."""
+    if isinstance(stated, str | Path):
+        stated = {"file": str(stated)}
+    if not isinstance(stated, Mapping) or "model" in stated or not isinstance(stated.get("file"), str | Path):
+        return stated
+    unknown = [name for name in stated if name not in _FILES]
+    if unknown:
+        raise ValueError(f"a camera file leaves nothing else to state than {', '.join(_FILES)}; given: {unknown[0]}")
+    path, number, folded = str(stated["file"]), stated.get("number", 0), stated.get("subframe_folded_in", False)
+    cameras = read_cameras(path, subframe_folded_in=bool(folded))
+    if not (isinstance(number, int) and 0 <= number < len(cameras)):
+        raise ValueError(f"{path}: holds {len(cameras)} cameras; number may be 0 to {len(cameras) - 1}, not {number!r}")
+    if len(cameras) > 1 and "number" not in stated:
+        raise ValueError(f"{path}: holds {len(cameras)} cameras; choose one with number, 0 to {len(cameras) - 1}")
+    return OwnCamera.of(cameras[number], file=path, number=number, subframe_folded_in=bool(folded))
+
+
+def _named_or_read(stated: object) -> object:
+    """A camera's name as it stands; what has an ending or a folder is a file's."""
+    return stated if isinstance(stated, str) and not Path(stated).suffix and "/" not in stated else _read(stated)
+
+
+#: An own camera as campaigns state it; and where a preset's name may stand instead.
+OwnCameraChoice = Annotated[OwnCamera, BeforeValidator(_read)]
+NamedOrOwnCamera = Annotated[str | OwnCamera, BeforeValidator(_named_or_read)]

@@ -1,0 +1,142 @@
+"""Detectors from a datasheet: against the figures that follow from them by hand, and the presets that we have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from sim.sensor import DetectorChoice, DetectorParameters, preset, read_datasheet
+
+CHOICE: TypeAdapter[DetectorParameters] = TypeAdapter(DetectorChoice)
+#: Sony IMX265 as a camera's maker states it by EMVA 1288 (rounded), behind 16 mm f/4.
+SHEET = """name = "Sony IMX265, f/4"
+pixel_pitch_um = 3.45
+full_well_e = 10500
+read_noise_e = 2.4
+bits = 12
+quantum_efficiency = 0.65
+dark_current_e_s = 1.0
+dark_temperature_c = 20.0
+prnu = 0.005
+rows = 1536
+readout_s = 0.0512
+
+[lens]
+f_number = 4.0
+band_nm = [420.0, 680.0]
+transmission = 0.9
+"""
+
+
+def written(folder: Path, text: str = SHEET) -> Path:
+    path = folder / "sensor.toml"
+    path.write_text(text)
+    return path
+
+
+def test_figures_follow(tmp_path: Path) -> None:
+    p = read_datasheet(written(tmp_path)).parameters()
+    assert p.gain_e_dn == pytest.approx(10500 / 4096)
+    assert p.rows_summed == 1
+    assert p.transfer_row_s == p.clear_row_s == 0.0
+    assert p.readout_row_s == pytest.approx(0.0512 / 1536)
+    # the dark current at the temperature at which it is stated
+    assert p.temperature_c == 20.0
+    assert p.dark_e_s * p.dark_growth == pytest.approx(1.0)
+    # diffraction: about 550 nm x 4 / 3.45 um
+    assert p.optics.diffraction_px == pytest.approx(0.55 * 4 / 3.45, rel=0.02)
+    # radiance factor 0.3 fills 60 % of the well
+    assert 0.3 * p.responsivity_e_s * p.exposure_s == pytest.approx(0.6 * 10500)
+
+
+def test_responsivity_is_the_suns_photons(tmp_path: Path) -> None:
+    """ASTM E490's sunlight between 420 and 680 nm is 475 W/m2; from a photon's mean energy, at 550 nm, all follows."""
+    p = read_datasheet(written(tmp_path, "sun_au = 1.0\n" + SHEET)).parameters()
+    photons = 475.0 / (6.62607015e-34 * 2.99792458e8 / 550e-9)
+    by_hand = 0.65 * 0.9 * (3.45e-6) ** 2 * photons / (4.0 * 4.0**2)
+    # the sun is taken for a black body, which is up to 9 % fainter in the green
+    assert p.responsivity_e_s == pytest.approx(by_hand, rel=0.1)
+
+
+def test_a_flat_curve_is_the_mean(tmp_path: Path) -> None:
+    curve = SHEET.replace("quantum_efficiency = 0.65\n", "").replace(
+        "[lens]", "[quantum_efficiency]\nwavelength_nm = [300.0, 900.0]\nefficiency = [0.65, 0.65]\n\n[lens]"
+    )
+    mean = read_datasheet(written(tmp_path)).parameters()
+    assert read_datasheet(written(tmp_path, curve)).parameters() == mean
+
+
+def test_the_mer_ccd_from_its_figures(tmp_path: Path) -> None:
+    """The preset's detector by the datasheet's way: Maki et al. 2003, and the assumed curve of quantum efficiency."""
+    points = [15, 22, 28, 33, 38, 42, 43, 40, 34, 27, 19, 11, 5, 2, 0]
+    text = f"""pixel_pitch_um = 12.0
+full_well_e = 170000
+read_noise_e = 25
+bits = 12
+gain_e_dn = 41.5
+black_level_dn = 20
+dark_current_e_s = 159
+dark_temperature_c = 0
+temperature_c = -40
+shutter = "frame-transfer"
+transfer_row_s = 5e-6
+rows = 1024
+readout_s = 5.4272
+[quantum_efficiency]
+wavelength_nm = {[400.0 + 50.0 * k for k in range(15)]}
+efficiency = {[one / 100 for one in points]}
+[lens]
+f_number = 12.0
+band_nm = [600.0, 800.0]
+"""
+    ours = read_datasheet(written(tmp_path, text)).parameters()
+    theirs = preset("mer-navcam").detector
+    for name in ("responsivity_e_s", "exposure_s", "full_well_e", "gain_e_dn", "read_noise_e", "readout_row_s"):
+        assert getattr(ours, name) == pytest.approx(getattr(theirs, name), rel=1e-3), name
+    assert ours.dark_e_s * ours.dark_growth == pytest.approx(theirs.dark_e_s * theirs.dark_growth)
+
+
+def test_campaigns_name_the_file(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    plain = CHOICE.validate_python(str(path))
+    assert plain == read_datasheet(path).parameters()
+    changed = CHOICE.validate_python({"file": str(path), "temperature_c": -10.0, "optics": {"dust_discs": 3}})
+    assert (changed.temperature_c, changed.optics.dust_discs) == (-10.0, 3)
+    assert changed.full_well_e == plain.full_well_e
+    # what was read stands for the file
+    stored = changed.model_dump(mode="json")
+    path.unlink()
+    assert CHOICE.validate_python(stored) == changed
+    assert CHOICE.validate_python("xc-55") == preset("xc-55").detector
+    assert np.isfinite(changed.dark_growth)
+
+
+FAULTS = [
+    ("full_well_e = 10500\n", "", "sensor.toml: full_well_e: Field required"),
+    ("full_well_e = 10500", "full_well = 10500", "sensor.toml: full_well_e: Field required"),
+    ("full_well_e = 10500", "full_well_e = -1", "full_well_e: Input should be greater than 0"),
+    ("bits = 12", "bits = 24", "bits: Input should be less than or equal to 16"),
+    ("bits = 12", 'bits = 12\nshutter = "rolling"', "shutter: Input should be 'global' or 'frame-transfer'"),
+    ("bits = 12", 'bits = 12\nshutter = "frame-transfer"', "needs it above 0"),
+    ("[420.0, 680.0]", "[680.0, 420.0]", "two increasing wavelengths"),
+    ("bits = 12", "bits = = 12", "not valid TOML"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "fault"), FAULTS, ids=[new or "nothing" for _, new, _ in FAULTS])
+def test_faults_are_named(tmp_path: Path, old: str, new: str, fault: str) -> None:
+    assert old in SHEET
+    path = written(tmp_path, SHEET.replace(old, new))
+    with pytest.raises(ValidationError, match=fault) as raised:
+        CHOICE.validate_python(str(path))
+    assert "sensor.toml" in str(raised.value)
+
+
+def test_both_a_preset_and_a_file_are_too_much(tmp_path: Path) -> None:
+    with pytest.raises(ValidationError, match="not both"):
+        CHOICE.validate_python({"file": str(written(tmp_path)), "preset": "xc-55"})
+    with pytest.raises(ValidationError, match="cannot be read"):
+        CHOICE.validate_python("absent.toml")
