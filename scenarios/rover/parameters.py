@@ -113,7 +113,7 @@ class StartParameters(_Parameters):
     """Where the rover stands at first, seen from the target."""
 
     distance_m: Annotated[
-        float, Field(gt=1.0, le=40.0, description="horizontally from the camera to the target, m")
+        float, Field(gt=1.0, le=40.0, description="horizontally from the mast to the designated point, m")
     ] = 10.0
     bearing_deg: Annotated[
         float, Field(ge=-360.0, le=720.0, description="direction from the target to the rover, clockwise from north")

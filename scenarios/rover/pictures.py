@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Float32
@@ -13,7 +14,7 @@ from algorithms.interface import PixelBox
 from scenarios.rover.parameters import ExposureParameters
 from sim.camera import CameraModel
 from sim.measurements import MastImage
-from sim.render import PixelRays, Scene, process_renderer
+from sim.render import Objects, PixelRays, Scene, process_renderer
 from sim.render.backend import Backend
 from sim.sensor import Detector, auto_expose, natural_fall_off, preset
 
@@ -61,6 +62,14 @@ class StereoPictures:
     right: MastImage
     exposure_s: float
 
+    @cached_property
+    def digest(self) -> bytes:
+        """Hash of both pictures' counts; kept, as many targets may be tracked over the same pictures."""
+        digest = hashlib.sha256()
+        for image in (self.left, self.right):
+            digest.update(np.ascontiguousarray(image.counts).tobytes())
+        return digest.digest()
+
 
 @dataclass(frozen=True)
 class Photographer:
@@ -86,6 +95,7 @@ class Photographer:
     def take(
         self,
         scene: Scene,
+        rover: Objects | None,
         world_from_head: RigidTransform,
         cameras: tuple[CameraModel, CameraModel],
         boxes: tuple[PixelBox, PixelBox],
@@ -97,7 +107,9 @@ class Photographer:
         Parameters
         ----------
         scene
-            What is there.
+            What is there, without the rover.
+        rover
+            The rover, where its shadow may fall on what is shown.
         world_from_head
             True pose of the mast's head.
         cameras
@@ -109,10 +121,11 @@ class Photographer:
         time_s
             When.
         """
-        light = [
-            self._light(scene, world_from_head, camera.cropped(*box.corner, box.size), brightness, time_s)
-            for camera, box in zip(cameras, boxes, strict=True)
+        shown = [
+            PixelRays.of(camera.cropped(*box.corner, box.size)) for camera, box in zip(cameras, boxes, strict=True)
         ]
+        near = _joined(scene.within([rays.cone(world_from_head) for rays in shown]), rover)
+        light = [self._light(near, world_from_head, rays, brightness, time_s) for rays in shown]
         if not self.detectors.noise:
             counts = [_noise_free(one, light[0]) for one in light]
             return StereoPictures(MastImage(counts[0], boxes[0].corner), MastImage(counts[1], boxes[1].corner), 0.0)
@@ -120,7 +133,9 @@ class Photographer:
             detector.window(*box.corner, box.size)
             for detector, box in zip((self.detectors.left, self.detectors.right), boxes, strict=True)
         ]
-        exposure_s = self._exposure_s(scene, world_from_head, cameras[0], parts[0], light[0], brightness, time_s)
+        exposure_s = self._exposure_s(
+            _joined(scene, rover), world_from_head, cameras[0], parts[0], light[0], brightness, time_s
+        )
         images = [
             MastImage(part.with_exposure(exposure_s).expose(one, self.noise), box.corner)
             for part, one, box in zip(parts, light, boxes, strict=True)
@@ -128,9 +143,9 @@ class Photographer:
         return StereoPictures(images[0], images[1], exposure_s)
 
     def _light(
-        self, scene: Scene, world_from_head: RigidTransform, camera: CameraModel, brightness: float, time_s: float
+        self, scene: Scene, world_from_head: RigidTransform, rays: PixelRays, brightness: float, time_s: float
     ) -> Float32[np.ndarray, "rows columns"]:
-        frame = process_renderer(self.backend).render(scene, PixelRays.of(camera), world_from_head, time_s)
+        frame = process_renderer(self.backend).render(scene, rays, world_from_head, time_s)
         light: Float32[np.ndarray, "rows columns"] = frame.radiance * np.float32(brightness)
         return light
 
@@ -149,12 +164,15 @@ class Photographer:
         if self.exposure.of == "subframe":
             return auto_expose(part, light, self.exposure.auto, self.noise).detector.parameters.exposure_s
         # the whole frame, each block of pixels by its mean light, through a detector of as many pixels
-        whole = self._light(
-            replace(scene, edge_rays=1), world_from_head, camera.scaled(1.0 / _BINNED), brightness, time_s
-        )
+        binned = PixelRays.of(camera.scaled(1.0 / _BINNED))
+        whole = self._light(replace(scene, edge_rays=1), world_from_head, binned, brightness, time_s)
         block = part.response[: len(whole), : whole.shape[1]]
         judged = replace(part, response=np.resize(block, whole.shape), hot_e_s=None)
         return auto_expose(judged, whole, self.exposure.auto, self.noise).detector.parameters.exposure_s
+
+
+def _joined(scene: Scene, rover: Objects | None) -> Scene:
+    return scene if rover is None else scene.with_objects(Objects.joined([scene.objects, rover]))
 
 
 def _noise_free(light: Float32[np.ndarray, "rows columns"], reference: Float32[np.ndarray, "_ _"]) -> np.ndarray:

@@ -179,13 +179,14 @@ class _Loop:
         run, world, rig, stance = self.run, self.run.world, self.run.rig, self.run.vehicle.stance
         rig.point(aim.azimuth_rad, aim.elevation_rad)
         angles, world_from_head = rig.state.readings_rad, stance.world_from_rover * rig.rover_from_head
-        scene = world.scene(run.time_s)
-        if self.p.rover_shadow:
-            geometry, point = rig.calibrated.geometry, run.target.point_world
-            scene = world.with_rover(scene, run.vehicle.rover, stance, geometry, rig.state.true_rad, point)
+        body, mast, point = run.vehicle.rover, rig.calibrated.geometry, run.target.point_world
+        shading = (
+            world.shading(body, stance, mast, rig.state.true_rad, point, run.time_s) if self.p.rover_shadow else None
+        )
         brightness = world.brightness(run.time_s) / sunlight_of_preset(self.p.camera.preset)
+        scene = world.scene(run.time_s)
         pictures = self.photographer.take(
-            scene, world_from_head, (rig.left, rig.right), (aim.left, aim.right), brightness, run.time_s
+            scene, shading, world_from_head, (rig.left, rig.right), (aim.left, aim.right), brightness, run.time_s
         )
         measurements = RoverMeasurements(pictures.left, pictures.right, rig.calibrated, *angles, run.vehicle.estimated)
         started = time.process_time()

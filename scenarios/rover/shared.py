@@ -1,8 +1,9 @@
 """One drive, many targets: trackers that are run over the same pictures, as in sections 5.1 to 5.3 of the paper.
 
-The rover is driven as told, by the true distance of the rock's middle, and its mast points there; at every stop a part
-of both frames is taken that holds the rock and the search windows about it. A case then tracks one of the targets over
-every (skip + 1)-th stop: larger steps are made by leaving pictures out. What the tracker answers moves nothing.
+The rover is driven as told, by the true place of the point in the middle of all targets, and its mast points there; at
+every stop a part of both frames is taken that holds the rock and the search windows about it. A case then tracks one of
+the targets over every (skip + 1)-th stop: larger steps are made by leaving pictures out. What the tracker answers moves
+nothing.
 
 A drive is a function of the parameters, the campaign's seed and the run's number; processes keep the last one.
 """
@@ -108,6 +109,11 @@ class SharedDriveParameters(_Parameters):
         """The drive of the run, its tracker left out: what its pictures depend on."""
         v, p = self.variants[self.run], self.drive
         target = {"diameter_m": v.diameter_m, "height_m": v.height_m, "shape": v.shape, "yaw_deg": v.yaw_deg}
+        # the drive is about the middle of its targets
+        target |= {
+            "across": float(np.mean([one.across for one in self.targets])),
+            "up": float(np.mean([one.up for one in self.targets])),
+        }
         sun = {"azimuth_deg": v.sun_azimuth_deg, "elevation_deg": v.sun_elevation_deg}
         return p.model_copy(
             update={
@@ -158,7 +164,7 @@ def shared_drive(p: RoverScenarioParameters, margin_px: float, seed: int, campai
     )
     corners = world.target_triangles.reshape(-1, 3)
     corners = corners[corners[:, 2] > world.rocks.position_m[world.target_number, 2]]
-    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    middle = _middle_of_targets(p, world, rig, vehicle.stance)
     leg, views, time_s = p.legs[0], [], 0.0
     while True:
         time_s += p.timing.track_s
@@ -170,8 +176,17 @@ def shared_drive(p: RoverScenarioParameters, margin_px: float, seed: int, campai
         time_s += p.timing.drive_s
 
 
+def _middle_of_targets(
+    p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance: Stance
+) -> Float64[np.ndarray, "3"]:
+    """The surface point in the middle of the targets, as seen from the mast at the start."""
+    rover_from_mast = rig.calibrated.geometry.rover_from_head(0.0, 0.0)
+    eye = np.asarray((stance.world_from_rover * rover_from_mast).apply(rig.left.c.copy()))
+    return point_on(world, eye, p.target.across, p.target.up, rig.pixel_rad, p.vtt)[0]
+
+
 def _belief(rig: Rig, vehicle: Vehicle, middle: Float64[np.ndarray, "3"]) -> Belief:
-    """The rock's middle as it truly lies from the rover: the drive is the test's, not the tracker's."""
+    """The targets' middle as it truly lies from the rover: the drive is the test's, not the tracker's."""
     position = np.asarray(vehicle.stance.world_from_rover.inv().apply(middle.copy()))
     return Belief(position, rig.range_m(position))
 
@@ -192,7 +207,7 @@ def _view(
     margin_px: float,
     time_s: float,
 ) -> View:
-    """Points at the rock's middle and takes what of both frames shows the rock, and a margin."""
+    """Points at the targets' middle and takes what of both frames shows the rock, and a margin."""
     stance, known = vehicle.stance, rig.calibrated
     angles = mast_angles(np.asarray(stance.world_from_rover.inv().apply(middle.copy())), known, p.vtt.aim_pair)
     if angles is None:
@@ -201,11 +216,11 @@ def _view(
     world_from_head = stance.world_from_rover * rig.rover_from_head
     in_head = np.asarray(world_from_head.inv().apply(corners.copy()))
     boxes = (_box(rig.left, in_head, margin_px), _box(rig.right, in_head, margin_px))
-    scene = world.scene(time_s)
-    if p.rover_shadow:
-        scene = world.with_rover(scene, vehicle.rover, stance, known.geometry, rig.state.true_rad, middle)
+    rover, mast, true = vehicle.rover, known.geometry, rig.state.true_rad
+    shading = world.shading(rover, stance, mast, true, middle, time_s) if p.rover_shadow else None
+    scene, cameras = world.scene(time_s), (rig.left, rig.right)
     brightness = world.brightness(time_s) / sunlight_of_preset(p.camera.preset)
-    pictures = photographer.take(scene, world_from_head, (rig.left, rig.right), boxes, brightness, time_s)
+    pictures = photographer.take(scene, shading, world_from_head, cameras, boxes, brightness, time_s)
     return View(time_s, stance, vehicle.estimated, rig.state.readings_rad, world_from_head, pictures)
 
 
@@ -267,6 +282,23 @@ def _outcome(run: Run) -> RunOutcome:
     return RunOutcome.COMPLETED if run.stops[-1].update.found else RunOutcome.LOST
 
 
+@lru_cache(maxsize=128)
+def stays_in_view(
+    p: RoverScenarioParameters,
+    margin_px: float,
+    seed: int,
+    campaign: str,
+    run: int,
+    chosen: PointParameters,
+    options: VttOptions,
+) -> bool:
+    """Whether a target is in view all along a drive; kept, as the cases of a target ask the same."""
+    drive = shared_drive(p, margin_px, seed, campaign, run)
+    eyes = [np.asarray(one.world_from_head.apply(drive.rig.left.c.copy())) for one in drive.views]
+    point = point_on(drive.world, eyes[0], chosen.across, chosen.up, drive.rig.pixel_rad, options)[0]
+    return in_view(drive.world, point, eyes, drive.rig.pixel_rad, options)
+
+
 class SharedDriveScenario:
     """Many targets tracked over the pictures of one drive."""
 
@@ -286,10 +318,9 @@ class SharedDriveScenario:
         """One target of one run, tracked with one step."""
         p = _checked(parameters)
         of_run = p.of_run()
-        drive = shared_drive(of_run, p.margin_px, streams.seed, streams.campaign, p.run)
-        run = tracked(p, drive)
+        shared = (of_run, p.margin_px, streams.seed, streams.campaign, p.run)
+        run = tracked(p, shared_drive(*shared))
         case = of_run.model_copy(update={"algorithm": p.drive.algorithm, "vtt": p.drive.vtt, "score": p.drive.score})
-        eyes = [np.asarray(one.world_from_head.apply(drive.rig.left.c.copy())) for one in drive.views]
         bands: dict[str, Scalar] = {one.name: bool(one.least <= p.step <= one.most) for one in p.bands}
         row = {
             **score(case, run),
@@ -303,7 +334,7 @@ class SharedDriveScenario:
             "step": p.step,
             "with_scale": p.drive.algorithm != "pure-ncc" and p.drive.vtt.scale,
             "pure_ncc": p.drive.algorithm == "pure-ncc",
-            "in_view": in_view(drive.world, run.target.point_world, eyes, drive.rig.pixel_rad, p.drive.vtt),
+            "in_view": stays_in_view(*shared, p.targets[p.target], p.drive.vtt),
             **bands,
             **stored_updates(run, p.drive.score.stored_updates),
             **provenance(case, run),

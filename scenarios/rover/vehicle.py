@@ -55,7 +55,7 @@ class Vehicle:
         left = np.array([-ahead[1], ahead[0]])
         base = rig.calibrated.geometry.base_m
         target = np.array([p.world.east_m, p.world.north_m])
-        place = target + p.start.distance_m * away - base[0] * ahead - base[1] * left
+        place = target + (world.face_m(p) + p.start.distance_m) * away - base[0] * ahead - base[1] * left
         ground = _felt_ground(p, world)
         stance = settle(rover, ground, float(place[0]), float(place[1]), float(azimuth))
         odometer = Odometer.drawn(p.odometry, stance.world_from_rover, streams.generator("odometry"))

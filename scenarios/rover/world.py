@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
+from scenarios.rover.points import Sight
 from scenarios.views import Eye, SiteGround, site_scene
 from sim.dynamics import RoverParameters, Stance
 from sim.frames import direction
 from sim.measurements import MastGeometry
-from sim.render import CloudLayer, Objects, Scene, Sun, rover_objects
+from sim.render import CloudLayer, Objects, Scene, Sun, may_shade, rover_objects
 from sim.streams import Streams
 from sim.terrain import PlacedRock, RockField, RockParameters, Site, Surface, TerrainBank, TerrainParameters, site
 from sim.terrain.landforms import Ramp
@@ -33,9 +34,9 @@ RAMP_SHARE = 0.4
 CLEARED_M = 2.0
 #: Rocks lie at least this far from the outline of one that was placed.
 FREE_M = 0.05
-#: Middle of the rover above the ground and the radius of a sphere about it, metres; how far from the target a subframe
-#: shows, over its distance: 6 deg are more than half the diagonal of 161 pixels of a navcam.
-ROVER_MIDDLE_M, ROVER_REACH_M, SEEN_SHARE = 0.8, 1.6, 0.11
+#: How far from the target a subframe shows, over its distance: 8 deg are more than half the diagonal of what is taken
+#: of a navcam's right frame.
+SEEN_SHARE = 0.14
 _ROCK_ARRAYS = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up")
 
 
@@ -160,35 +161,38 @@ class RunWorld:
         numbers = list(self.rocks.names.values())
         return np.column_stack([self.rocks.position_m[numbers, :2], self.rocks.diameter_m[numbers]])
 
+    def face_m(self, p: RoverScenarioParameters) -> float:
+        """How far before the rock's middle the designated point lies, along the horizontal line to the start, metres.
+
+        As seen from about where the rover will stand: from the start's distance, an eye's height above the rock's foot.
+        """
+        bearing, foot = p.bearing_rad, self.rocks.position_m[self.target_number]
+        away = np.array([np.sin(bearing), np.cos(bearing), 0.0])
+        eye = foot + (p.start.distance_m + 0.5 * p.target.diameter_m) * away + np.array([0.0, 0.0, EYE_HEIGHT_M])
+        point = Sight.of(self.target_triangles, eye, float(foot[2])).point(p.target.across, p.target.up)
+        return float((point - foot) @ away)
+
     def scene(self, time_s: float) -> Scene:
         """The scene at a time of the run, without the rover. The sun is held for `SunParameters.held_s`."""
         step = self.sun.step(time_s)
         if self._latest is None or self._latest[0] != step:
             sun = self.sun.held(step, self.site.environment.sun_radius_rad)
-            self._latest = (step, replace(self.base, sun=sun, photometry=self.ground.photometry(sun)))
+            self._latest = (step, self.base.in_light(sun, self.ground.photometry(sun)))
         return self._latest[1]
 
-    def with_rover(
+    def shading(
         self,
-        scene: Scene,
         rover: RoverParameters,
         stance: Stance,
         mast: MastGeometry,
         angles_rad: tuple[float, float],
         target_m: Float64[np.ndarray, "3"],
-    ) -> Scene:
-        """The scene with the rover in it, whose shadow may fall on what a subframe about the target shows.
-
-        Where its shadow stays clear of that it is left out: it would change nothing, and costs a new search tree.
-        """
-        middle = stance.world_from_rover.translation + np.array([0.0, 0.0, ROVER_MIDDLE_M])
-        away = target_m - middle
-        behind = -float(away @ scene.sun.direction)
-        beside = float(np.linalg.norm(away + behind * scene.sun.direction))
-        if behind < 0.0 or beside > ROVER_REACH_M + SEEN_SHARE * float(np.linalg.norm(away)):
-            return scene
+        time_s: float,
+    ) -> Objects | None:
+        """The rover, where its shadow may fall on what a subframe about the target shows; None where it stays clear."""
         body = rover_objects(rover, stance, mast, *angles_rad)
-        return replace(scene, objects=Objects.joined([scene.objects, body]))
+        seen_m = SEEN_SHARE * float(np.linalg.norm(target_m - stance.world_from_rover.translation))
+        return body if may_shade(body, self.scene(time_s).sun.direction, target_m, seen_m) else None
 
     def brightness(self, time_s: float) -> float:
         """Direct sunlight on the ground over that at 1 AU."""

@@ -41,6 +41,8 @@ _TREAD_RAD = np.radians(np.linspace(-72.0, 72.0, 25))
 _TREAD_LINES = np.array([-0.5, 0.0, 0.5])
 #: Steps of the six numbers in which derivatives are taken: metres and radians.
 _DIFFERENCE = 1e-6
+#: Steps of Newton's method before another is asked, and the gap at which a wheel is on the ground.
+_NEWTON_STEPS, _CLOSED_M = 12, 1e-10
 
 
 @runtime_checkable
@@ -217,10 +219,10 @@ def settle(
         A stance close by, from which the solution starts; by default from level on the ground's height.
     """
     frame = _Frame(rover, ground, np.array([east_m, north_m]), 0.5 * np.pi - azimuth_rad)
-    solved = least_squares(frame.gaps, frame.start(near), jac=frame.gap_slopes, method="lm", xtol=1e-8, ftol=1e-12)
-    differential, left, right = (float(angle) for angle in solved.x[3:])
-    pose = rigid(frame.rotation(solved.x[None])[0], np.array([east_m, north_m, solved.x[0]]))
-    return Stance(pose, differential, (left, right), solved.fun)
+    unknown, gaps = frame.solved(frame.start(near))
+    differential, left, right = (float(angle) for angle in unknown[3:])
+    pose = rigid(frame.rotation(unknown[None])[0], np.array([east_m, north_m, unknown[0]]))
+    return Stance(pose, differential, (left, right), gaps)
 
 
 def wheel_centres(
@@ -278,15 +280,39 @@ class _Frame:
         yaw = np.full(len(unknown), self.yaw_rad)
         return Rotation.from_euler("ZYX", np.stack([yaw, -unknown[:, 1], unknown[:, 2]], axis=1))
 
+    def solved(self, start: Float64[np.ndarray, "6"]) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6"]]:
+        """What closes the gaps, and what is left of them: by Newton's method, which needs few steps on most ground.
+
+        A wheel's lowest place jumps along its tread; where that leads the method astray, and where no stance has all
+        wheels on the ground, Levenberg-Marquardt finds the least gaps.
+        """
+        unknown = start
+        for _ in range(_NEWTON_STEPS):
+            gaps, slopes = self.gaps_and_slopes(unknown)
+            if float(np.abs(gaps).max()) < _CLOSED_M:
+                return unknown, gaps
+            try:
+                unknown = unknown - np.linalg.solve(slopes, gaps)
+            except np.linalg.LinAlgError:
+                break
+        found = least_squares(self.gaps, start, jac=self.gap_slopes, method="lm", xtol=1e-8, ftol=1e-12)
+        return found.x, found.fun
+
     def gaps(self, unknown: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6"]:
         gaps: Float64[np.ndarray, "6"] = self._gaps(unknown[None])[0]
         return gaps
 
     def gap_slopes(self, unknown: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6 6"]:
-        beside = np.concatenate([unknown - _DIFFERENCE * np.eye(6), unknown + _DIFFERENCE * np.eye(6)])
-        low, high = np.split(self._gaps(beside), 2)
-        slopes: Float64[np.ndarray, "6 6"] = ((high - low) / (2.0 * _DIFFERENCE)).T
-        return slopes
+        return self.gaps_and_slopes(unknown)[1]
+
+    def gaps_and_slopes(
+        self, unknown: Float64[np.ndarray, "6"]
+    ) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 6"]]:
+        """The gaps, and by differences how they change with each unknown."""
+        beside = _DIFFERENCE * np.eye(6)
+        all_gaps = self._gaps(np.concatenate([unknown[None], unknown - beside, unknown + beside]))
+        slopes: Float64[np.ndarray, "6 6"] = ((all_gaps[7:] - all_gaps[1:7]) / (2.0 * _DIFFERENCE)).T
+        return all_gaps[0], slopes
 
     def _gaps(self, unknown: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
         """Least height of each wheel's tread above the ground."""

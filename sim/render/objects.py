@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64, Int32, Int64
+from jaxtyping import Bool, Float64, Int32, Int64
 
 from sim.render.kernels.hierarchy import Hierarchy, morton_codes, node_boxes
 
@@ -87,9 +87,7 @@ class Objects:
             albedo=np.concatenate([part.albedo for part in parts]),
             names=np.concatenate([part.names for part in parts]),
         )
-        # a body keeps its sphere: a scene's thousands of rocks are not gone through again for the rover that joins them
-        whole.__dict__["spheres"] = np.concatenate([part.spheres for part in parts])
-        return whole
+        return _with_spheres(whole, np.concatenate([part.spheres for part in parts]))
 
     @classmethod
     def none(cls) -> Objects:
@@ -110,18 +108,51 @@ class Objects:
         self, apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_angle_rad: float
     ) -> Int64[np.ndarray, "kept"]:
         """Numbers of the triangles of all bodies whose spheres reach into a cone."""
-        away = self.spheres[:, :3] - apex
-        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
-        beside = np.arccos(np.clip(away @ axis / distance, -1.0, 1.0))
-        widening = np.arcsin(np.clip(self.spheres[:, 3] / distance, 0.0, 1.0))
-        kept = beside <= half_angle_rad + np.where(distance <= self.spheres[:, 3], np.pi, widening)
+        kept = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
         return np.flatnonzero(np.repeat(kept, np.diff(self.first_triangle)))
+
+    def only(self, kept: Bool[np.ndarray, "bodies"]) -> Objects:
+        """Some of the bodies, which are counted anew."""
+        counts = np.diff(self.first_triangle)
+        triangles = np.flatnonzero(np.repeat(kept, counts))
+        some = Objects(
+            triangles=self.triangles[triangles],
+            normals=self.normals[triangles],
+            body_of_triangle=np.repeat(np.arange(np.count_nonzero(kept), dtype=np.int32), counts[kept]),
+            first_triangle=np.concatenate([[0], np.cumsum(counts[kept])]).astype(np.int64),
+            albedo=self.albedo[kept],
+            names=self.names[kept],
+        )
+        return _with_spheres(some, self.spheres[kept])
 
     @cached_property
     def hierarchy(self) -> Hierarchy:
         """The tree in which shadows look for triangles."""
         order = np.argsort(morton_codes(self.triangles), kind="stable")
         return self.triangles, order, node_boxes(self.triangles, order)
+
+
+def spheres_in_cone(
+    spheres: Float64[np.ndarray, "bodies 4"],
+    apex: Float64[np.ndarray, "3"],
+    axis: Float64[np.ndarray, "3"],
+    half_angle_rad: float,
+) -> Bool[np.ndarray, "bodies"]:
+    """Which spheres reach into a cone."""
+    away = spheres[:, :3] - apex
+    distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+    beside = np.arccos(np.clip(away @ axis / distance, -1.0, 1.0))
+    widening = np.arcsin(np.clip(spheres[:, 3] / distance, 0.0, 1.0))
+    reaching: Bool[np.ndarray, "bodies"] = beside <= half_angle_rad + np.where(
+        distance <= spheres[:, 3], np.pi, widening
+    )
+    return reaching
+
+
+def _with_spheres(objects: Objects, spheres: Float64[np.ndarray, "bodies 4"]) -> Objects:
+    """Objects whose spheres are known: a scene's thousands of rocks are not gone through again for each rover there."""
+    objects.__dict__["spheres"] = spheres
+    return objects
 
 
 def _spheres(

@@ -7,9 +7,11 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
+from scipy.spatial.transform import RigidTransform
 
 from sim.camera import CameraModel
 from sim.render.backend import RenderingError
+from sim.render.reach import Cone
 
 #: Samples along each side of the pinhole views: a camera takes the first that leaves `_SPARE_PX` of them beside its own
 #: pixels, and the last where none does (full frames of 1024 x 1024 and 45 deg are drawn at about their own resolution).
@@ -89,6 +91,11 @@ class PixelRays:
     def half_angle_rad(self) -> float:
         """Widest angle of a ray from the axis, radians."""
         return float(np.arccos(np.clip((self.directions @ self.axis).min(), -1.0, 1.0)))
+
+    def cone(self, world_from_body: RigidTransform) -> Cone:
+        """What holds all rays where the camera stands so."""
+        tip, axis = world_from_body.apply(self.centre.copy()), world_from_body.rotation.apply(self.axis.copy())
+        return tip, axis, self.half_angle_rad
 
     @classmethod
     def of(cls, camera: CameraModel) -> PixelRays:

@@ -1,13 +1,16 @@
-"""Where things may shade the ground: what spares most of a wide picture's pixels the search for what hides the sun."""
+"""Where things may shade what pictures show: what need not be looked for, or drawn."""
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation
 
 from sim.render.kernels.shading import Reach
+from sim.render.objects import spheres_in_cone
 
+#: A cone: where its tip is, the unit vector along its middle, and its half angle in radians.
+Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]
 #: Most cells along a side.
 SIDE = 512
 #: No place is spared the search.
@@ -46,3 +49,31 @@ def shade_reach(spheres: Float64[np.ndarray, "bodies 4"], sun: Float64[np.ndarra
     column, row = np.floor((places - corner) / cell).astype(int).T
     touched[row, column] = True
     return binary_dilation(touched, np.ones((3, 3), dtype=np.bool_)), float(corner[0]), float(corner[1]), 1.0 / cell
+
+
+def concerned(
+    spheres: Float64[np.ndarray, "bodies 4"],
+    sun: Float64[np.ndarray, "3"],
+    lowest_m: float,
+    cone: Cone,
+) -> Bool[np.ndarray, "bodies"]:
+    """Which bodies a picture within a cone may show, or show the shadows of: all others may as well not be there.
+
+    What a body hides from the sun lies within its radius of a line from its middle away from the sun, which ends where
+    all of it is below the lowest ground. A sphere about that line and the body is held against the cone.
+
+    Parameters
+    ----------
+    spheres
+        Centre and radius of a sphere about each body, metres.
+    sun
+        Unit vector towards the sun; where it is not above the horizon there are no shadows.
+    lowest_m
+        Bound of the ground's height.
+    cone
+        What the picture shows lies in it.
+    """
+    tops = np.maximum(spheres[:, 2] + spheres[:, 3] - lowest_m, 0.0)
+    half = 0.5 * tops / sun[2] if sun[2] > 0.0 else np.zeros(len(spheres))
+    about = np.column_stack([spheres[:, :3] - half[:, None] * sun, spheres[:, 3] + half])
+    return spheres_in_cone(about, *cone)

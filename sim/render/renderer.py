@@ -9,6 +9,7 @@ Distortion is therefore exact and not a resampling of a pinhole picture.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
@@ -27,7 +28,7 @@ from sim.render.mesh import graded_offsets, ground_mesh, lines_in_view
 from sim.render.objects import Objects
 from sim.render.photometry import Photometry, Sun, Texture
 from sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
-from sim.render.reach import EVERYWHERE, shade_reach
+from sim.render.reach import EVERYWHERE, Cone, concerned, shade_reach
 from sim.terrain import Surface
 
 NO_TEXTURE = Texture()
@@ -91,6 +92,27 @@ class Scene:
     def mesh_offsets(self) -> Float64[np.ndarray, "lines"]:
         """Offsets of the mesh's lines from the centre."""
         return graded_offsets(self.mesh_reach_m, self.mesh_finest_m, self.mesh_lines)
+
+    def with_objects(self, objects: Objects) -> Scene:
+        """The same ground in the same light with other things on it; what was found of the ground is kept."""
+        return self._knowing(replace(self, objects=objects), "mesh_offsets", "height_range_m", "shadow")
+
+    def in_light(self, sun: Sun, photometry: Photometry) -> Scene:
+        """The same ground with the same things on it under another sun."""
+        return self._knowing(replace(self, sun=sun, photometry=photometry), "mesh_offsets", "height_range_m")
+
+    def _knowing(self, other: Scene, *found: str) -> Scene:
+        """Another scene, with what was found of this one and holds for it too."""
+        other.__dict__.update({name: getattr(self, name) for name in found})
+        return other
+
+    def within(self, cones: Sequence[Cone]) -> Scene:
+        """The scene with those objects alone that pictures within these cones may show, or show the shadows of."""
+        sun, lowest = np.asarray(self.sun.direction, dtype=np.float64), self.height_range_m[0]
+        kept = np.zeros(len(self.objects), dtype=np.bool_)
+        for cone in cones:
+            kept |= concerned(self.objects.spheres, sun, lowest, cone)
+        return self.with_objects(self.objects.only(kept))
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:

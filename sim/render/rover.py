@@ -73,8 +73,7 @@ def may_shade(
 ) -> bool:
     """Whether bodies can hide the sun from any point within a radius of a place: false is certain, true is not.
 
-    A rover joined with a scene's rocks makes their tree of triangles be built anew at every stop; this tells where it
-    cannot matter to what a picture shows.
+    Drawing a rover that cannot matter to what a picture shows takes time for nothing.
     """
     away = objects.spheres[:, :3] - place_m
     along = away @ sun_direction

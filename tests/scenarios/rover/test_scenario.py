@@ -67,6 +67,32 @@ def test_the_designated_point_is_where_the_picture_shows_it() -> None:
     assert np.linalg.norm(around - run.target.point_world, axis=1).min() < 0.008
 
 
+@pytest.mark.parametrize("diameter_m", [0.07, 1.2])
+def test_the_start_is_as_far_from_the_point_as_is_asked(diameter_m: float) -> None:
+    """From the mast to the designated point, however large its rock is; the run ends as far from it as is asked."""
+    target = {**SHORT["target"], "diameter_m": diameter_m, "across": 0.3, "up": 0.5}
+    run = run_case(parameters(target=target), streams(4))
+    first, last = run.stops[0], run.stops[-1]
+    mast = first.stance.world_from_rover.apply(np.append(run.rig.calibrated.geometry.base_m[:2], 0.0))
+    # to the side of the line it is a little further
+    assert np.hypot(*(run.target.point_world - mast)[:2]) == pytest.approx(3.6, abs=0.06)
+    assert np.hypot(*(run.target.point_world - last.stance.world_from_rover.translation)[:2]) == pytest.approx(
+        3.3, abs=0.06
+    )
+
+
+def test_targets_may_be_on_small_rocks_but_on_no_occluding_edge() -> None:
+    """The template reaches over a rock of 7 cm at 3.6 m, but shows the ground close behind; over a large rock's top it
+    shows what lies far behind, over its foot the ground before it."""
+    chosen = {
+        (diameter, up): run_case(
+            parameters(target={**SHORT["target"], "diameter_m": diameter, "up": up}), streams(5)
+        ).target.on_edge
+        for diameter, up in ((0.07, 0.5), (1.2, 0.5), (1.2, 0.97), (1.2, 0.03))
+    }
+    assert chosen == {(0.07, 0.5): False, (1.2, 0.5): False, (1.2, 0.97): True, (1.2, 0.03): False}
+
+
 def test_exact_instruments_leave_the_match_alone() -> None:
     exact = {
         "camera": {"detector_noise": False},
@@ -133,6 +159,6 @@ def test_trackers_share_the_pictures_of_a_drive() -> None:
     other = tracked(SharedDriveParameters.model_validate({**stated, "target": 1}), drive)
     assert other.stops[0].point_px[0] > drive.views[0].pictures.left.corner[0]
     assert other.stops[0].pictures is drive.views[0].pictures
-    # The camera keeps its distance from the target and goes around it.
+    # The camera keeps its distance from the targets' middle and goes around it.
     ranges = [stop.range_m for stop in other.stops]
     assert np.ptp(ranges) < 0.15

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenarios.views import Eye, SiteGround, nadir_pose, site_scene
+from scenarios.views import Eye, SiteGround, mast_pose, nadir_pose, site_scene
 from sim.frames import direction
-from sim.render import PixelRays, Sun, process_renderer
+from sim.render import Objects, PixelRays, Sun, process_renderer
 from sim.render.backend import default_backend
 from sim.render.reach import EVERYWHERE, shade_reach
 from sim.sensor import preset
@@ -67,3 +67,25 @@ def test_pictures_are_the_same_with_and_without() -> None:
     whole = process_renderer(default_backend()).render(unlimited, rays, pose)
     np.testing.assert_array_equal(limited.radiance, whole.radiance)
     assert not scene.reach[0].all()
+
+
+@pytest.mark.parametrize("elevation", [0.25, 1.0])
+def test_a_picture_is_the_same_with_what_concerns_it_alone(elevation: float) -> None:
+    """Bit for bit: a subframe from a mast among rocks under a low and a high sun, from either side."""
+    terrain = ROCKY.model_copy(update={"spacing_m": 0.05, "rms_slope_deg": 5.0, "slope_baseline_m": 1.0})
+    terrain = terrain.model_copy(update={"outer_scale_m": 10.0, "craters_per_km2": 0.0})
+    rocks = RockParameters(abundance=0.1, smallest_m=0.05)
+    ground = SiteGround.of(site("gusev").model_copy(update={"descent": terrain.model_copy(update={"rocks": rocks})}))
+    rays = PixelRays.of(preset("research-navcam").cameras()[0].cropped(400, 380, (161, 161)))
+    pose = mast_pose(ground.surface, 12.0, 11.0, 1.5, 30.0, -14.0)
+    for azimuth in (0.5, 3.0):
+        eye = Eye(12.0, 11.0, 1.5, float(np.median(rays.pixel_angles)), 0.5, 1.2, 25.0)
+        scene = site_scene(ground, eye, Sun(direction(azimuth, elevation)))
+        near = scene.within([rays.cone(pose)])
+        assert 0 < len(near.objects) < 0.5 * len(scene.objects)
+        whole, some = (process_renderer(default_backend()).render(one, rays, pose) for one in (scene, near))
+        np.testing.assert_array_equal(some.radiance, whole.radiance)
+        np.testing.assert_array_equal(some.range_m, whole.range_m)
+        # what is known of bodies stays with them
+        again = Objects(**{name: getattr(near.objects, name) for name in Objects.__dataclass_fields__})
+        np.testing.assert_array_equal(near.objects.spheres, again.spheres)
