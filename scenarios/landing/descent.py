@@ -6,6 +6,7 @@ import numpy as np
 
 from algorithms.interface import SiteEstimate
 from scenarios.interface import Scalar
+from scenarios.landing.faults import stuck_range_m
 from scenarios.landing.flight import Flight
 from scenarios.landing.helicopter import Touchdown, land
 from scenarios.landing.parameters import LandingScenarioParameters
@@ -25,7 +26,8 @@ def landing_row(
 
     `touchdown_error_gps_m` is the distance of the receiver's averaged solutions from the site's coordinates, as the
     paper measured it; `touchdown_error_m` that of the true touchdown from where these coordinates led it, the error of
-    the navigation at the first picture taken off; `touchdown_safe` whether it stands safely. Without a site, or in a
+    the navigation at the first picture taken off; `touchdown_safe` whether it stands safely, `touchdown_sink_m_s` and
+    `touchdown_drift_m_s` how fast it came down and went sideways. Without a site, or in a
     case that states its pair and flies no helicopter, there is no landing.
     """
     landed = _landed(p, estimate, flight, truth, streams)
@@ -43,6 +45,8 @@ def landing_row(
         landed.turns,
         landed.moved_m,
         landed.time_s - flight.states[1].time_s,
+        -float(landed.state.velocity_m_s[2]),
+        float(np.hypot(*landed.state.velocity_m_s[:2])),
     )
     return {"landed": True, **place_row("touchdown", place[:2], truth), **dict(zip(_NUMBERS, numbers, strict=True))}
 
@@ -57,6 +61,8 @@ _NUMBERS = (
     "landing_turns",
     "landing_moved_m",
     "landing_after_s",
+    "touchdown_sink_m_s",
+    "touchdown_drift_m_s",
 )
 
 
@@ -68,4 +74,4 @@ def _landed(
     relief = truth.relief
     ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
     unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
-    return land(flight.transit, estimate.site_world, ground, unit, streams)
+    return land(flight.transit, estimate.site_world, ground, unit, streams, stuck_range_m(p.faults, p.height_m))

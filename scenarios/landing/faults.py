@@ -9,17 +9,22 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float64, UInt16
+from jaxtyping import Float64, Int64, UInt16
 from pydantic import BaseModel, ConfigDict, Field
 
+from scenarios.landing.helicopter import HelicopterParameters
 from sim.sensor import DetectorParameters
+from sim.sensor.rtk import Outage
 
 Size = Annotated[float, Field(ge=0.0)]
 Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 
 class Faults(BaseModel):
-    """Faults of a flight. A size of 0 is no fault."""
+    """Faults of a flight. A size of 0 is no fault.
+
+    Lost pictures and outages of the receiver are those of a helicopter that is flown.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -30,15 +35,25 @@ class Faults(BaseModel):
     lost_rows: Annotated[
         Size, Field(le=1.0, description="share of the second picture's rows that is lost, from below")
     ] = 0.0
-    laser_silent: Annotated[int, Field(ge=0, le=1, description="1: the altimeter gives no range")] = 0
+    lost_pictures: Annotated[
+        float, Field(ge=0.0, le=1.0, description="share of a flight's pictures that is lost; two always arrive")
+    ] = 0.0
+    laser_silent: Annotated[int, Field(ge=0, le=1, description="1: the altimeter gives no range, to the ground")] = 0
     laser_stuck: Annotated[
-        Size, Field(le=5.0, description="share by which a stuck altimeter's range is too long: it is from before")
+        Size,
+        Field(
+            le=5.0, description="share by which the range that a stuck altimeter repeats is above the flight's height"
+        ),
     ] = 0.0
     gps_outage_s: Annotated[
-        Size, Field(le=600.0, description="how long the receiver has been without fixes at the first picture, s")
+        Size,
+        Field(le=300.0, description="how long the receiver has been silent at the first picture, and stays so, s"),
     ] = 0.0
     bad_pixels: Annotated[
         Size, Field(le=0.5, description="share of pixels that are dead, and of those that are hot")
+    ] = 0.0
+    listed_bad_pixels: Annotated[
+        Size, Field(le=0.5, description="the same, where the camera has a list of them and fills them")
     ] = 0.0
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
     own_shadow_m: Annotated[Size, Field(le=100.0, description="diameter of the disc that casts the own shadow, m")] = (
@@ -59,10 +74,34 @@ def faulty_detector(faults: Faults, detector: DetectorParameters) -> DetectorPar
     changes: dict[str, BaseModel] = {}
     if faults.dust_discs:
         changes["optics"] = detector.optics.model_copy(update={"dust_discs": faults.dust_discs})
-    if faults.bad_pixels:
-        bad = {"dead_share": faults.bad_pixels, "hot_share": faults.bad_pixels}
+    share = max(faults.bad_pixels, faults.listed_bad_pixels)
+    if share:
+        bad = {"dead_share": share, "hot_share": share, "listed": share == faults.listed_bad_pixels}
         changes["defects"] = detector.defects.model_copy(update=bad)
     return detector.model_copy(update=changes)
+
+
+def faulty_helicopter(faults: Faults, helicopter: HelicopterParameters) -> HelicopterParameters:
+    """The helicopter with its receiver's outage: from before the first picture until after the landing.
+
+    It hovers for as much longer before, so that its filter starts with the receiver as in any other flight.
+    """
+    if not faults.gps_outage_s:
+        return helicopter
+    transit, rtk = helicopter.transit, helicopter.rtk
+    outage = Outage(start_s=-faults.gps_outage_s, duration_s=faults.gps_outage_s + helicopter.received_s[1])
+    return helicopter.model_copy(
+        update={
+            "transit": transit.model_copy(update={"hover_s": transit.hover_s + faults.gps_outage_s}),
+            "rtk": rtk.model_copy(update={"outages": (*rtk.outages, outage)}),
+        }
+    )
+
+
+def arrived_numbers(faults: Faults, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "n"]:
+    """Numbers of a flight's pictures that arrive, at least two, in order."""
+    kept = max(2, count - round(faults.lost_pictures * count))
+    return np.sort(rng.permutation(count)[:kept]).astype(np.int64)
 
 
 def delivered(faults: Faults, pictures: Pictures) -> list[UInt16[np.ndarray, "rows columns"]]:
@@ -78,22 +117,16 @@ def delivered(faults: Faults, pictures: Pictures) -> list[UInt16[np.ndarray, "ro
     return arrived
 
 
-def faulty_range(faults: Faults, range_m: float) -> float:
-    """The altimeter's range, or what it gives instead."""
-    return float("nan") if faults.laser_silent else range_m * (1.0 + faults.laser_stuck)
+def faulty_ranges(faults: Faults, ranges_m: Float64[np.ndarray, "n"], height_m: float) -> Float64[np.ndarray, "n"]:
+    """The altimeter's ranges from a flight's height, or what it gives instead."""
+    stuck = stuck_range_m(faults, height_m)
+    if stuck is None:
+        return ranges_m
+    return np.full_like(ranges_m, np.nan if np.isinf(stuck) else stuck)
 
 
-#: How an inertial unit of this class drifts without fixes: bias of its accelerometers, m/s2, as a tactical unit's.
-OUTAGE_ACCELERATION_M_S2 = 0.01
-
-
-def outage_errors(
-    faults: Faults, interval_s: float, rng: np.random.Generator
-) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-    """What an outage adds to the first pose's position and to the motion between the pictures, metres, drawn.
-
-    A constant error of acceleration a makes a t^2 / 2 of position and a t of velocity.
-    """
-    acceleration = OUTAGE_ACCELERATION_M_S2 * rng.standard_normal(3)
-    since = faults.gps_outage_s
-    return 0.5 * since**2 * acceleration, since * interval_s * acceleration
+def stuck_range_m(faults: Faults, height_m: float) -> float | None:
+    """What the altimeter says whatever the range is, infinite if it is silent; None if it works."""
+    if faults.laser_silent:
+        return float("inf")
+    return height_m * (1.0 + faults.laser_stuck) if faults.laser_stuck else None

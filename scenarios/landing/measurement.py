@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenarios.landing.faults import faulty_range
+from scenarios.landing.faults import faulty_ranges
 from scenarios.landing.flight import Flight
 from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.landing.pictures import Pair
@@ -17,7 +17,7 @@ def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: S
     """The measurements of a case. The a-priori site is the ground on the first picture's optical axis."""
     unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
     reading = unit.readings(np.zeros(1), np.array([pair.axis_range_m]), streams.generator("laser noise"))
-    slant = faulty_range(p.faults, float(reading.values[0]))
+    slant = float(faulty_ranges(p.faults, reading.values, p.height_m)[0])
     ahead = pair.axis_range_m * pair.images[0].camera.a
     return LandingMeasurements(
         images=pair.images,

@@ -1,12 +1,13 @@
-"""What goes wrong in a detector and its cable: hot and dead pixels, bursts of noise."""
+"""What goes wrong in a detector and its cable: hot and dead pixels, and the list that hides them; bursts of noise."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, UInt16
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.ndimage import uniform_filter
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -22,6 +23,9 @@ class DefectParameters(BaseModel):
         NonNegative, Field(description="mean dark current of a hot pixel at 0 deg C, electrons per second")
     ] = 20000.0
     dead_share: Annotated[Share, Field(description="share of pixels without response")] = 0.0
+    listed: Annotated[
+        bool, Field(description="whether the camera has a list of them all, and fills them from their neighbours")
+    ] = False
 
 
 class BurstParameters(BaseModel):
@@ -49,6 +53,19 @@ def hot_currents(
     current = np.zeros(shape, dtype=np.float32)
     current[hot] = parameters.hot_e_s * rng.standard_exponential(int(hot.sum()), dtype=np.float32)
     return current
+
+
+def filled(
+    counts: UInt16[np.ndarray, "rows columns"], bad: Bool[np.ndarray, "rows columns"]
+) -> UInt16[np.ndarray, "rows columns"]:
+    """Counts with the bad pixels replaced by the mean of those of their eight neighbours that are good, if any are."""
+    good = np.where(bad, 0.0, 1.0)
+    total, share = (uniform_filter(values, 3, mode="constant") for values in (good * counts, good))
+    # means of nine: where there is one good neighbour the share is 1/9
+    known = bad & (share > 0.5 / 9.0)
+    repaired = counts.copy()
+    repaired[known] = np.rint(total[known] / share[known]).astype(np.uint16)
+    return repaired
 
 
 def add_bursts(

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, UInt16
+from jaxtyping import Bool, Float, Float32, Float64, UInt16
 
 from sim.measurements import DetectorCalibration
 from sim.sensor.companding import compand, expand
-from sim.sensor.defects import add_bursts, dead_pixels, hot_currents
+from sim.sensor.defects import add_bursts, dead_pixels, filled, hot_currents
 from sim.sensor.motion import ImageMotion, moving_exposure
 from sim.sensor.optics import dust_transmission, natural_fall_off, spread
 from sim.sensor.parameters import DetectorParameters
@@ -33,12 +33,15 @@ class Detector:
     hot_e_s
         Dark current of each physical pixel at 0 deg C beyond the common one, electrons per second; None without hot
         pixels.
+    listed
+        Delivered pixels that are filled from their neighbours; None without a list of bad pixels.
     """
 
     parameters: DetectorParameters
     response: Float32[np.ndarray, "rows columns"]
     calibration: DetectorCalibration
     hot_e_s: Float32[np.ndarray, "rows columns"] | None = None
+    listed: Bool[np.ndarray, "delivered_rows columns"] | None = None
 
     @classmethod
     def drawn(
@@ -64,11 +67,13 @@ class Detector:
         )
         defects, optics = parameters.defects, parameters.optics
         hot = None if defects.hot_share == 0.0 else hot_currents(fall_off.shape, defects, rng)
-        if defects.dead_share > 0.0:
-            response = np.where(dead_pixels(fall_off.shape, defects, rng), np.float32(0.0), response)
+        dead = None if defects.dead_share == 0.0 else dead_pixels(fall_off.shape, defects, rng)
+        if dead is not None:
+            response = np.where(dead, np.float32(0.0), response)
         if optics.dust_discs > 0:
             response = response * dust_transmission(fall_off.shape, optics, rng)
-        return cls(parameters, response.astype(np.float32), calibration, hot)
+        listed = _listed(hot, dead, parameters)
+        return cls(parameters, response.astype(np.float32), calibration, hot, listed)
 
     def with_exposure(self, exposure_s: float) -> Detector:
         """The same detector set to another exposure time, which its calibration states."""
@@ -108,6 +113,7 @@ class Detector:
             response=np.ascontiguousarray(self.response[part]),
             calibration=replace(self.calibration, flat_field=known),
             hot_e_s=hot,
+            listed=None if self.listed is None else self.listed[row // count : (row + size[1]) // count, part[1]],
         )
 
     def expose(
@@ -137,6 +143,8 @@ class Detector:
         delivered: UInt16[np.ndarray, "delivered_rows columns"] = np.clip(np.rint(counts), 0, p.full_scale_dn).astype(
             np.uint16
         )
+        if self.listed is not None:
+            delivered = filled(delivered, self.listed)
         return expand(compand(delivered, p.full_scale_dn), p.full_scale_dn) if p.companded else delivered
 
     def charge(
@@ -183,6 +191,21 @@ def dark_seconds(parameters: DetectorParameters, rows: int) -> Float64[np.ndarra
     waits = parameters.readout_row_s * np.arange(rows // parameters.rows_summed, dtype=np.float64)
     seconds: Float64[np.ndarray, "delivered_rows"] = waits + parameters.exposure_s + rows * parameters.transfer_row_s
     return seconds
+
+
+def _listed(
+    hot_e_s: Float32[np.ndarray, "rows columns"] | None,
+    dead: Bool[np.ndarray, "rows columns"] | None,
+    parameters: DetectorParameters,
+) -> Bool[np.ndarray, "delivered_rows columns"] | None:
+    """Delivered pixels that hold a hot or dead one, if the camera has a list of them."""
+    bad = [one for one in (None if hot_e_s is None else hot_e_s > 0.0, dead) if one is not None]
+    if not (parameters.defects.listed and bad):
+        return None
+    listed: Bool[np.ndarray, "delivered_rows columns"] = (
+        _sum_rows(np.logical_or.reduce(bad).astype(np.float32), parameters.rows_summed) > 0.0
+    )
+    return listed
 
 
 def _sum_rows(picture: Float[np.ndarray, "rows columns"], count: int) -> Float[np.ndarray, "summed columns"]:
