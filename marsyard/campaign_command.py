@@ -103,12 +103,20 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Estimate time and disk from a few trial cases, and run nothing else.")
     ] = False,
+    until_decided: Annotated[
+        bool,
+        typer.Option(
+            "--until-decided",
+            help="Take the number of cases as the most: look at the verdicts on the way, and stop when decided.",
+        ),
+    ] = False,
     override: SetOption = None,
     algorithm: AlgorithmOption = None,
 ) -> None:
     """Run a campaign, judge its requirements, and write its report."""
     from campaigns.definition.loading import load_campaign
     from campaigns.running.engine import run_campaign
+    from marsyard.deciding import run_until_decided
 
     crew = _crew(jobs, cluster)
     limits = [] if case_time is None else [f"limits.case_time_s={case_time}"]
@@ -117,7 +125,8 @@ def run(
         _print_estimate(loaded, crew)
         return
     directory = out if out is not None else _default_directory(loaded.configuration.name)
-    _carry_out(directory, lambda watch: run_campaign(loaded, directory, crew, watch))
+    start = run_until_decided if until_decided else run_campaign
+    _carry_out(directory, lambda watch: start(loaded, directory, crew, watch))
 
 
 @says_what_is_wrong
@@ -139,11 +148,13 @@ def resume(
 ) -> None:
     """Run the cases that an interrupted or killed campaign still lacks, and judge it; finished cases stay."""
     from campaigns.running.engine import resume_campaign
+    from marsyard.deciding import go_on_until_decided
 
     crew, words = _crew(jobs, cluster), _outcomes(retry or [])
 
     def go_on(watch: Watch) -> None:
         resume_campaign(directory, crew, watch, retry=words, case_time_s=case_time, allow_changed=allow_changed)
+        go_on_until_decided(directory, crew, watch)
 
     _carry_out(directory, go_on)
 
@@ -157,8 +168,12 @@ def append(
     allow_changed: ChangedOption = False,
 ) -> None:
     """Add a block of cases to a finished campaign, run them, and judge all; the cases that are there stay."""
+    from campaigns.errors import CampaignError
     from campaigns.running.engine import append_cases
+    from campaigns.store.record import stored_configuration
 
+    if stored_configuration(directory).most_cases is not None:
+        raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
     crew = _crew(jobs, cluster)
     _carry_out(directory, lambda watch: append_cases(directory, cases, crew, watch, allow_changed=allow_changed))
 

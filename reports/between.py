@@ -2,7 +2,7 @@
 
 Where both ran the same draws (name, seed, dispersions) cases are compared in pairs: rates by McNemar's exact test,
 errors by Wilcoxon's signed ranks. Otherwise terrain by terrain (`reports.statistics.changes`). The p are corrected for
-number by Holm's method.
+their number by Holm's method.
 """
 
 from __future__ import annotations

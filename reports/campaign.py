@@ -17,13 +17,16 @@ from reports.columns import label, numbers, primary_metric
 from reports.comparison import comparison_section
 from reports.conditions import conditions_section
 from reports.consistency import consistency_section
+from reports.convergence import convergence_section
 from reports.dimes.carried import carried_section
 from reports.dimes.fieldtest import field_test_section
 from reports.dimes.landing import landing_section
 from reports.dimes.sensitivity import sensitivity_section
+from reports.drivers import drivers_section
 from reports.faults import faults_section
 from reports.hda.every import HDA_SECTIONS
 from reports.sampled import sampled
+from reports.scatter import scatter_section
 from reports.section import Section, SectionMaker, Subject
 from reports.stored import StoredRun, read_run
 from reports.systems import shown_cases
@@ -53,6 +56,9 @@ FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
     goal_section,
     answers_section,
     comparison_section,
+    scatter_section,
+    drivers_section,
+    convergence_section,
     consistency_section,
     faults_section,
     carried_section,

@@ -12,10 +12,11 @@ import pandas as pd
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import MaxNLocator
 
 from reports.columns import axis_columns, category_column, label, magnitude_label, numbers, split_unit
+from reports.statistics.plane import error_ellipse
 from reports.svg import (
     INK,
     LARGEST_VECTOR_SAMPLE,
@@ -28,9 +29,14 @@ from reports.svg import (
 )
 from reports.tables import answered_outcomes, outcome_counts
 from reports.verdicts import ENGINE_FAILURES
+from reports.wording import stated
 
+#: Probability of the ellipse about the errors.
+ELLIPSE = 0.95
 #: Errors beyond this many times the bound are drawn at the edge, or one of them would hide all others.
 _FARTHEST = 3.0
+#: Cases behind a point of a conditional curve, and how many points it has at least and at most.
+_CASES_PER_POINT, _FEWEST_POINTS, _MOST_POINTS = 25, 4, 16
 
 
 @dataclass(frozen=True)
@@ -92,6 +98,12 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
         axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
         if bound <= reach * math.sqrt(2.0):  # else the circle lies outside of all four corners
             axes.plot([], [], "--", color=REQUIREMENT, label=f"requirement {bound:g} {split_unit(metric)[1]}")
+    ellipse = error_ellipse(points, ELLIPSE)
+    if ellipse is not None:
+        outline: dict[str, Any] = {"fill": False, "color": INK, "linewidth": 1.4, "linestyle": ":", "zorder": 3}
+        size = (2.0 * ellipse.semi_major, 2.0 * ellipse.semi_minor)
+        axes.add_patch(Ellipse(ellipse.centre, *size, angle=ellipse.angle_deg, **outline))
+        axes.plot([], [], ":", color=INK, label=f"{stated(ELLIPSE)} ellipse")
     _cross(axes)
     axes.set(xlim=(-reach * 1.04, reach * 1.04), ylim=(-reach * 1.04, reach * 1.04), aspect="equal")
     axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))
@@ -164,12 +176,24 @@ def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | 
     for kind in categories(frame, metric, bound):
         chosen = kind.chosen & known
         _draw_points(axes, x[chosen], np.minimum(magnitude[chosen], top), kind)
+    _conditional_curves(axes, x[known], np.minimum(magnitude[known], top))
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
     raster = bool(silent.sum() > LARGEST_VECTOR_SAMPLE)
     axes.plot(x[silent], np.full(silent.sum(), top), "|", color=INK, markersize=9, clip_on=False, rasterized=raster)
     axes.set(xlabel=label(driver), ylabel=magnitude_label(metric), ylim=(0.0, top))
     return figure
+
+
+def _conditional_curves(axes: Axes, x: Float[np.ndarray, " n"], magnitude: Float[np.ndarray, " n"]) -> None:
+    """Median (full) and 95 % quantile (dotted) of the errors in bins of as many cases each; none of few cases."""
+    bins = min(magnitude.size // _CASES_PER_POINT, _MOST_POINTS)
+    if bins < _FEWEST_POINTS:
+        return
+    parts = np.array_split(np.argsort(x, kind="stable"), bins)
+    middles = [float(np.median(x[part])) for part in parts]
+    for quantile, line in ((0.5, "-"), (0.95, ":")):
+        axes.plot(middles, [float(np.quantile(magnitude[part], quantile)) for part in parts], line, color=INK, zorder=4)
 
 
 @in_page_style

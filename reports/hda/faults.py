@@ -27,10 +27,12 @@ NAMES: Mapping[str, tuple[str, str | None]] = MappingProxyType(
         "black_picture": ("picture delivered black", "number"),
         "repeated_picture": ("first picture delivered again", None),
         "lost_rows": ("rows of the second picture lost", "share"),
+        "lost_pictures": ("pictures of the flight lost", "share"),
         "laser_silent": ("altimeter silent", None),
-        "laser_stuck": ("altimeter stuck, range too long by", "share"),
-        "gps_outage_s": ("no GPS for", "s"),
+        "laser_stuck": ("altimeter stuck at a height greater by", "share"),
+        "gps_outage_s": ("no GPS from before the pictures on", "s"),
         "bad_pixels": ("dead pixels, and as many hot ones", "share"),
+        "listed_bad_pixels": ("the same, listed and filled", "share"),
         "dust_discs": ("specks of dust on the lens", "number"),
         "own_shadow_m": ("own shadow in view", "m"),
         "several": ("several", None),
@@ -50,6 +52,8 @@ class LandingFault:
         Flights; truly safe sites, `no safe site`, not converged, sites that are not safe, not run to their end.
     wrong_share
         Wrong ones of all.
+    off_m, sink_m_s
+        Medians over the landings: true touchdown from the site, and speed of sinking then; NaN where nothing landed.
     """
 
     fault: str
@@ -61,6 +65,8 @@ class LandingFault:
     wrong: int
     unfinished: int
     wrong_share: Share
+    off_m: float
+    sink_m_s: float
 
 
 def landing_faults_section(subject: Subject) -> Section | None:
@@ -71,7 +77,8 @@ def landing_faults_section(subject: Subject) -> Section | None:
     caption = "Full: a truly safe site. Hatched: no safe site. Dotted: not converged. Crossed: a site that is not safe."
     note = (
         "Not converged: said so, and the a-priori site is what is left. Wrong: a site was reported as safe and is not, "
-        f"with the interval of its share at {stated(CONFIDENCE)}. 'No safe site' may be right: rows tell no difference."
+        f"with the interval of its share at {stated(CONFIDENCE)}. 'No safe site' may be right: rows tell no difference. "
+        "Touchdown off: median distance of the true touchdown from where the site was; sinking: median speed then."
     )
     blocks = [Block(plates=[plate(fault_bars(rows), "hdafaults", caption)]), Block(grid=_grid(rows), note=note)]
     data = {"rows": [asdict(row) for row in rows]}
@@ -105,7 +112,15 @@ def _row(chosen: pd.DataFrame, fault: str, size: float) -> LandingFault:
         wrong=int((reported & ~safe).sum()),
         unfinished=int((~finished).sum()),
         wrong_share=share_of(reported & ~safe, chosen),
+        off_m=_median(chosen, "touchdown_error_m"),
+        sink_m_s=_median(chosen, "touchdown_sink_m_s"),
     )
+
+
+def _median(chosen: pd.DataFrame, name: str) -> float:
+    values = numbers(chosen, name)
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else float("nan")
 
 
 @in_page_style
@@ -142,11 +157,13 @@ def _named(row: LandingFault) -> tuple[str, str]:
 
 def _grid(rows: list[LandingFault]) -> Grid:
     head = ["Fault", "Size", "Flights", "Safe site", "No safe site", "Not converged", "Wrong", "Wrong, interval"]
+    head += ["Touchdown off (m)", "Sinking (m/s)"]
     texts = []
     for row in rows:
         name, size = _named(row)
         counts = [
             f"{count:,} ({percent(count / row.n)})" for count in (row.safe, row.refused, row.unconverged, row.wrong)
         ]
-        texts.append([name, size or NOTHING, f"{row.n:,}", *counts, interval_text(row.wrong_share)])
+        landing = [NOTHING if np.isnan(value) else f"{value:.2f}" for value in (row.off_m, row.sink_m_s)]
+        texts.append([name, size or NOTHING, f"{row.n:,}", *counts, interval_text(row.wrong_share), *landing])
     return Grid(head, texts)
