@@ -77,7 +77,8 @@ def landing_faults_section(subject: Subject) -> Section | None:
     caption = "Full: a truly safe site. Hatched: no safe site. Dotted: not converged. Crossed: a site that is not safe."
     note = (
         "Not converged: said so, and the a-priori site is what is left. Wrong: a site was reported as safe and is not, "
-        f"with the interval of its share at {stated(CONFIDENCE)}. 'No safe site' may be right: rows tell no difference. "
+        f"with the interval of its share at {stated(CONFIDENCE)}. 'No safe site' may be right: rows tell no "
+        "difference. "
         "Touchdown off: median distance of the true touchdown from where the site was; sinking: median speed then."
     )
     blocks = [Block(plates=[plate(fault_bars(rows), "hdafaults", caption)]), Block(grid=_grid(rows), note=note)]

@@ -56,9 +56,10 @@ class Faults(BaseModel):
         Size, Field(le=0.5, description="the same, where the camera has a list of them and fills them")
     ] = 0.0
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
-    own_shadow_m: Annotated[Size, Field(le=100.0, description="diameter of the disc that casts the own shadow, m")] = (
-        0.0
-    )
+    own_shadow_m: Annotated[
+        Size,
+        Field(le=100.0, description="diameter of the disc that casts the own shadow, m; the sun is nearer the zenith"),
+    ] = 0.0
 
     @property
     def name_and_size(self) -> tuple[str, float]:
@@ -67,6 +68,14 @@ class Faults(BaseModel):
         if len(present) > 1:
             return "several", float("nan")
         return present[0] if present else ("none", 0.0)
+
+
+def faulty_sun_deg(faults: Faults, elevation_deg: float) -> float:
+    """The sun's elevation: where the own shadow is to be seen its distance from the zenith is a quarter.
+
+    A camera that looks down sees the shadow only if the sun is nearer to the zenith than half of its angle of view.
+    """
+    return 90.0 - 0.25 * (90.0 - elevation_deg) if faults.own_shadow_m else elevation_deg
 
 
 def faulty_detector(faults: Faults, detector: DetectorParameters) -> DetectorParameters:

@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from scenarios.landing.faults import faulty_sun_deg
 from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.optics import Optics
 from scenarios.views import Eye, SiteGround, site_scene
@@ -49,7 +50,7 @@ class World:
         )
         ground = replace(ground, site=p.preset.model_copy(update={"ground_texture": textured}))
         air = p.preset.environment
-        elevation = float(np.radians(p.sun.elevation_deg))
+        elevation = float(np.radians(faulty_sun_deg(p.faults, p.sun.elevation_deg)))
         sun = Sun(direction(np.radians(p.sun.azimuth_deg), elevation), air.sun_radius_rad)
         return cls(ground, sun, air.direct_share(elevation) * air.solar_irradiance)
 
