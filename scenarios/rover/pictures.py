@@ -133,9 +133,7 @@ class Photographer:
             detector.window(*box.corner, box.size)
             for detector, box in zip((self.detectors.left, self.detectors.right), boxes, strict=True)
         ]
-        exposure_s = self._exposure_s(
-            _joined(scene, rover), world_from_head, cameras[0], parts[0], light[0], brightness, time_s
-        )
+        exposure_s = self._exposure_s(scene, rover, world_from_head, cameras[0], parts[0], light[0], brightness, time_s)
         images = [
             MastImage(part.with_exposure(exposure_s).expose(one, self.noise), box.corner)
             for part, one, box in zip(parts, light, boxes, strict=True)
@@ -152,6 +150,7 @@ class Photographer:
     def _exposure_s(
         self,
         scene: Scene,
+        rover: Objects | None,
         world_from_head: RigidTransform,
         camera: CameraModel,
         part: Detector,
@@ -165,7 +164,8 @@ class Photographer:
             return auto_expose(part, light, self.exposure.auto, self.noise).detector.parameters.exposure_s
         # the whole frame, each block of pixels by its mean light, through a detector of as many pixels
         binned = PixelRays.of(camera.scaled(1.0 / _BINNED))
-        whole = self._light(replace(scene, edge_rays=1), world_from_head, binned, brightness, time_s)
+        drawn = replace(_joined(scene, rover), edge_rays=1)
+        whole = self._light(drawn, world_from_head, binned, brightness, time_s)
         block = part.response[: len(whole), : whole.shape[1]]
         judged = replace(part, response=np.resize(block, whole.shape), hot_e_s=None)
         return auto_expose(judged, whole, self.exposure.auto, self.noise).detector.parameters.exposure_s
