@@ -11,8 +11,17 @@ from typing import Any
 import numpy as np
 
 from algorithms.faults import AlgorithmError, Fault
-from algorithms.interface import SiteEstimate, SiteOutcome, TargetUpdate, TrackingState, VelocityEstimate
+from algorithms.interface import (
+    MastAim,
+    PixelBox,
+    SiteEstimate,
+    SiteOutcome,
+    TargetUpdate,
+    TrackingState,
+    VelocityEstimate,
+)
 from algorithms.interface import VelocityOutcome as Outcome
+from sim.measurements import MastCalibration
 
 #: Share of its largest variance by which a covariance may be off symmetry.
 _ROUNDING = 1e-9
@@ -68,6 +77,35 @@ def checked_update(answer: object) -> TargetUpdate:
     if answer.position_rover is not None:
         _check_numbers("position_rover", answer.position_rover, (3,))
     return answer
+
+
+def checked_aim(answer: object, mast: MastCalibration) -> MastAim | None:
+    """The answer, if it is None or a valid `MastAim` for this mast; raises as `checked_velocity`."""
+    if answer is None:
+        return None
+    if not isinstance(answer, MastAim):
+        raise _bad(f"the aim is a {_kind(answer)}; allowed: a MastAim, or None")
+    limits = {
+        "azimuth_rad": mast.geometry.azimuth_limits_rad,
+        "elevation_rad": mast.geometry.elevation_limits_rad,
+    }
+    for name, (least, most) in limits.items():
+        angle = getattr(answer, name)
+        if not isinstance(angle, float | int) or not least <= angle <= most:
+            raise _bad(f"{name} is {angle!r}; allowed: {least:g} to {most:g}")
+    for name, camera in (("left", mast.left), ("right", mast.right)):
+        _check_box(name, getattr(answer, name), camera.size)
+    return answer
+
+
+def _check_box(name: str, box: Any, size: tuple[int, int]) -> None:
+    """Raises where a box is no part of a frame of this size."""
+    if not isinstance(box, PixelBox):
+        raise _bad(f"{name} is a {_kind(box)}; allowed: a PixelBox")
+    for corner, extent, whole in zip(box.corner, box.size, size, strict=True):
+        whole_numbers = all(isinstance(one, int | np.integer) for one in (corner, extent))
+        if not whole_numbers or corner < 0 or extent < 1 or corner + extent > whole:
+            raise _bad(f"{name} is {box.corner} and {box.size}; allowed: a part of the frame of {size} pixels")
 
 
 def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> None:

@@ -118,15 +118,15 @@ def run(
     from campaigns.running.engine import run_campaign
     from marsyard.deciding import run_until_decided
 
-    crew = _crew(jobs, cluster)
+    crew = make_crew(jobs, cluster)
     limits = [] if case_time is None else [f"limits.case_time_s={case_time}"]
     loaded = load_campaign(campaign, [*(override or []), *limits], cases, seed, algorithm or [])
     if dry_run:
         _print_estimate(loaded, crew)
         return
-    directory = out if out is not None else _default_directory(loaded.configuration.name)
+    directory = out if out is not None else default_directory(loaded.configuration.name)
     start = run_until_decided if until_decided else run_campaign
-    _carry_out(directory, lambda watch: start(loaded, directory, crew, watch))
+    carry_out(directory, lambda watch: start(loaded, directory, crew, watch))
 
 
 @says_what_is_wrong
@@ -150,13 +150,13 @@ def resume(
     from campaigns.running.engine import resume_campaign
     from marsyard.deciding import go_on_until_decided
 
-    crew, words = _crew(jobs, cluster), _outcomes(retry or [])
+    crew, words = make_crew(jobs, cluster), _outcomes(retry or [])
 
     def go_on(watch: Watch) -> None:
         resume_campaign(directory, crew, watch, retry=words, case_time_s=case_time, allow_changed=allow_changed)
         go_on_until_decided(directory, crew, watch)
 
-    _carry_out(directory, go_on)
+    carry_out(directory, go_on)
 
 
 @says_what_is_wrong
@@ -174,8 +174,8 @@ def append(
 
     if stored_configuration(directory).most_cases is not None:
         raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
-    crew = _crew(jobs, cluster)
-    _carry_out(directory, lambda watch: append_cases(directory, cases, crew, watch, allow_changed=allow_changed))
+    crew = make_crew(jobs, cluster)
+    carry_out(directory, lambda watch: append_cases(directory, cases, crew, watch, allow_changed=allow_changed))
 
 
 @says_what_is_wrong
@@ -236,7 +236,7 @@ def console(*, stderr: bool = False) -> Console:
     return Console(stderr=stderr)
 
 
-def _crew(jobs: int | None, cluster: str | None) -> Crew:
+def make_crew(jobs: int | None, cluster: str | None) -> Crew:
     """Who runs a campaign, as the options say."""
     from campaigns.errors import CampaignError
     from campaigns.execution.crew import Crew
@@ -260,29 +260,37 @@ def _outcomes(words: Sequence[str]) -> list[str]:
     return list(RETRYABLE) if "all" in words else list(words)
 
 
-def _carry_out(directory: Path, work: Callable[[Watch], None]) -> None:
+def carry_out(directory: Path, work: Callable[[Watch], None]) -> None:
     """Does a campaign's work and judges it; where it is interrupted says how to go on."""
+    from marsyard.outcome import conclude
+
+    with shown_progress(directory, f"marsyard resume {directory}") as progress:
+        work(progress)
+    raise typer.Exit(conclude(directory, console()))
+
+
+@contextmanager
+def shown_progress(directory: Path, to_go_on: str) -> Iterator[Watch]:
+    """Shows how far the work in a folder is; where it is interrupted says how to go on, and ends with status 130."""
     from campaigns.errors import CampaignError
     from campaigns.store.record import read
-    from marsyard.outcome import conclude
     from marsyard.progress import campaign_progress
 
     try:
-        with _stopped_by_signals(), campaign_progress(console(stderr=True)) as progress:
-            work(progress)
+        with stopped_by_signals(), campaign_progress(console(stderr=True)) as progress:
+            yield progress
     except KeyboardInterrupt:
         try:
             stored = read(directory)
             said = f"the rows so far are in {directory} ({stored['cases_finished']} of {stored['cases']})"
         except CampaignError:
             raise typer.Exit(Exit.INTERRUPTED) from None
-        typer.echo(f"interrupted; {said}. To go on: marsyard resume {directory}", err=True)
+        typer.echo(f"interrupted; {said}. To go on: {to_go_on}", err=True)
         raise typer.Exit(Exit.INTERRUPTED) from None
-    raise typer.Exit(conclude(directory, console()))
 
 
 @contextmanager
-def _stopped_by_signals() -> Iterator[None]:
+def stopped_by_signals() -> Iterator[None]:
     """Has the first Ctrl-C or SIGTERM stop the work; those after it do not disturb the end."""
 
     def stop(number: int, _frame: object) -> None:
@@ -330,7 +338,7 @@ def _size(count: float) -> str:
     return f"{count:.0f} bytes"
 
 
-def _default_directory(name: str) -> Path:
+def default_directory(name: str) -> Path:
     """A folder that is not there yet: ``runs/<campaign>-<UTC time>``, with a number behind it in a busy second."""
     from datetime import UTC, datetime
 

@@ -22,7 +22,9 @@ from marsyard.campaign_command import (
     run,
     says_what_is_wrong,
 )
+from marsyard.conformance_command import conformance
 from marsyard.gallery_command import gallery
+from marsyard.offline_command import export, score
 from marsyard.render_command import render
 from marsyard.report_command import compare, report
 from marsyard.terrain_command import app as terrain
@@ -41,6 +43,9 @@ for command in (run, resume, append, report, compare, replay):
     app.command()(command)
 app.command()(render)
 app.command()(gallery)
+app.command()(conformance)
+for command in (export, score):
+    app.command()(command)
 
 
 @app.command(name="list")

@@ -6,7 +6,8 @@ An algorithm is named by
   `marsyard.algorithms`; where both have it Marsyard's own is meant;
 - ``module:Class``, or ``module:function``: what is found there is called without arguments and gives the algorithm. The
   module may lie in the current folder;
-- ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: a program of its own (docs/own-algorithms.md).
+- ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: a program of its own (docs/own-algorithms.md);
+- ``answers:FILE.csv``: one that was run elsewhere (`scenarios.offline`).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from typing import Any, Generic, TypeVar, cast
 from algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
 from algorithms.dimes import DimesEstimator, DimesOptions
 from algorithms.exchange import (
+    PREFIXES,
     Command,
     ExecutableLimits,
     ExecutableSiteEstimator,
@@ -33,7 +35,8 @@ from algorithms.hda import HdaEstimator, HdaOptions
 from algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
 from algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
-from scenarios.dotted import found_at
+from scenarios.dotted import found_at, sources_at
+from scenarios.offline import SITE_FORM, VELOCITY_FORM, OfflineForm, check_offline, is_offline, made_offline
 
 #: Entry points of other packages' algorithms.
 GROUP = "marsyard.algorithms"
@@ -58,6 +61,8 @@ class Task(Generic[Algorithm, Options]):
         How each algorithm that ships is made from the options of the paper's own.
     executable
         How a program becomes one; None where programs cannot.
+    offline
+        How its answers stand in a table; None where each answer decides what is seen next.
     """
 
     name: str
@@ -65,10 +70,14 @@ class Task(Generic[Algorithm, Options]):
     methods: tuple[str, ...]
     shipped: Mapping[str, Callable[[Options], Algorithm]]
     executable: Callable[[Command, ExecutableLimits], Algorithm] | None
+    offline: OfflineForm[Any] | None = None
 
     def check(self, spec: str) -> None:
         """Raises ValueError where there is no algorithm of this name for the task; the message says what is allowed."""
         if spec in self.shipped or self._command(spec) is not None:
+            return
+        if is_offline(spec):
+            check_offline(spec, self._form(spec))
             return
         found = self._class(spec)
         missing = [method for method in self.methods if not hasattr(found, method)]
@@ -77,14 +86,26 @@ class Task(Generic[Algorithm, Options]):
         if missing and isinstance(found, type):
             raise ValueError(f"'{spec}' is no {self.what}: it has no {', '.join(missing)}")
 
-    def make(self, spec: str, options: Options, limits: ExecutableLimits) -> Algorithm:
-        """The algorithm of a name. Raises ValueError where there is none, and whatever making a user's own raises."""
+    def make(self, spec: str, options: Options, limits: ExecutableLimits, case: int = 0) -> Algorithm:
+        """The algorithm of a name. Raises ValueError where there is none, and whatever making a user's own raises.
+
+        `case` is the case's number, of which only the tables of algorithms that are run elsewhere know.
+        """
         if spec in self.shipped:
             return self.shipped[spec](options)
+        if is_offline(spec):
+            return cast(Algorithm, made_offline(spec, self._form(spec), case))
         command = self._command(spec)
         if command is not None and self.executable is not None:
             return self.executable(command, limits)
         return cast(Algorithm, self._class(spec)())
+
+    def _form(self, spec: str) -> OfflineForm[Any]:
+        if self.offline is None:
+            raise ValueError(
+                f"'{spec}': a {self.what} cannot be run elsewhere, as each of its answers decides what it sees next"
+            )
+        return self.offline
 
     def _command(self, spec: str) -> Command | None:
         command = command_of(spec)
@@ -129,6 +150,7 @@ VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
         "homography": lambda _: HomographyEstimator(),
     },
     executable=ExecutableVelocityEstimator,
+    offline=VELOCITY_FORM,
 )
 
 TRACKING: Task[TargetTracker, VttOptions] = Task(
@@ -145,6 +167,7 @@ LANDING: Task[SiteEstimator, HdaOptions] = Task(
     methods=("estimate",),
     shipped={"hda": HdaEstimator, "essential-matrix": EssentialMatrixEstimator, "semi-global": SemiGlobalEstimator},
     executable=ExecutableSiteEstimator,
+    offline=SITE_FORM,
 )
 
 TASKS: Mapping[str, Task[Any, Any]] = {task.name: task for task in (VELOCITY, TRACKING, LANDING)}
@@ -154,6 +177,14 @@ TASKS: Mapping[str, Task[Any, Any]] = {task.name: task for task in (VELOCITY, TR
 def installed() -> Mapping[str, EntryPoint]:
     """Algorithms that installed packages name, in the order of their names."""
     return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+
+
+def sources_of(spec: str) -> list[tuple[str, Path]]:
+    """The sources of an algorithm of one's own in Python, by their names; none of one that ships, or of a program."""
+    path = installed()[spec].value if spec in installed() else spec
+    ours = any(spec in task.shipped for task in TASKS.values())
+    named = ":" in path and not ours and not is_offline(spec) and not spec.startswith(tuple(PREFIXES))
+    return list(sources_at(path)) if named else []
 
 
 def check_chosen(task: Task[Any, Any], specs: Sequence[str]) -> None:
@@ -183,7 +214,7 @@ def labels(specs: Sequence[str]) -> tuple[str, ...]:
 
 def _short(spec: str) -> str:
     """The last part of a name, as an identifier."""
-    program = re.match(r"(?:exec|serve):\s*(\S+)", spec)
+    program = re.match(r"(?:exec|serve|answers|export):\s*(\S+)", spec)
     last = Path(program[1]).stem if program else spec.rpartition(":")[2]
     label = re.sub(r"\W", "_", last, flags=re.ASCII)
     return label if label[:1].isalpha() else f"a_{label}"

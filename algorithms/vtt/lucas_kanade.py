@@ -32,11 +32,14 @@ def match_by_lucas_kanade(
     before = cut_patch(sighting.image, sighting.pixel, side, change)
     half, reach = (options.template_px - 1) // 2, (side - 1) // 2
     template = before[reach - half : reach + half + 1, reach - half : reach + half + 1]
+    # both pictures of one size, as OpenCV asks: the window is cut where the frame ends
+    rows, columns = window.shape
+    after = np.pad(window.astype(np.float64), ((0, side - rows), (0, side - columns)), mode="edge")
     start = np.full((1, 1, 2), reach, dtype=np.float32)
     guess = (predicted - corner).astype(np.float32).reshape(1, 1, 2)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         _eight_bits(before),
-        _eight_bits(window.astype(np.float64)),
+        _eight_bits(after),
         start,
         guess.copy(),
         winSize=(options.template_px, options.template_px),

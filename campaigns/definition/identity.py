@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
 import platform
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import metadata
@@ -17,15 +16,17 @@ from typing import Any, Self
 
 from algorithms.exchange import command_of
 from campaigns.definition.configuration import CampaignConfiguration
-from scenarios.estimators import installed
+from scenarios.dotted import relative_to
+from scenarios.estimators import sources_of
 from scenarios.interface import TakesAlgorithms
+from scenarios.offline import answers_file
 from scenarios.registry import UnknownScenarioError, scenario
 
 #: Folders of ours whose code rows depend on; what reports and commands do changes no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")
 
 #: Keys of a configuration that change no row of a case that comes to its end.
-_OF_NO_EFFECT = frozenset({"appended", "description", "limits", "requirements", "retain"})
+_OF_NO_EFFECT = frozenset({"appended", "description", "limits", "most_cases", "requirements", "retain"})
 
 _HOME = Path(__file__).resolve().parents[2]
 
@@ -112,12 +113,16 @@ def code_hash(named: tuple[str, ...]) -> str:
 def _own_sources() -> Iterator[tuple[str, Path]]:
     """Our code, and the constants that lie beside it."""
     for folder in _CODE:
-        yield from _named(_HOME, sorted((_HOME / folder).rglob("*.py")))
-        yield from _named(_HOME, sorted((_HOME / folder).rglob("*.json")))
+        yield from relative_to(_HOME, sorted((_HOME / folder).rglob("*.py")))
+        yield from relative_to(_HOME, sorted((_HOME / folder).rglob("*.json")))
 
 
 def _foreign_sources(named: str) -> Iterator[tuple[str, Path]]:
-    """The package or module of what is given as `module:Class` or by an entry point; a program's own file."""
+    """The package or module of what is given as `module:Class` or by an entry point; a program's or a table's file."""
+    table = answers_file(named)
+    if table is not None:
+        yield table.name, table
+        return
     try:
         command = command_of(named)
     except ValueError:
@@ -127,23 +132,8 @@ def _foreign_sources(named: str) -> Iterator[tuple[str, Path]]:
         words = [Path(word) for word in (program, *command.words[1:]) if word is not None]
         yield from ((path.name, path) for path in words if path.is_file())
         return
-    path = installed()[named].value if named in installed() else named
-    if ":" not in path:
-        return
-    top = path.partition(":")[0].partition(".")[0]
-    found = importlib.util.find_spec(top)
-    if found is None or found.origin is None:
-        return
-    origin = Path(found.origin)
-    if found.submodule_search_locations:
-        yield from _named(origin.parent.parent, sorted(origin.parent.rglob("*.py")))
-    else:
-        yield origin.name, origin
-
-
-def _named(base: Path, paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
-    for path in paths:
-        yield path.relative_to(base).as_posix(), path
+    # a scenario of one's own is named in the same way
+    yield from sources_of(named)
 
 
 def package_versions() -> dict[str, str]:

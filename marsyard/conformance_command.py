@@ -1,0 +1,78 @@
+"""`marsyard conformance`: an algorithm put to its protocol's suite."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marsyard.campaign_command import Exit, console, says_what_is_wrong
+
+if TYPE_CHECKING:
+    from scenarios.conformance import Finding, Subject
+
+
+@says_what_is_wrong
+def conformance(
+    algorithm: Annotated[
+        str, typer.Argument(metavar="ALGORITHM", help="A name, module:Class, exec:PROGRAM or serve:PROGRAM.")
+    ],
+    task: Annotated[
+        str | None,
+        typer.Option(
+            "--task",
+            metavar="TASK",
+            help="velocity, tracking or landing; by default what its methods tell, and velocity of a program.",
+        ),
+    ] = None,
+    time_limit: Annotated[
+        float, typer.Option("--time-limit", metavar="S", help="Seconds that one answer may take.", min=0.1)
+    ] = 60.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Put an algorithm to its protocol's suite: right types, no change of inputs, an outcome for any picture, ..."""
+    from campaigns.running.conformance import examine, subject_of
+
+    subject = subject_of(algorithm, task, time_limit)
+    findings = []
+    if not as_json:
+        typer.echo(f"{algorithm} as an algorithm for {subject.task}")
+    for finding in examine(subject):
+        findings.append(finding)
+        if not as_json:
+            _print(finding)
+    if as_json:
+        typer.echo(json.dumps(_plain(subject, findings), indent=2))
+    else:
+        failed = sum(not finding.passed for finding in findings)
+        typer.echo(f"{len(findings) - failed} of {len(findings)} checks passed")
+    if not all(finding.passed for finding in findings):
+        raise typer.Exit(Exit.FAILED)
+
+
+def _print(finding: Finding) -> None:
+    word = "[green]ok  [/]" if finding.passed else "[bold red]FAIL[/]"
+    console().print(f"{word} {finding.check:<14}", end="", highlight=False)
+    note = f" ({finding.note})" if finding.note else ""
+    console().print(f"{finding.asked}{note}", markup=False, highlight=False, soft_wrap=True)
+    if not finding.passed:
+        for line in (finding.problem, f"next: {finding.next_step}"):
+            console().print(f"{'':20}{line}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _plain(subject: Subject, findings: Sequence[Finding]) -> dict[str, object]:
+    checks = [
+        {
+            "check": one.check,
+            "asked": one.asked,
+            "passed": one.passed,
+            "problem": one.problem,
+            "next_step": one.next_step,
+            "note": one.note,
+        }
+        for one in findings
+    ]
+    passed = all(one.passed for one in findings)
+    return {"algorithm": subject.spec, "task": subject.task, "passed": passed, "checks": checks}

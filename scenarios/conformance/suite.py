@@ -1,0 +1,101 @@
+"""The suite of each task, check by check."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from algorithms.dimes import DimesOptions
+from algorithms.exchange import PREFIXES, ExecutableLimits
+from algorithms.hda import HdaOptions
+from algorithms.vtt import VttOptions
+from scenarios.conformance import estimators, inputs, surfaces, trackers
+from scenarios.conformance.findings import Check, Finding
+from scenarios.dotted import found_at
+from scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
+
+_INPUTS: Mapping[str, Sequence[Callable[[], object]]] = {
+    "velocity": [inputs.descent],
+    "landing": [inputs.landing],
+    "tracking": [trackers.mast, surfaces.texture],
+}
+_OPTIONS = {"velocity": DimesOptions, "tracking": VttOptions, "landing": HdaOptions}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An algorithm to be examined.
+
+    Attributes
+    ----------
+    spec
+        How it is named; see `scenarios.estimators`.
+    task
+        The name of its task.
+    limit_s
+        Longest time that an answer may take.
+    """
+
+    spec: str
+    task: str
+    limit_s: float
+
+    def checks(self) -> Iterator[Check]:
+        """The task's suite for it."""
+        task: Task[Any, Any] = TASKS[self.task]
+        limits = ExecutableLimits(time_s=self.limit_s)
+        program = self.spec.startswith(tuple(PREFIXES))
+
+        def make() -> Any:
+            return task.make(self.spec, _OPTIONS[self.task](), limits)
+
+        if task is TRACKING:
+            return trackers.TrackerSuite(make, self.spec, program, self.limit_s).checks()
+        protocol = estimators.VELOCITY if task is VELOCITY else estimators.LANDING
+        return estimators.EstimatorSuite(protocol, make, self.spec, program, self.limit_s).checks()
+
+    def prepare(self) -> None:
+        """Loads and compiles what the suite itself needs, and the algorithm's code."""
+        task: Task[Any, Any] = TASKS[self.task]
+        task.check(self.spec)
+        for one in _INPUTS[self.task]:
+            one()
+
+
+def check_names(subject: Subject) -> list[tuple[str, str]]:
+    """The checks that a subject is put to: their names, and what they ask for."""
+    return [(check.name, check.asked) for check in subject.checks()]
+
+
+def run_check(subject: Subject, number: int) -> Finding:
+    """Does one check."""
+    return list(subject.checks())[number].finding()
+
+
+def task_of(spec: str) -> str:
+    """The task that an algorithm is for, as far as its name, its methods or their annotations tell; else velocity.
+
+    Raises
+    ------
+    ValueError
+        Where there is no such algorithm.
+    """
+    shipped = next((task.name for task in TASKS.values() if spec in task.shipped), None)
+    if shipped is not None:
+        return shipped
+    if spec.startswith(tuple(PREFIXES)):
+        return VELOCITY.name
+    path = installed()[spec].value if spec in installed() else spec
+    if ":" not in path:
+        VELOCITY.check(spec)
+    try:
+        found = found_at(path)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"no algorithm at '{spec}': {error}") from error
+    if hasattr(found, "designate"):
+        return TRACKING.name
+    annotations = inspect.get_annotations(getattr(found, "estimate", None) or found)
+    landing = any("Landing" in str(one) or "Site" in str(one) for one in annotations.values())
+    return LANDING.name if landing else VELOCITY.name

@@ -1,0 +1,252 @@
+"""The checks of target trackers: a drive towards a textured wall, with what can go wrong on the way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from algorithms.answers import checked_aim, checked_update
+from algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
+from algorithms.vtt.pointing import mast_angles
+from scenarios.conformance.findings import BreachError, Check
+from scenarios.conformance.process import WATCHER, fingerprint, own_copy, surroundings
+from scenarios.conformance.shared import (
+    ADVICE_PROCESS,
+    ADVICE_TRUTH,
+    COPIES,
+    changed,
+    imports_nothing_closed,
+    seed_global_generators,
+)
+from scenarios.conformance.surfaces import MEAN, TexturedPlane
+from scenarios.estimators import sources_of
+from sim.camera import CameraModel
+from sim.frames import rigid
+from sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements
+from sim.sensor import stereo_mast
+
+FULL_SCALE_DN = 4095
+_LEVEL_DN = 1500.0
+_WALL_M, _STEP_M = 8.0, 0.4
+#: The designated point, in the world, and the stops of the drive, metres ahead.
+TARGET_M = np.array([_WALL_M, 0.3, 1.2])
+_STOPS = 4
+
+#: Pictures that show nothing, by name: their count.
+BLANKS = {"featureless": 1500, "dark": 0, "saturated": FULL_SCALE_DN}
+
+
+@cache
+def mast() -> MastCalibration:
+    """The mast of the suite's rover."""
+    return stereo_mast("research-navcam")
+
+
+def pose(ahead_m: float) -> RigidTransform:
+    """The rover's pose so far along its way."""
+    return rigid(Rotation.identity(), np.array([ahead_m, 0.0, 0.0]))
+
+
+def designation() -> PixelTarget:
+    """The target, picked in a picture taken at the start."""
+    angles = mast_angles(TARGET_M, mast())
+    if angles is None:
+        raise ValueError("the mast cannot point at the suite's target")
+    left = mast().left.moved(mast().geometry.rover_from_head(*angles))
+    return PixelTarget(np.asarray(left.project(TARGET_M)[0]), *angles)
+
+
+def taken(aim: MastAim, world_from_rover: RigidTransform, blank: int | None = None) -> RoverMeasurements:
+    """What a stop delivers at the angles asked for: the wall, or pictures of one count."""
+    head = world_from_rover * mast().geometry.rover_from_head(aim.azimuth_rad, aim.elevation_rad)
+    return RoverMeasurements(
+        left=_picture(mast().left.moved(head), aim.left, blank),
+        right=_picture(mast().right.moved(head), aim.right, blank),
+        mast=mast(),
+        azimuth_rad=aim.azimuth_rad,
+        elevation_rad=aim.elevation_rad,
+        world_from_rover=world_from_rover,
+    )
+
+
+def _picture(camera: CameraModel, box: PixelBox, blank: int | None) -> MastImage:
+    if blank is not None:
+        return MastImage(np.full(box.size[::-1], blank, np.uint16), box.corner)
+    wall = TexturedPlane(np.array([_WALL_M, 0.0, 0.0]), np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]), 0.006)
+    radiance = wall.radiance(camera.cropped(*box.corner, box.size))
+    return MastImage(np.clip(np.rint(_LEVEL_DN / MEAN * radiance), 0, FULL_SCALE_DN).astype(np.uint16), box.corner)
+
+
+@dataclass(frozen=True)
+class TrackerSuite:
+    """The suite of one tracker, made anew for each check. See `EstimatorSuite`."""
+
+    make: Callable[[], Any]
+    spec: str
+    program: bool
+    limit_s: float
+
+    def checks(self) -> Iterator[Check]:
+        """All of them, the ordinary drive first."""
+        form = "see algorithms/interface.py for what aim, update and state give"
+        yield Check("answer", "aims and answers well-formed at every stop of a drive", form, self._answers)
+        yield Check("states", "has no target before one is designated and after it is cleared", form, self._states)
+        advice = "return a TargetUpdate with the state LOST and the reasons in losses"
+        for name, blank in BLANKS.items():
+            yield Check(name, f"loses its target where pictures are {name}", advice, partial(self._loses, name, blank))
+        yield Check(
+            "pose",
+            "answers where the pose jumps and pictures show other ground",
+            advice,
+            self._answers_elsewhere,
+        )
+        if not self.program:
+            yield Check("inputs", "leaves its inputs as they are", COPIES, self._inputs)
+        yield Check(
+            "deterministic",
+            "gives the same answers on the same drive, also after it was cleared",
+            "draw from numpy.random.default_rng(a fixed seed); forget all in clear and designate",
+            self._deterministic,
+        )
+        yield Check(
+            "time", f"updates within {self.limit_s:g} s", "be faster, or allow more with --time-limit", self._time
+        )
+        if not self.program:
+            yield Check("process", "leaves its process as it is", ADVICE_PROCESS, self._process)
+            yield Check("truth", "reaches for no truth", ADVICE_TRUTH, self._truth)
+
+    def _answers(self) -> str:
+        updates = drive(self.make())
+        return ", ".join(update.state.name for update in updates)
+
+    def _states(self) -> str:
+        tracker = self.make()
+        _expect(tracker, "before a target is designated", TrackingState.NO_TARGET)
+        tracker.designate(own_copy(designation()), pose(0.0))
+        _expect(tracker, "once a target is designated", TrackingState.NORMAL)
+        tracker.clear()
+        _expect(tracker, "once it is cleared", TrackingState.NO_TARGET)
+        update = checked_update(tracker.update(own_copy(taken(_box_ahead(), pose(0.0)))))
+        if update.state is not TrackingState.NO_TARGET:
+            raise BreachError(f"asked without a target, it answers {update.state.name}; allowed: NO_TARGET")
+        return ""
+
+    def _loses(self, name: str, blank: int) -> str:
+        tracker = self.make()
+        drive(tracker)
+        update = stop(tracker, pose(_STOPS * _STEP_M), blank)
+        if update is None:
+            return "it finds no aim"
+        if update.found:
+            raise BreachError(f"it finds its target in pictures that are {name}")
+        if update.state is TrackingState.LOST and not update.losses:
+            raise BreachError("it does not say why the target is lost: losses is empty")
+        return ", ".join([update.state.name, *(loss.name for loss in update.losses)])
+
+    def _answers_elsewhere(self) -> str:
+        tracker = self.make()
+        drive(tracker)
+        measurements = replace(taken(_box_ahead(), pose(0.0)), world_from_rover=pose(3.0))
+        return checked_update(tracker.update(own_copy(measurements))).state.name
+
+    def _inputs(self) -> str:
+        tracker, told = self.make(), own_copy(designation())
+        before = fingerprint(told)
+        tracker.designate(told, pose(0.0))
+        measurements = own_copy(taken(_aimed(tracker, pose(0.0)), pose(0.0)))
+        seen = fingerprint(measurements)
+        tracker.update(measurements)
+        if fingerprint(told) != before or fingerprint(measurements) != seen:
+            raise BreachError("its designation or measurements are not what they were before")
+        return ""
+
+    def _deterministic(self) -> str:
+        seed_global_generators(1)
+        first = fingerprint(drive(self.make()))
+        seed_global_generators(2)
+        again = self.make()
+        if fingerprint(drive(again)) != first:
+            raise BreachError("two that are made alike answer differently on the same drive")
+        again.clear()
+        if fingerprint(drive(again)) != first:
+            raise BreachError("cleared and given the target anew, it answers differently")
+        return ""
+
+    def _time(self) -> str:
+        tracker = self.make()
+        tracker.designate(own_copy(designation()), pose(0.0))
+        times = []
+        for number in range(_STOPS):
+            here = pose(number * _STEP_M)
+            measurements = own_copy(taken(_aimed(tracker, here), here))
+            began = time.perf_counter()
+            tracker.update(measurements)
+            times.append(time.perf_counter() - began)
+        if max(times) > self.limit_s:
+            raise BreachError(f"an update took {max(times):.3g} s")
+        return f"{max(times[1:]):.3g} s"
+
+    def _process(self) -> str:
+        tracker = self.make()
+        before = surroundings()
+        drive(tracker)
+        return changed(before, surroundings())
+
+    def _truth(self) -> str:
+        imports_nothing_closed(self.spec)
+        tracker = self.make()
+        with WATCHER.looking(frozenset(str(path) for _, path in sources_of(self.spec))) as seen:
+            drive(tracker)
+        if seen:
+            raise BreachError("; ".join(seen))
+        return ""
+
+
+def drive(tracker: Any) -> Sequence[TargetUpdate]:
+    """Designates the target and drives towards it; the updates at the stops, up to a failure."""
+    tracker.designate(own_copy(designation()), pose(0.0))
+    updates: list[TargetUpdate] = []
+    for number in range(_STOPS):
+        update = stop(tracker, pose(number * _STEP_M))
+        if update is None:
+            break
+        updates.append(update)
+        if update.state is TrackingState.FAILURE:
+            break
+    return updates
+
+
+def stop(tracker: Any, here: RigidTransform, blank: int | None = None) -> TargetUpdate | None:
+    """Aims, takes pictures and updates, all held against the interface; None where there is no aim."""
+    aim = checked_aim(tracker.aim(here, own_copy(mast())), mast())
+    if aim is None:
+        return None
+    update = checked_update(tracker.update(own_copy(taken(aim, here, blank))))
+    if tracker.state is not update.state:
+        raise BreachError(f"its state is {tracker.state}, but its update says {update.state}")
+    return update
+
+
+def _aimed(tracker: Any, here: RigidTransform) -> MastAim:
+    aim = checked_aim(tracker.aim(here, own_copy(mast())), mast())
+    if aim is None:
+        raise BreachError("it finds no aim at a target 8 m ahead, in full view")
+    return aim
+
+
+def _box_ahead() -> MastAim:
+    """Straight ahead, the middle of both frames."""
+    columns, rows = mast().left.size
+    box = PixelBox((columns // 4, rows // 4), (columns // 2, rows // 2))
+    return MastAim(0.0, -0.2, box, box)
+
+
+def _expect(tracker: Any, when: str, state: TrackingState) -> None:
+    if tracker.state is not state:
+        raise BreachError(f"its state {when} is {tracker.state}; allowed: {state}")

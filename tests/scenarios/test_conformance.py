@@ -1,0 +1,170 @@
+"""The suite passes what ships, and names what bad algorithms do."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenarios.conformance import Finding, Subject, check_names, inputs, run_check, task_of, trackers
+from scenarios.conformance.surfaces import TexturedPlane
+from scenarios.estimators import LANDING, TRACKING, VELOCITY
+from sim.camera import Cahv
+
+HEAD = """
+import os, random, gc
+import numpy as np
+from algorithms.interface import VelocityEstimate, VelocityOutcome as Outcome
+from algorithms.vtt import VisualTargetTracker, VttOptions
+NOTHING = VelocityEstimate(Outcome.NO_VALID_TRACK, None)
+def seen(m):
+    return m.images[0].counts.std() > 5
+"""
+
+
+def findings(spec: str, *only: str) -> dict[str, Finding]:
+    subject = Subject(spec, task_of(spec), 60.0)
+    names = [name for name, _ in check_names(subject)]
+    return {name: run_check(subject, names.index(name)) for name in (only or names)}
+
+
+@pytest.mark.parametrize(
+    "spec", [*VELOCITY.shipped, *TRACKING.shipped, *LANDING.shipped, "velocity_estimator:MedianShift"]
+)
+def test_what_ships_conforms(spec: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
+    assert {name: one.problem for name, one in findings(spec).items() if not one.passed} == {}
+
+
+def bad(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
+    """A module with a class `Bad`, in the current folder; its name is its own, as modules are kept."""
+    name = f"bad_{abs(hash(body))}"
+    (folder / f"{name}.py").write_text(HEAD + textwrap.dedent(body))
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(str(folder))
+    return f"{name}:Bad"
+
+
+def estimator(lines: str) -> str:
+    return "class Bad:\n    def estimate(self, m):\n" + textwrap.indent(textwrap.dedent(lines), " " * 8)
+
+
+@pytest.mark.parametrize(
+    ("check", "lines", "problem"),
+    [
+        ("answer", "return (1.0, 2.0)", "BAD_ANSWER: the answer is a tuple; allowed: a VelocityEstimate"),
+        ("answer", "return VelocityEstimate(Outcome.VALID, np.full(2, np.nan))", "velocity_m_s is not finite"),
+        (
+            "answer",
+            "return VelocityEstimate(Outcome.VALID, np.ones(2), None, np.full((2, 2), np.nan))",
+            "covariance_m2_s2 is not finite",
+        ),
+        ("answer", "return 1 / 0", "it raised ZeroDivisionError: division by zero (bad_"),
+        ("featureless", "return VelocityEstimate(Outcome.VALID, np.zeros(2))", "it answers VALID to pictures that are"),
+        ("saturated", "return NOTHING if seen(m) else 1 / 0", "it raised ZeroDivisionError"),
+        ("inputs", "m.images[0].counts[:] = 0\nreturn NOTHING", "are not what they were before"),
+        ("inputs", "m.interval_velocities_m_s[0] -= 1\nreturn NOTHING", "are not what they were before"),
+        ("deterministic", "return VelocityEstimate(Outcome.VALID, np.random.random(2))", "answers differently"),
+        (
+            "deterministic",
+            "global KEPT\nwas = globals().get('KEPT', 0.0)\nKEPT = m.images[0].counts.mean()\n"
+            "return VelocityEstimate(Outcome.VALID, np.full(2, was))",
+            "answer",
+        ),
+        ("process", "os.chdir('/')\nreturn NOTHING", "it has changed the current folder"),
+        ("process", "np.random.random()\nreturn NOTHING", "it has changed NumPy's global random state"),
+        ("process", "os.environ['X_OF_MINE'] = '1'\nreturn NOTHING", "it has changed environment variables"),
+        ("truth", "import sim.terrain\nreturn NOTHING", "it imports what knows the truth: bad_"),
+        ("truth", "from sim import sensor\nreturn NOTHING", ": sim.sensor"),
+        ("truth", "gc.get_objects()\nreturn NOTHING", "goes through all objects of the process (gc.get_objects)"),
+        ("truth", "import inspect\ninspect.stack()\nreturn NOTHING", "looks at its callers' frames"),
+        (
+            "truth",
+            "import contextlib\nwith contextlib.suppress(OSError):\n    open('runs/x/cases.sqlite')\nreturn NOTHING",
+            "it opens runs/x/cases.sqlite",
+        ),
+    ],
+)
+def test_bad_estimators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, lines: str, problem: str) -> None:
+    monkeypatch.setenv("X_OF_MINE", "0")
+    found = findings(bad(tmp_path, monkeypatch, estimator(lines)), check)[check]
+    assert problem in found.problem
+    assert found.next_step
+
+
+def test_state_of_the_estimator_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    body = """
+    class Bad:
+        def __init__(self):
+            self.before = np.zeros(2)
+        def estimate(self, m):
+            answer, self.before = self.before, self.before + m.images[0].counts.mean()
+            return VelocityEstimate(Outcome.VALID, answer)
+    """
+    found = findings(bad(tmp_path, monkeypatch, body), "deterministic", "inputs", "time")
+    assert found["deterministic"].problem == "its answer depends on the case that it was asked before"
+    assert found["inputs"].passed
+    assert found["time"].passed
+
+
+@pytest.mark.parametrize(
+    ("check", "changed", "problem"),
+    [
+        ("answer", "def update(self, m): return None", "BAD_ANSWER: the answer is a NoneType; allowed: a TargetUpdate"),
+        ("answer", "def aim(self, pose, mast): return (0.0, 0.0)", "the aim is a tuple; allowed: a MastAim, or None"),
+        ("states", "def clear(self): pass", "its state once it is cleared is TrackingState.NORMAL"),
+        (
+            "deterministic",
+            "def clear(self): pass\n    def designate(self, t, p): self.track or super().designate(t, p)",
+            "cleared and given the target anew, it answers differently",
+        ),
+        ("inputs", "def update(self, m): m.left.counts[:] = 0; return super().update(m)", "not what they were before"),
+        ("truth", "def update(self, m): gc.get_objects(); return super().update(m)", "all objects"),
+    ],
+)
+def test_bad_trackers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, changed: str, problem: str) -> None:
+    # the tracker that ships is final to type checkers alone
+    spec = bad(tmp_path, monkeypatch, f"class Bad(VisualTargetTracker):\n    {changed}\n")
+    assert problem in findings(spec, check)[check].problem
+
+
+def test_the_task_is_told_by_name_and_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [task_of(name) for name in ("homography", "semi-global", "pure-ncc", "exec:cat")] == [
+        "velocity",
+        "landing",
+        "tracking",
+        "velocity",
+    ]
+    assert task_of("algorithms.hda:HdaEstimator") == "landing"
+    assert task_of("algorithms.vtt:VisualTargetTracker") == "tracking"
+    assert task_of(bad(tmp_path, monkeypatch, estimator("return NOTHING"))) == "velocity"
+    with pytest.raises(ValueError, match="unknown algorithm 'vt'"):
+        task_of("vt")
+    with pytest.raises(ValueError, match="no algorithm at 'nowhere:Nothing'"):
+        task_of("nowhere:Nothing")
+
+
+def test_a_plane_is_seen_where_it_lies() -> None:
+    """A step of one sample along the plane moves the picture by focal length / distance pixels."""
+    down, right = np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0])
+    camera = Cahv.from_axes((500.0, 500.0), (64, 48), axis=down, right=right, centre=np.array([0.0, 0.0, 10.0]))
+    plane = TexturedPlane(np.zeros(3), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), 0.02)
+    before = plane.radiance(camera)
+    # 0.02 m at 10 m are 1 px: the picture is the same one, a column on
+    moved = TexturedPlane(np.array([0.02, 0.0, 0.0]), plane.along, plane.step_m)
+    assert np.allclose(moved.radiance(camera)[:, 1:], before[:, :-1], atol=1e-6)
+    away = TexturedPlane(np.array([0.0, 0.0, 20.0]), plane.along, plane.step_m)
+    assert np.ptp(away.radiance(camera)) == 0.0
+
+
+def test_inputs_are_what_instruments_deliver() -> None:
+    descent, landing = inputs.descent(), inputs.landing()
+    assert descent.images[0].counts.shape == (256, 1024)
+    assert 200 < descent.images[0].counts.mean() < 4000
+    # the laser's ray ends on the ground
+    assert abs(landing.apriori_site_world[2]) < 1e-9
+    blank = inputs.blanked(descent, inputs.BLANKS["saturated"])
+    assert {int(one.counts.min()) for one in blank.images} == {4095}
+    assert trackers.taken(trackers._box_ahead(), trackers.pose(0.0)).left.counts.std() > 100
