@@ -77,7 +77,8 @@ class DescentScenario:
 
         def judge(algorithm: str) -> Judged:
             attempt = attempted(
-                lambda: VELOCITY.make(algorithm, p.dimes, p.executable).estimate(measurements), checked_velocity
+                lambda: VELOCITY.make(algorithm, p.dimes, p.executable, streams.case).estimate(measurements),
+                checked_velocity,
             )
             estimate = attempt.answer
             velocity = None if estimate is None else estimate.velocity_m_s

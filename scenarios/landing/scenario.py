@@ -51,7 +51,7 @@ class LandingScenario:
 
         def judge(algorithm: str) -> Judged:
             attempt = attempted(
-                lambda: LANDING.make(algorithm, p.hda, p.executable).estimate(measurements), checked_site
+                lambda: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(measurements), checked_site
             )
             estimate = nothing if attempt.answer is None else attempt.answer
             return Judged(
