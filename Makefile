@@ -1,7 +1,7 @@
 # Marsyard's tasks. `make` alone lists them. Each sets up what it needs first; doing so again costs nothing.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format bench validate constraints clean distclean
+.PHONY: help setup demo test lint format bench docs validate constraints clean distclean
 
 BIN := .venv/bin
 # More words for pytest, as in: make test PYTEST_ARGS="-k camera"
@@ -33,6 +33,10 @@ bench: setup ## Measure speed and memory
 validate: setup ## Compare with the papers' published results
 	@[ -e benchmarks/validation.py ] || [ -e benchmarks/validation/__main__.py ] || { echo "validate: there is no comparison with published results yet" >&2; exit 1; }
 	$(BIN)/python -m benchmarks.validation
+
+docs: setup ## Build the documentation site into build/docs
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
+	@echo "documentation: build/docs/index.html"
 
 constraints: ## Renew the pinned versions in constraints.txt
 	@tools/constraints.sh

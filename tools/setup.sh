@@ -118,7 +118,7 @@ install_packages() {
     : >"$unfinished"
     # setuptools first, from the same pins: building in isolation would fetch another one, past the constraints
     "${install[@]}" pip setuptools
-    "${install[@]}" --no-build-isolation -e '.[dask,dev,geo]'
+    "${install[@]}" --no-build-isolation -e '.[dask,dev,docs,geo]'
 }
 
 check_rendering() {

@@ -1,0 +1,61 @@
+"""Figures of the explanations, drawn by the code that they explain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from reports.statistics.proportions import proportion_lower
+from sim.render import Photometry
+
+mpl.rcParams["svg.hashsalt"] = "marsyard"
+INCIDENCE_DEG = 30.0
+LAWS = {
+    "Lambert": Photometry(lunar_share=0.0, surge_amplitude=0.0),
+    "Lommel-Seeliger": Photometry(lunar_share=1.0, surge_amplitude=0.0),
+    "Lunar-Lambert, Mars": Photometry(surge_amplitude=0.0),
+    "with the opposition surge": Photometry(),
+}
+
+
+def draw_figures(folder: Path) -> None:
+    """Writes them all."""
+    folder.mkdir(exist_ok=True)
+    for name, figure in {"light": light(), "statistics": statistics()}.items():
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+
+
+def light() -> Figure:
+    """Radiance factor of level ground of unit albedo under direct sun, over the phase angle in the sun's plane."""
+    emission = np.radians(np.linspace(-85.0, 85.0, 681))
+    incidence = np.radians(INCIDENCE_DEG)
+    phase = np.abs(emission - incidence)
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for (name, law), style in zip(LAWS.items(), ("-", "--", "-.", ":"), strict=True):
+        surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(phase / 2.0) / law.surge_width)
+        lunar = 2.0 * law.lunar_share * np.cos(incidence) / (np.cos(incidence) + np.cos(emission))
+        lambert = (1.0 - law.lunar_share) * np.cos(incidence)
+        axes.plot(np.degrees(emission), law.normalisation() * surge * (lunar + lambert), style, label=name)
+    axes.axvline(INCIDENCE_DEG, color="0.7", linewidth=0.8)
+    axes.set(xlabel="emission angle towards the sun (deg); the line: sun behind the camera", ylabel="I/F over albedo")
+    axes.legend(frameon=False)
+    return figure
+
+
+def statistics() -> Figure:
+    """Lower bound of the success rate at 90 % confidence over the number of cases, for few failures."""
+    cases = np.unique(np.geomspace(10, 2000, 120).astype(int))
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for failures, style in enumerate(("-", "--", "-.", ":")):
+        bounds = [100.0 * proportion_lower(int(n) - failures, int(n), 0.9) for n in cases]
+        axes.semilogx(cases, bounds, style, label=f"{failures} failed")
+    axes.axhline(99.0, color="0.7", linewidth=0.8)
+    axes.text(11, 99.15, "99 % asked", color="0.35")
+    axes.set(xlabel="cases", ylabel="lower bound of success rate (%)", ylim=(80, 100.5))
+    axes.legend(frameon=False)
+    return figure

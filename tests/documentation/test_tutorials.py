@@ -1,0 +1,52 @@
+"""The tutorials' commands, run literally, one after the other, in an empty folder."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TUTORIALS = sorted((Path(__file__).parents[2] / "docs" / "tutorials").glob("*.md"))
+FENCED = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+SAVED_AS = re.compile(r"Save it as `([\w.]+)`")
+EXITS = re.compile(r"# exits with (\d)(?: or (\d))?")
+
+
+@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
+def test_tutorial(tutorial: Path, tmp_path: Path) -> None:
+    text = tutorial.read_text(encoding="utf-8")
+    names = iter(SAVED_AS.findall(text))
+    commands = 0
+    for language, body in FENCED.findall(text):
+        if language == "toml":
+            (tmp_path / next(names)).write_text(body, encoding="utf-8")
+        elif language == "python":
+            _run([sys.executable, "-c", body], {0}, tmp_path)
+        elif language == "console":
+            for line in body.splitlines():
+                assert line.startswith("$ "), line
+                commands += 1
+                allowed = {int(code) for found in EXITS.findall(line) for code in found if code} or {0}
+                words = shlex.split(line.removeprefix("$ ").split("#")[0])
+                _run([str(Path(sys.executable).with_name(words[0])), *words[1:]], allowed, tmp_path)
+    assert commands >= 3
+
+
+def test_what_the_first_tutorial_promises_is_there(tmp_path: Path) -> None:
+    program = str(Path(sys.executable).with_name("marsyard"))
+    _run([program, "run", "dimes-smoke", "-n", "1", "--out", "first"], {3}, tmp_path)
+    _run([program, "replay", "first", "0"], {0}, tmp_path)
+    for name in ("report.html", "cases.parquet", "cases.sqlite", "campaign.json", "cases/000000/dimes.png"):
+        assert (tmp_path / "first" / name).stat().st_size > 0
+
+
+def _run(command: list[str], allowed: set[int], folder: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode in allowed, f"{command}: {done.returncode}\n{done.stdout}\n{done.stderr}"
+    assert "Traceback" not in done.stderr
