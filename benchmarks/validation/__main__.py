@@ -14,6 +14,7 @@ from benchmarks.validation import (
     dimes_checks,
     document,
     geometry_checks,
+    landing_checks,
     light_checks,
     motion_checks,
     sampling_checks,
@@ -25,6 +26,7 @@ CHECKS = (
     *motion_checks.CHECKS,
     *light_checks.CHECKS,
     *dimes_checks.CHECKS,
+    *landing_checks.CHECKS,
     *sampling_checks.CHECKS,
     *campaign_checks.CHECKS,
 )
