@@ -320,7 +320,7 @@ def _print_estimate(campaign: Campaign, crew: Crew) -> None:
     typer.echo(f"  {found.case_s:.3g} s a case ({least:.3g} to {most:.3g} s in {found.trials} trial cases)")
     if found.unfinished:
         typer.echo(f"  {found.unfinished} of the trial cases did not come to their end")
-    typer.echo(f"disk: {_size(found.rows_bytes)} of rows, up to {_size(found.products_bytes)} of products")
+    typer.echo(f"disk: {size_text(found.rows_bytes)} of rows, up to {size_text(found.products_bytes)} of products")
 
 
 def _duration(seconds: float) -> str:
@@ -330,7 +330,7 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
-def _size(count: float) -> str:
+def size_text(count: float) -> str:
     """A number of bytes as people say it."""
     for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= size:

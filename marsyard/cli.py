@@ -22,15 +22,18 @@ from marsyard.campaign_command import (
     run,
     says_what_is_wrong,
 )
+from marsyard.clean_command import clean
 from marsyard.conformance_command import conformance
+from marsyard.dashboard_command import dashboard
 from marsyard.gallery_command import gallery
+from marsyard.new_command import new
+from marsyard.nightly_command import nightly
 from marsyard.offline_command import export, score
 from marsyard.render_command import render
 from marsyard.report_command import compare, report
 from marsyard.terrain_command import app as terrain
 
 app = typer.Typer(
-    add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="A virtual Mars Yard: runs vision software through rendered, truth-known cases and says whether its "
@@ -39,10 +42,12 @@ app = typer.Typer(
     "2 the command or a file is wrong; 3 not enough cases to say, or no independent random draws.",
 )
 app.add_typer(terrain, name="terrain")
-for command in (run, resume, append, report, compare, replay):
+for command in (run, resume, append, report, compare, replay, nightly, dashboard):
     app.command()(command)
 app.command()(render)
 app.command()(gallery)
+app.command()(new)
+app.command()(clean)
 app.command()(conformance)
 for command in (export, score):
     app.command()(command)
@@ -50,11 +55,16 @@ for command in (export, score):
 
 @app.command(name="list")
 @says_what_is_wrong
-def list_campaigns() -> None:
+def list_campaigns(
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+) -> None:
     """List the campaigns of the catalogue."""
     from campaigns.definition.loading import catalogue
-    from marsyard.showing import catalogue_table
+    from marsyard.showing import catalogue_data, catalogue_table
 
+    if as_json:
+        typer.echo(json.dumps(catalogue_data(catalogue()), indent=2))
+        return
     console().print(catalogue_table(catalogue()))
 
 

@@ -82,7 +82,7 @@ def answers_section(subject: Subject) -> Section | None:
 
 def answer_shares(subject: Subject) -> Mapping[str, Share]:
     """The shares by name; those alone that the rows tell."""
-    frame = subject.frame
+    frame = subject.whole
     if not is_flag(frame, "answered") or frame.empty:
         return {}
     answered = members(frame, "valid")

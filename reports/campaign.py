@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from reports import gallery, sections
@@ -23,6 +24,8 @@ from reports.dimes.fieldtest import field_test_section
 from reports.dimes.landing import landing_section
 from reports.dimes.sensitivity import sensitivity_section
 from reports.drivers import drivers_section
+from reports.explorer import embedded, explorer_data, script_hash
+from reports.explorer import script as explorer_script
 from reports.faults import faults_section
 from reports.hda.every import HDA_SECTIONS
 from reports.sampled import sampled
@@ -95,13 +98,11 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     OSError
         Where the report cannot be written.
     """
-    run = read_run(directory)
-    if requirements is not None:
-        run = replace(run, record={**run.record, "requirements": list(requirements)})
+    run = read_run(directory, requirements)
     how = sampled(run.configuration)
-    verdicts = judge_campaign(run.frame, run.requirements, how)
-    whole = overall(verdicts, run.frame, how)
-    drawn = replace(run, frame=how.drawn(run.frame))
+    verdicts = judge_campaign(run.whole, run.requirements, how)
+    whole = overall(verdicts, run.whole, how)
+    drawn = replace(run, frame=how.drawn(run.frame), whole=how.drawn(run.whole))
     metric = primary_metric(drawn.frame, run.requirements)
     bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
     subject = Subject(drawn, metric, bound)
@@ -112,7 +113,7 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     write_whole(directory / JUNIT_FILE, junit_xml(run.name, verdicts, whole))
     page = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, whole, further)
-    write_whole(page, _environment().get_template("report.html.j2").render(context))
+    write_whole(page, page_environment().get_template("report.html.j2").render(context))
     return page
 
 
@@ -131,8 +132,8 @@ def page_context(
         "metric": metric,
         "bound": bound,
         "further": further,
-        "outcomes": sections.outcome_grid(run.frame),
-        "outcome_plates": gallery.outcome_plates(run.frame),
+        "outcomes": sections.outcome_grid(run.whole),
+        "outcome_plates": gallery.outcome_plates(run.whole),
         "crashed": sections.crashed_rows(run),
         "dispersions": sections.dispersion_grid(subject.run),
         "shown": shown_cases(run),
@@ -143,7 +144,17 @@ def page_context(
         "replay": sections.replay_command(run, "CASE"),
     }
     pictured = [str(case.case) for case in context["shown"]]
+    context["explorer"] = _explorer(subject, pictured)
     return {**context, **_error_sections(subject.run, metric, bound, pictured)}
+
+
+def _explorer(subject: Subject, pictured: Sequence[str]) -> dict[str, Any] | None:
+    """The points to explore; None where there is nothing to draw."""
+    metric = subject.metric
+    if metric is None or not np.isfinite(numbers(subject.frame, metric)).any():
+        return None
+    data, script = explorer_data(subject.run, metric, subject.bound, pictured), explorer_script()
+    return {"data": data, "json": embedded(data), "script": script, "hash": script_hash(str(script))}
 
 
 def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
@@ -154,6 +165,11 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
         said.append(
             f"The cases are no independent random draws: {how.text}. Statistics describe these cases; intervals, "
             "bounds and probabilities on this page, which take cases as independent draws, do not hold for them."
+        )
+    if run.sampled_from is not None:
+        said.append(
+            f"Verdicts, outcomes, answers, statistics and convergence are of all {run.sampled_from:,} cases; points, "
+            f"conditions and drivers of the first {len(run.frame):,}, which are as random as all."
         )
     nominal = run.frame[run.frame["case"] == 0] if how.nominal and "case" in run.frame else run.frame[:0]
     if len(nominal):
@@ -169,7 +185,7 @@ def summary(
 ) -> dict[str, Any]:
     """The report as plain data; NaN and infinities are null."""
     metric, how = subject.metric, sampled(run.configuration)
-    summaries = error_summaries(subject.frame, metric) if metric is not None else []
+    summaries = error_summaries(subject.whole, metric) if metric is not None else []
     twin = {
         "schema": SCHEMA,
         "campaign": run.name,
@@ -178,7 +194,7 @@ def summary(
         "git_commit": run.said("git_commit"),
         "started_utc": run.said("started_utc"),
         "finished_utc": run.said("finished_utc"),
-        "cases": len(run.frame),
+        "cases": len(run.whole),
         "crashed": whole.crashed,
         "sampling": {**asdict(how), "independent": how.independent, "text": how.text},
         "verdict": whole.word,
@@ -193,7 +209,7 @@ def summary(
             }
             for verdict in verdicts
         ],
-        "outcomes": dict(outcome_counts(run.frame)),
+        "outcomes": dict(outcome_counts(run.whole)),
         "metric": metric,
         "statistics": {name: asdict(summarized) for name, summarized in summaries},
         "worst_cases": [] if metric is None else [row.case for row in sections.worst_cases(subject.run, metric).rows],
@@ -211,15 +227,15 @@ def _error_sections(run: StoredRun, metric: str | None, bound: float | None, pic
         grid = sections.Grid((), ())
         return {"error_plates": [], "driver_plates": [], "statistics": grid, "worst": none, "silent": none}
     return {
-        "error_plates": gallery.error_plates(run.frame, metric, bound),
+        "error_plates": gallery.error_plates(run.frame, run.whole, metric, bound),
         "driver_plates": gallery.driver_plates(run.frame, metric, bound),
-        "statistics": sections.statistics_grid(run.frame, metric),
+        "statistics": sections.statistics_grid(run.whole, metric),
         "worst": sections.worst_cases(run, metric, pictured),
         "silent": sections.silent_cases(run, metric, pictured),
     }
 
 
-def _environment() -> Environment:
+def page_environment() -> Environment:
     """Jinja with escaping on for every template: what comes from files is shown as text."""
     return Environment(
         autoescape=True,

@@ -36,7 +36,7 @@ class Point:
 
 def convergence_section(subject: Subject) -> Section | None:
     """Success rates and the 95 % quantile of the errors against the number of cases; None for fewer than sixteen."""
-    frame = subject.frame
+    frame = subject.whole
     if len(frame) < 2 * FEWEST:
         return None
     curves = requirement_curves(subject)
@@ -69,7 +69,7 @@ def sizes(cases: int) -> list[int]:
 def requirement_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]:
     """Each requirement's name, the rate asked, and the rates of the first cases; none where it cannot be judged."""
     how = sampled(subject.run.configuration)
-    frame, requirements = subject.frame, subject.run.requirements
+    frame, requirements = subject.whole, subject.run.requirements
     judged = [(size, judge_campaign(frame.head(size), requirements, how)) for size in sizes(len(frame))]
     curves = []
     for place, last in enumerate(judged[-1][1]):

@@ -22,16 +22,16 @@ from reports.plates import Plate, plate
 from reports.wording import count, number
 
 
-def error_plates(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Plate]:
-    """Scatter and distribution of a metric."""
+def error_plates(frame: pd.DataFrame, whole: pd.DataFrame, metric: str, bound: float | None) -> list[Plate]:
+    """Scatter of a metric over some rows, and its distribution over all."""
     beyond = off_scale(frame, metric, bound)
     scatter = "Errors of single cases; the dashed circle is the requirement."
     if beyond:
         scatter += f" {count(beyond, 'error')} too large for these axes: drawn at their edge."
     plates: list[tuple[str, Figure | None, str]] = [
         ("scatter", error_scatter(frame, metric, bound), scatter),
-        ("histogram", error_histogram(frame, metric, bound), "How often each magnitude of error occurred."),
-        ("distribution", error_distribution(frame, metric, bound), "Fraction of cases up to each magnitude."),
+        ("histogram", error_histogram(whole, metric, bound), "How often each magnitude of error occurred."),
+        ("distribution", error_distribution(whole, metric, bound), "Fraction of cases up to each magnitude."),
     ]
     if worth_a_closer_look(frame, metric, bound):
         closer = ("close", error_scatter(frame, metric, bound, close=True), "The same errors seen closely.")

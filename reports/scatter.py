@@ -22,10 +22,10 @@ def scatter_section(subject: Subject) -> Section | None:
     metric = subject.metric
     if metric is None:
         return None
-    parts = axis_columns(metric, [str(name) for name in subject.frame.columns])[:2]
+    parts = axis_columns(metric, [str(name) for name in subject.whole.columns])[:2]
     if len(parts) < 2:
         return None
-    errors = np.column_stack([numbers(subject.frame, part) for part in parts])
+    errors = np.column_stack([numbers(subject.whole, part) for part in parts])
     ellipse = error_ellipse(errors, ELLIPSE)
     if ellipse is None:
         return None

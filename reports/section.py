@@ -27,8 +27,13 @@ class Subject:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """The rows."""
+        """The rows: all, or of very many cases the first."""
         return self.run.frame
+
+    @property
+    def whole(self) -> pd.DataFrame:
+        """The rows of all cases; of very many only some columns."""
+        return self.run.whole
 
 
 @dataclass(frozen=True)

@@ -118,32 +118,32 @@ def outcome_grid(frame: pd.DataFrame) -> Grid:
 
 def worst_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
     """The cases with the largest errors, largest first; `pictured` are those that the page has pictures of."""
-    magnitude = np.abs(numbers(run.frame, metric))
+    magnitude = np.abs(numbers(run.whole, metric))
     known = np.flatnonzero(np.isfinite(magnitude))
     order = known[np.argsort(-magnitude[known], kind="stable")][:_MOST_CASES]
-    columns = [metric, *axis_columns(metric, [str(name) for name in run.frame.columns])]
+    columns = [metric, *axis_columns(metric, [str(name) for name in run.whole.columns])]
     return _case_table(run, order.tolist(), columns, metric, known.size - order.size, pictured)
 
 
 def silent_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
     """Cases that ran to their end without an error to score: no answer was given."""
-    silent = ~np.isfinite(numbers(run.frame, metric)) & members(run.frame, "completed")
+    silent = ~np.isfinite(numbers(run.whole, metric)) & members(run.whole, "completed")
     order = np.flatnonzero(silent)
     return _case_table(run, order[:_MOST_CASES].tolist(), [], metric, max(0, order.size - _MOST_CASES), pictured)
 
 
 def crashed_rows(run: StoredRun) -> CaseTable:
     """Cases that the engine could not finish, with what they said."""
-    order = np.flatnonzero(~members(run.frame, "completed"))
+    order = np.flatnonzero(~members(run.whole, "completed"))
     head = ["Case", "Outcome"]
     rows = [
         CaseRow(
-            case=_case(run.frame, index),
+            case=_case(run.whole, index),
             pictured=False,
-            values=[_text(run.frame, "outcome", index)],
-            command=replay_command(run, _case(run.frame, index)),
-            message=_text(run.frame, "error", index),
-            trace=_text(run.frame, "traceback", index),
+            values=[_text(run.whole, "outcome", index)],
+            command=replay_command(run, _case(run.whole, index)),
+            message=_text(run.whole, "error", index),
+            trace=_text(run.whole, "traceback", index),
         )
         for index in order[:_MOST_CASES].tolist()
     ]
@@ -171,7 +171,7 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
         ("Root seed", run.said("seed")),
         ("Sampling", sampled(run.configuration).text),
         ("Cases asked", run.said("cases")),
-        ("Cases stored", len(run.frame)),
+        ("Cases stored", len(run.whole)),
         ("Started", run.said("started_utc")),
         ("Finished", run.said("finished_utc")),
         ("Worker processes", run.said("jobs")),
@@ -217,13 +217,13 @@ def _case_table(
     left_out: int,
     pictured: Collection[str],
 ) -> CaseTable:
-    shown = [name for name in [*columns, "terrain", *driver_columns(run.frame, metric, most=3)] if name in run.frame]
+    shown = [name for name in [*columns, "terrain", *driver_columns(run.frame, metric, most=3)] if name in run.whole]
     rows = [
         CaseRow(
-            case=_case(run.frame, index),
-            pictured=_case(run.frame, index) in pictured,
-            values=[_text(run.frame, "outcome", index), *(_text(run.frame, name, index) for name in shown)],
-            command=replay_command(run, _case(run.frame, index)),
+            case=_case(run.whole, index),
+            pictured=_case(run.whole, index) in pictured,
+            values=[_text(run.whole, "outcome", index), *(_text(run.whole, name, index) for name in shown)],
+            command=replay_command(run, _case(run.whole, index)),
         )
         for index in order
     ]

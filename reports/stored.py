@@ -12,6 +12,10 @@ import pandas as pd
 
 from campaigns.errors import StoreError
 from campaigns.store.products import load_products
+from reports.columns import axis_columns, driver_columns, primary_metric
+
+#: Up to so many cases all columns of all are read; of more, all columns of the first so many.
+LARGEST_WHOLE, FIRST_CASES = 50_000, 20_000
 
 TABLE_FILE = "cases.parquet"
 RECORD_FILE = "campaign.json"
@@ -26,7 +30,9 @@ class StoredRun:
     directory
         The folder, as it was named.
     frame
-        One row a case, in the order of the cases.
+        One row a case, in the order of the cases: all of them, or of very many the first, which are as random as all.
+    whole
+        All cases; of very many only the columns that verdicts, outcomes and errors are known by.
     record
         `campaign.json`; empty where there is none or it cannot be read.
     showcases
@@ -35,8 +41,14 @@ class StoredRun:
 
     directory: Path
     frame: pd.DataFrame
+    whole: pd.DataFrame
     record: Mapping[str, Any]
     showcases: tuple[int, ...]
+
+    @property
+    def sampled_from(self) -> int | None:
+        """The number of all cases where `frame` holds but the first of them; None where it holds all."""
+        return len(self.whole) if len(self.whole) > len(self.frame) else None
 
     @property
     def configuration(self) -> Mapping[str, Any]:
@@ -67,8 +79,8 @@ class StoredRun:
             return {}
 
 
-def read_run(directory: Path) -> StoredRun:
-    """Reads a campaign's folder.
+def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> StoredRun:
+    """Reads a campaign's folder; `requirements` stand in for the campaign's own.
 
     Raises
     ------
@@ -78,14 +90,47 @@ def read_run(directory: Path) -> StoredRun:
     path = directory / TABLE_FILE
     if not path.is_file():
         raise StoreError(f"{directory} holds no {TABLE_FILE}; a report needs the rows of a campaign")
+    record = dict(_record(directory / RECORD_FILE))
+    if requirements is not None:
+        record["requirements"] = list(requirements)
     try:
-        frame = pd.read_parquet(path)
+        frame, whole = _frames(path, record)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path} cannot be read: {error}") from error
-    if "case" in frame:
-        frame = frame.sort_values("case", kind="stable").reset_index(drop=True)
-    record = _record(directory / RECORD_FILE)
-    return StoredRun(directory, frame, record, _showcases(directory / "cases", record.get("showcase")))
+    return StoredRun(directory, frame, whole, record, _showcases(directory / "cases", record.get("showcase")))
+
+
+def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The rows as they are looked at, and all of them; the same where there are not very many."""
+    import pyarrow.parquet as pq
+
+    file = pq.ParquetFile(path)
+    if file.metadata.num_rows <= LARGEST_WHOLE:
+        frame = _ordered(pd.read_parquet(path))
+        return frame, frame
+    first = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas()
+    return _ordered(first), _ordered(pd.read_parquet(path, columns=_needed(file.schema_arrow.names, record, first)))
+
+
+def _needed(names: Sequence[str], record: Mapping[str, Any], first: pd.DataFrame) -> list[str]:
+    """Columns that are read of very many cases."""
+    asked = record.get("requirements")
+    stated = [one for one in asked if isinstance(one, Mapping)] if isinstance(asked, list) else []
+    wanted = {"case", "outcome", "answered", "terrain", "room", "error", "traceback"}
+    for one in stated:
+        wanted.update(str(one.get("metric", "")).split(" + "))
+        wanted.update(str(one.get("population", "")).split(" and "))
+    metric = primary_metric(first, stated)
+    if metric is not None:
+        wanted.update([metric, *axis_columns(metric, names), *driver_columns(first, metric, most=3)])
+    return [name for name in names if name in wanted]
+
+
+def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
+    """The rows in the order of the cases."""
+    if "case" not in frame or frame["case"].is_monotonic_increasing:
+        return frame
+    return frame.sort_values("case", kind="stable").reset_index(drop=True)
 
 
 def table(value: object) -> Mapping[str, Any]:

@@ -38,12 +38,19 @@ def shown_cases(run: StoredRun) -> list[ShownCase]:
     for case in run.showcases:
         if len(shown) == _MOST_SHOWN:
             break
-        products = run.products(case)
-        system = _system(products)
-        if system is not None:
-            view = system.view(products, f"case{case}")
-            shown.append(ShownCase(case, _outcome(run.frame, case), view, system.legend))
+        one = shown_case(run, case)
+        if one is not None:
+            shown.append(one)
     return shown
+
+
+def shown_case(run: StoredRun, case: int) -> ShownCase | None:
+    """A kept case as a page shows it; None where no system knows its products."""
+    products = run.products(case)
+    system = _system(products)
+    if system is None:
+        return None
+    return ShownCase(case, _outcome(run.whole, case), system.view(products, f"case{case}"), system.legend)
 
 
 def write_case_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:

@@ -27,7 +27,7 @@ METRIC = "velocity_error_m_s"
 
 
 def subject(frame: pd.DataFrame, bound: float | None = 5.0) -> Subject:
-    return Subject(StoredRun(Path("run"), frame, {}, ()), METRIC, bound)
+    return Subject(StoredRun(Path("run"), frame, frame, {}, ()), METRIC, bound)
 
 
 def cells(section: Section | None, row: str) -> list[str]:

@@ -25,7 +25,7 @@ from tests.reports.hda.made_up import landing_frame
 
 
 def _subject(frame: pd.DataFrame) -> Subject:
-    return Subject(StoredRun(Path("nowhere"), frame, {}, ()), None, None)
+    return Subject(StoredRun(Path("nowhere"), frame, frame, {}, ()), None, None)
 
 
 def test_rates_pool_footprints_over_flights() -> None:

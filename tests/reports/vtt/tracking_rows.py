@@ -51,7 +51,7 @@ def subject(frame: pd.DataFrame, name: str = "a-campaign", legs: list[Mapping[st
     """A report's subject of these rows, as of a campaign of this name whose shared drive has these legs."""
     parameters = {"drive": {"legs": legs}} if legs else {}
     record = {"name": name, "configuration": {"parameters": parameters}}
-    return Subject(StoredRun(Path("run"), frame, record, ()), "position_error_m", 0.03)
+    return Subject(StoredRun(Path("run"), frame, frame, record, ()), "position_error_m", 0.03)
 
 
 def table(section: Section | None, block: int = 0) -> list[dict[str, str]]:

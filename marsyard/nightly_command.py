@@ -1,0 +1,138 @@
+"""`marsyard nightly`: runs a plan's campaigns, holds their figures against the nights before, and tells."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marsyard.campaign_command import Exit, JobsOption, console, make_crew, says_what_is_wrong, stopped_by_signals
+
+if TYPE_CHECKING:
+    from campaigns.execution.crew import Crew
+    from campaigns.running.engine import Watch
+    from marsyard.nightly_plan import Plan, PlannedCampaign
+    from reports.history import History, NightCampaign
+    from reports.regressions import Change
+
+#: What a nightly's folder holds.
+HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "site"
+#: Verdict of a campaign that could not be run at all.
+NOT_RUN = "NOT RUN"
+
+
+@says_what_is_wrong
+def nightly(
+    plan: Annotated[
+        Path | None, typer.Argument(metavar="[PLAN.toml]", help="The plan; by default the one that ships.")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder of the history, the runs, the page and the dashboard.")
+    ] = Path("nightly"),
+    jobs: JobsOption = None,
+) -> None:
+    """Run the plan's campaigns, compare each figure with the nights before, write nightly.md and the dashboard.
+
+    Exit status: as of the campaigns, the worst; 1 also for a regression, or a campaign that could not be run.
+    """
+    from campaigns.errors import StoreError
+    from campaigns.store.lock import folder_lock
+    from campaigns.store.record import git_commit
+    from marsyard.nightly_plan import PLAN_FILE, read_plan
+    from marsyard.progress import campaign_progress
+    from reports.history import FINISHED, INTERRUPTED, History
+
+    path = plan or PLAN_FILE
+    stated, crew = read_plan(path), make_crew(jobs, None)
+    try:
+        (out / RUNS).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"{out} cannot be written: {error.strerror or error}") from error
+    with folder_lock(out), History(out / HISTORY_FILE) as history:
+        night = history.begin(git_commit())
+        try:
+            with stopped_by_signals(), campaign_progress(console(stderr=True)) as watch:
+                for one in stated.campaigns:
+                    _run_one(_Night(history, night, out, crew, stated), one, path.parent, watch)
+        except KeyboardInterrupt:
+            history.finish(night, INTERRUPTED)
+            _tell(history, night, out, ())
+            raise typer.Exit(Exit.INTERRUPTED) from None
+        found = _changes(history, night)
+        history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in found])
+        _tell(history, night, out, found)
+        status = _status(history.campaigns(night), found)
+    raise typer.Exit(status)
+
+
+class _Night:
+    """A night under way."""
+
+    def __init__(self, history: History, night: int, out: Path, crew: Crew, plan: Plan) -> None:
+        self.history, self.night, self.out, self.crew, self.plan = history, night, out, crew, plan
+
+
+def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) -> None:
+    """Runs a campaign, judges it, and keeps its figures; whatever goes wrong with it leaves the others alone."""
+    from campaigns.errors import CampaignError
+    from campaigns.running.engine import run_campaign
+    from marsyard.nightly_plan import definition_of
+    from reports.between import figures_of, sample_of
+    from reports.campaign import write_report
+    from reports.history import NightCampaign, NightFigure
+    from reports.sampled import sampled
+    from reports.stored import read_run
+    from reports.verdicts import exit_code, judge_campaign, overall
+
+    try:
+        campaign = planned.load(now.plan.seed, now.night, folder)
+        name = campaign.configuration.name
+        directory = now.out / RUNS / f"night-{now.night:05d}-{name}"
+        run_campaign(campaign, directory, now.crew, watch)
+        run = read_run(directory)
+        how = sampled(run.configuration)
+        verdicts = judge_campaign(run.whole, run.requirements, how)
+        whole = overall(verdicts, run.whole, how)
+        write_report(directory)
+        frame, figures = figures_of(run)
+        kept = [NightFigure(one.name, one.larger_is_better, one.level, sample_of(frame, one)) for one in figures]
+        status = exit_code(verdicts, bool(whole.crashed))
+        told = NightCampaign(name, definition_of(campaign), directory.name, whole.word, status, whole.sentence)
+    except Exception as error:  # a defect in one campaign must not cost the night its others
+        kept = []
+        if not isinstance(error, CampaignError):
+            traceback.print_exc()
+        told = NightCampaign(planned.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
+    now.history.add(now.night, told, kept)
+
+
+def _changes(history: History, night: int) -> list[Change]:
+    from reports.regressions import changes, comparisons_of
+
+    return changes(comparisons_of(history, night))
+
+
+def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
+    """Writes the page, renews the dashboard, and prints the page."""
+    from reports.dashboard.site import write_site
+
+    from reports.campaign import write_whole
+    from reports.night_page import night_text
+    from reports.regressions import comparisons_of
+
+    nights = history.nights()
+    now = next(one for one in nights if one.night == night)
+    earlier = [one for one in nights if one.night < night]
+    compared = sum(bool(one.before) for one in comparisons_of(history, night))
+    text = night_text(now, earlier, history.campaigns(night), found, compared)
+    write_whole(out / PAGE_FILE, text)
+    write_site(out / SITE, [out / RUNS])
+    typer.echo(text)
+
+
+def _status(campaigns: Sequence[NightCampaign], found: Sequence[Change]) -> int:
+    statuses = {one.exit_code for one in campaigns} | {int(Exit.FAILED) for one in found if one.worse}
+    return next((status for status in (Exit.FAILED, Exit.INSUFFICIENT) if status in statuses), Exit.MET)

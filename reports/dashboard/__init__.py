@@ -1,0 +1,1 @@
+"""The dashboard: a static site over stored campaigns."""

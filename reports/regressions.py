@@ -1,0 +1,103 @@
+"""What has changed since the nights before: every figure of a night held against its history."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from reports.history import History, NightFigure
+from reports.statistics.changes import Sample, difference_p, holm
+
+#: The chance that a night in which nothing changed reports any change at all.
+FALSE_ALARMS = 0.01
+
+
+@dataclass(frozen=True)
+class Change:
+    """A figure that has changed.
+
+    Attributes
+    ----------
+    campaign, figure, rate
+        What changed; whether it is a rate of successes, of which more is better, or a size of errors.
+    before, now
+        Its level in the nights before and tonight: the rate, or the median.
+    p_value
+        Probability of so much by chance, corrected for the number of figures compared tonight.
+    nights
+        Nights before that it was held against.
+    """
+
+    campaign: str
+    figure: str
+    rate: bool
+    before: float
+    now: float
+    p_value: float
+    nights: int
+
+    @property
+    def worse(self) -> bool:
+        """Whether it changed for the worse."""
+        return self.now < self.before if self.rate else self.now > self.before
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A figure of tonight, and the same figure in the nights before."""
+
+    campaign: str
+    figure: NightFigure
+    before: Sequence[Sample]
+
+
+def changes(comparisons: Sequence[Comparison]) -> list[Change]:
+    """The figures of a night that have changed; the family-wise rate of false alarms is at most `FALSE_ALARMS`."""
+    pooled = [_pooled(one.before) for one in comparisons]
+    p_values = holm(
+        [
+            math.nan if before is None else difference_p(one.figure.sample, before)
+            for one, before in zip(comparisons, pooled, strict=True)
+        ]
+    )
+    return [
+        Change(
+            campaign=one.campaign,
+            figure=one.figure.figure,
+            rate=one.figure.rate,
+            before=level_of(before, one.figure.rate),
+            now=level_of(one.figure.sample, one.figure.rate),
+            p_value=p,
+            nights=len(one.before),
+        )
+        for one, before, p in zip(comparisons, pooled, p_values, strict=True)
+        if before is not None and p <= FALSE_ALARMS
+    ]
+
+
+def comparisons_of(history: History, night: int) -> list[Comparison]:
+    """Every figure of a night with the same figure in the nights before."""
+    return [
+        Comparison(campaign.name, figure, history.before(night, campaign, figure.figure))
+        for campaign in history.campaigns(night)
+        for figure in history.figures(night, campaign.name)
+    ]
+
+
+def level_of(sample: Sample, rate: bool) -> float:
+    """The rate, or the median; NaN for no cases."""
+    known = sample.known().values
+    if known.size == 0:
+        return math.nan
+    return float(known.mean() if rate else np.median(known))
+
+
+def _pooled(samples: Sequence[Sample]) -> Sample | None:
+    """The cases of several nights together; None where there are none."""
+    if not samples:
+        return None
+    values = np.concatenate([one.values for one in samples])
+    return Sample(values, np.concatenate([one.terrains for one in samples]))
