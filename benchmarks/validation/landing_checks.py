@@ -83,7 +83,7 @@ def errors(number: int) -> dict[str, dict[str, Scalar]]:
     p = exact(SITES[number % len(SITES)], streams.generator("pair"))
     world = World.of(p)
     flight = Flight.of(p, world.ground.surface, streams)
-    pair = take_pictures(p, world, flight, camera_optics(p.camera), streams)
+    pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
     measurements = measure(p, flight, pair, streams)
     truth = GroundTruth.of(world, flight, pair, p.lander.limits)
     rows: dict[str, dict[str, Scalar]] = {}
