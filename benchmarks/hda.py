@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 from scipy import ndimage
@@ -18,6 +20,7 @@ from algorithms.hda.sighting import sighting
 from algorithms.hda.tracking import track_features
 from algorithms.hda.view import undistorted
 from benchmarks.timing import Figure, core_seconds
+from campaigns.definition.loading import load_campaign
 from sim.camera import Cahv
 from sim.frames import rigid
 from sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
@@ -61,9 +64,9 @@ def _picture(texture: np.ndarray, pose: RigidTransform) -> np.ndarray:
 
 
 def figures(repeats: int) -> list[Figure]:
-    """Stages with the paper's parameters, the whole with them and dense, the hazard maps of a large map."""
+    """Stages with the paper's parameters, the whole with them and dense, maps of a large map, a campaign's case."""
     given = measurements()
-    return [*table_one(given, repeats), *_whole(given, repeats), _large_map(repeats)]
+    return [*table_one(given, repeats), *_whole(given, repeats), _large_map(repeats), case(repeats)]
 
 
 def table_one(given: LandingMeasurements, repeats: int) -> list[Figure]:
@@ -127,3 +130,14 @@ def _large_map(repeats: int) -> Figure:
     return Figure(
         "HDA hazard maps of 256 x 256", core_seconds(lambda: hazard_maps(ground, HdaOptions()), repeats), bar=0.05
     )
+
+
+def case(cases: int) -> Figure:
+    """Whole cases of `hda-hazardous`, as a worker runs them that has had their ground before."""
+    campaign = load_campaign("hda-hazardous")
+
+    def fly(number: int) -> None:
+        campaign.scenario.run(campaign.parameters(number), campaign.streams(number))
+
+    times = [time for number in range(cases) for time in core_seconds(partial(fly, number), 1)]
+    return Figure("hda-hazardous case: flight, 2 frames, map, landing, truth", times, bar=1.5)
