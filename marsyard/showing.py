@@ -43,6 +43,17 @@ def catalogue_table(campaigns: Mapping[str, Path]) -> Table:
     return table
 
 
+def catalogue_data(campaigns: Mapping[str, Path]) -> list[dict[str, Any]]:
+    """The campaigns of the catalogue as plain data."""
+    told = []
+    for name, path in campaigns.items():
+        stated = _as_stated(path)
+        told.append(
+            {"name": name, "file": str(path), **{k: stated.get(k) for k in ("scenario", "cases", "description")}}
+        )
+    return told
+
+
 def _as_stated(path: Path) -> dict[str, Any]:
     """A campaign's file as it stands; what is wrong with it is said by whoever runs it."""
     try:

@@ -20,12 +20,29 @@ app = typer.Typer(no_args_is_help=True, help="Sites and the figures of their ter
 
 
 @app.command(name="list")
-def list_sites() -> None:
+def list_sites(
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+) -> None:
     """List the sites."""
+    import json
+
     from rich.console import Console
     from rich.table import Table
 
     from sim.terrain.sites import sites
+
+    if as_json:
+        told = [
+            {
+                "name": one.name,
+                "planet": one.environment.planet,
+                "terrain": [scale for scale in ("descent", "ground") if getattr(one, scale) is not None],
+                "description": one.description,
+            }
+            for one in sites().values()
+        ]
+        typer.echo(json.dumps(told, indent=2))
+        return
 
     table = Table(box=None, pad_edge=False)
     for heading in ("site", "planet", "terrain", "description"):
@@ -77,6 +94,7 @@ def _terrain(site: str, scale: str | None) -> TerrainParameters:
     """Parameters of a site's terrain, or of one around a file. Raises ValueError."""
     from pathlib import Path
 
+    from scenarios.terrain_files import check_source
     from sim.terrain.embedding import grid_for
     from sim.terrain.imported import RealTerrain
     from sim.terrain.parameters import TerrainParameters
@@ -84,6 +102,7 @@ def _terrain(site: str, scale: str | None) -> TerrainParameters:
 
     if Path(site).suffix.lower() in (".npz", ".tif", ".tiff"):
         source = RealTerrain(dtm=Path(site))
+        check_source(source)
         samples, spacing_m = grid_for(source)
         return TerrainParameters(samples=samples, spacing_m=spacing_m, craters_per_km2=0.0, source=source)
     return preset(site).terrain(scale)

@@ -10,12 +10,14 @@ import numpy as np
 from benchmarks.validation.estimators import PATCH
 from benchmarks.validation.motion import STEPS_PX, Motion, View, measure, render, supersampled
 from benchmarks.validation.records import Check, Measure
-from benchmarks.validation.scenes import descent_view, renderer, rock_view
+from benchmarks.validation.scenes import descent_view, renderer, rock_view, tile_view
 from sim.render.edges import edge_pixels
 from sim.terrain.sites import sites
 
 BAR_PX, CONTROL_BAR_PX = 0.02, 0.005
 DESCENT_HEIGHT_M = 2000.0
+#: From which the descent camera's pixel is 0.25 m on the tile, whose picture has 0.5 m.
+TILE_HEIGHT_M = 300.0
 DISTANCES_M = (10.0, 5.0, 2.0)
 #: Those from which the picture holds the rock's outline; nearer, the rock fills it.
 OUTLINE_DISTANCES_M = (10.0, 5.0)
@@ -94,6 +96,15 @@ def run(quick: bool) -> Iterator[Measure]:
         )
 
 
+def run_tile(quick: bool) -> Iterator[Measure]:
+    view = tile_view(TILE_HEIGHT_M, DESCENT_SIZE)
+    if view is None:
+        return
+    steps = QUICK_STEPS_PX if quick else STEPS_PX
+    errors = [motion.error for motion in measure(renderer(), view, steps)]
+    yield _row(f"bias of motion, the HiRISE tile from {TILE_HEIGHT_M:g} m", errors, BAR_PX, steps)
+
+
 def _commonest_rock(motion: Motion) -> int:
     rocks = motion.body[motion.body >= 0]
     return int(np.bincount(rocks).argmax())
@@ -146,5 +157,6 @@ def run_edges(quick: bool) -> Iterator[Measure]:
 CHECKS = (
     Check("edges", "Motion of the picture", run_edges),
     Check("motion", "Motion of the picture", run),
+    Check("motion-tile", "Motion of the picture", run_tile),
     Check("motion-control", "Motion of the picture", run_control),
 )

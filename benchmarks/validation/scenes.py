@@ -14,13 +14,16 @@ from sim.frames import direction, rigid
 from sim.render import Objects, Photometry, Renderer, Scene, Sun, Texture, process_renderer
 from sim.render.backend import default_backend
 from sim.sensor.presets import preset
-from sim.terrain import Surface, TerrainBank
+from sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
+from sim.terrain.imported import RealTerrain
 from sim.terrain.rocks import PlacedRock, RockField, RockParameters
 from sim.terrain.sites import Site, SiteTexture, site
 
 #: The bank from which the checks take their terrains.
 SEED = 20
 HAZCAM_LABEL = Path(__file__).parents[3] / "shared/data/mer_opportunity/1F483288473EFFCMUFP1214L0M1.IMG"
+#: The HiRISE tile in Gale: 1 m posts, picture of 0.5 m.
+TILE = Path(__file__).parents[3] / "shared/data/gale_hirise/gale_1m_dem_0p5m_ortho.npz"
 #: Where the descents look: anywhere.
 DESCENT_PLACE = (1000.0, 1200.0)
 #: Where the large rock lies, its size, and how high the mast's camera stands.
@@ -119,6 +122,29 @@ def rocks(
     field = RockField.on(surface, parameters, np.random.default_rng(SEED))
     mesh = field.near(*place, reach_m, above_m=above_m)
     return Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=albedo)
+
+
+def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
+    """The middle of the descent camera's picture of the HiRISE tile in Gale with its ortho; None without the data."""
+    if not TILE.exists():
+        return None
+    # its ortho lies about 2 m east and 1 m south of its heights; finer than its 1 m posts the ground is synthetic
+    source = RealTerrain(dtm=TILE, ortho_east_m=2.0, ortho_north_m=-1.0)
+    terrain = TerrainParameters(samples=2048, spacing_m=0.25, craters_per_km2=0.0, source=source)
+    surface = synthesise(terrain, np.random.default_rng(SEED))
+    middle = (0.5 * 2048 * 0.25, 0.5 * 2048 * 0.25)
+    whole = preset("mer-descent-flown").cameras()[0]
+    camera = whole.cropped((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
+    scene = Scene(
+        surface,
+        middle,
+        Sun(direction(np.radians(110.0), np.radians(40.0))),
+        Photometry(),
+        mesh_finest_m=0.0085 * height_m,
+        mesh_reach_m=14.0 * height_m,
+    )
+    place = np.array([*middle, float(surface.height(*middle)) + height_m])
+    return View(scene, camera, rigid(Rotation.from_euler("xy", [4.0, -3.0], degrees=True), place))
 
 
 def descent_view(name: str, height_m: float, size: tuple[int, int]) -> View:

@@ -1,23 +1,53 @@
-"""The true motion of a descent."""
+"""The true motion of a descent: flown by the dynamics, or recorded."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 
 from scenarios.descent.faults import faulty_times
 from scenarios.descent.parameters import DescentScenarioParameters
-from sim.dynamics import State, SwingDescent
+from scenarios.descent.recorded import FlightFile
+from scenarios.interface import Scalar
+from sim.dynamics import State, SwingDescent, Trajectory
+from sim.dynamics.recorded_files import TrajectoryFileError
 from sim.streams import Streams
 from sim.terrain import Surface
 
-PICTURES = 3
 #: Gravity over a plain terrain: Mars.
 MARS_GRAVITY_M_S2 = 3.72
-#: How long before the first picture the flight is known, s.
+#: How long before the first picture a flight of the dynamics is known, s.
 LEAD_S = 5.0
+#: How long before the first picture and after the last instant of interest the inertial unit is read, s.
+MARGIN_S = 0.1
+#: Instants at which a recorded flight is searched for the height of the thrusters' firing.
+_SEARCHED = 2000
+
+
+@dataclass(frozen=True)
+class Flown:
+    """A descent's motion.
+
+    Attributes
+    ----------
+    motion
+        Truth over time; its time 0 is that of the first picture.
+    lead_s
+        How long before the first picture it is known.
+    firing_s
+        When the thrusters fire: at `thruster_firing_m` above the ground; where a recorded flight ends before, at its
+        end.
+    row
+        What it was flown by, as columns of the results.
+    """
+
+    motion: Trajectory
+    lead_s: float
+    firing_s: float
+    row: Mapping[str, Scalar]
 
 
 def gravity_m_s2(p: DescentScenarioParameters) -> float:
@@ -25,28 +55,59 @@ def gravity_m_s2(p: DescentScenarioParameters) -> float:
     return MARS_GRAVITY_M_S2 if p.preset is None else p.preset.environment.gravity_m_s2
 
 
-def flown_descent(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> SwingDescent:
-    """The descent whose first picture is taken at the stated height above the ground below."""
+def flown_descent(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> Flown:
+    """The descent whose first picture is taken at the stated height above the ground below; or the recorded one.
+
+    Raises
+    ------
+    TrajectoryFileError
+        If a recorded flight is below the ground at a picture.
+    """
     ground = float(surface.height(p.place.east_m, p.place.north_m))
-    start = np.array([p.place.east_m, p.place.north_m, ground + p.descent.altitude_first_m])
-    return SwingDescent.flown(
+    below = np.array([p.place.east_m, p.place.north_m, ground])
+    if p.flight is not None:
+        return _recorded(p, p.flight, below, surface)
+    descent = SwingDescent.flown(
         p.descent,
-        start,
+        below + np.array([0.0, 0.0, p.descent.altitude_first_m]),
         streams.generator("gusts"),
         ground_height_m=ground,
         gravity_m_s2=gravity_m_s2(p),
         lead_s=LEAD_S,
     )
+    row = {f"descent_{name}": value for name, value in descent.parameters.model_dump().items()}
+    return Flown(descent, LEAD_S, descent.thruster_firing_s, row)
 
 
-def nominal_times_s(p: DescentScenarioParameters) -> list[float]:
-    """When pictures should be taken."""
-    return [number * p.descent.interval_s for number in range(PICTURES)]
+def _recorded(
+    p: DescentScenarioParameters, flight: FlightFile, below: Float64[np.ndarray, "3"], surface: Surface
+) -> Flown:
+    motion = flight.motion(below, gravity_m_s2(p))
+    check_clearance(flight, motion, faulty_times(p.faults, p.picture_times_s), surface)
+    times = np.linspace(max(p.picture_times_s), motion.span_s[1] - MARGIN_S, _SEARCHED)
+    positions = motion.motion(times).positions_m
+    heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
+    low = np.flatnonzero(heights <= p.descent.thruster_firing_m)
+    firing_s = float(times[low[0] if low.size else -1])
+    row: dict[str, Scalar] = {"flight_file": flight.file, "flight_first_picture_s": flight.start_s}
+    return Flown(motion, flight.lead_s, firing_s, row)
 
 
-def picture_states(p: DescentScenarioParameters, descent: SwingDescent) -> list[State]:
+def check_clearance(flight: FlightFile, motion: Trajectory, times_s: Sequence[float], surface: Surface) -> None:
+    """Raises TrajectoryFileError where a recorded flight is below the ground at a picture."""
+    positions = motion.motion(np.array(times_s)).positions_m
+    heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
+    buried = np.flatnonzero(heights <= 0.0)
+    if buried.size:
+        raise TrajectoryFileError(
+            f"{flight.file}: at picture {buried[0] + 1} the camera is {-heights[buried[0]]:.1f} m below the ground; "
+            "allowed: above it"
+        )
+
+
+def picture_states(p: DescentScenarioParameters, motion: Trajectory) -> list[State]:
     """Truth at the three exposures."""
-    return [descent.state(time) for time in faulty_times(p.faults, nominal_times_s(p))]
+    return [motion.state(time) for time in faulty_times(p.faults, p.picture_times_s)]
 
 
 def mean_velocities(states: Sequence[State]) -> Float64[np.ndarray, "2 3"]:

@@ -9,17 +9,14 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 
 from scenarios.descent.faults import faulty_altitudes, faulty_attitudes
-from scenarios.descent.flight import LEAD_S, gravity_m_s2, nominal_times_s
+from scenarios.descent.flight import MARGIN_S, Flown, gravity_m_s2
 from scenarios.descent.optics import calibrated_camera
 from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.descent.world import World
-from sim.dynamics import SwingDescent
+from sim.dynamics import Trajectory
 from sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter
 from sim.streams import Streams
-
-#: How long before the first picture and after the last instant of interest the inertial unit is read, s.
-MARGIN_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -47,29 +44,29 @@ class Instruments:
     clock: Clock
 
     @classmethod
-    def drawn(cls, p: DescentScenarioParameters, world: World, descent: SwingDescent, streams: Streams) -> Instruments:
+    def drawn(cls, p: DescentScenarioParameters, world: World, flown: Flown, streams: Streams) -> Instruments:
         """The instruments of a case, and what navigation makes of its motion."""
-        start, end = -LEAD_S + MARGIN_S, descent.thruster_firing_s + MARGIN_S
+        start, end = -flown.lead_s + MARGIN_S, flown.firing_s + MARGIN_S
         approach = Approach(p.approach, start)
         unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
         imu = approach.calibrated(unit, streams.generator("inertial unit's calibration"))
         return cls(
             approach=approach,
             imu=imu,
-            navigation=_navigated(p, approach, imu, descent, streams),
+            navigation=_navigated(p, approach, imu, flown, streams),
             altimeter=RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
             clock=Clock.drawn(p.clock, streams.generator("image clock")),
         )
 
 
 def _navigated(
-    p: DescentScenarioParameters, approach: Approach, imu: Imu, descent: SwingDescent, streams: Streams
+    p: DescentScenarioParameters, approach: Approach, imu: Imu, flown: Flown, streams: Streams
 ) -> InertialSolution:
     """Navigation from the last star reference, before entry, to the thrusters' firing."""
-    start, end = approach.end_s, descent.thruster_firing_s + MARGIN_S
+    start, end = approach.end_s, flown.firing_s + MARGIN_S
     errors = approach.errors(imu, streams.generator("approach"))
-    increments = imu.increments(descent, start, end, streams.generator("inertial noise"))
-    state = descent.state(start)
+    increments = imu.increments(flown.motion, start, end, streams.generator("inertial noise"))
+    state = flown.motion.state(start)
     attitude, velocity = errors.believed(state.attitude, state.velocity_m_s)
     return InertialSolution.propagated(increments, attitude, velocity, gravity_m_s2(p))
 
@@ -77,14 +74,14 @@ def _navigated(
 def measure(
     p: DescentScenarioParameters,
     world: World,
-    descent: SwingDescent,
+    motion: Trajectory,
     pictures: Sequence[UInt16[np.ndarray, "rows columns"]],
     detector: Detector,
     instruments: Instruments,
     streams: Streams,
 ) -> DescentMeasurements:
     """Pictures and readings: attitudes at the pictures' tags, altitudes of the radar's last readings before them."""
-    times = np.array(nominal_times_s(p))
+    times = np.array(p.picture_times_s)
     tags = instruments.clock.tags(times, streams.generator("image time tags"))
     model = calibrated_camera(p.camera, streams.generator("camera calibration"))
     camera = model.binned(columns=1, rows=p.detector.rows_summed)
@@ -97,7 +94,7 @@ def measure(
         for attitude, tag in zip(instruments.navigation.attitude(tags), tags, strict=True)
     ]
     attitudes = faulty_attitudes(p.faults, attitudes, streams.generator("attitude fault"))
-    altitudes = faulty_altitudes(p.faults, _altitudes(descent, times, instruments.altimeter, streams))
+    altitudes = faulty_altitudes(p.faults, _altitudes(motion, times, instruments.altimeter, streams))
     return DescentMeasurements(
         images=(images[0], images[1], images[2]),
         attitudes=(attitudes[0], attitudes[1], attitudes[2]),
@@ -108,11 +105,11 @@ def measure(
 
 
 def _altitudes(
-    descent: SwingDescent, times_s: Float64[np.ndarray, "3"], altimeter: RadarAltimeter, streams: Streams
+    motion: Trajectory, times_s: Float64[np.ndarray, "3"], altimeter: RadarAltimeter, streams: Streams
 ) -> list[AltitudeMeasurement]:
     """The radar's last readings before the pictures, with their own tags."""
     at = altimeter.sampling.latest(times_s)
-    readings = altimeter.measure(descent, at, streams.generator("altimeter noise"))
+    readings = altimeter.measure(motion, at, streams.generator("altimeter noise"))
     return [
         AltitudeMeasurement(float(value), float(tag))
         for value, tag in zip(readings.values, readings.times_s, strict=True)

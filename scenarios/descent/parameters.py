@@ -9,8 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from algorithms.dimes import DimesOptions
 from scenarios.chosen import ChosenAlgorithms
-from scenarios.descent.faults import Faults
+from scenarios.descent.faults import Faults, faulty_times
+from scenarios.descent.recorded import FlightFile
 from scenarios.estimators import VELOCITY
+from scenarios.terrain_files import check_terrain
 from sim.dynamics import SwingParameters
 from sim.render.backend import Backend, default_backend
 from sim.sensor import (
@@ -23,6 +25,9 @@ from sim.sensor import (
     RadarParameters,
 )
 from sim.terrain import Site, TerrainParameters, site, sites
+
+#: Pictures of a descent.
+PICTURES = 3
 
 
 class Place(BaseModel):
@@ -155,6 +160,9 @@ class DescentScenarioParameters(ChosenAlgorithms):
     terrain: TerrainParameters = TerrainParameters()
     sun: SunParameters = SunParameters()
     descent: SwingParameters = SwingParameters()
+    flight: Annotated[FlightFile | None, Field(description="a recorded flight, in place of the descent's dynamics")] = (
+        None
+    )
     lander: LanderParameters = LanderParameters()
     camera: CameraParameters = CameraParameters()
     faults: Faults = Faults()
@@ -178,6 +186,12 @@ class DescentScenarioParameters(ChosenAlgorithms):
         if name is not None and name not in descent_sites():
             raise ValueError(f"no site for a descent is called '{name}'; allowed: {', '.join(descent_sites())}")
         return name
+
+    @field_validator("terrain")
+    @classmethod
+    def _terrain_files_can_be_used(cls, terrain: TerrainParameters) -> TerrainParameters:
+        check_terrain(terrain)
+        return terrain
 
     @model_validator(mode="before")
     @classmethod
@@ -206,6 +220,17 @@ class DescentScenarioParameters(ChosenAlgorithms):
                 f"detector.rows_summed {self.detector.rows_summed} does not divide the camera's {rows} rows"
             )
         return self
+
+    @model_validator(mode="after")
+    def _flight_is_over_the_ground(self) -> DescentScenarioParameters:
+        if self.flight is not None:
+            self.flight.check(faulty_times(self.faults, self.picture_times_s))
+        return self
+
+    @property
+    def picture_times_s(self) -> list[float]:
+        """When pictures should be taken, s after the first."""
+        return [number * self.descent.interval_s for number in range(PICTURES)]
 
     @property
     def preset(self) -> Site | None:

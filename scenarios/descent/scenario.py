@@ -53,15 +53,15 @@ class DescentScenario:
         """One descent."""
         p = _checked(parameters)
         world = World.of(p)
-        descent = flown_descent(p, world.surface, streams)
-        states = picture_states(p, descent)
-        at_firing = descent.state(descent.thruster_firing_s)
+        flown = flown_descent(p, world.surface, streams)
+        states = picture_states(p, flown.motion)
+        at_firing = flown.motion.state(flown.firing_s)
         optics = camera_optics(p.camera)
         settings = faulty_detector(p.faults, p.detector)
         detector = Detector.drawn(optics.fall_off, settings, streams.generator("detector response"))
         pictures = expose(p, world, states, optics, detector, streams)
-        instruments = Instruments.drawn(p, world, descent, streams)
-        measurements = measure(p, world, descent, pictures, detector, instruments, streams)
+        instruments = Instruments.drawn(p, world, flown, streams)
+        measurements = measure(p, world, flown.motion, pictures, detector, instruments, streams)
         camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
         places = room(states, world.surface, camera, detector.calibration, world.sun.direction, p.dimes)
         conditions_row = {
@@ -71,7 +71,7 @@ class DescentScenario:
             **conditions(p, world, states, at_firing),
             **instrument_conditions(instruments),
             **instrument_errors(world, states, measurements),
-            **{f"descent_{name}": value for name, value in descent.parameters.model_dump().items()},
+            **flown.row,
             **provenance(p, pictures),
         }
 

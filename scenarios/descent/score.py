@@ -11,10 +11,10 @@ from jaxtyping import Float64, UInt16
 from algorithms.dimes import propagated
 from algorithms.dimes.binning import altitudes_at_images
 from algorithms.interface import VelocityEstimate
-from scenarios.descent.flight import PICTURES, mean_velocities, off_nadir_deg
+from scenarios.descent.flight import mean_velocities, off_nadir_deg
 from scenarios.descent.landing import Touchdown
 from scenarios.descent.measurement import Instruments
-from scenarios.descent.parameters import DescentScenarioParameters
+from scenarios.descent.parameters import PICTURES, DescentScenarioParameters
 from scenarios.descent.world import World
 from scenarios.interface import Scalar
 from scenarios.velocity import velocity_products

@@ -16,6 +16,7 @@ from scenarios.landing.faults import Faults
 from scenarios.landing.helicopter import HelicopterParameters
 from scenarios.landing.pair_choice import PairParameters
 from scenarios.landing.relief import Limits
+from scenarios.terrain_files import check_terrain
 from sim.camera import CameraModel
 from sim.sensor import (
     PRESETS,
@@ -159,6 +160,12 @@ class LandingScenarioParameters(ChosenAlgorithms):
         if name not in down:
             raise ValueError(f"no camera preset that looks down is called '{name}'; allowed: {', '.join(down)}")
         return name
+
+    @field_validator("terrain")
+    @classmethod
+    def _terrain_files_can_be_used(cls, terrain: TerrainParameters) -> TerrainParameters:
+        check_terrain(terrain)
+        return terrain
 
     @model_validator(mode="before")
     @classmethod

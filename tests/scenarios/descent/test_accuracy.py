@@ -37,13 +37,13 @@ def _tracked(case: int, **parts: Any) -> tuple[list[Track], list[State], Descent
     }
     p = parameters(**PERFECT, descent=motion, detector=NOISELESS, **parts)
     world, streams = World.of(p), Streams(5, "accuracy", case)
-    descent = flown_descent(p, world.surface, streams)
-    states = picture_states(p, descent)
+    flown = flown_descent(p, world.surface, streams)
+    states = picture_states(p, flown.motion)
     optics = camera_optics(p.camera)
     detector = Detector.drawn(optics.fall_off, p.detector, streams.generator("detector response"))
     pictures = expose(p, world, states, optics, detector, streams)
-    instruments = Instruments.drawn(p, world, descent, streams)
-    measurements = measure(p, world, descent, pictures, detector, instruments, streams)
+    instruments = Instruments.drawn(p, world, flown, streams)
+    measurements = measure(p, world, flown.motion, pictures, detector, instruments, streams)
     details = DimesEstimator().estimate(measurements).details
     assert isinstance(details, DimesDetails)
     return [track for track in details.tracks if track.valid], states, measurements, world.surface

@@ -1,0 +1,103 @@
+"""`marsyard clean`: what is kept on disk between runs, with its size; removes it where asked to."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from marsyard.campaign_command import console, says_what_is_wrong, size_text
+
+#: What is kept, and what it costs to be without it.
+KINDS = {
+    "terrain": "terrains built for campaigns; built again when a case needs one, from seconds to minutes each",
+    "kernels": "compiled code; compiled again in the next minute of running",
+}
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of one kind: its folder, how many files, and how many bytes on disk they take."""
+
+    kind: str
+    folder: Path
+    files: int
+    size_bytes: int
+
+
+@says_what_is_wrong
+def clean(
+    kinds: Annotated[
+        list[str] | None, typer.Argument(metavar="[KIND]...", help="terrain, kernels; by default all of them.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Remove it; without this it is only shown.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Show what Marsyard keeps on disk beside campaigns, with sizes; with --yes remove it.
+
+    Campaigns' folders are never touched. Running campaigns go on: what they need is built again.
+    """
+    from campaigns.errors import CampaignError, not_allowed
+
+    for kind in kinds or []:
+        if kind not in KINDS:
+            raise CampaignError(not_allowed("kind", kind, KINDS))
+    found = [kept(kind) for kind in kinds or KINDS]
+    freed = sum(_removed(one.folder) for one in found) if yes else 0
+    if as_json:
+        told = [{"kind": k.kind, "folder": str(k.folder), "files": k.files, "bytes": k.size_bytes} for k in found]
+        typer.echo(json.dumps({"kept": told, "removed_bytes": freed}, indent=2))
+        return
+    _print(found)
+    if yes:
+        typer.echo(f"removed {size_text(freed)}")
+    else:
+        typer.echo("nothing was removed; to remove it: marsyard clean --yes")
+
+
+def kept(kind: str) -> Kept:
+    """What is kept of a kind."""
+    from sim.cache import cache_directory
+
+    folder = cache_directory(kind)
+    sizes = []
+    for path in folder.rglob("*"):
+        try:
+            if path.is_file() and not path.is_symlink():
+                sizes.append(path.stat().st_size)
+        except OSError:  # another process has removed it meanwhile
+            continue
+    return Kept(kind, folder, len(sizes), sum(sizes))
+
+
+def _removed(folder: Path) -> int:
+    """Removes all files in a folder; returns their bytes. What another process writes just now stays."""
+    from sim.cache import UNFINISHED
+
+    freed = 0
+    for path in sorted(folder.rglob("*"), reverse=True):
+        try:
+            if path.is_dir() and not path.is_symlink():
+                path.rmdir()
+            elif path.suffix != UNFINISHED:
+                size = path.stat().st_size
+                path.unlink()
+                freed += size
+        except OSError:  # not empty, in use, or gone already
+            continue
+    return freed
+
+
+def _print(found: list[Kept]) -> None:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("kind", "files", "size", "folder", "what it is"):
+        table.add_column(heading, justify="right" if heading in ("files", "size") else "left", overflow="fold")
+    for one in found:
+        table.add_row(one.kind, str(one.files), size_text(one.size_bytes), str(one.folder), KINDS[one.kind])
+    console().print(table)

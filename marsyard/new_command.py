@@ -1,0 +1,92 @@
+"""`marsyard new`: a commented campaign from flags or a short dialogue, which runs as it is written."""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from marsyard.campaign_command import says_what_is_wrong
+
+
+class System(StrEnum):
+    """What a campaign puts to the test."""
+
+    VELOCITY = "velocity"
+    LANDING = "landing"
+    TRACKING = "tracking"
+
+
+#: What is asked for each system: site and the most that its error may be, in the unit of its metric.
+_USUAL = {
+    System.VELOCITY: ("gusev", 5.0, "horizontal velocity within this many m/s (5 of the DIMES requirement)"),
+    System.LANDING: ("heli-hazardous", 0.99, "share of chosen sites that must be safe"),
+    System.TRACKING: ("mars-yard", 0.03, "position of the target within this many metres at the goal"),
+}
+
+
+@says_what_is_wrong
+def new(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")],
+    system: Annotated[
+        System | None,
+        typer.Option("--system", help="velocity (DIMES in a descent), landing (hazards), or tracking (a rover)."),
+    ] = None,
+    site: Annotated[str | None, typer.Option("--site", help="One of `marsyard terrain list`.")] = None,
+    camera: Annotated[
+        str | None, typer.Option("--camera", metavar="FILE", help="Your camera's file (docs/own-worlds.md).")
+    ] = None,
+    detector: Annotated[
+        str | None, typer.Option("--detector", metavar="FILE", help="Your detector's datasheet in TOML.")
+    ] = None,
+    flight: Annotated[
+        str | None, typer.Option("--flight", metavar="FILE", help="Your trajectory, in place of the dynamics.")
+    ] = None,
+    axes: Annotated[str, typer.Option("--axes", help="The trajectory's world axes: enu or ned.")] = "enu",
+    bound: Annotated[
+        float | None, typer.Option("--bound", metavar="X", help="The requirement: most error, or least share.")
+    ] = None,
+    cases: Annotated[int, typer.Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Instead of NAME.toml.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it is there.")] = False,
+) -> None:
+    """Write a commented campaign of your own; at a terminal asks for what is not given."""
+    from campaigns.definition.loading import load_campaign
+    from campaigns.errors import CampaignError
+    from marsyard.new_campaign import Choices, campaign_text
+
+    path = Path(f"{name}.toml") if out is None else out
+    if path.exists() and not overwrite:
+        raise CampaignError(f"{path}: there already; --overwrite replaces it, --out writes another")
+    if not name or any(letter in name for letter in '/\\"\n'):
+        raise CampaignError(f"'{name}' is no name for a campaign: without slashes and quotes")
+    asked = system is None and sys.stdin.isatty()
+    chosen = System(_asked("System: velocity, landing or tracking", "velocity", asked)) if system is None else system
+    usual_site, usual_bound, about = _USUAL[chosen]
+    site = site or _asked("Site", usual_site, asked)
+    camera = camera or _asked("Camera's file (empty: the paper's camera)", "", asked and chosen != System.TRACKING)
+    flight = flight or _asked("Trajectory's file (empty: simulated)", "", asked and chosen == System.VELOCITY)
+    stated = float(_asked(f"Requirement: {about}", f"{usual_bound:g}", asked)) if bound is None else bound
+    choices = Choices(name, chosen.value, site, camera, detector or "", flight, axes, stated, cases)
+    text = campaign_text(choices)
+    before = path.read_text(encoding="utf-8") if path.exists() else None
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CampaignError(f"{path}: cannot be written: {error.strerror or error}") from error
+    try:
+        load_campaign(str(path))
+    except CampaignError:
+        # what was asked for cannot be run: nothing of it stays
+        path.unlink() if before is None else path.write_text(before, encoding="utf-8")
+        raise
+    typer.echo(f"{path}: {chosen.value} over {site}, {cases} cases. See it with `marsyard show {path}`, run it with")
+    typer.echo(f"  marsyard run {path}")
+
+
+def _asked(question: str, usual: str, asked: bool) -> str:
+    """The answer at the terminal, or the usual."""
+    return str(typer.prompt(question, default=usual, show_default=bool(usual))) if asked else usual

@@ -1,0 +1,141 @@
+"""A flight from a file, in place of the descent's dynamics: `[parameters.flight]` of a descent campaign."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from scipy.spatial.transform import Rotation
+
+from sim.dynamics.recorded import RecordedMotion
+from sim.dynamics.recorded_files import RecordedPoses, TrajectoryFileError, read_poses
+
+#: Rotations from a file's world axes to ours, which are east, north, up.
+_WORLD = {
+    "enu": Rotation.identity(),
+    "ned": Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])),
+}
+#: OpenCV's camera axes (x right, y down, z forward) in the body's, whose camera looks along -z, its columns along x.
+_CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+#: How long after the last picture the flight must be known, s.
+AFTER_S = 0.5
+
+
+class FlightFile(BaseModel):
+    """A recorded or computed flight.
+
+    Positions are the camera's, unless `lever_m` says where the camera is. The file's time `first_picture_s` is that of
+    the first picture; others follow after `descent.interval_s` each. All instruments measure this motion as they would
+    a simulated one.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    file: Annotated[str, Field(description="CSV, Parquet, TUM or EuRoC file of poses")]
+    sha256: Annotated[str | None, Field(description="of the file; filled in")] = None
+    axes: Annotated[Literal["enu", "ned"], Field(description="world axes: east, north, up; or north, east, down")]
+    origin: Annotated[
+        Literal["place", "terrain"],
+        Field(description="positions count from the ground at `place`, or from the terrain's own origin"),
+    ] = "place"
+    attitude_of: Annotated[
+        Literal["camera", "body"],
+        Field(description="whose axes: OpenCV's of the camera, or the body's, whose camera looks along -z"),
+    ] = "camera"
+    mounting: Annotated[
+        tuple[float, float, float, float],
+        Field(description="quaternion x, y, z, w from those axes of the camera or body to the recorded vehicle's"),
+    ] = (0.0, 0.0, 0.0, 1.0)
+    lever_m: Annotated[
+        tuple[float, float, float], Field(description="the camera in the recorded vehicle's axes, m")
+    ] = (0.0, 0.0, 0.0)
+    first_picture_s: Annotated[
+        float | None, Field(description="file's time of the first picture; not stated: `lead_s` after its beginning")
+    ] = None
+    lead_s: Annotated[
+        float, Field(ge=0.2, le=30.0, description="how long before the first picture navigation is followed, s")
+    ] = 5.0
+    turn_deg: Annotated[
+        float, Field(ge=-720.0, le=720.0, description="turns the flight about the vertical, clockwise from above")
+    ] = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_its_hash(cls, stated: Any) -> Any:
+        """Fills in the hash of the file, by which a campaign knows it again."""
+        if isinstance(stated, str):
+            stated = {"file": stated}
+        if isinstance(stated, Mapping) and isinstance(stated.get("file"), str) and stated.get("sha256") is None:
+            return {**stated, "sha256": read_poses(stated["file"]).sha256}
+        return stated
+
+    @model_validator(mode="after")
+    def _file_is_as_it_was(self) -> FlightFile:
+        if self.sha256 != self.poses.sha256:
+            raise TrajectoryFileError(f"{self.file}: has changed since the campaign was made from it")
+        if abs(float(np.linalg.norm(self.mounting)) - 1.0) > 1e-3:
+            raise ValueError(f"mounting {list(self.mounting)} is no quaternion of length 1")
+        return self
+
+    @property
+    def poses(self) -> RecordedPoses:
+        """The file's poses."""
+        return read_poses(self.file)
+
+    @property
+    def start_s(self) -> float:
+        """The file's time of the first picture."""
+        if self.first_picture_s is not None:
+            return self.first_picture_s
+        return float(self.poses.times_s[0]) + self.lead_s
+
+    def check(self, pictures_s: Sequence[float]) -> None:
+        """Raises ValueError where the flight is not known at the pictures, or cannot be one over the ground."""
+        motion = self.motion(np.zeros(3), 0.0)
+        first, last = motion.span_s
+        if first > -self.lead_s + 1e-9 or last < max(pictures_s) + AFTER_S:
+            begin, end = self.poses.times_s[0], self.poses.times_s[-1]
+            raise TrajectoryFileError(
+                f"{self.file}: covers {begin:.3f} to {end:.3f} s; pictures from {self.start_s:.3f} to "
+                f"{self.start_s + max(pictures_s):.3f} s, lead_s {self.lead_s:g} s before and {AFTER_S:g} s after them "
+                "are needed"
+            )
+        at = motion.motion(np.array(pictures_s))
+        for number, (position, attitude) in enumerate(zip(at.positions_m, at.attitudes, strict=True), start=1):
+            axis = attitude.apply(np.array([0.0, 0.0, -1.0]))
+            if axis[2] >= 0.0:
+                elevation = np.degrees(np.arcsin(np.clip(axis[2], -1.0, 1.0)))
+                raise TrajectoryFileError(
+                    f"{self.file}: at picture {number} the camera looks up, {elevation:.1f} deg above the horizon; "
+                    "allowed: down (flight.axes, attitude_of and mounting say whose axes the file means)"
+                )
+            if self.origin == "place" and position[2] <= 0.0:
+                raise TrajectoryFileError(
+                    f"{self.file}: at picture {number} the camera is {-position[2]:.1f} m below the ground at the "
+                    'place; allowed: above it (origin = "terrain" counts heights as the terrain does)'
+                )
+
+    def motion(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
+        """The flight in the terrain's world, its time 0 at the first picture.
+
+        Parameters
+        ----------
+        ground_m
+            The ground at the place, which positions count from where `origin` says so; shape (3,).
+        gravity_m_s2
+            Gravity of the site.
+        """
+        poses = self.poses
+        turn = Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0]))
+        world = turn * _WORLD[self.axes]
+        recorded = world * Rotation.from_quat(poses.quaternions)
+        positions = world.apply(poses.positions_m) + recorded.apply(np.array(self.lever_m))
+        attitudes = recorded * Rotation.from_quat(np.array(self.mounting))
+        if self.attitude_of == "camera":
+            attitudes = attitudes * _CAMERA_IN_BODY.inv()
+        if self.origin == "place":
+            positions = positions + ground_m
+        return RecordedMotion(poses.times_s - self.start_s, positions, attitudes, gravity_m_s2)

@@ -1,0 +1,102 @@
+"""A motion that was recorded: positions and attitudes at instants, continued between them.
+
+Positions are joined by a cubic spline of continuous acceleration (not-a-knot), attitudes by one of continuous angular
+acceleration (`scipy.spatial.transform.RotationSpline`). Velocity, body rate and specific force are the splines' own
+derivatives, so that instruments which feel them agree with what is seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from sim.dynamics.state import State
+from sim.dynamics.trajectory import Motion
+
+#: Fewest instants from which acceleration can be told.
+LEAST_INSTANTS = 4
+#: Most turn from one instant to the next: beyond, the way round is a guess.
+MOST_TURN_DEG = 90.0
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedMotion:
+    """A `Trajectory` through recorded poses.
+
+    Attributes
+    ----------
+    times_s
+        Increasing times, seconds, at least `LEAST_INSTANTS`.
+    positions_m
+        Of the body frame's origin, world axes.
+    attitudes
+        Rotations from body to world axes.
+    gravity_m_s2
+        By which specific force differs from acceleration.
+
+    Raises
+    ------
+    ValueError
+        If there are too few instants, times do not increase, a value is not finite, or the body turns by more than
+        `MOST_TURN_DEG` from one instant to the next.
+    """
+
+    times_s: Float64[np.ndarray, "n"]
+    positions_m: Float64[np.ndarray, "n 3"]
+    attitudes: Rotation
+    gravity_m_s2: float
+
+    def __post_init__(self) -> None:
+        if self.times_s.size < LEAST_INSTANTS:
+            raise ValueError(f"has {self.times_s.size} poses; allowed: at least {LEAST_INSTANTS}")
+        if not (np.all(np.isfinite(self.times_s)) and np.all(np.isfinite(self.positions_m))):
+            raise ValueError("holds a value that is not finite")
+        late = np.flatnonzero(np.diff(self.times_s) <= 0.0)
+        if late.size:
+            raise ValueError(f"time does not increase after {self.times_s[late[0]]:.6f} s (pose {late[0] + 1})")
+        turns = np.degrees((self.attitudes[:-1].inv() * self.attitudes[1:]).magnitude())
+        wide = np.flatnonzero(turns > MOST_TURN_DEG)
+        if wide.size:
+            raise ValueError(
+                f"turns by {turns[wide[0]]:.0f} deg after {self.times_s[wide[0]]:.6f} s (pose {wide[0] + 1}); "
+                f"allowed: up to {MOST_TURN_DEG:g} deg from one pose to the next"
+            )
+
+    @cached_property
+    def _position(self) -> CubicSpline:
+        return CubicSpline(self.times_s, self.positions_m)
+
+    @cached_property
+    def _attitude(self) -> RotationSpline:
+        return RotationSpline(self.times_s, self.attitudes)
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last recorded time."""
+        return float(self.times_s[0]), float(self.times_s[-1])
+
+    def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
+        """Truth at many times. Raises ValueError outside of the span."""
+        first, last = self.span_s
+        outside = times_s[(times_s < first) | (times_s > last)]
+        if outside.size:
+            raise ValueError(f"time {outside[0]:.6g} s is not recorded; allowed: {first:.6g} to {last:.6g} s")
+        attitudes = self._attitude(times_s)
+        felt = self._position(times_s, 2) + np.array([0.0, 0.0, self.gravity_m_s2])
+        return Motion(
+            times_s=times_s,
+            positions_m=self._position(times_s),
+            velocities_m_s=self._position(times_s, 1),
+            attitudes=attitudes,
+            body_rates_rad_s=self._attitude(times_s, 1),
+            specific_forces_m_s2=attitudes.inv().apply(felt),
+        )
+
+    def state(self, time_s: float) -> State:
+        """Truth at a time. Raises ValueError outside of the span."""
+        return self.motion(np.array([time_s])).state(0)

@@ -1,0 +1,115 @@
+"""`marsyard new` writes campaigns that run as they are written; `marsyard clean` and the lists as JSON."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from campaigns.definition.loading import load_campaign
+from marsyard.cli import app
+
+#: EuRoC's first camera (its sensor.yaml), of the fields that are read.
+EUROC = """resolution: [752, 480]
+camera_model: pinhole
+intrinsics: [458.654, 457.296, 367.215, 248.375]
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def told(*words: str) -> tuple[int, str]:
+    result = CliRunner().invoke(app, list(words))
+    return result.exit_code, result.output
+
+
+@pytest.mark.parametrize(
+    ("system", "scenario", "bound"),
+    [("velocity", "descent", 4.0), ("landing", "landing", 0.95), ("tracking", "rover", 0.05)],
+)
+def test_a_new_campaign_is_one(here: Path, system: str, scenario: str, bound: float) -> None:
+    status, output = told("new", "mine", "--system", system, "--bound", str(bound), "-n", "30")
+    assert status == 0, output
+    configuration = load_campaign("mine.toml").configuration
+    assert (configuration.name, configuration.scenario, configuration.cases) == ("mine", scenario, 30)
+    (asked,) = configuration.requirements
+    assert bound in (asked.bound, asked.probability)
+    # what it disperses says where that is from, and every table has a comment before it
+    assert all(one.source for one in configuration.dispersions.values())
+    lines = (here / "mine.toml").read_text().splitlines()
+    assert sum(line.startswith("#") for line in lines) >= 8
+    assert load_campaign("mine.toml").draws(3)
+
+
+def test_own_files_are_named_in_it(here: Path) -> None:
+    (here / "cam.yaml").write_text(EUROC)
+    status, output = told("new", "mine", "--system", "velocity", "--camera", "cam.yaml")
+    assert status == 0, output
+    tables = tomllib.loads((here / "mine.toml").read_text())
+    assert tables["parameters"]["camera"]["model"] == "cam.yaml"
+    parameters = load_campaign("mine.toml").configuration.parameters
+    assert parameters["camera"]["model"]["columns"] == 752
+    assert parameters["detector"]["rows_summed"] == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--system", "velocity", "--site", "venus"), "venus"),
+        (("--system", "velocity", "--camera", "absent.yaml"), "absent.yaml: file: cannot be read"),
+        (("--system", "tracking", "--camera", "cam.yaml"), "see camera.preset"),
+        (("--system", "landing", "--flight", "flight.csv"), "only descents fly"),
+    ],
+)
+def test_what_cannot_run_is_not_written(here: Path, words: tuple[str, ...], said: str) -> None:
+    status, output = told("new", "mine", *words)
+    assert status == 2
+    assert said in output
+    assert not (here / "mine.toml").exists()
+
+
+def test_files_that_are_there_stay(here: Path) -> None:
+    (here / "mine.toml").write_text("precious")
+    status, output = told("new", "mine", "--system", "tracking")
+    assert status == 2
+    assert "mine.toml: there already; --overwrite" in output
+    assert told("new", "mine", "--system", "tracking", "--site", "venus", "--overwrite")[0] == 2
+    assert (here / "mine.toml").read_text() == "precious"
+
+
+def test_clean_shows_and_then_removes(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MARSYARD_CACHE", str(here / "cache"))
+    folder = here / "cache" / "terrain"
+    folder.mkdir(parents=True)
+    (folder / "one.npy").write_bytes(b"\0" * 3000)
+    (folder / "half.part").write_bytes(b"\0" * 500)
+    status, output = told("clean")
+    assert status == 0
+    assert "3.5 kB" in output
+    assert "nothing was removed" in output
+    assert (folder / "one.npy").exists()
+    status, output = told("clean", "terrain", "--yes", "--json")
+    assert json.loads(output)["removed_bytes"] == 3000
+    assert not (folder / "one.npy").exists()
+    # what another process writes just now stays
+    assert (folder / "half.part").exists()
+    status, output = told("clean", "terrains")
+    assert status == 2
+    assert "did you mean 'terrain'" in output
+
+
+def test_lists_as_json() -> None:
+    campaigns = {one["name"]: one for one in json.loads(told("list", "--json")[1])}
+    assert campaigns["dimes-smoke"]["cases"] == 24
+    sites = {one["name"]: one for one in json.loads(told("terrain", "list", "--json")[1])}
+    assert sites["gusev"]["planet"] == "Mars"
+    assert "descent" in sites["gusev"]["terrain"]

@@ -1,0 +1,210 @@
+"""Recorded motions: files that others wrote, and splines against motions in closed form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sim.dynamics import Trajectory
+from sim.dynamics.recorded import RecordedMotion
+from sim.dynamics.recorded_files import COLUMNS, TrajectoryFileError, read_poses
+from tests.sim.sensor.motions import GRAVITY, Swaying
+
+#: The beginning of freiburg1_xyz of the TUM RGB-D benchmark (Sturm et al. 2012): its two first poses, twice, the
+#: second time a second later.
+TUM = """# ground truth trajectory
+# file: 'rgbd_dataset_freiburg1_xyz.bag'
+# timestamp tx ty tz qx qy qz qw
+1305031098.6659 1.3563 0.6305 1.6380 0.6132 0.5962 -0.3311 -0.3986
+1305031098.6758 1.3543 0.6306 1.6360 0.6129 0.5966 -0.3316 -0.3980
+1305031099.6659 1.3563 0.6305 1.6380 0.6132 0.5962 -0.3311 -0.3986
+1305031099.6758 1.3543 0.6306 1.6360 0.6129 0.5966 -0.3316 -0.3980
+"""
+
+#: The beginning of MH_01_easy's ground truth of the EuRoC data sets (Burri et al. 2016), velocities included.
+EUROC = """#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], \
+v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1]
+1403636580838555648,4.688319,-1.786938,0.783338,0.534108,-0.153029,-0.827383,-0.082152,-0.027876,0.033207,0.800006
+1403636580843555328,4.688177,-1.786770,0.787350,0.534640,-0.152990,-0.826976,-0.082863,-0.029272,0.033992,0.804771
+1403636580848555520,4.688028,-1.786598,0.791382,0.535178,-0.152945,-0.826562,-0.083605,-0.030043,0.034999,0.808240
+1403636580853555456,4.687878,-1.786421,0.795429,0.535715,-0.152884,-0.826146,-0.084391,-0.030230,0.035853,0.810462
+"""
+
+
+def table(times: np.ndarray, positions: np.ndarray, attitudes: Rotation) -> pd.DataFrame:
+    return pd.DataFrame(np.column_stack([times, positions, attitudes.as_quat()]), columns=list(COLUMNS))
+
+
+def written(folder: Path, text: str, name: str = "poses.txt") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_tums_file(tmp_path: Path) -> None:
+    poses = read_poses(written(tmp_path, TUM))
+    assert poses.times_s[0] == 1305031098.6659
+    assert np.allclose(poses.positions_m[1], [1.3543, 0.6306, 1.6360])
+    # stored with four digits, and brought to length 1
+    assert np.allclose(poses.quaternions[0], [0.6132, 0.5962, -0.3311, -0.3986], atol=1e-4)
+    assert np.allclose(np.linalg.norm(poses.quaternions, axis=1), 1.0)
+
+
+def test_eurocs_ground_truth_and_its_velocities(tmp_path: Path) -> None:
+    poses = read_poses(written(tmp_path, EUROC, "data.csv"))
+    # scalar first in the file, last in ours; nanoseconds become seconds without losing the steps of 5 ms
+    assert np.allclose(poses.quaternions[0], [-0.153029, -0.827383, -0.082152, 0.534108], atol=1e-5)
+    assert np.allclose(np.diff(poses.times_s), 0.005, atol=1e-6)
+    motion = RecordedMotion(
+        poses.times_s - poses.times_s[0], poses.positions_m, Rotation.from_quat(poses.quaternions), 9.81
+    )
+    middle = motion.motion(motion.times_s[1:3])
+    # the file's own velocities, which its estimator found together with the positions
+    assert np.allclose(middle.velocities_m_s, [[-0.0293, 0.0340, 0.8048], [-0.0300, 0.0350, 0.8082]], atol=2e-3)
+
+
+def _swaying() -> Swaying:
+    return Swaying(
+        spin_rad_s=0.3,
+        nod_rad=0.2,
+        nod_rad_s=2.0,
+        velocity_m_s=(10.0, -3.0, -60.0),
+        acceleration_m_s2=(0.0, 0.0, 1.0),
+        sway_m=5.0,
+        sway_rad_s=1.5,
+        tilt=Rotation.from_rotvec([0.2, 0.1, 0.0]),
+    )
+
+
+def _recorded(spacing_s: float) -> RecordedMotion:
+    times = np.arange(0.0, 10.0 + 0.5 * spacing_s, spacing_s)
+    truth = _swaying().motion(times)
+    return RecordedMotion(times, truth.positions_m, truth.attitudes, GRAVITY)
+
+
+def _errors(spacing_s: float) -> dict[str, float]:
+    motion, at = _recorded(spacing_s), np.linspace(1.0, 9.0, 501)
+    ours, theirs = motion.motion(at), _swaying().motion(at)
+    return {
+        "position": float(np.abs(ours.positions_m - theirs.positions_m).max()),
+        "velocity": float(np.abs(ours.velocities_m_s - theirs.velocities_m_s).max()),
+        "attitude": float((ours.attitudes.inv() * theirs.attitudes).magnitude().max()),
+        "rate": float(np.abs(ours.body_rates_rad_s - theirs.body_rates_rad_s).max()),
+        "force": float(np.abs(ours.specific_forces_m_s2 - theirs.specific_forces_m_s2).max()),
+    }
+
+
+def test_splines_follow_a_motion_in_closed_form() -> None:
+    """Cubic splines are wrong by h^4 in value, h^3 in slope, h^2 in curvature: twice as fine: 16, 8, 4 times nearer."""
+    assert isinstance(_recorded(0.1), Trajectory)
+    coarse, fine = _errors(0.1), _errors(0.05)
+    for name, order in (("position", 4), ("velocity", 3), ("attitude", 4), ("rate", 3), ("force", 2)):
+        assert fine[name] < coarse[name] / 2 ** (order - 0.5), name
+    assert fine["position"] < 1e-5
+    assert fine["rate"] < 1e-4
+    # curvature of the sway, 5 m x 1.5^4 rad/s^4, over h^2 / 12
+    assert fine["force"] < 2.0 * 5.0 * 1.5**4 * 0.05**2 / 12.0 + 1e-3
+
+
+def test_rates_and_forces_are_the_splines_own_derivatives() -> None:
+    """What instruments feel agrees with what is seen, recorded noise included."""
+    rng = np.random.default_rng(3)
+    times = np.arange(0.0, 3.0, 0.1)
+    noisy = Rotation.from_rotvec(0.02 * rng.standard_normal((times.size, 3))) * _swaying().motion(times).attitudes
+    positions = _swaying().motion(times).positions_m + 0.1 * rng.standard_normal((times.size, 3))
+    motion, at, h = RecordedMotion(times, positions, noisy, GRAVITY), np.linspace(0.5, 2.5, 57), 1e-5
+    before, here, after = motion.motion(at - h), motion.motion(at), motion.motion(at + h)
+    assert np.allclose((after.positions_m - before.positions_m) / (2 * h), here.velocities_m_s, atol=1e-4)
+    acceleration = (after.velocities_m_s - before.velocities_m_s) / (2 * h)
+    assert np.allclose(
+        here.attitudes.apply(here.specific_forces_m_s2),
+        acceleration + np.array([0.0, 0.0, GRAVITY]),
+        rtol=1e-4,
+        atol=1e-2,
+    )
+    turned = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2 * h)
+    assert np.allclose(turned, here.body_rates_rad_s, atol=1e-4)
+
+
+def test_tables_of_pandas(tmp_path: Path) -> None:
+    truth = _swaying().motion(np.linspace(0.0, 2.0, 21))
+    frame = table(truth.times_s, truth.positions_m, truth.attitudes)
+    frame.insert(2, "comment", "as flown")
+    frame.to_csv(tmp_path / "poses.csv", index=False)
+    frame.to_parquet(tmp_path / "poses.parquet")
+    for name in ("poses.csv", "poses.parquet"):
+        poses = read_poses(tmp_path / name)
+        assert np.allclose(poses.positions_m, truth.positions_m, rtol=0, atol=1e-9)
+        turned = Rotation.from_quat(poses.quaternions).inv() * truth.attitudes
+        assert turned.magnitude().max() < 1e-9
+    # the same file is the same; another has another hash
+    assert read_poses(tmp_path / "poses.csv") is read_poses(tmp_path / "poses.csv")
+    assert read_poses(tmp_path / "poses.csv").sha256 != read_poses(tmp_path / "poses.parquet").sha256
+
+
+def _faulty(tmp_path: Path, **changes: float) -> Path:
+    truth = _swaying().motion(np.linspace(0.0, 2.0, 21))
+    frame = table(truth.times_s, truth.positions_m, truth.attitudes)
+    for column, value in changes.items():
+        frame.loc[7, column] = value
+    frame.to_csv(tmp_path / "faulty.csv", index=False)
+    return tmp_path / "faulty.csv"
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"x_m": np.nan}, "pose 8: x_m is not finite"),
+        ({"time_s": np.inf}, "pose 8: time_s is not finite"),
+        ({"time_s": 0.5}, "pose 8: time goes from 0.600000 to 0.500000 s; allowed: times that increase"),
+        ({"time_s": 0.6}, "pose 8: time goes from 0.600000 to 0.600000 s"),
+        ({"qw": 3.0}, r"pose 8: the quaternion's length is 3.\d+; allowed: 1 to 0.005"),
+    ],
+)
+def test_faulty_poses_are_named(tmp_path: Path, changes: dict[str, float], fault: str) -> None:
+    with pytest.raises(TrajectoryFileError, match=fault) as raised:
+        read_poses(_faulty(tmp_path, **changes))
+    assert "faulty.csv" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("time_s,x_m\n1,2\n", "has no column y_m, z_m, qx"),
+        ("1 2 3\n4 5 6\n", "has 3 numbers in a line"),
+        ("", "has 0 poses; allowed: at least 4"),
+        (TUM[: TUM.rindex("1305031099.6758")], "has 3 poses"),
+        ("hello world\n", "cannot be read as a table"),
+        ("a,b\n\x00\x01", "is no table of poses"),
+        ("PAR1 but no more", "cannot be read as a table"),
+    ],
+)
+def test_files_that_are_no_poses(tmp_path: Path, text: str, fault: str) -> None:
+    with pytest.raises(TrajectoryFileError, match=fault):
+        read_poses(written(tmp_path, text, "faulty.dat"))
+    with pytest.raises(TrajectoryFileError, match=r"absent\.csv: cannot be read"):
+        read_poses(tmp_path / "absent.csv")
+
+
+def test_a_picture_of_a_gigabyte_is_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "picture.csv"
+    with path.open("wb") as file:
+        file.truncate(1 << 30)
+    with pytest.raises(TrajectoryFileError, match="larger than 512 MiB"):
+        read_poses(path)
+
+
+def test_motions_that_cannot_be_followed() -> None:
+    times, still = np.arange(4.0), Rotation.identity(4)
+    places = np.zeros((4, 3))
+    with pytest.raises(ValueError, match="has 3 poses"):
+        RecordedMotion(times[:3], places[:3], still[:3], 3.7)
+    half = Rotation.from_euler("z", [0, 0, 120, 120], degrees=True)
+    with pytest.raises(ValueError, match=r"turns by 120 deg after 1.000000 s \(pose 2\)"):
+        RecordedMotion(times, places, half, 3.7)
+    with pytest.raises(ValueError, match="time 4 s is not recorded; allowed: 0 to 3 s"):
+        RecordedMotion(times, places, still, 3.7).state(4.0)
