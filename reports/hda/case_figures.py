@@ -50,6 +50,8 @@ ELEVATION_COLOURS = "gray_r"
 _MOST_MATCHES = 600
 #: Cells of a terrain's longer side as drawn.
 _DRAWN_CELLS = 90
+#: Height of the drawn relief over the terrain's side, at least, as far as drawing it up to ten times as high does it.
+_LEAST_RELIEF = 0.12
 _BACKGROUND = "#15191e"
 
 
@@ -63,7 +65,7 @@ def draw_tracks(products: Mapping[str, Any]) -> Figure:
         As all figures here: where the products do not hold what it shows.
     """
     shown, tracks = _known(pictures(products), "pictures"), _known(tracked_features(products), "tracks")
-    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     _show(left, shown[0])
     _show(right, shown[1])
@@ -98,7 +100,7 @@ def draw_epipolar(products: Mapping[str, Any]) -> Figure:
     """Fig. 3: structure pixels in the first picture, their segments and matches in the second."""
     shown, matches = _known(pictures(products), "pictures"), _known(epipolar_matches(products), "matches")
     chosen = _thinned(matches)
-    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     _show(left, shown[0])
     _show(right, shown[1])
@@ -195,7 +197,6 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
     terrain = figure.add_subplot(grid[2], projection="3d", computed_zorder=False)
     colours = SAFETY_COLOURS(np.clip(np.nan_to_num(maps.safety, nan=1.0), 0, 2).astype(np.int64))[..., :3]
     _draw_terrain(terrain, maps, colours, -115.0)
-    terrain.set_title("On the terrain", fontsize=9)
     return figure
 
 
@@ -321,31 +322,41 @@ def _draw_terrain(
     x = maps.corner_m[0] + maps.cell_m * np.arange(columns)
     y = maps.corner_m[1] - maps.cell_m * np.arange(rows)
     heights = maps.elevation_m - np.nanmedian(maps.elevation_m)
+    sides = maps.cell_m * np.array([columns, rows])
+    raised = _raised(heights, float(sides.max()))
     lit = LightSource(315.0, 45.0).shade_rgb(
-        np.asarray(colours), np.nan_to_num(heights), vert_exag=1.0, dx=maps.cell_m, dy=maps.cell_m, blend_mode="soft"
+        np.asarray(colours), np.nan_to_num(heights), vert_exag=raised, dx=maps.cell_m, dy=maps.cell_m, blend_mode="soft"
     )
     pick = np.s_[::step, ::step]
     axes.plot_surface(
         *(one[pick] for one in np.meshgrid(x, y)), heights[pick], facecolors=lit[pick], rcount=200, ccount=200,
         shade=False, antialiased=False, linewidth=0.0, rasterized=True, zorder=1,
     )  # fmt: skip
-    lift = 0.02 * max(rows, columns) * maps.cell_m
+    lift = 0.02 * float(sides.max()) / raised
     for name, cell in (("apriori", maps.apriori), ("site", maps.site)):
         height = _at_cell(heights[..., None], cell)
         if height is not None and np.isfinite(height).all():
             place = maps.corner_m + maps.cell_m * cell[::-1] * np.array([1.0, -1.0])
             axes.plot([place[0]], [place[1]], [float(height[0]) + lift], **_SITE_MARKS[name], zorder=5)
     reach = float(np.nanmax(heights) - np.nanmin(heights))
-    sides = maps.cell_m * np.array([columns, rows])
-    axes.set_box_aspect((sides[0], sides[1], max(reach, 0.05 * sides.max())), zoom=1.25)
+    axes.set_box_aspect((sides[0], sides[1], max(raised * reach, 0.05 * sides.max())), zoom=1.3)
     axes.view_init(elev=38.0, azim=azimuth_deg)
-    axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
+    axes.set(xlabel="x (m)", ylabel="y (m)")
+    axes.set_title("Heights in m" if raised == 1.0 else f"Heights in m, drawn {raised:g} times as high", fontsize=9)
     axes.tick_params(labelsize=6, pad=-2, colors=MUTED)
+    axes.locator_params(axis="z", nbins=3)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.label.set_size(7)
         axis.labelpad = -6
         axis.set_pane_color((0.0, 0.0, 0.0, 0.0))
-    axes.locator_params(nbins=4)
+    for flat in ("x", "y"):
+        axes.locator_params(axis=flat, nbins=4)
+
+
+def _raised(heights: Float[np.ndarray, "rows columns"], across: float) -> float:
+    """By how much heights are drawn larger, so that gentle ground shows its relief."""
+    reach = float(np.nanmax(heights) - np.nanmin(heights))
+    return next((times for times in (1.0, 2.0, 5.0) if times * reach >= _LEAST_RELIEF * across), 10.0)
 
 
 def _draw_safety(axes: Axes, maps: LandingMaps) -> None:
