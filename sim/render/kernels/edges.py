@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, Bounds, cross_ground, way_out
+from sim.render.kernels.ground import Array32, Bounds, cross_ground, way_out, world_ray
 from sim.render.kernels.hierarchy import Hierarchy, in_beam, nearest_hit
 from sim.render.kernels.intersection import hit_triangle
 from sim.render.kernels.sight import Ints
@@ -221,11 +221,12 @@ def look_closely(
         The same of the rays: outputs.
     """
     inverse_spacing = 1.0 / spacing
-    w = world_from_body
     rows = distance.size // columns
     ranges = np.empty(9)
     found = np.empty(9, dtype=np.int8)
     listed = np.empty(MOST_LISTED, dtype=np.int64)
+    middle_origin = np.empty((1, 3))
+    middle_direction = np.empty((1, 3))
     for k in range(pixels.size):
         pixel = pixels[k]
         row = pixel // columns
@@ -258,37 +259,24 @@ def look_closely(
             # the pixel's middle lies between its first ray and its last
             a = k * share
             b = a + share - 1
-            bx = 0.5 * (directions[a, 0] + directions[b, 0])
-            by = 0.5 * (directions[a, 1] + directions[b, 1])
-            bz = 0.5 * (directions[a, 2] + directions[b, 2])
-            ox = 0.5 * (origins[a, 0] + origins[b, 0])
-            oy = 0.5 * (origins[a, 1] + origins[b, 1])
-            oz = 0.5 * (origins[a, 2] + origins[b, 2])
+            for axis in range(3):
+                middle_origin[0, axis] = 0.5 * (origins[a, axis] + origins[b, axis])
+                middle_direction[0, axis] = 0.5 * (directions[a, axis] + directions[b, axis])
+            x0, y0, z0, dx, dy, dz = world_ray(world_from_body, position, middle_origin, middle_direction, 0)
             in_list = in_beam(
                 tree,
-                position[0] + w[0, 0] * ox + w[0, 1] * oy + w[0, 2] * oz,
-                position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz,
-                position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz,
-                w[0, 0] * bx + w[0, 1] * by + w[0, 2] * bz,
-                w[1, 0] * bx + w[1, 1] * by + w[1, 2] * bz,
-                w[2, 0] * bx + w[2, 1] * by + w[2, 2] * bz,
+                x0,
+                y0,
+                z0,
+                dx,
+                dy,
+                dz,
                 BEAM_PX * pixel_angles[a],
                 math.inf if sky else BEYOND * last,
                 listed,
             )
         for n in range(k * share, (k + 1) * share):
-            bx = directions[n, 0]
-            by = directions[n, 1]
-            bz = directions[n, 2]
-            ox = origins[n, 0]
-            oy = origins[n, 1]
-            oz = origins[n, 2]
-            dx = w[0, 0] * bx + w[0, 1] * by + w[0, 2] * bz
-            dy = w[1, 0] * bx + w[1, 1] * by + w[1, 2] * bz
-            dz = w[2, 0] * bx + w[2, 1] * by + w[2, 2] * bz
-            x0 = position[0] + w[0, 0] * ox + w[0, 1] * oy + w[0, 2] * oz
-            y0 = position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz
-            z0 = position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz
+            x0, y0, z0, dx, dy, dz = world_ray(world_from_body, position, origins, directions, n)
             t = math.inf
             level = 0
             end = math.inf

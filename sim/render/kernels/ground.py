@@ -19,6 +19,27 @@ FINEST_STEP = 0.00125
 
 
 @njit(cache=True, inline="always")
+def turned(rotation: Array, vectors: Array | Array32, n: int) -> tuple[float, float, float]:
+    """The n-th of some vectors in the axes that a rotation matrix turns it to."""
+    x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
+    return (
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
+    )
+
+
+@njit(cache=True, inline="always")
+def world_ray(
+    world_from_body: Array, position: Array, origins: Array | Array32, directions: Array | Array32, n: int
+) -> tuple[float, float, float, float, float, float]:
+    """Origin and direction in world axes of the n-th of some rays, whose origins are relative to `position`."""
+    dx, dy, dz = turned(world_from_body, directions, n)
+    x, y, z = turned(world_from_body, origins, n)
+    return position[0] + x, position[1] + y, position[2] + z, dx, dy, dz
+
+
+@njit(cache=True, inline="always")
 def meet_ground(
     field: Level,
     inverse_spacing: float,
@@ -170,5 +191,7 @@ __all__ = [
     "first_ground",
     "height_range",
     "meet_ground",
+    "turned",
     "way_out",
+    "world_ray",
 ]

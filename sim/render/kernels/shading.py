@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32
+from sim.render.kernels.ground import Array32, world_ray
 from sim.render.kernels.hierarchy import Hierarchy, anything_hit
 from sim.render.kernels.sight import FLATTEST, Ints
 from sim.render.kernels.sky import sky_brightness
@@ -135,20 +135,8 @@ def shade(
     shadowed = shadow[0].shape[0] > 1
     finest = levels[0]
     things = tree[0].shape[0] > 0
-    w = world_from_body
     for n in range(directions.shape[0]):
-        bx = directions[n, 0]
-        by = directions[n, 1]
-        bz = directions[n, 2]
-        ox = origins[n, 0]
-        oy = origins[n, 1]
-        oz = origins[n, 2]
-        dx = w[0, 0] * bx + w[0, 1] * by + w[0, 2] * bz
-        dy = w[1, 0] * bx + w[1, 1] * by + w[1, 2] * bz
-        dz = w[2, 0] * bx + w[2, 1] * by + w[2, 2] * bz
-        x0 = position[0] + w[0, 0] * ox + w[0, 1] * oy + w[0, 2] * oz
-        y0 = position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz
-        z0 = position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz
+        x0, y0, z0, dx, dy, dz = world_ray(world_from_body, position, origins, directions, n)
         t = distance[n]
         triangle = triangle_of_pixel[n]
         smooth = max(level_of_pixel[n], 0)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, Bounds, first_ground
+from sim.render.kernels.ground import Array32, Bounds, first_ground, turned, world_ray
 from sim.render.kernels.hierarchy import Hierarchy, nearest_hit
 from sim.render.kernels.intersection import hit_triangle
 from sim.terrain.kernels import Array, Level, sample
@@ -191,7 +191,6 @@ def look(
     inverse_spacing = 1.0 / spacing
     top_level = len(levels) - 1
     things = ids.shape[1] > 0
-    w = world_from_body
     ray = np.empty((6, STRIP))
     guess = np.empty(STRIP)
     met = np.empty(STRIP)
@@ -208,23 +207,11 @@ def look(
         lowest, highest = top_level, 0
         for k in range(width):
             n = first + k
-            bx = directions[n, 0]
-            by = directions[n, 1]
-            bz = directions[n, 2]
-            ox = origins[n, 0]
-            oy = origins[n, 1]
-            oz = origins[n, 2]
-            ray[0, k] = position[0] + w[0, 0] * ox + w[0, 1] * oy + w[0, 2] * oz
-            ray[1, k] = position[1] + w[1, 0] * ox + w[1, 1] * oy + w[1, 2] * oz
-            ray[2, k] = position[2] + w[2, 0] * ox + w[2, 1] * oy + w[2, 2] * oz
-            ray[3, k] = w[0, 0] * bx + w[0, 1] * by + w[0, 2] * bz
-            ray[4, k] = w[1, 0] * bx + w[1, 1] * by + w[1, 2] * bz
-            ray[5, k] = w[2, 0] * bx + w[2, 1] * by + w[2, 2] * bz
+            ray[0, k], ray[1, k], ray[2, k], ray[3, k], ray[4, k], ray[5, k] = world_ray(
+                world_from_body, position, origins, directions, n
+            )
             face = face_of_pixel[n]
-            p = view_from_body[face]
-            px = p[0, 0] * bx + p[0, 1] * by + p[0, 2] * bz
-            py = p[1, 0] * bx + p[1, 1] * by + p[1, 2] * bz
-            pz = p[2, 0] * bx + p[2, 1] * by + p[2, 2] * bz
+            px, py, pz = turned(view_from_body[face], directions, n)
             u = focal[face] * px / pz + middle
             v = focal[face] * py / pz + middle
             i = min(max(math.floor(v), 0), side - 2)

@@ -97,22 +97,32 @@ def sweep_shadow(
 
 
 @njit(cache=True, inline="always")
-def shadow_clearance(shadow: Shadow, inverse_spacing: float, x: float, y: float, z: float) -> tuple[float, float]:
-    """How far a place lies above the ground's shadow, metres, and how many rows away what casts the shadow is."""
-    height, away, along_x = shadow
-    row_mask = height.shape[0] - 1
-    gx = (y if along_x else x) * inverse_spacing
-    gy = (x if along_x else y) * inverse_spacing
+def _between(
+    field: Array32, inverse_spacing: float, x: float, y: float
+) -> tuple[float, tuple[int, int], tuple[int, int]]:
+    """A periodic field between its posts, bilinear, and the rows and columns of the four posts around."""
+    mask = field.shape[0] - 1
+    gx = x * inverse_spacing
+    gy = y * inverse_spacing
     j = math.floor(gx)
     i = math.floor(gy)
     fx = gx - j
     fy = gy - i
-    i0 = i & row_mask
-    i1 = (i + 1) & row_mask
-    j0 = j & row_mask
-    j1 = (j + 1) & row_mask
-    edge = (1.0 - fy) * ((1.0 - fx) * height[i0, j0] + fx * height[i0, j1])
-    edge += fy * ((1.0 - fx) * height[i1, j0] + fx * height[i1, j1])
+    i0 = i & mask
+    i1 = (i + 1) & mask
+    j0 = j & mask
+    j1 = (j + 1) & mask
+    south = (1.0 - fx) * field[i0, j0] + fx * field[i0, j1]
+    north = (1.0 - fx) * field[i1, j0] + fx * field[i1, j1]
+    return (1.0 - fy) * south + fy * north, (i0, i1), (j0, j1)
+
+
+@njit(cache=True, inline="always")
+def shadow_clearance(shadow: Shadow, inverse_spacing: float, x: float, y: float, z: float) -> tuple[float, float]:
+    """How far a place lies above the ground's shadow, metres, and how many rows away what casts the shadow is."""
+    height, away, along_x = shadow
+    across, along = (y, x) if along_x else (x, y)
+    edge, (i0, i1), (j0, j1) = _between(height, inverse_spacing, across, along)
     farthest = max(max(away[i0, j0], away[i0, j1]), max(away[i1, j0], away[i1, j1]))
     return z - edge, float(farthest * REACH_ROWS)
 
@@ -238,18 +248,5 @@ def sun_over_ground(
 @njit(cache=True, inline="always")
 def cloud_cover(cover: Array32, inverse_cell: float, x: float, y: float) -> float:
     """Cover of a periodic layer of clouds at one place, bilinear between its cells."""
-    row_mask = cover.shape[0] - 1
-    gx = x * inverse_cell
-    gy = y * inverse_cell
-    j = math.floor(gx)
-    i = math.floor(gy)
-    fx = gx - j
-    fy = gy - i
-    i0 = i & row_mask
-    i1 = (i + 1) & row_mask
-    j0 = j & row_mask
-    j1 = (j + 1) & row_mask
-    south = (1.0 - fx) * cover[i0, j0] + fx * cover[i0, j1]
-    north = (1.0 - fx) * cover[i1, j0] + fx * cover[i1, j1]
-    between: float = (1.0 - fy) * south + fy * north
+    between: float = _between(cover, inverse_cell, x, y)[0]
     return between

@@ -43,7 +43,8 @@ GRADIENTS = np.array(
 def _slope(h: np.uint32, x: float, y: float, z: float) -> float:
     """The gradient of a hash times an offset. A table: which gradient comes next, no processor can predict."""
     kind = h & np.uint32(15)
-    return GRADIENTS[kind, 0] * x + GRADIENTS[kind, 1] * y + GRADIENTS[kind, 2] * z
+    slope: float = GRADIENTS[kind, 0] * x + GRADIENTS[kind, 1] * y + GRADIENTS[kind, 2] * z
+    return slope
 
 
 @njit(cache=True)
