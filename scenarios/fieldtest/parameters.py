@@ -147,9 +147,6 @@ class FieldTestParameters(BaseModel):
     pictures: PictureParameters = PictureParameters()
     triples: TripleParameters = TripleParameters()
     detector: DetectorChoice = Field(default_factory=lambda: preset(CAMERA).detector)
-    sun_step_s: Annotated[
-        float, Field(gt=0.0, le=3600.0, description="time for which the sun is held in a picture's light, s")
-    ] = 60.0
     backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
         default_factory=default_backend
     )

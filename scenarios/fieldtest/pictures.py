@@ -47,7 +47,7 @@ def take_picture(run: Run, state: State, detector: Detector, rng: np.random.Gene
     """The picture taken in a state of the flight."""
     optics = field_optics()
     p = run.key.field_test
-    scene = _scene(run.key, round(state.time_s / p.sun_step_s))
+    scene = _scene(run.key, state.time_s)
     frame = process_renderer(p.backend).render(scene, optics.rays, state.world_from_body, state.time_s)
     motion = ImageMotion.seen(
         optics.camera,
@@ -87,11 +87,13 @@ def site_ground(site_name: str, samples: int, bank_seed: int) -> SiteGround:
     return SiteGround(preset, terrain, bank.terrain(0), bank.rocks(0))
 
 
-@lru_cache(maxsize=3)
-def _scene(key: RunKey, step: int) -> Scene:
-    """The site around the middle of the line under the sun of a time; as many are kept as a triple has pictures."""
-    run, p = worked_out(key), key.field_test
-    sun = sun_at(run, step * p.sun_step_s)
+def _scene(key: RunKey, time_s: float) -> Scene:
+    """The site around the middle of the line under the sun of a time.
+
+    The sun may not be held from one picture to the next: shadows of clouds 2.5 km up move by a third of a metre a
+    second with it, and would leap by as much as it was held for.
+    """
+    sun = sun_at(worked_out(key), time_s)
     return replace(_first_light(key), sun=sun, photometry=_ground(key).photometry(sun))
 
 

@@ -139,14 +139,14 @@ def test_a_run_is_worked_out_the_same_again() -> None:
 def test_the_sun_moves_over_rocks_that_stay() -> None:
     """Lava's rocks take core-seconds to build: a run builds them once, whatever its pictures' times."""
     key = RunKey(stated(), 0, 5, "test")
-    run, step_s = worked_out(key), key.field_test.sun_step_s
-    early, late = pictures._scene(key, 0), pictures._scene(key, 30)
+    run, time_s = worked_out(key), 1800.0
+    early, late = pictures._scene(key, 0.0), pictures._scene(key, time_s)
     assert len(early.objects) > 0
     assert late.objects is early.objects
     east, north, _ = run.flight.origin_m.tolist()
     pixel_rad = float(np.median(pictures.field_optics().rays.pixel_angles))
     eye = Eye(east, north, key.field_test.helicopter.lowest_m, pixel_rad)
-    alone = site_scene(pictures._ground(key), eye, pictures.sun_at(run, 30 * step_s))
+    alone = site_scene(pictures._ground(key), eye, pictures.sun_at(run, time_s))
     assert np.array_equal(late.sun.direction, alone.sun.direction)
     assert late.photometry == alone.photometry
     assert np.array_equal(late.objects.triangles, alone.objects.triangles)
@@ -171,3 +171,22 @@ def test_case_is_answered_and_repeats() -> None:
     assert again.row == found.row
     with pytest.raises(ValueError, match="allowed: 0 to 138"):
         FieldTestScenario().run(parameters, Streams(5, "test", 139))
+
+
+def test_shadows_of_clouds_move_steadily_from_picture_to_picture() -> None:
+    """A sun that is held for a while and then jumps would take the shadows of high clouds with it, past the wind."""
+    key = RunKey(stated(), 3, 5, "test")
+    run = worked_out(key)
+    assert run.clouds is not None
+    ground = np.array([[[0.0, 0.0, 0.0]]])
+    places = []
+    for time_s in np.arange(1000.0, 1120.0, 3.0).tolist():
+        sun = pictures._scene(key, time_s).sun
+        _, height, east, north, _ = run.clouds.numbers(sun, time_s)
+        up = (height - ground[0, 0, 2]) / sun.direction[2]
+        # where in the layer the ground's point sees the sun
+        places.append([up * sun.direction[0] - east, up * sun.direction[1] - north])
+    moved = np.linalg.norm(np.diff(places, axis=0), axis=1) / 3.0
+    wind = np.hypot(key.field_test.runs[3].clouds.wind_east_m_s, key.field_test.runs[3].clouds.wind_north_m_s)
+    assert np.ptp(moved) < 0.01
+    assert abs(moved.mean() - wind) < 0.5
