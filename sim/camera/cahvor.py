@@ -91,8 +91,8 @@ class Cahvor(RadialModel):
     """A camera with radial distortion.
 
     A point P is moved to P' = P + mu lambda before the linear projection, with omega = (P - C).O,
-    lambda = P - C - omega O, tau = lambda.lambda / omega^2 and mu = rho0 + rho1 tau + rho2 tau^2. Points beyond the tau at
-    which the distance (1 + mu) sqrt(tau) from the axis stops growing are not visible.
+    lambda = P - C - omega O, tau = lambda.lambda / omega^2 and mu = rho0 + rho1 tau + rho2 tau^2. Points beyond the tau
+    at which the distance (1 + mu) sqrt(tau) from the axis stops growing are not visible.
 
     Attributes
     ----------

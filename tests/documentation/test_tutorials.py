@@ -41,7 +41,7 @@ def test_what_the_first_tutorial_promises_is_there(tmp_path: Path) -> None:
     program = str(Path(sys.executable).with_name("marsyard"))
     _run([program, "run", "dimes-smoke", "-n", "1", "--out", "first"], {3}, tmp_path)
     _run([program, "replay", "first", "0"], {0}, tmp_path)
-    for name in ("report.html", "cases.parquet", "cases.sqlite", "campaign.json", "cases/000000/dimes.png"):
+    for name in ("report.html", "cases.parquet", "cases.sqlite", "campaign.json", "cases/0/dimes.png"):
         assert (tmp_path / "first" / name).stat().st_size > 0
 
 
