@@ -1,4 +1,4 @@
-"""How long an update of the target tracker takes, and its search beside the full search and OpenCV's."""
+"""How long an update of the target tracker and a whole run take, and its search beside the full search and OpenCV's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from algorithms.vtt.matching import cut_patch, search_window
 from algorithms.vtt.options import VttOptions
 from algorithms.vtt.tracker import VisualTargetTracker
 from benchmarks.timing import Figure, core_seconds
+from scenarios.rover import RoverScenarioParameters, run_case
 from sim.measurements import RoverMeasurements, RoverTarget
+from sim.streams import Streams
 from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, navcam, pose, waves
 
 TARGET = np.array([10.0, 0.1, 0.2])
@@ -79,6 +81,19 @@ def searches(repeats: int) -> list[Figure]:
     return figures
 
 
+def runs(repeats: int) -> list[Figure]:
+    """A closed loop from 10 m to 2 m in steps of 10 %: 17 stereo pairs of rendered subframes, among a yard's rocks."""
+    of_run = {
+        "camera": {"preset": "research-navcam"},
+        "target": {"diameter_m": 0.9, "shape": 2, "yaw_deg": 74.0, "across": 0.1},
+        "sun": {"azimuth_deg": 260.0, "elevation_deg": 45.0},
+        "legs": [{"motion": "approach", "step_share": 0.1, "goal_m": 2.0}],
+    }
+    parameters = RoverScenarioParameters.model_validate(of_run)
+    taken = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)
+    return [Figure("a rover's run from 10 m to 2 m, rendered", taken, bar=3.0)]
+
+
 def figures(repeats: int) -> list[Figure]:
     """All of target tracking."""
-    return [*updates(repeats), *searches(repeats)]
+    return [*updates(repeats), *searches(repeats), *runs(min(repeats, 3))]

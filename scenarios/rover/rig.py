@@ -66,6 +66,11 @@ class Rig:
         """Angle that a pixel in the middle of the frame takes."""
         return 1.0 / self.left.focal_lengths[0]
 
+    def eyes(self, world_from_head: RigidTransform) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """Where the left and the right camera truly are, world, metres."""
+        left, right = world_from_head.apply(np.stack([self.left.c, self.right.c]))
+        return left, right
+
     def point(self, azimuth_rad: float, elevation_rad: float) -> None:
         """Points the mast; where it reads these angles already, it stays."""
         if self.state.readings_rad != (azimuth_rad, elevation_rad):

@@ -181,8 +181,8 @@ def _middle_of_targets(
 ) -> Float64[np.ndarray, "3"]:
     """The surface point in the middle of the targets, as seen from the mast at the start."""
     rover_from_mast = rig.calibrated.geometry.rover_from_head(0.0, 0.0)
-    eye = np.asarray((stance.world_from_rover * rover_from_mast).apply(rig.left.c.copy()))
-    return point_on(world, eye, p.target.across, p.target.up, rig.pixel_rad, p.vtt)[0]
+    eyes = rig.eyes(stance.world_from_rover * rover_from_mast)
+    return point_on(world, eyes, p.target.across, p.target.up, rig.pixel_rad, p.vtt)[0]
 
 
 def _belief(rig: Rig, vehicle: Vehicle, middle: Float64[np.ndarray, "3"]) -> Belief:
@@ -237,9 +237,9 @@ def _box(camera: CameraModel, points: Float64[np.ndarray, "points 3"], margin_px
 def tracked(p: SharedDriveParameters, drive: SharedDrive) -> Run:
     """A tracker run over the drive's pictures for one of the targets."""
     first = drive.views[0]
-    eye = np.asarray(first.world_from_head.apply(drive.rig.left.c.copy()))
+    eyes = drive.rig.eyes(first.world_from_head)
     chosen = p.targets[p.target]
-    point, on_edge, lit = point_on(drive.world, eye, chosen.across, chosen.up, drive.rig.pixel_rad, p.drive.vtt)
+    point, on_edge, lit = point_on(drive.world, eyes, chosen.across, chosen.up, drive.rig.pixel_rad, p.drive.vtt)
     told = told_by_pixel(drive.rig.left, first.world_from_head, point, first.angles_rad)
     run = Run(drive.world, drive.rig, drive.vehicle, rock_of(drive.world, point, told, on_edge, lit))
     tracker = TRACKING.make(p.drive.algorithm, p.drive.vtt, p.drive.executable)
@@ -292,10 +292,10 @@ def stays_in_view(
     chosen: PointParameters,
     options: VttOptions,
 ) -> bool:
-    """Whether a target is in view all along a drive; kept, as the cases of a target ask the same."""
+    """Whether both cameras see a target all along a drive; kept, as the cases of a target ask the same."""
     drive = shared_drive(p, margin_px, seed, campaign, run)
-    eyes = [np.asarray(one.world_from_head.apply(drive.rig.left.c.copy())) for one in drive.views]
-    point = point_on(drive.world, eyes[0], chosen.across, chosen.up, drive.rig.pixel_rad, options)[0]
+    eyes = [eye for one in drive.views for eye in drive.rig.eyes(one.world_from_head)]
+    point = point_on(drive.world, eyes[:2], chosen.across, chosen.up, drive.rig.pixel_rad, options)[0]
     return in_view(drive.world, point, eyes, drive.rig.pixel_rad, options)
 
 

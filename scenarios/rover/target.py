@@ -53,7 +53,7 @@ class ChosenTarget:
     rock
         The rock that it is on.
     on_edge
-        Whether the template about it, as seen from the start, shows what lies well behind the rock.
+        Whether the template about it, as either camera sees it from the start, shows what lies well behind the rock.
     lit
         Whether the sun shines on it at the start: no part of the rock is before the sun.
     """
@@ -78,25 +78,26 @@ def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance:
         raise ValueError("the mast cannot point at the target's rock from the start; start.target_azimuth_deg turns it")
     rig.point(*angles)
     world_from_head = stance.world_from_rover * rig.rover_from_head
-    eye = np.asarray(world_from_head.apply(rig.left.c.copy()))
-    point, on_edge, lit = point_on(world, eye, p.target.across, p.target.up, rig.pixel_rad, p.vtt)
+    point, on_edge, lit = point_on(world, rig.eyes(world_from_head), p.target.across, p.target.up, rig.pixel_rad, p.vtt)
     told = _told(p, rig, stance.world_from_rover, world_from_head, point)
     return rock_of(world, point, told, on_edge, lit)
 
 
 def point_on(
     world: RunWorld,
-    eye: Float64[np.ndarray, "3"],
+    eyes: Sequence[Float64[np.ndarray, "3"]],
     across: float,
     up: float,
     pixel_rad: float,
     options: VttOptions,
 ) -> tuple[Float64[np.ndarray, "3"], bool, bool]:
-    """A point of the rock's face as seen from a place; whether it is on the rock's edge, and whether it is lit."""
-    point = Sight.of(world.target_triangles, eye, float(world.rocks.position_m[world.target_number, 2])).point(
-        across, up
-    )
-    on_edge = _on_edge(world, eye, point, 0.5 * options.template_px * pixel_rad)
+    """A point of the rock's face as the first eye sees it; whether it is on the rock's edge for any, and whether lit.
+
+    Eyes are those of the pair: point stereo needs the point off the edge in the right picture too.
+    """
+    foot = float(world.rocks.position_m[world.target_number, 2])
+    point = Sight.of(world.target_triangles, eyes[0], foot).point(across, up)
+    on_edge = any(_on_edge(world, eye, point, 0.5 * options.template_px * pixel_rad) for eye in eyes)
     return point, on_edge, not bool(shaded(world.target_triangles, point[None], world.sun.direction(0.0))[0])
 
 
