@@ -34,6 +34,9 @@ napoleon_use_ivar = True
 napoleon_attr_annotations = False
 python_use_unqualified_type_names = True
 
+# `name` in a docstring is a thing of the code
+default_role = "py:obj"
+
 html_theme = "furo"
 html_title = f"Marsyard {release}"
 html_show_copyright = False
