@@ -97,6 +97,9 @@ install_gl_libraries() {
 # The tests build an example in C.
 install_compiler() { command -v cc >/dev/null || need gcc libc6-dev || true; }
 
+# The tests of pages drive Debian's own browser; nothing fetches another.
+install_browser() { command -v chromium >/dev/null || need chromium || true; }
+
 # --- the environment --------------------------------------------------------------------------------------------------
 
 make_venv() {
@@ -151,6 +154,7 @@ else
     make_venv "$python"
 fi
 install_compiler
+install_browser
 install_packages
 check_rendering
 rm -f "$unfinished"

@@ -18,6 +18,7 @@ from benchmarks.validation import (
     light_checks,
     motion_checks,
     sampling_checks,
+    statistics_checks,
 )
 from benchmarks.validation.records import Measure
 
@@ -29,6 +30,7 @@ CHECKS = (
     *landing_checks.CHECKS,
     *sampling_checks.CHECKS,
     *campaign_checks.CHECKS,
+    *statistics_checks.CHECKS,
 )
 
 

@@ -80,14 +80,14 @@ def _row(name: str, found: Sequence[Cell], stated: StatedRequirement | None) -> 
 
 
 def sparkline(shown: Sequence[Shown]) -> Sparkline | None:
-    """Rates seen over time against the rate asked; None where no campaign tells one."""
+    """Rates seen over time against the rate asked; None where fewer than two campaigns tell one."""
     known = [one for one in shown if math.isfinite(one.estimate) and math.isfinite(one.probability)][-_TREND:]
-    if not known:
+    if len(known) < 2:
         return None
     rates = [one.estimate for one in known]
     low = min(*rates, *(one.probability for one in known))
     low -= 0.15 * (1.0 - low) + 1e-9
-    step = (_WIDTH - 8.0) / max(1, len(known) - 1)
+    step = (_WIDTH - 8.0) / (len(known) - 1)
 
     def height(rate: float) -> float:
         return round(3.0 + (_HEIGHT - 6.0) * (1.0 - rate) / (1.0 - low), 2)

@@ -36,7 +36,7 @@
     return data.bound !== null && Math.abs(value) > data.bound ? "beyond" : "within";
   };
   const ticks = (low, high) => {
-    const raw = (high - low) / 5, power = 10 ** Math.floor(Math.log10(raw));
+    const raw = (high - low) / 7, power = 10 ** Math.floor(Math.log10(raw));
     const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= raw);
     const found = [];
     for (let v = Math.ceil(low / step) * step; v <= high + 1e-9 * step; v += step) found.push(Number(v.toPrecision(6)));

@@ -85,7 +85,9 @@ class FakeScenario:
             os.abort()
         misbehave(parameters, streams.case)
         answered = streams.case not in parameters.silent_cases
-        error = parameters.error_scale * streams.generator("noise").normal(size=2) if answered else np.full(2, np.nan)
+        # what no campaign states stands for an algorithm's code that was changed
+        scale = parameters.error_scale * float(os.environ.get("FAKE_ERROR_SCALE", "1"))
+        error = scale * streams.generator("noise").normal(size=2) if answered else np.full(2, np.nan)
         row = {
             "velocity_error_m_s": np.hypot(*error),
             "velocity_error_x_m_s": error[0],

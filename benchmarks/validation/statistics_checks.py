@@ -1,0 +1,172 @@
+"""The bars on statistics: coverage of every interval, error rates of the sequential stop, alarms of the nightly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from scipy import stats
+
+from benchmarks.validation.records import Check, Measure
+from reports.history import NightFigure
+from reports.regressions import Comparison, changes
+from reports.statistics.changes import Sample
+from reports.statistics.clusters import clustered_evidence
+from reports.statistics.plane import error_ellipse
+from reports.statistics.proportions import proportion_lower
+from reports.statistics.samples import Interval, mean_interval, quantile_bounds, spread_interval
+from reports.statistics.sequential import confidence_at, looks_of
+
+CONFIDENCE = 0.9
+#: Cases on a terrain, and what is asked and risked in simulated campaigns.
+_ON_TERRAIN = 8
+#: Nights of the nightly's check: cases of each, terrains, nights before, and how much larger planted errors are.
+CASES, TERRAINS, BEFORE, WORSE = 100, 12, 7, 1.75
+
+
+def _least(nominal: float, trials: int) -> float:
+    """The least coverage seen that goes with a nominal one: three standard deviations of the simulation below."""
+    return nominal - 3.0 * math.sqrt(nominal * (1.0 - nominal) / trials)
+
+
+def _share(hits: Iterator[bool], trials: int) -> float:
+    return sum(bool(hit) for hit in hits) / trials
+
+
+def run_intervals(quick: bool) -> Iterator[Measure]:
+    """Coverage of the intervals of independent values."""
+    trials = 200 if quick else 1000
+    rng = np.random.default_rng(1)
+    draws: tuple[tuple[str, Callable[[int], np.ndarray], float, float], ...] = (
+        ("normal errors", lambda n: rng.normal(size=n), 0.0, 1.0),
+        ("radial errors", lambda n: rng.rayleigh(size=n), math.sqrt(math.pi / 2), math.sqrt(2.0 - math.pi / 2)),
+    )
+    intervals: tuple[tuple[str, Callable[[np.ndarray, float], Interval]], ...] = (
+        ("mean", mean_interval),
+        ("standard deviation", spread_interval),
+    )
+    for name, draw, mean, spread in draws:
+        for what, interval in intervals:
+            truth = mean if what == "mean" else spread
+            found = (interval(draw(30), 0.95) for _ in range(trials))
+            covered = _share((low <= truth <= high for low, high in found), trials)
+            how = f"{trials} samples of 30; BCa, widened; bar: nominal less three deviations of the simulation"
+            yield Measure(f"95 % interval of the {what}, {name}", covered, "", _least(0.95, trials), how, "at least")
+    truth = float(stats.norm.ppf(0.95))
+    bounds = [quantile_bounds(rng.normal(size=80), 0.95, CONFIDENCE) for _ in range(20 * trials)]
+    worst = min(np.mean([low <= truth for low, _ in bounds]), np.mean([high >= truth for _, high in bounds]))
+    how = f"{20 * trials} samples of 80; the worse of the lower and the upper bound"
+    yield Measure("90 % bounds of a 95 % quantile", float(worst), "", _least(0.9, 20 * trials), how, "at least")
+    inside = 0
+    for _ in range(4 * trials):
+        points = rng.normal(size=(21, 2)) @ np.array([[2.0, 0.0], [0.9, 0.4]])
+        ellipse = error_ellipse(points[:20], 0.95)
+        assert ellipse is not None
+        turn = math.radians(ellipse.angle_deg)
+        x, y = points[20] - ellipse.centre
+        along, across = x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn)
+        inside += (along / ellipse.semi_major) ** 2 + (across / ellipse.semi_minor) ** 2 <= 1.0
+    how = f"{4 * trials} samples of 20, and one error more each"
+    yield Measure(
+        "95 % ellipse holds the next error", inside / (4 * trials), "", _least(0.95, 4 * trials), how, "at least"
+    )
+
+
+def _cases(rng: np.random.Generator, rate: float, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
+    """Successes on terrains whose own rates are beta distributed."""
+    weight = (1.0 - correlation) / correlation
+    rates = rng.beta(rate * weight, (1.0 - rate) * weight, terrains)
+    terrain = np.repeat(np.arange(terrains), _ON_TERRAIN)
+    return rng.random(terrain.size) < rates[terrain], terrain
+
+
+def run_clustered(quick: bool) -> Iterator[Measure]:
+    """Coverage of the bounds of cases that share terrains."""
+    trials = 400 if quick else 3000
+    rng = np.random.default_rng(2)
+    for rate in (0.99, 0.95, 0.8):
+        for correlation in (0.05, 0.3, 0.9):
+            for terrains in (20, 60, 250):
+                shown = [
+                    clustered_evidence(*_cases(rng, rate, correlation, terrains), CONFIDENCE) for _ in range(trials)
+                ]
+                lower = float(np.mean([one.lower <= rate for one in shown]))
+                upper = float(np.mean([one.upper >= rate for one in shown]))
+                claim = f"90 % bounds, rate {rate}, correlation {correlation}, {terrains} terrains"
+                how = f"{trials} campaigns, {_ON_TERRAIN} cases a terrain; the worse of both bounds"
+                yield Measure(claim, min(lower, upper), "", _least(CONFIDENCE, trials), how, "at least")
+
+
+def run_sequential(quick: bool) -> Iterator[Measure]:
+    """Error rates of campaigns that stop themselves, at the rate asked, where every verdict is wrong one way."""
+    trials = 300 if quick else 2000
+    rng = np.random.default_rng(3)
+    for asked, most in ((0.9, 512), (0.99, 1000)):
+        for correlation in (None, 0.2):
+            passed = sum(_passes(rng, asked, most, correlation) for _ in range(trials)) / trials
+            kind = "independent cases" if correlation is None else f"cases on terrains, correlation {correlation}"
+            how = f"{trials} campaigns of at most {most} cases at a true rate of {asked}; Monte Carlo error allowed"
+            bar = 1.0 - _least(CONFIDENCE, trials)
+            yield Measure(f"false PASS of {asked} at 90 %, {kind}", passed, "", bar, how)
+
+
+def _passes(rng: np.random.Generator, asked: float, most: int, correlation: float | None) -> bool:
+    """Whether any look at a campaign finds its requirement met."""
+    if correlation is None:
+        success, terrain = rng.random(most) < asked, np.arange(most)
+    else:
+        success, terrain = _cases(rng, asked, correlation, -(-most // _ON_TERRAIN))
+        order = rng.permutation(success.size)
+        success, terrain = success[order][:most], terrain[order][:most]
+    for look in looks_of(most):
+        confidence, first = confidence_at(CONFIDENCE, look.share), success[: look.cases]
+        if correlation is None:
+            lower = proportion_lower(int(first.sum()), look.cases, confidence)
+        else:
+            lower = clustered_evidence(first, terrain[: look.cases], confidence).lower
+        if lower >= asked:
+            return True
+    return False
+
+
+def _night(rng: np.random.Generator, pool: tuple[np.ndarray, np.ndarray], worse: float) -> list[NightFigure]:
+    """A night's figures, resampled from a pool of cases on terrains of which some are harder."""
+    terrains = rng.integers(0, TERRAINS, CASES)
+    errors = worse * pool[0][terrains, rng.integers(0, pool[0].shape[1], CASES)]
+    answered = (rng.random(CASES) < pool[1][terrains]).astype(np.float64)
+    rates = (("within 2 m", (errors < 2.0).astype(np.float64)), ("answered", answered))
+    figures = [NightFigure(name, True, float(values.mean()), Sample(values, terrains)) for name, values in rates]
+    return [*figures, NightFigure("error (m)", False, float(np.median(errors)), Sample(errors, terrains))]
+
+
+def run_nights(quick: bool) -> Iterator[Measure]:
+    """False alarms of nights in which nothing changed, and regressions found where one was planted."""
+    nights = 200 if quick else 1000
+    rng = np.random.default_rng(4)
+    scale = rng.uniform(0.5, 2.0, TERRAINS)
+    pool = np.abs(rng.normal(size=(TERRAINS, 200))) * scale[:, None], rng.uniform(0.85, 1.0, TERRAINS)
+
+    def found(worse: float) -> set[tuple[str, str]]:
+        comparisons = []
+        for campaign, factor in (("first", worse), ("second", 1.0), ("third", 1.0)):
+            before = [_night(rng, pool, 1.0) for _ in range(BEFORE)]
+            for place, figure in enumerate(_night(rng, pool, factor)):
+                comparisons.append(Comparison(campaign, figure, [night[place].sample for night in before]))
+        return {(one.campaign, one.figure) for one in changes(comparisons)}
+
+    how = (
+        f"{nights} resampled nights of three campaigns of {CASES} cases on {TERRAINS} terrains, {BEFORE} nights before"
+    )
+    yield Measure("nights with a false alarm", sum(bool(found(1.0)) for _ in range(nights)) / nights, "", 0.01, how)
+    named = sum(("first", "error (m)") in found(WORSE) for _ in range(nights)) / nights
+    claim = f"nights that name a regression: errors {WORSE} times as large"
+    yield Measure(claim, named, "", 0.95, how, "at least")
+
+
+CHECKS = (
+    Check("intervals", "Statistics", run_intervals),
+    Check("clustered", "Statistics", run_clustered),
+    Check("sequential", "Statistics", run_sequential),
+    Check("nights", "Statistics", run_nights),
+)

@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from reports.explorer import MOST_POINTS, embedded, explorer_data, points_of
+from reports.stored import read_run
+
+Rows = Callable[..., pd.DataFrame]
+METRIC = "velocity_error_m_s"
+
+
+def test_points_hold_the_worst_the_silent_and_the_crashed(make_rows: Rows) -> None:
+    frame = make_rows(12_000, crashed=3)
+    chosen = points_of(frame, METRIC)
+    assert chosen.size == MOST_POINTS
+    assert np.all(np.diff(chosen) > 0)
+    assert int(np.nanargmax(frame[METRIC])) in chosen
+    assert {11_997, 11_998, 11_999} <= set(chosen.tolist())
+    assert frame.iloc[chosen]["outcome"].nunique() == frame["outcome"].nunique()
+    assert points_of(frame.head(50), METRIC).tolist() == list(range(50))
+
+
+def test_data_of_the_points(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+    frame = make_rows(30, crashed=1)
+    run = read_run(make_run(frame))
+    data = explorer_data(run, METRIC, 5.0, ["3"])
+    assert [data["labels"][place] for place in data["axes"]] == ["velocity error x (m/s)", "velocity error y (m/s)"]
+    assert (data["cases"], data["pictured"], data["shown"], data["all"]) == (list(range(30)), [3], 30, 30)
+    assert data["outcomes"][data["outcome"][29]] == "CRASHED"
+    assert data["columns"][data["metric"]][29] is None
+    first = frame[METRIC].iloc[0]
+    assert data["columns"][data["metric"]][0] == (None if np.isnan(first) else float(f"{first:.4g}"))
+
+
+def test_embedded_data_cannot_end_its_element() -> None:
+    hostile = {"</script><script>alert(1)//": "<!--\u2028&"}
+    text = str(embedded(hostile))
+    assert not set("<>&\u2028") & set(text)
+    assert json.loads(text) == hostile
