@@ -1,0 +1,58 @@
+"""A scenario with velocity estimators and without a world: the suite's descent, another inertial error in each case."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+from pydantic import BaseModel
+
+from algorithms.answers import checked_velocity
+from algorithms.dimes import DimesOptions
+from scenarios.chosen import ChosenAlgorithms
+from scenarios.conformance import inputs
+from scenarios.estimators import VELOCITY, Task
+from scenarios.interface import CaseResult
+from scenarios.trial import Judged, attempted, case_result
+from scenarios.velocity import velocity_row
+from sim.streams import Streams
+
+
+class FakeVelocityParameters(ChosenAlgorithms):
+    task: ClassVar[Task] = VELOCITY  # type: ignore[type-arg]
+
+    algorithm: str = "homography"
+
+
+class FakeVelocityScenario:
+    name = "fake-velocity"
+    parameters_type = FakeVelocityParameters
+    task = VELOCITY
+    algorithm_table = ()
+
+    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
+        return ()
+
+    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
+        """Nothing: there are no shared inputs."""
+
+    def run(self, parameters: FakeVelocityParameters, streams: Streams) -> CaseResult:
+        p, common = parameters, streams.generator("inertial").normal(size=3)
+        given = inputs.descent()
+        measurements = replace(given, interval_velocities_m_s=given.interval_velocities_m_s + common)
+
+        def judge(algorithm: str) -> Judged:
+            attempt = attempted(
+                lambda: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(measurements),
+                checked_velocity,
+            )
+            velocity = None if attempt.answer is None else attempt.answer.velocity_m_s
+            return Judged(
+                outcome=attempt.outcome(lambda answer: answer.outcome.name),
+                answered=velocity is not None,
+                row={**velocity_row("velocity", velocity, inputs.DESCENT_VELOCITY_M_S[:2]), **attempt.row},
+                failure=attempt.failure,
+            )
+
+        hashed = f"{measurements.interval_velocities_m_s.tolist()}"
+        return case_result(p.algorithms, judge, {"image_hash": hashed})

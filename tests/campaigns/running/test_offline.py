@@ -1,0 +1,131 @@
+"""Cases are written for others to answer, and their answers are scored as a run's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fake_campaign import Silence, rows_of
+
+from algorithms.baselines import HomographyEstimator
+from algorithms.exchange import read_case
+from algorithms.interface import VelocityEstimate
+from campaigns.definition.campaign import Campaign
+from campaigns.definition.loading import load_campaign
+from campaigns.errors import CampaignError, StoreError
+from campaigns.execution.crew import Crew
+from campaigns.running.engine import run_campaign
+from campaigns.running.offline import (
+    Exported,
+    export_campaign,
+    other_pictures,
+    scored_campaign,
+    truth_folder,
+)
+from campaigns.running.replay import differing_columns
+from sim.measurements import DescentMeasurements
+
+CASES = 3
+FILE = f"""
+name = "fake-velocity"
+scenario = "fake_velocity:FakeVelocityScenario"
+cases = {CASES}
+seed = 3
+[[requirements]]
+id = "v"
+metric = "velocity_error_m_s"
+bound = 5.0
+probability = 0.5
+confidence = 0.5
+"""
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    folder = tmp_path_factory.mktemp("offline")
+    (folder / "fake.toml").write_text(FILE)
+    made = Exported(folder / "out", truth_folder(folder / "out"))
+    export_campaign(campaign(made), made, Crew(1), Silence())
+    return made
+
+
+def campaign(exported: Exported, *settings: str) -> Campaign:
+    kept = ["retain.showcase=none", *settings]
+    return load_campaign(
+        str(exported.directory.parent / "fake.toml"), kept, None, None, [f"export:{exported.directory}"]
+    )
+
+
+def answered(exported: Exported) -> dict[int, VelocityEstimate]:
+    """What an estimator makes of the exported files, and of nothing else."""
+    found = {}
+    for folder in sorted((exported.directory / "cases").iterdir()):
+        measurements = read_case(folder)
+        assert isinstance(measurements, DescentMeasurements)
+        found[int(folder.name)] = HomographyEstimator().estimate(measurements)
+    return found
+
+
+def written(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
+    lines = ["case,outcome,velocity_east_m_s,velocity_north_m_s"]
+    for case, one in answers.items():
+        numbers = ["", ""] if one.velocity_m_s is None else [repr(float(value)) for value in one.velocity_m_s]
+        lines.append(",".join([str(case), one.outcome.name, *numbers]))
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_answers_made_elsewhere_score_as_a_run(exported: Exported, tmp_path: Path) -> None:
+    watch = Silence()
+    scored = scored_campaign(exported, written(tmp_path / "theirs.csv", answered(exported)))
+    run_campaign(scored, tmp_path / "scored", Crew(1), watch)
+    own = load_campaign(str(exported.directory.parent / "fake.toml"))
+    run_campaign(own, tmp_path / "own", Crew(1), watch)
+    for row, other in zip(rows_of(tmp_path / "scored"), rows_of(tmp_path / "own"), strict=True):
+        assert differing_columns(row, other) == ("algorithm",)
+        assert row["algorithm"] == "theirs"
+        assert row["velocity_error_m_s"] < 1.0
+    assert other_pictures(exported.truth, tmp_path / "scored") == []
+    assert watch.notes == []
+
+
+def test_truth_stays_in_its_own_folder(exported: Exported) -> None:
+    rows = rows_of(exported.truth)
+    assert [row["velocity_true_x_m_s"] for row in rows] == [12.0] * CASES
+    files = sorted(path.relative_to(exported.directory).as_posix() for path in exported.directory.rglob("*"))
+    assert {name for name in files if "/" not in name} == {"README.md", "cases", "export.json"}
+    assert not any("12.0" in path.read_text() for path in exported.directory.glob("*.*"))
+    with pytest.raises(CampaignError, match="lies within"):
+        export_campaign(
+            campaign(exported), Exported(exported.directory, exported.directory / "truth"), Crew(1), Silence()
+        )
+
+
+def test_an_export_goes_on_and_is_not_mixed_with_another(exported: Exported) -> None:
+    times = {path: path.stat().st_mtime_ns for path in (exported.directory / "cases").rglob("*")}
+    export_campaign(campaign(exported), exported, Crew(1), Silence())
+    assert {path: path.stat().st_mtime_ns for path in times} == times
+    with pytest.raises(StoreError, match="holds the truth of another export"):
+        export_campaign(campaign(exported, "seed=4"), exported, Crew(1), Silence())
+    elsewhere = Exported(exported.directory, exported.truth.with_name("new-truth"))
+    with pytest.raises(StoreError, match="is there already, and is not empty"):
+        export_campaign(campaign(exported), elsewhere, Crew(1), Silence())
+
+
+def test_tables_that_do_not_answer_each_case_once(exported: Exported, tmp_path: Path) -> None:
+    answers = answered(exported)
+    few = written(tmp_path / "few.csv", {case: answers[case] for case in (0, 2)})
+    with pytest.raises(CampaignError, match=r"no answer to 1 of 3 cases: 1; .*such as NO_TEMPLATE_AREA"):
+        scored_campaign(exported, few)
+    many = written(tmp_path / "many.csv", {**answers, 7: answers[0]})
+    with pytest.raises(CampaignError, match="there is no case 7; allowed: 0 to 2"):
+        scored_campaign(exported, many)
+    with pytest.raises(CampaignError, match="No such file"):
+        scored_campaign(exported, tmp_path / "none.csv")
+    with pytest.raises(StoreError, match="holds no finished export"):
+        scored_campaign(Exported(tmp_path, exported.truth), few)
+
+
+def test_closed_loops_cannot_be_exported(tmp_path: Path) -> None:
+    with pytest.raises(CampaignError, match="a target tracker cannot be run elsewhere"):
+        load_campaign("vtt-checkout-1", [], 1, None, [f"export:{tmp_path}"])

@@ -1,0 +1,127 @@
+"""Tables of answers are read as they are meant, or refused with line, column and what is allowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from algorithms.dimes import DimesOptions
+from algorithms.exchange import ExecutableLimits, read_case
+from algorithms.faults import AlgorithmError
+from algorithms.hda import HdaOptions
+from algorithms.interface import SiteOutcome, VelocityOutcome
+from scenarios.conformance import inputs
+from scenarios.conformance.process import fingerprint
+from scenarios.estimators import LANDING, TRACKING, VELOCITY, labels, sources_of
+from scenarios.offline import SITE_FORM, VELOCITY_FORM, answers_of
+
+LIMITS = ExecutableLimits()
+HEAD = "case,outcome,velocity_east_m_s,velocity_north_m_s\n"
+COVARIANCE = "covariance_east_m2_s2,covariance_east_north_m2_s2,covariance_north_m2_s2"
+
+
+def table(folder: Path, text: str) -> Path:
+    path = folder / "answers.csv"
+    path.write_text(text)
+    return path
+
+
+def test_answers_of_velocity(tmp_path: Path) -> None:
+    path = table(
+        tmp_path, HEAD.strip() + f",{COVARIANCE}\n7,,1.5,-2,4,1,9\n\n 0 , NO_VALID_TRACK ,,,,,\n1,VALID,3,4,,,\n"
+    )
+    answers = answers_of(path, VELOCITY_FORM)
+    assert sorted(answers) == [0, 1, 7]
+    assert (answers[0].outcome, answers[0].velocity_m_s) == (VelocityOutcome.NO_VALID_TRACK, None)
+    assert answers[7].outcome is VelocityOutcome.VALID
+    assert np.array_equal(answers[7].velocity_m_s, [1.5, -2.0])  # type: ignore[arg-type]
+    assert np.array_equal(answers[7].covariance_m2_s2, [[4.0, 1.0], [1.0, 9.0]])  # type: ignore[arg-type]
+    assert answers[1].covariance_m2_s2 is None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "it is empty"),
+        ("case,velocity_east_m_s\n", "the column 'velocity_north_m_s' is missing"),
+        ("case,velocity_east_km_h,velocity_north_m_s\n", "'velocity_east_km_h' (did you mean 'velocity_east_m_s'?)"),
+        ("case,velocity_east_km_h,velocity_north_m_s\n", "units are those of the names"),
+        (f"case,{HEAD}", "the column 'case' stands there twice"),
+        (f"{HEAD}1,VALID,2\n", "line 2: it has 3 cells; the first line has 4"),
+        (f"{HEAD}-1,VALID,2,3\n", "line 2: case is '-1'; allowed: a whole number from 0"),
+        (f"{HEAD}1,VALID,nan,3\n", "line 2: velocity_east_m_s is 'nan'; allowed: a finite number, or nothing"),
+        (f"{HEAD}1,VALID,2,fast\n", "velocity_north_m_s is 'fast'; allowed: a finite number"),
+        (f"{HEAD}1,VALID,2500,3\n", "velocity_east_m_s is 2500, beyond 1000; is it in the unit"),
+        (f"{HEAD}1,VALID,2,\n", "velocity_east_m_s is given, but velocity_north_m_s is not"),
+        (f"{HEAD}1,,,\n", "neither an outcome nor numbers are given"),
+        (f"{HEAD}1,GOOD,2,3\n", "outcome is 'GOOD'; allowed: VALID, NO_TEMPLATE_AREA"),
+        (f"{HEAD}1,VALID,,\n", "outcome is VALID, but of velocity_m_s none is given"),
+        (f"{HEAD}1,NO_VALID_TRACK,2,3\n", "outcome is NO_VALID_TRACK, but of velocity_m_s one is given"),
+        (f"{HEAD}1,VALID,2,3\n2,VALID,2,3\n1,VALID,2,3\n", "line 4: case 1 is answered twice, before in line 2"),
+        (f"{HEAD.strip()},{COVARIANCE}\n1,,2,3,1,2,1\n", "covariance_m2_s2 is not positive definite"),
+    ],
+)
+def test_tables_that_are_none(tmp_path: Path, text: str, said: str) -> None:
+    path = table(tmp_path, text)
+    with pytest.raises(ValueError, match=r"answers\.csv") as caught:
+        answers_of(path, VELOCITY_FORM)
+    assert said in str(caught.value)
+
+
+def test_all_that_is_wrong_is_told_but_not_without_end(tmp_path: Path) -> None:
+    path = table(tmp_path, HEAD + "".join(f"{case},VALID,x,1\n" for case in range(30)))
+    with pytest.raises(ValueError, match=r"(?s)line 2:.*line 21:.*\.\.\. and 10 more"):
+        answers_of(path, VELOCITY_FORM)
+    with pytest.raises(ValueError, match="No such file"):
+        VELOCITY.check(f"answers:{tmp_path}/nothing.csv")
+
+
+def test_answers_stand_in_for_an_algorithm(tmp_path: Path) -> None:
+    spec = f"answers:{table(tmp_path, HEAD + '3,,1,2')}"
+    VELOCITY.check(spec)
+    assert labels(["dimes", spec]) == ("dimes", "answers")
+    assert sources_of(spec) == []
+    answer = VELOCITY.make(spec, DimesOptions(), LIMITS, 3).estimate(inputs.descent())
+    assert np.array_equal(answer.velocity_m_s, [1.0, 2.0])  # type: ignore[arg-type]
+    with pytest.raises(AlgorithmError, match=r"answers\.csv has no answer to case 4"):
+        VELOCITY.make(spec, DimesOptions(), LIMITS, 4).estimate(inputs.descent())
+    with pytest.raises(ValueError, match="a target tracker cannot be run elsewhere"):
+        TRACKING.check(spec)
+
+
+def test_answers_of_landing_sites(tmp_path: Path) -> None:
+    path = table(
+        tmp_path,
+        "case,outcome,site_east_m,site_north_m,site_up_m\n0,SAFE_SITE,1,2,3\n1,NO_SAFE_SITE,,,\n2,NO_MOTION,,,\n",
+    )
+    assert [one.outcome for one in answers_of(path, SITE_FORM).values()] == [
+        SiteOutcome.SAFE_SITE,
+        SiteOutcome.NO_SAFE_SITE,
+        SiteOutcome.NO_MOTION,
+    ]
+    given = inputs.landing()
+    sites = [
+        LANDING.make(f"answers:{path}", HdaOptions(), LIMITS, case).estimate(given).site_world for case in range(3)
+    ]
+    assert np.array_equal(sites[0], [1.0, 2.0, 3.0])  # type: ignore[arg-type]
+    assert sites[1] is None
+    # where the algorithm did not converge, the a-priori site is what is left
+    assert np.array_equal(sites[2], given.apriori_site_world)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("task", ["velocity", "landing"])
+def test_what_is_exported_is_what_was_measured(tmp_path: Path, task: str) -> None:
+    if task == "velocity":
+        given = inputs.descent()
+        answer = VELOCITY.make(f"export:{tmp_path}", DimesOptions(), LIMITS, 12).estimate(given)
+        assert answer.velocity_m_s is None
+        read = read_case(tmp_path / "cases" / "000012")
+        assert [fingerprint(one.counts) for one in read.images] == [fingerprint(one.counts) for one in given.images]
+    else:
+        site = LANDING.make(f"export:{tmp_path}", HdaOptions(), LIMITS, 12).estimate(inputs.landing())
+        assert not site.outcome.converged
+        assert read_case(tmp_path / "cases" / "000012").images[1].counts.dtype == np.uint16
+    assert {path.suffix for path in (tmp_path / "cases" / "000012").iterdir()} == {".json", ".png", ".cahvor", ".f64"}
+    assert [path.name for path in (tmp_path / "cases").iterdir()] == ["000012"]
