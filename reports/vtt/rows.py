@@ -37,7 +37,7 @@ def holds(frame: pd.DataFrame, *names: str) -> Bool[np.ndarray, " n"]:
 
 
 def selectable(frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows whose target operators would have selected: lit, off the rock's edge, in view to the end."""
+    """The rows whose target operators would have selected: lit, off the rock's edge, in both pictures to the end."""
     return frame[holds(frame, "selectable", "in_view")]
 
 
