@@ -112,8 +112,8 @@ def steps_section(subject: Subject) -> Section | None:
 
 
 _NOTE = (
-    "Selectable: lit, off the rock's edge, and in both pictures to the end. Tracked: found in the last picture within the "
-    "stated pixels of the designated point's true projection. Falsely tracked: reported beyond them at some stop. "
+    "Selectable: lit, off the rock's edge, and in both pictures to the end. Tracked: found in the last picture within "
+    "the stated pixels of the designated point's true projection. Falsely tracked: reported beyond them at some stop. "
     f"Intervals: two-sided, Clopper and Pearson, at {stated(CONFIDENCE)} confidence, as for independent targets; "
     "those of a rock share its pictures and are not."
 )
