@@ -263,9 +263,10 @@ def _outcomes(words: Sequence[str]) -> list[str]:
 def carry_out(directory: Path, work: Callable[[Watch], None]) -> None:
     """Does a campaign's work and judges it; where it is interrupted says how to go on."""
     from marsyard.outcome import conclude
+    from marsyard.run_log import RunLog
 
-    with shown_progress(directory, f"marsyard resume {directory}") as progress:
-        work(progress)
+    with shown_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
+        work(log)
     raise typer.Exit(conclude(directory, console()))
 
 

@@ -25,6 +25,7 @@ from marsyard.campaign_command import (
 from marsyard.clean_command import clean
 from marsyard.conformance_command import conformance
 from marsyard.dashboard_command import dashboard
+from marsyard.dataset_command import dataset
 from marsyard.gallery_command import gallery
 from marsyard.new_command import new
 from marsyard.nightly_command import nightly
@@ -48,9 +49,10 @@ app.command()(render)
 app.command()(gallery)
 app.command()(new)
 app.command()(clean)
+app.command()(dataset)
 app.command()(conformance)
-for command in (export, score):
-    app.command()(command)
+for offline in (export, score):
+    app.command()(offline)
 
 
 @app.command(name="list")

@@ -157,9 +157,7 @@ def _stretch(file: Any) -> np.ndarray:
 
 def _check_heights(path: Path, file: Any) -> None:
     if file.dtypes[0] == "uint8":
-        raise TerrainFileError(
-            f"{path}: holds 8-bit values, which are a picture's; heights in metres are needed"
-        )
+        raise TerrainFileError(f"{path}: holds 8-bit values, which are a picture's; heights in metres are needed")
     unit = (file.units[0] or "").strip().lower()
     if unit not in _METRES:
         raise TerrainFileError(f"{path}: its heights are in {file.units[0]!r}; metres are needed (gdal_calc.py)")

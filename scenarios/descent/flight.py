@@ -84,13 +84,20 @@ def _recorded(
 ) -> Flown:
     motion = flight.motion(below, gravity_m_s2(p))
     check_clearance(flight, motion, faulty_times(p.faults, p.picture_times_s), surface)
-    times = np.linspace(max(p.picture_times_s), motion.span_s[1] - MARGIN_S, _SEARCHED)
-    positions = motion.motion(times).positions_m
-    heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
-    low = np.flatnonzero(heights <= p.descent.thruster_firing_m)
-    firing_s = float(times[low[0] if low.size else -1])
     row: dict[str, Scalar] = {"flight_file": flight.file, "flight_first_picture_s": flight.start_s}
-    return Flown(motion, flight.lead_s, firing_s, row)
+    return Flown(motion, flight.lead_s, _firing_s(p, motion, surface), row)
+
+
+def _firing_s(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
+    """When a recorded flight first comes down to the thrusters' firing, over the ground below its first picture."""
+    times = np.linspace(max(p.picture_times_s), motion.span_s[1] - MARGIN_S, _SEARCHED)
+    first = motion.state(0.0).position_m
+    heights = motion.motion(times).positions_m[:, 2] - float(surface.height(first[0], first[1]))
+    low = np.flatnonzero(heights <= p.descent.thruster_firing_m)
+    if not low.size or low[0] == 0:
+        return float(times[0 if low.size else -1])
+    around = slice(low[0] - 1, low[0] + 1)
+    return float(np.interp(-p.descent.thruster_firing_m, -heights[around], times[around]))
 
 
 def check_clearance(flight: FlightFile, motion: Trajectory, times_s: Sequence[float], surface: Surface) -> None:

@@ -12,6 +12,7 @@ from scenarios.chosen import ChosenAlgorithms
 from scenarios.descent.faults import Faults, faulty_times
 from scenarios.descent.recorded import FlightFile
 from scenarios.estimators import VELOCITY
+from scenarios.meshes import MeshParameters
 from scenarios.terrain_files import check_terrain
 from sim.dynamics import SwingParameters
 from sim.render.backend import Backend, default_backend
@@ -158,6 +159,7 @@ class DescentScenarioParameters(ChosenAlgorithms):
     ] = None
     place: Place = Place()
     terrain: TerrainParameters = TerrainParameters()
+    meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
     sun: SunParameters = SunParameters()
     descent: SwingParameters = SwingParameters()
     flight: Annotated[FlightFile | None, Field(description="a recorded flight, in place of the descent's dynamics")] = (

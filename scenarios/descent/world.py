@@ -8,9 +8,10 @@ import numpy as np
 
 from scenarios.descent.faults import faulty_terrain
 from scenarios.descent.parameters import DescentScenarioParameters
+from scenarios.meshes import MeshParameters, standing
 from scenarios.views import Eye, SiteGround, site_scene
 from sim.frames import direction
-from sim.render import Photometry, Scene, Sun
+from sim.render import Objects, Photometry, Scene, Sun
 from sim.render.clouds import CloudLayer
 from sim.terrain import Environment, Surface, TerrainBank
 
@@ -30,6 +31,8 @@ class World:
         The same with its site's light, texture and rocks; None for a plain terrain.
     sun
         The sun.
+    meshes
+        Own bodies on the ground.
     brightness
         Sunlight at the ground over that for which the detector's responsivity is stated.
     """
@@ -37,6 +40,7 @@ class World:
     surface: Surface
     ground: SiteGround | None
     sun: Sun
+    meshes: tuple[MeshParameters, ...] = ()
     brightness: float = 1.0
 
     @property
@@ -53,12 +57,12 @@ class World:
         elevation = float(np.radians(p.sun.elevation_deg))
         towards_sun = direction(np.radians(p.sun.azimuth_deg), elevation)
         if p.preset is None:
-            return cls(surface, None, Sun(towards_sun))
+            return cls(surface, None, Sun(towards_sun), p.meshes)
         air = p.preset.environment
         sun = Sun(towards_sun, air.sun_radius_rad)
         brightness = air.direct_share(elevation) * air.solar_irradiance / SUNLIGHT_OF_RESPONSIVITY
         ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.place.terrain))
-        return cls(surface, ground, sun, brightness)
+        return cls(surface, ground, sun, p.meshes, brightness)
 
     def scene(
         self,
@@ -89,4 +93,7 @@ class World:
             scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry())
         else:
             scene = site_scene(self.ground, Eye(east_m, north_m, lowest_m, pixel_rad), self.sun)
+        if self.meshes:
+            own = standing(self.meshes, self.surface, (east_m, north_m))
+            scene = scene.with_objects(Objects.joined([scene.objects, own]))
         return replace(scene, caster_diameter_m=caster_diameter_m, clouds=clouds)

@@ -16,6 +16,7 @@ from scenarios.landing.faults import Faults
 from scenarios.landing.helicopter import HelicopterParameters
 from scenarios.landing.pair_choice import PairParameters
 from scenarios.landing.relief import Limits
+from scenarios.meshes import MeshParameters
 from scenarios.terrain_files import check_terrain
 from sim.camera import CameraModel
 from sim.sensor import (
@@ -110,6 +111,7 @@ class LandingScenarioParameters(ChosenAlgorithms):
     ] = None
     terrain: TerrainParameters = TerrainParameters()
     place: Place = Place()
+    meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
     texture: Annotated[
         Size, Field(le=10.0, description="contrast of ground finer than the terrain, over the site's own")
     ] = 1.0

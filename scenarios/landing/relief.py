@@ -8,6 +8,7 @@ interpolated between footprints.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from scenarios.landing import kernels
+from scenarios.meshes import MeshParameters
 from scenarios.views import SiteGround
 
 #: Spacing of the exact heights, in footprints' diameters: 80 points across a footprint, 2.5 cm for one of 2 m.
@@ -85,21 +87,31 @@ class Relief:
 
     @classmethod
     def of(
-        cls, ground: SiteGround, low_m: Float[np.ndarray, "2"], high_m: Float[np.ndarray, "2"], spacing_m: float
+        cls,
+        ground: SiteGround,
+        low_m: Float[np.ndarray, "2"],
+        high_m: Float[np.ndarray, "2"],
+        spacing_m: float,
+        meshes: Sequence[MeshParameters] = (),
     ) -> Relief:
-        """The ground between two corners (x, y); rocks are drawn so finely that no grid can tell."""
+        """The ground between two corners (x, y), own meshes on it; rocks are drawn so finely that no grid can tell."""
         columns, rows = (int(n) for n in np.ceil((high_m - low_m) / spacing_m) + 1)
         west, south = float(low_m[0]), float(low_m[1])
         x, y = np.meshgrid(west + spacing_m * np.arange(columns), south + spacing_m * np.arange(rows))
         heights = np.array(ground.surface.height(x, y))
+        middle = 0.5 * (low_m + high_m)
         if ground.rocks is not None:
-            middle = 0.5 * (low_m + high_m)
             reach = 0.5 * float(np.hypot(*(high_m - low_m))) + float(ground.rocks.diameter_m.max(initial=0.0))
             # as if seen from far above by pixels of the grid's spacing
             mesh = ground.rocks.near(
                 float(middle[0]), float(middle[1]), reach, above_m=1e3 * reach, pixel_rad=spacing_m / (1e3 * reach)
             )
             kernels.raise_by_triangles(heights, west, south, spacing_m, mesh.vertices, mesh.faces)
+        for one in meshes:
+            own = one.standing(ground.surface, (float(middle[0]), float(middle[1])))
+            corners = own.triangles.reshape(-1, 3)
+            faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+            kernels.raise_by_triangles(heights, west, south, spacing_m, corners, faces)
         return cls(heights, west, south, spacing_m)
 
     def cells(self, places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:

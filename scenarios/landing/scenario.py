@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from pydantic import BaseModel
 
 from algorithms.answers import checked_site
@@ -13,9 +15,11 @@ from scenarios.landing.flight import Flight
 from scenarios.landing.measurement import measure
 from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.landing.pictures import take_pictures
+from scenarios.landing.samples import landing_samples
 from scenarios.landing.score import conditions, map_row, motion_row, products, provenance, site_row, times_row
 from scenarios.landing.truth import GroundTruth
-from scenarios.landing.world import World, camera_optics
+from scenarios.landing.world import KEPT_GROUNDS, World, camera_optics
+from scenarios.samples import Sample
 from scenarios.trial import Judged, attempted, case_result
 from sim.streams import Streams
 from sim.terrain import TerrainBank
@@ -30,13 +34,21 @@ class LandingScenario:
     algorithm_table = ()
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Numbers of the bank's terrains."""
-        return tuple(range(_checked(parameters).place.bank))
+        """Numbers of the bank's terrains; none of a bank so large that hardly two flights have the same one.
+
+        Those are built by the flights that need them, in a tenth of a core-second each.
+        """
+        bank = _checked(parameters).place.bank
+        return tuple(range(bank)) if bank <= KEPT_GROUNDS else ()
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Builds one terrain of the bank."""
         p = _checked(parameters)
         TerrainBank(p.terrain, p.place.bank_seed).terrain(shared_input)
+
+    def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
+        """The two pictures of a case with the truth of their pixels."""
+        return landing_samples(_checked(parameters), streams)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One flight."""

@@ -69,6 +69,7 @@ class GroundTruth:
             corners.min(axis=0) - margin,
             corners.max(axis=0) + margin,
             SPACING_DIAMETERS * limits.diameter_m,
+            world.meshes,
         )
         heights = relief.averaged(places, relief.spacing_m)
         seen = seen_by_both(pair, flight, np.concatenate([corners, heights.reshape(-1, 1)], axis=1), 0.0)

@@ -9,11 +9,12 @@ import numpy as np
 
 from scenarios.landing.faults import faulty_sun_deg
 from scenarios.landing.parameters import LandingScenarioParameters
+from scenarios.meshes import MeshParameters, standing
 from scenarios.optics import Optics
 from scenarios.views import Eye, SiteGround, site_scene
 from sim.camera import CameraModel
 from sim.frames import direction
-from sim.render import Scene, Sun
+from sim.render import Objects, Scene, Sun
 from sim.terrain import TerrainBank, TerrainParameters, site
 from sim.terrain.sites import SiteTexture
 
@@ -31,6 +32,8 @@ class World:
         The terrain with its rocks.
     sun
         The sun.
+    meshes
+        Own bodies on the ground.
     brightness
         Sunlight at the ground over that at 1 AU above the air. The exposure is set by the picture, so that a detector
         whose responsivity is stated for another distance from the sun is only exposed for longer.
@@ -38,6 +41,7 @@ class World:
 
     ground: SiteGround
     sun: Sun
+    meshes: tuple[MeshParameters, ...]
     brightness: float
 
     @classmethod
@@ -52,11 +56,15 @@ class World:
         air = p.preset.environment
         elevation = float(np.radians(faulty_sun_deg(p.faults, p.sun.elevation_deg)))
         sun = Sun(direction(np.radians(p.sun.azimuth_deg), elevation), air.sun_radius_rad)
-        return cls(ground, sun, air.direct_share(elevation) * air.solar_irradiance)
+        return cls(ground, sun, p.meshes, air.direct_share(elevation) * air.solar_irradiance)
 
     def scene(self, eye: Eye, caster_diameter_m: float) -> Scene:
         """One scene for both pictures, as fine as the lower one sees."""
-        return replace(site_scene(self.ground, eye, self.sun), caster_diameter_m=caster_diameter_m)
+        scene = site_scene(self.ground, eye, self.sun)
+        if self.meshes:
+            own = standing(self.meshes, self.ground.surface, (eye.east_m, eye.north_m))
+            scene = scene.with_objects(Objects.joined([scene.objects, own]))
+        return replace(scene, caster_diameter_m=caster_diameter_m)
 
 
 @lru_cache(maxsize=KEPT_GROUNDS)

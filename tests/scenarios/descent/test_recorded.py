@@ -103,7 +103,7 @@ def test_what_cannot_be_flown_is_refused_when_the_campaign_is_read(tmp_path: Pat
 
     refused("at picture 1 the camera looks up, 60.0 deg above the horizon", _straight(tmp_path, tilt_deg=150.0))
     refused("at picture 1 the camera looks up", _straight(tmp_path), attitude_of="body")
-    refused(r"at picture 3 the camera is 30.0 m below the ground", _straight(tmp_path, height=870.0))
+    refused(r"at picture 3 the camera is 5.0 m below the ground", _straight(tmp_path, height=870.0))
     refused(r"covers 0.000 to 24.900 s; pictures from 23.000 to", _straight(tmp_path), first_picture_s=23.0)
     refused("flight.axes|axes", _straight(tmp_path), axes="xyz")
     refused("no quaternion of length 1", _straight(tmp_path), mounting=(0.0, 0.0, 0.0, 2.0))

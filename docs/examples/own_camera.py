@@ -1,0 +1,30 @@
+"""A calibration by OpenCV, ROS or Kalibr: how near our camera is to it, and where a point is seen."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import marsyard
+from sim.camera import read_calibrations
+
+# EuRoC's first camera in Kalibr's format
+CHAIN = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+  distortion_model: radtan
+  intrinsics: [458.654, 457.296, 367.215, 248.375]
+  resolution: [752, 480]
+"""
+with tempfile.TemporaryDirectory() as folder:
+    path = Path(folder) / "camchain.yaml"
+    path.write_text(CHAIN)
+    (read,) = read_calibrations(path)
+    print(f"{type(read.camera).__name__}: {read.residual.rms_px:.2f} px off (RMS), {read.residual.max_px:.2f} at most")
+
+    # in a campaign it stands under camera.model
+    campaign = marsyard.load_campaign("dimes-smoke", {"camera.model": str(path), "detector.rows_summed": 1})
+    print("columns:", campaign.configuration.parameters["camera"]["model"]["columns"])
+
+pixel, seen = read.camera.project(np.array([0.2, -0.1, 1.0]))
+print("pixel:", pixel.round(2), "seen:", bool(seen))

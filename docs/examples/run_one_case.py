@@ -1,0 +1,18 @@
+"""One descent over plain, small terrain: run, scored, and its pictures at hand."""
+
+import marsyard
+
+campaign = marsyard.load_campaign(
+    "dimes-smoke",
+    # small, so that it is built in a moment; a site's own terrain is 4 to 8 km wide
+    {"terrain.samples": 512, "terrain.spacing_m": 8.0, "place.bank": 1, "place.terrain": 0},
+)
+case = marsyard.run_case(campaign, 3)
+print(case.outcome, "answered" if case.answered else "no answer")
+
+row = case.row
+print(f"altitude {row['altitude_1_m']:.0f} m, {row['horizontal_speed_m_s']:.1f} m/s")
+if case.answered:
+    print(f"velocity wrong by {row['velocity_error_m_s']:.2f} m/s")
+
+print("products:", ", ".join(sorted(case.products)))

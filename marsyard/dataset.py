@@ -1,0 +1,138 @@
+"""Data sets for learning: a campaign's pictures and their truth, in shards that any WebDataset reader takes.
+
+A shard is a tar of whole cases. Of each picture it holds, under one key, the 16-bit picture (`image.png`), range
+(`range.npy`, m), normals (`normal.npy`, world axes), masks (`rocks.png`; `hazard.png`: 0 safe, 1 not, 255 not known),
+the camera (`cahvor`) and all else (`json`). A shard that is there is whole, and never written again: a data set that
+was interrupted is gone on with, and the same campaign makes the same bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from campaigns.definition.campaign import Campaign
+from campaigns.definition.identity import configuration_hash
+from campaigns.errors import CampaignError, StoreError
+from scenarios.samples import GivesSamples, Sample
+
+MANIFEST = "dataset.json"
+
+
+def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: int) -> list[Path]:
+    """Writes the shards that are not there yet; returns all.
+
+    Raises
+    ------
+    CampaignError
+        Where the scenario gives no samples, the folder holds another data set, or cannot be written.
+    """
+    if not isinstance(campaign.scenario, GivesSamples):
+        raise CampaignError(
+            f"the scenario '{campaign.configuration.scenario}' has no hazard maps to learn from; allowed: landing"
+        )
+    _claim(campaign, folder, cases_per_shard)
+    total = campaign.configuration.total_cases
+    starts = range(0, total, cases_per_shard)
+    paths = [folder / f"shard-{number:06d}.tar" for number in range(len(starts))]
+    missing = [
+        (path, range(start, min(start + cases_per_shard, total)))
+        for path, start in zip(paths, starts, strict=True)
+        if not path.exists()
+    ]
+    if missing:
+        from joblib import Parallel, delayed
+
+        # the first case builds what all share
+        _prepare(campaign)
+        Parallel(n_jobs=jobs)(delayed(_write_shard)(campaign, path, cases) for path, cases in missing)
+    return paths
+
+
+def _claim(campaign: Campaign, folder: Path, cases_per_shard: int) -> None:
+    """Notes what the folder's data set is, or raises StoreError where it is another."""
+    configuration = campaign.configuration
+    told = {
+        "campaign": configuration.name,
+        "cases_per_shard": cases_per_shard,
+        "configuration_sha256": configuration_hash(configuration),
+        "configuration": configuration.model_dump(mode="json"),
+    }
+    path = folder / MANIFEST
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if path.exists():
+            before = json.loads(path.read_text(encoding="utf-8"))
+            for key in ("configuration_sha256", "cases_per_shard"):
+                if before.get(key) != told[key]:
+                    raise StoreError(f"{folder} holds another data set ({key} differs); choose another folder")
+            return
+        path.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: cannot be used: {error}") from error
+
+
+def _prepare(campaign: Campaign) -> None:
+    base = campaign.base_parameters()
+    for number in campaign.scenario.shared_inputs(base):
+        campaign.scenario.prepare(base, number)
+
+
+def _write_shard(campaign: Campaign, path: Path, cases: range) -> None:
+    """One shard, under its own name only when it is whole."""
+    part = path.with_suffix(".part")
+    with tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as shard:
+        for case in cases:
+            for name, contents in _files(campaign, case):
+                about = tarfile.TarInfo(name)
+                about.size = len(contents)
+                shard.addfile(about, io.BytesIO(contents))
+    part.replace(path)
+
+
+def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of a case's files."""
+    scenario = campaign.scenario
+    assert isinstance(scenario, GivesSamples)  # noqa: S101  (said by who calls)
+    drawn = campaign.draws(case)
+    for number, sample in enumerate(scenario.samples(campaign.parameters(case), campaign.streams(case))):
+        key = f"{case:07d}-{number}"
+        told = {"campaign": campaign.configuration.name, "case": case, "picture": number, "drawn": drawn}
+        yield f"{key}.image.png", _png(sample.image * np.uint16(2 ** (16 - sample.bits)))
+        yield f"{key}.range.npy", _npy(sample.range_m)
+        yield f"{key}.normal.npy", _npy(sample.normal)
+        yield f"{key}.rocks.png", _png(sample.rocks)
+        yield f"{key}.hazard.png", _png(sample.hazard)
+        yield f"{key}.cahvor", _camera(sample)
+        yield f"{key}.json", json.dumps({**told, "bits": sample.bits, **sample.about}, indent=1).encode()
+
+
+def _png(values: np.ndarray[Any, Any]) -> bytes:
+    import cv2
+
+    done, encoded = cv2.imencode(".png", values)
+    if not done:
+        raise ValueError("a picture could not be written as PNG")
+    return encoded.tobytes()
+
+
+def _npy(values: np.ndarray[Any, Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, values, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _camera(sample: Sample) -> bytes:
+    from sim.camera import write_cahvor
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "camera.cahvor"
+        write_cahvor(sample.camera, path, "in the body's axes")
+        return path.read_bytes()

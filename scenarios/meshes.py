@@ -1,0 +1,178 @@
+"""Own meshes on the ground: rocks, landers, landmarks, from any file that trimesh reads.
+
+They stand in pictures with their shadows and in the truth (range, bodies, and in landings the ground that a lander
+would stand on), once on the periodic terrain.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from scipy.spatial.transform import Rotation
+
+from sim.render import Objects
+from sim.terrain import Surface
+
+#: Largest file, and most triangles, that are read.
+MOST_BYTES, MOST_FACES = 1 << 28, 1_000_000
+#: Number given to the first mesh where bodies have names; rocks of a field count from 0.
+FIRST_NAME = 1 << 30
+#: Albedo where it is not stated: a rock's, painted structure, a bright target.
+_ALBEDO = {"rock": 0.15, "lander": 0.5, "landmark": 0.6}
+
+
+class MeshFileError(ValueError):
+    """A mesh that cannot be used; the message names the file, the fault, and what is allowed."""
+
+
+class MeshParameters(BaseModel):
+    """A mesh on the ground: its lowest point stands there, sunk in by `sink_m`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    file: Annotated[str, Field(description="STL, OBJ, PLY, GLB or whatever trimesh reads")]
+    sha256: Annotated[str | None, Field(description="of the file; filled in")] = None
+    kind: Annotated[Literal["rock", "lander", "landmark"], Field(description="what it is: rocks are smooth")] = "rock"
+    east_m: Annotated[float, Field(allow_inf_nan=False, description="where its origin stands, on the terrain")] = 0.0
+    north_m: Annotated[float, Field(allow_inf_nan=False)] = 0.0
+    heading_deg: Annotated[float, Field(ge=-720.0, le=720.0, description="turn about the vertical, clockwise")] = 0.0
+    size_m: Annotated[
+        float | None, Field(gt=0.0, le=1000.0, description="its greatest horizontal extent; scales the file")
+    ] = None
+    scale: Annotated[
+        float, Field(gt=0.0, le=1e4, description="metres in the file's unit, where size_m is not stated")
+    ] = 1.0
+    up: Annotated[Literal["x", "y", "z"], Field(description="the file's axis that points up")] = "z"
+    sink_m: Annotated[float, Field(ge=-100.0, le=100.0, description="how far its lowest point is in the ground")] = 0.0
+    albedo: Annotated[float | None, Field(gt=0.0, lt=1.0, description="not stated: that of its kind")] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_its_hash(cls, stated: Any) -> Any:
+        """Fills in the hash of the file, by which a campaign knows it again."""
+        if isinstance(stated, Mapping) and isinstance(stated.get("file"), str) and stated.get("sha256") is None:
+            return {**stated, "sha256": read_mesh(stated["file"]).sha256}
+        return stated
+
+    @model_validator(mode="after")
+    def _file_is_as_it_was(self) -> MeshParameters:
+        if read_mesh(self.file).sha256 != self.sha256:
+            raise MeshFileError(f"{self.file}: has changed since the campaign was made from it")
+        return self
+
+    def standing(self, surface: Surface, near: tuple[float, float]) -> Objects:
+        """The mesh on the ground, at that of its repetitions that is nearest to a place."""
+        mesh = read_mesh(self.file)
+        corners = _upright(self.up).apply(mesh.triangles.reshape(-1, 3))
+        extent = float(np.ptp(corners[:, :2], axis=0).max())
+        corners = corners * (self.scale if self.size_m is None else self.size_m / extent)
+        turn = Rotation.from_rotvec(np.radians(-self.heading_deg) * np.array([0.0, 0.0, 1.0]))
+        corners = turn.apply(corners)
+        normals = turn.apply(_upright(self.up).apply(mesh.normals.reshape(-1, 3)))
+        period = surface.levels[0].shape[0] * surface.spacing_m
+        place = np.array([self.east_m, self.north_m])
+        place = place + period * np.round((np.array(near) - place) / period)
+        ground = float(surface.height(place[0], place[1]))
+        corners = corners + np.array([*place, ground - self.sink_m - float(corners[:, 2].min())])
+        if self.kind != "rock":
+            normals = np.repeat(_face_normals(corners.reshape(-1, 3, 3)), 3, axis=0)
+        faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+        name = np.full(len(faces), FIRST_NAME, dtype=np.int32)
+        return Objects.of_mesh(corners, normals, faces, name, self.albedo or _ALBEDO[self.kind])
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A mesh as its file has it.
+
+    Attributes
+    ----------
+    sha256
+        Of the file.
+    triangles
+        Corners, in the file's unit and axes, counter-clockwise seen from outside.
+    normals
+        Smooth outward normals at the corners.
+    """
+
+    sha256: str
+    triangles: Float64[np.ndarray, "faces 3 3"]
+    normals: Float64[np.ndarray, "faces 3 3"]
+
+
+def standing(meshes: Sequence[MeshParameters], surface: Surface, near: tuple[float, float]) -> Objects:
+    """All meshes on the ground, each nearest to a place."""
+    return Objects.joined([one.standing(surface, near) for one in meshes]) if meshes else Objects.none()
+
+
+def read_mesh(path: str) -> Mesh:
+    """A mesh, checked; kept while its file does not change. Raises MeshFileError."""
+    try:
+        about = Path(path).stat()
+    except OSError as fault:
+        raise MeshFileError(f"{path}: cannot be read ({fault.strerror})") from fault
+    if about.st_size > MOST_BYTES:
+        raise MeshFileError(f"{path}: is larger than {MOST_BYTES >> 20} MiB; make the mesh coarser")
+    return _read(path, about.st_mtime_ns)
+
+
+@lru_cache(maxsize=16)
+def _read(path: str, _changed_ns: int) -> Mesh:
+    import trimesh
+
+    kind = Path(path).suffix.lower().lstrip(".")
+    if kind not in trimesh.available_formats():
+        raise MeshFileError(f"{path}: '.{kind}' is no format of meshes; allowed: {', '.join(_formats())}")
+    try:
+        found = trimesh.load(path, force="mesh", process=False)
+        digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except Exception as fault:  # each format's reader raises its own
+        said = " ".join(str(fault).split())[:200] or type(fault).__name__
+        raise MeshFileError(f"{path}: cannot be read as a mesh ({said})") from fault
+    # trimesh's own arrays are read-only, which rotations refuse
+    triangles = np.array(getattr(found, "triangles", np.zeros((0, 3, 3))), dtype=np.float64)
+    if len(triangles) == 0:
+        raise MeshFileError(f"{path}: holds no triangle")
+    if len(triangles) > MOST_FACES:
+        raise MeshFileError(f"{path}: holds {len(triangles)} triangles; allowed: up to {MOST_FACES}")
+    if not np.all(np.isfinite(triangles)):
+        raise MeshFileError(f"{path}: holds a corner that is not finite")
+    if not np.ptp(triangles.reshape(-1, 3), axis=0).all():
+        raise MeshFileError(f"{path}: is flat; a body with an extent along all axes is needed")
+    merged = trimesh.Trimesh(*_merged(triangles), process=False)
+    return Mesh(digest, triangles, np.array(merged.vertex_normals, dtype=np.float64)[np.array(merged.faces)])
+
+
+def _formats() -> list[str]:
+    import trimesh
+
+    return sorted(trimesh.available_formats())
+
+
+def _merged(triangles: Float64[np.ndarray, "faces 3 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces with equal corners made one, so that normals are smooth over a file of loose triangles."""
+    vertices, numbers = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    return vertices, numbers.reshape(-1, 3)
+
+
+def _upright(up: str) -> Rotation:
+    """Turns a file's axes so that this one points up."""
+    return {
+        "x": Rotation.from_euler("y", -90.0, degrees=True),
+        "y": Rotation.from_euler("x", 90.0, degrees=True),
+        "z": Rotation.identity(),
+    }[up]
+
+
+def _face_normals(triangles: Float64[np.ndarray, "faces 3 3"]) -> Float64[np.ndarray, "faces 3"]:
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0))

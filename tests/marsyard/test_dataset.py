@@ -1,0 +1,110 @@
+"""Data sets for learning: whole shards, the truth of each pixel, the same bytes again."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from marsyard.cli import app
+from sim.camera import read_cahvor
+
+CAMPAIGN = """name = "samples"
+scenario = "landing"
+cases = 2
+seed = 3
+
+[parameters]
+site = "heli-hazardous"
+
+[parameters.terrain]
+samples = 512
+
+[parameters.place]
+bank = 1
+
+[parameters.lander]
+diameter_m = 1.0
+
+[dispersions]
+"place.east_m" = { distribution = "uniform", low = 0.0, high = 20.0, source = "anywhere" }
+"flown.tilt_deg" = { distribution = "uniform", low = 0.0, high = 5.0, source = "assumed" }
+"""
+
+
+def made(folder: Path, *words: str) -> tuple[int, str]:
+    (folder / "samples.toml").write_text(CAMPAIGN)
+    result = CliRunner().invoke(
+        app, ["dataset", str(folder / "samples.toml"), "--out", str(folder / "set"), "--shard", "1", *words]
+    )
+    return result.exit_code, result.output
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    with tarfile.open(path) as shard:
+        return {one.name: shard.extractfile(one).read() for one in shard.getmembers()}  # type: ignore[union-attr]
+
+
+def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: Path) -> None:
+    status, output = made(tmp_path)
+    assert status == 0, output
+    shards = sorted((tmp_path / "set").glob("*.tar"))
+    assert [path.name for path in shards] == ["shard-000000.tar", "shard-000001.tar"]
+    files = contents(shards[1])
+    assert {name.partition(".")[0] for name in files} == {"0000001-0", "0000001-1"}
+
+    told = json.loads(files["0000001-0.json"])
+    image, rocks, hazard = (
+        cv2.imdecode(np.frombuffer(files[f"0000001-0.{name}.png"], np.uint8), cv2.IMREAD_UNCHANGED)
+        for name in ("image", "rocks", "hazard")
+    )
+    distance, normal = (np.load(io.BytesIO(files[f"0000001-0.{name}.npy"])) for name in ("range", "normal"))
+    assert image.dtype == np.uint16
+    assert image.shape == rocks.shape == hazard.shape == distance.shape == normal.shape[:2]
+    assert np.allclose(np.linalg.norm(normal, axis=2), 1.0, atol=1e-3)
+    assert set(np.unique(rocks)) == {0, 1}
+    assert set(np.unique(hazard)) <= {0, 1, 255}
+    assert 0 in hazard
+
+    # pose, camera and range give world points; of flat parts the height changes as the normals say
+    path = tmp_path / "camera.cahvor"
+    path.write_bytes(files["0000001-0.cahvor"])
+    camera = read_cahvor(path)
+    origins, directions = camera.rays(camera.pixel_grid())
+    turn = Rotation.from_quat(told["world_from_body_xyzw"])
+    points = np.array(told["position_m"]) + turn.apply((origins + distance[..., None] * directions).reshape(-1, 3))
+    points = points.reshape(normal.shape)
+    bare = rocks[:-1, :-1] + rocks[1:, :-1] + rocks[:-1, 1:] == 0
+    across, along = points[:-1, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, :-1]
+    fitted = np.cross(along, across)
+    fitted /= np.linalg.norm(fitted, axis=2, keepdims=True)
+    cosine = np.sum(fitted * normal[:-1, :-1], axis=2)[bare]
+    assert np.median(cosine) > 0.99
+
+    # the drawn values are the campaign's, and an interrupted set is gone on with, byte for byte
+    assert 0.0 <= told["drawn"]["place.east_m"] <= 20.0
+    before = [path.read_bytes() for path in shards]
+    shards[0].unlink()
+    assert made(tmp_path)[0] == 0
+    assert [path.read_bytes() for path in shards] == before
+    status, output = made(tmp_path, "--seed", "4")
+    assert status == 2
+    assert "holds another data set (configuration_sha256 differs)" in output
+
+
+def test_campaigns_without_hazards_are_refused(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["dataset", "dimes-smoke", "--out", str(tmp_path / "set")])
+    assert result.exit_code == 2
+    assert "has no hazard maps to learn from; allowed: landing" in result.output
+
+
+@pytest.mark.parametrize("words", [("--shard", "0"), ("--jobs", "0")])
+def test_wrong_numbers(tmp_path: Path, words: tuple[str, str]) -> None:
+    assert made(tmp_path, *words)[0] == 2
