@@ -13,13 +13,14 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, cast
 
 import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import RigidTransform
 
+from algorithms.answers import checked_update
 from algorithms.interface import PixelBox, TrackingState
 from algorithms.vtt import VttOptions
 from algorithms.vtt.pointing import box_around, mast_angles
@@ -35,6 +36,7 @@ from scenarios.rover.stops import RunOutcome, Stop
 from scenarios.rover.target import in_view, point_on, rock_of, told_by_pixel
 from scenarios.rover.vehicle import Vehicle
 from scenarios.rover.world import RunWorld, terrain_parameters
+from scenarios.trial import Judged, attempted, case_result
 from sim.camera import CameraModel
 from sim.dynamics import Stance
 from sim.measurements import RoverMeasurements
@@ -59,7 +61,7 @@ class VariantParameters(_Parameters):
 
 
 class PointParameters(_Parameters):
-    """A target on the rock's face, see `scenarios.rover.TargetParameters`."""
+    """A target on the rock's face, see `scenarios.rover.TargetParameters`; of a circle as seen from its middle."""
 
     across: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
     up: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
@@ -179,10 +181,23 @@ def shared_drive(p: RoverScenarioParameters, margin_px: float, seed: int, campai
 def _middle_of_targets(
     p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance: Stance
 ) -> Float64[np.ndarray, "3"]:
-    """The surface point in the middle of the targets, as seen from the mast at the start."""
+    """The surface point in the middle of the targets."""
     rover_from_mast = rig.calibrated.geometry.rover_from_head(0.0, 0.0)
     eyes = rig.eyes(stance.world_from_rover * rover_from_mast)
-    return point_on(world, eyes, p.target.across, p.target.up, rig.pixel_rad, p.vtt)[0]
+    return point_on(world, eyes, p.target.across, p.target.up, rig.pixel_rad, p.vtt, _picked_from(p, world, eyes[0]))[0]
+
+
+def _picked_from(
+    p: RoverScenarioParameters, world: RunWorld, eye: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "3"]:
+    """Where from the targets' places on the rock are meant: the start; of a circle its middle.
+
+    The paper selected the targets of its circle on the one face that is seen from both of its ends.
+    """
+    leg, rock = p.legs[0], world.rocks.position_m[world.target_number]
+    turn = np.radians(0.5 * leg.steps * leg.step_deg) if leg.motion == "circle" else 0.0
+    (east, north, up), sine, cosine = eye - rock, np.sin(turn), np.cos(turn)
+    return np.asarray(rock + np.array([cosine * east + sine * north, cosine * north - sine * east, up]))
 
 
 def _belief(rig: Rig, vehicle: Vehicle, middle: Float64[np.ndarray, "3"]) -> Belief:
@@ -234,15 +249,15 @@ def _box(camera: CameraModel, points: Float64[np.ndarray, "points 3"], margin_px
     return box
 
 
-def tracked(p: SharedDriveParameters, drive: SharedDrive) -> Run:
-    """A tracker run over the drive's pictures for one of the targets."""
+def tracked(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> Run:
+    """A tracker run over the drive's pictures for one of the targets; the one that is judged if none is named."""
     first = drive.views[0]
     eyes = drive.rig.eyes(first.world_from_head)
-    chosen = p.targets[p.target]
-    point, on_edge, lit = point_on(drive.world, eyes, chosen.across, chosen.up, drive.rig.pixel_rad, p.drive.vtt)
+    chosen, seen = p.targets[p.target], _picked_from(p.drive, drive.world, eyes[0])
+    point, on_edge, lit = point_on(drive.world, eyes, chosen.across, chosen.up, drive.rig.pixel_rad, p.drive.vtt, seen)
     told = told_by_pixel(drive.rig.left, first.world_from_head, point, first.angles_rad)
     run = Run(drive.world, drive.rig, drive.vehicle, rock_of(drive.world, point, told, on_edge, lit))
-    tracker = TRACKING.make(p.drive.algorithm, p.drive.vtt, p.drive.executable)
+    tracker = TRACKING.make(algorithm or p.drive.algorithm, p.drive.vtt, p.drive.executable)
     tracker.designate(told, first.estimated)
     for view in drive.views[:: p.skip + 1]:
         pictures = view.pictures
@@ -250,7 +265,7 @@ def tracked(p: SharedDriveParameters, drive: SharedDrive) -> Run:
             pictures.left, pictures.right, drive.rig.calibrated, *view.angles_rad, view.estimated
         )
         started = time.process_time()
-        update = tracker.update(measurements)
+        update = checked_update(tracker.update(measurements))
         taken = time.process_time() - started
         in_head = np.asarray(view.world_from_head.inv().apply(point.copy()))
         run.stops.append(
@@ -295,7 +310,8 @@ def stays_in_view(
     """Whether both cameras see a target all along a drive; kept, as the cases of a target ask the same."""
     drive = shared_drive(p, margin_px, seed, campaign, run)
     eyes = [eye for one in drive.views for eye in drive.rig.eyes(one.world_from_head)]
-    point = point_on(drive.world, eyes[:2], chosen.across, chosen.up, drive.rig.pixel_rad, options)[0]
+    seen = _picked_from(p, drive.world, eyes[0])
+    point = point_on(drive.world, eyes[:2], chosen.across, chosen.up, drive.rig.pixel_rad, options, seen)[0]
     return in_view(drive.world, point, eyes, drive.rig.pixel_rad, options)
 
 
@@ -304,6 +320,8 @@ class SharedDriveScenario:
 
     name = "rover-drive"
     parameters_type = SharedDriveParameters
+    task = TRACKING
+    algorithm_table = ("drive",)
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains that runs use."""
@@ -315,36 +333,49 @@ class SharedDriveScenario:
         TerrainBank(terrain_parameters(w), w.bank_seed).terrain(shared_input)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """One target of one run, tracked with one step."""
+        """One target of one run, tracked with one step; all algorithms see the same pictures."""
         p = _checked(parameters)
         of_run = p.of_run()
         shared = (of_run, p.margin_px, streams.seed, streams.campaign, p.run)
-        run = tracked(p, shared_drive(*shared))
+        drive = shared_drive(*shared)
         case = of_run.model_copy(update={"algorithm": p.drive.algorithm, "vtt": p.drive.vtt, "score": p.drive.score})
-        bands: dict[str, Scalar] = {one.name: bool(one.least <= p.step <= one.most) for one in p.bands}
-        row = {
-            **score(case, run),
-            **tracking(run),
-            **conditions(case, run),
-            "run": p.run,
-            "target": p.target,
-            "point_across": p.targets[p.target].across,
-            "point_up": p.targets[p.target].up,
-            "skip": p.skip,
-            "step": p.step,
-            "with_scale": p.drive.algorithm != "pure-ncc" and p.drive.vtt.scale,
-            "pure_ncc": p.drive.algorithm == "pure-ncc",
-            "in_view": stays_in_view(*shared, p.targets[p.target], p.drive.vtt),
-            **bands,
-            **stored_updates(run, p.drive.score.stored_updates),
-            **provenance(case, run),
-        }
-        return CaseResult(
-            outcome=run.outcome.name,
-            answered=run.outcome is RunOutcome.COMPLETED,
-            row=row,
-            products=products(case, run),
-        )
+
+        def judge(algorithm: str) -> Judged:
+            attempt = attempted(lambda: tracked(p, drive, algorithm), lambda made: cast(Run, made))
+            run = attempt.answer
+            if run is None:
+                outcome = attempt.outcome(lambda made: made.outcome.name)
+                return Judged(outcome, False, attempt.row, failure=attempt.failure)
+            row = {**score(case, run), **tracking(run)}
+            completed = run.outcome is RunOutcome.COMPLETED
+            if algorithm != p.drive.algorithm:
+                return Judged(run.outcome.name, completed, row)
+            row |= {
+                **conditions(case, run),
+                **stored_updates(run, p.drive.score.stored_updates),
+                **provenance(case, run),
+            }
+            return Judged(run.outcome.name, completed, row, products(case, run))
+
+        seen = stays_in_view(*shared, p.targets[p.target], p.drive.vtt)
+        return case_result(p.drive.algorithms, judge, {**_known(p), "in_view": seen})
+
+
+def _known(p: SharedDriveParameters) -> dict[str, Scalar]:
+    """What makes a case, whatever tracks in it."""
+    chosen = p.targets[p.target]
+    bands: dict[str, Scalar] = {one.name: bool(one.least <= p.step <= one.most) for one in p.bands}
+    return {
+        "run": p.run,
+        "target": p.target,
+        "point_across": chosen.across,
+        "point_up": chosen.up,
+        "skip": p.skip,
+        "step": p.step,
+        "with_scale": p.drive.algorithm != "pure-ncc" and p.drive.vtt.scale,
+        "pure_ncc": p.drive.algorithm == "pure-ncc",
+        **bands,
+    }
 
 
 def _checked(parameters: BaseModel) -> SharedDriveParameters:

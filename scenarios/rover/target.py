@@ -90,13 +90,15 @@ def point_on(
     up: float,
     pixel_rad: float,
     options: VttOptions,
+    picked_from: Float64[np.ndarray, "3"] | None = None,
 ) -> tuple[Float64[np.ndarray, "3"], bool, bool]:
     """A point of the rock's face as the first eye sees it; whether it is on the rock's edge for any, and whether lit.
 
-    Eyes are those of the pair: point stereo needs the point off the edge in the right picture too.
+    Eyes are those of the pair: point stereo needs the point off the edge in the right picture too. `across` and `up`
+    may be meant as seen from somewhere else.
     """
     foot = float(world.rocks.position_m[world.target_number, 2])
-    point = Sight.of(world.target_triangles, eyes[0], foot).point(across, up)
+    point = Sight.of(world.target_triangles, eyes[0] if picked_from is None else picked_from, foot).point(across, up)
     on_edge = any(_on_edge(world, eye, point, 0.5 * options.template_px * pixel_rad) for eye in eyes)
     return point, on_edge, not bool(shaded(world.target_triangles, point[None], world.sun.direction(0.0))[0])
 
