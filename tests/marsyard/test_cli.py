@@ -182,7 +182,8 @@ def _crash(case: int) -> str:
     [
         ("", "", 0, "NO REQUIREMENT"),
         (_crash(1), "", 1, "NO REQUIREMENT"),
-        ("", REQUIREMENT.replace("0.99", "0.3"), 0, "PASS"),
+        # Three cases on one terrain are worth one: at 90 % it shows a rate of 10 %.
+        ("", REQUIREMENT.replace("0.99", "0.09"), 0, "PASS"),
         ("error_scale = 1e3", REQUIREMENT, 1, "FAIL"),
         ("", REQUIREMENT, 3, "INSUFFICIENT"),
         # One failure of three leaves open whether nine of ten would succeed, but a crash is a crash.
