@@ -7,17 +7,18 @@ would stand on), once on the periodic terrain.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from scenarios.own_files import OwnFile
 from sim.render import Objects
 from sim.terrain import Surface
 
@@ -33,13 +34,9 @@ class MeshFileError(ValueError):
     """A mesh that cannot be used; the message names the file, the fault, and what is allowed."""
 
 
-class MeshParameters(BaseModel):
-    """A mesh on the ground: its lowest point stands there, sunk in by `sink_m`."""
+class MeshParameters(OwnFile):
+    """A mesh on the ground, of a file that trimesh reads: its lowest point stands there, sunk in by `sink_m`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    file: Annotated[str, Field(description="STL, OBJ, PLY, GLB or whatever trimesh reads")]
-    sha256: Annotated[str | None, Field(description="of the file; filled in")] = None
     kind: Annotated[Literal["rock", "lander", "landmark"], Field(description="what it is: rocks are smooth")] = "rock"
     east_m: Annotated[float, Field(allow_inf_nan=False, description="where its origin stands, on the terrain")] = 0.0
     north_m: Annotated[float, Field(allow_inf_nan=False)] = 0.0
@@ -54,19 +51,10 @@ class MeshParameters(BaseModel):
     sink_m: Annotated[float, Field(ge=-100.0, le=100.0, description="how far its lowest point is in the ground")] = 0.0
     albedo: Annotated[float | None, Field(gt=0.0, lt=1.0, description="not stated: that of its kind")] = None
 
-    @model_validator(mode="before")
     @classmethod
-    def _with_its_hash(cls, stated: Any) -> Any:
-        """Fills in the hash of the file, by which a campaign knows it again."""
-        if isinstance(stated, Mapping) and isinstance(stated.get("file"), str) and stated.get("sha256") is None:
-            return {**stated, "sha256": read_mesh(stated["file"]).sha256}
-        return stated
-
-    @model_validator(mode="after")
-    def _file_is_as_it_was(self) -> MeshParameters:
-        if read_mesh(self.file).sha256 != self.sha256:
-            raise MeshFileError(f"{self.file}: has changed since the campaign was made from it")
-        return self
+    def hash_of(cls, file: str) -> str:
+        """SHA-256 of the mesh's file, which is checked."""
+        return read_mesh(file).sha256
 
     def standing(self, surface: Surface, near: tuple[float, float]) -> Objects:
         """The mesh on the ground, at that of its repetitions that is nearest to a place."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Sequence
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
+from scenarios.own_files import OwnFile
 from sim.dynamics.recorded import RecordedMotion
 from sim.dynamics.recorded_files import RecordedPoses, TrajectoryFileError, read_poses
 
@@ -24,18 +25,14 @@ _CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 AFTER_S = 0.5
 
 
-class FlightFile(BaseModel):
-    """A recorded or computed flight.
+class FlightFile(OwnFile):
+    """A recorded or computed flight: a CSV, Parquet, TUM or EuRoC file of poses.
 
     Positions are the camera's, unless `lever_m` says where the camera is. The file's time `first_picture_s` is that of
     the first picture; others follow after `descent.interval_s` each. All instruments measure this motion as they would
     a simulated one.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    file: Annotated[str, Field(description="CSV, Parquet, TUM or EuRoC file of poses")]
-    sha256: Annotated[str | None, Field(description="of the file; filled in")] = None
     axes: Annotated[Literal["enu", "ned"], Field(description="world axes: east, north, up; or north, east, down")]
     origin: Annotated[
         Literal["place", "terrain"],
@@ -62,20 +59,13 @@ class FlightFile(BaseModel):
         float, Field(ge=-720.0, le=720.0, description="turns the flight about the vertical, clockwise from above")
     ] = 0.0
 
-    @model_validator(mode="before")
     @classmethod
-    def _with_its_hash(cls, stated: Any) -> Any:
-        """Fills in the hash of the file, by which a campaign knows it again."""
-        if isinstance(stated, str):
-            stated = {"file": stated}
-        if isinstance(stated, Mapping) and isinstance(stated.get("file"), str) and stated.get("sha256") is None:
-            return {**stated, "sha256": read_poses(stated["file"]).sha256}
-        return stated
+    def hash_of(cls, file: str) -> str:
+        """SHA-256 of the file of poses, which are checked."""
+        return read_poses(file).sha256
 
     @model_validator(mode="after")
-    def _file_is_as_it_was(self) -> FlightFile:
-        if self.sha256 != self.poses.sha256:
-            raise TrajectoryFileError(f"{self.file}: has changed since the campaign was made from it")
+    def _mounting_is_a_rotation(self) -> FlightFile:
         if abs(float(np.linalg.norm(self.mounting)) - 1.0) > 1e-3:
             raise ValueError(f"mounting {list(self.mounting)} is no quaternion of length 1")
         return self

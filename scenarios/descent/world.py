@@ -18,6 +18,9 @@ from sim.terrain import Environment, Surface, TerrainBank
 #: Sunlight over that at 1 AU for which the descent camera's responsivity is stated: Mars at 1.5 AU.
 SUNLIGHT_OF_RESPONSIVITY = 1.0 / 1.5**2
 
+#: Finest spacing of a plain terrain's mesh: that of pictures from 1200 m and more, and its share of a lower height.
+MESH_FINEST_M, MESH_FINEST_HEIGHTS = 12.0, 0.01
+
 
 @dataclass(frozen=True)
 class World:
@@ -90,7 +93,8 @@ class World:
             Clouds that drift above.
         """
         if self.ground is None:
-            scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry())
+            finest = min(MESH_FINEST_M, MESH_FINEST_HEIGHTS * lowest_m)
+            scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry(), mesh_finest_m=finest)
         else:
             scene = site_scene(self.ground, Eye(east_m, north_m, lowest_m, pixel_rad), self.sun)
         if self.meshes:

@@ -31,7 +31,7 @@ class SwingParameters(WindParameters):
     )
     interval_s: Annotated[float, Field(gt=0.1, le=60.0, description="time between pictures, s")] = 3.75
     descent_rate_m_s: Annotated[
-        float, Field(ge=5.0, le=200.0, description="the canopy's descent rate at the first picture, m/s")
+        float, Field(ge=20.0, le=200.0, description="the canopy's descent rate at the first picture, m/s")
     ] = 75.0
     density_scale_height_m: Annotated[
         float, Field(ge=5000.0, le=20000.0, description="height over which density falls to 1/e, m; CO2 at 220 K")

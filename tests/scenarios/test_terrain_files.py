@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 
+from campaigns.definition.loading import load_campaign
 from scenarios.descent import DescentScenarioParameters
 from scenarios.terrain_files import check_source
 from sim.terrain.imported import RealTerrain, TerrainFileError
@@ -50,6 +51,14 @@ def test_the_hirise_tile_passes(shared_data: Path) -> None:
     folder = shared_data / "gale_hirise"
     check_source(RealTerrain(dtm=folder / "dem.tif"))
     check_source(RealTerrain(dtm=folder / "gale_1m_dem_0p5m_ortho.npz"))
+
+
+@pytest.mark.parametrize("name", ["dimes-hirise", "hda-hirise"])
+def test_campaigns_over_the_tile_are_complete(shared_data: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """They name its file from the checkout's own folder, as they are run."""
+    monkeypatch.chdir(shared_data.parents[1] / Path(__file__).parents[2].name)
+    loaded = load_campaign(f"docs/examples/{name}.toml")
+    assert loaded.draws(7)
 
 
 def test_a_dtm_and_its_picture_pass(tmp_path: Path) -> None:

@@ -1,0 +1,36 @@
+"""Parameters that name a file: a campaign knows it again by the hash of its contents."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+
+class OwnFile(BaseModel):
+    """A file that a campaign is made from. The hash is filled in when the campaign is read; each case checks it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    file: Annotated[str, Field(description="path of the file")]
+    sha256: Annotated[str | None, Field(description="of the file; filled in")] = None
+
+    @classmethod
+    @abstractmethod
+    def hash_of(cls, file: str) -> str:
+        """SHA-256 of a file's contents. Raises ValueError, naming it, where it cannot be used."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_its_hash(cls, stated: Any) -> Any:
+        if isinstance(stated, Mapping) and isinstance(stated.get("file"), str) and stated.get("sha256") is None:
+            return {**stated, "sha256": cls.hash_of(stated["file"])}
+        return stated
+
+    @model_validator(mode="after")
+    def _is_as_it_was(self) -> OwnFile:
+        if self.sha256 != self.hash_of(self.file):
+            raise ValueError(f"{self.file}: has changed since the campaign was made from it")
+        return self
