@@ -13,8 +13,8 @@ from campaigns.outcomes import CaseEndedError
 from scenarios.conformance import Finding, Subject, check_names, run_check, task_of
 from scenarios.estimators import TASKS
 
-#: Output that the whole of a check may write.
-_OUTPUT_BYTES = 10e6
+#: Output that a check may write, and memory that it may have.
+_OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 
 def subject_of(spec: str, task: str | None, limit_s: float) -> Subject:
@@ -41,7 +41,7 @@ def examine(subject: Subject) -> Iterator[Finding]:
     Where the first, the ordinary case, does not come to an end, the others are not tried.
     """
     names = check_names(subject)
-    limits = WorkLimits(time_s=_limit_s(subject), output_bytes=_OUTPUT_BYTES)
+    limits = WorkLimits(_limit_s(subject), _MEMORY_BYTES, _OUTPUT_BYTES)
     with LocalWorkers(1) as workers:
         for number, (name, asked) in enumerate(names):
             work = Work(partial(_check, subject), [number], limits)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from scenarios.chosen import ChosenAlgorithms
+from scenarios.estimators import VELOCITY, Task
 from sim.dynamics.helicopter import HelicopterParameters
 from sim.render import CloudParameters
 from sim.render.backend import Backend, default_backend
@@ -130,11 +132,12 @@ class TripleParameters(BaseModel):
     most_step_m: Annotated[Positive, Field(description="most height between pictures apart, m (assumed)")] = 390.0
 
 
-class FieldTestParameters(BaseModel):
+class FieldTestParameters(ChosenAlgorithms):
     """A field test: its runs and what is common to them. Case i is a triple of one of the runs."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    task: ClassVar[Task[Any, Any]] = VELOCITY
 
+    algorithm: Annotated[str, Field(description="velocity estimator under test, see `scenarios.estimators`")] = "dimes"
     runs: Annotated[tuple[RunParameters, ...], Field(min_length=1, description="in the report's order")]
     bank_seed: Annotated[int, Field(ge=0, description="seed of the sites' terrains; each site has one")] = 1
     samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side of a terrain")] = 4096

@@ -1,22 +1,26 @@
-"""The field test as a scenario: case i is one triple of one run, with its measurements, DIMES' answer and the score."""
+"""The field test as a scenario: case i is one triple of one run, its measurements, an estimator's answer, the score."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float64, UInt16
 from pydantic import BaseModel
 
-from algorithms.dimes import DimesDetails, DimesEstimator, dimes_products
-from algorithms.interface import VelocityEstimate
+from algorithms.answers import checked_velocity
+from algorithms.dimes import DimesOptions
+from scenarios.estimators import VELOCITY
 from scenarios.fieldtest.parameters import FieldTestParameters
 from scenarios.fieldtest.pictures import cloud_transmittances, field_optics, take_picture
 from scenarios.fieldtest.run import Run, RunKey, worked_out
 from scenarios.fieldtest.triples import Category, Triple
 from scenarios.interface import CaseResult, Scalar
+from scenarios.trial import Judged, attempted, case_result
+from scenarios.velocity import consistency_row, velocity_products, velocity_row
 from sim.dynamics import State
 from sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from sim.processor import processor_features
@@ -39,10 +43,12 @@ class Case:
 
 
 class FieldTestScenario:
-    """Triples of pictures of a helicopter's flights, measured as the paper did and given to DIMES."""
+    """Triples of pictures of a helicopter's flights, measured as the paper did and given to an estimator: DIMES."""
 
     name = "fieldtest"
     parameters_type = FieldTestParameters
+    task = VELOCITY
+    algorithm_table = ()
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the sites."""
@@ -64,20 +70,27 @@ class FieldTestScenario:
         taken = [take_picture(case.run, state, detector, noise) for state in case.states]
         pictures = [one.counts for one in taken]
         measurements = measure(p, case, pictures, detector)
-        estimate = DimesEstimator().estimate(measurements)
         truth = truth_velocities(p, case)[1, :2]
-        row = {
-            **_score(estimate, truth),
+
+        def judge(algorithm: str) -> Judged:
+            estimator = partial(VELOCITY.make, algorithm, DimesOptions(), p.executable, streams.case)
+            attempt = attempted(lambda: estimator().estimate(measurements), checked_velocity)
+            estimate = attempt.answer
+            velocity = None if estimate is None else estimate.velocity_m_s
+            return Judged(
+                outcome=attempt.outcome(lambda answer: answer.outcome.name),
+                answered=velocity is not None,
+                row={**velocity_row("velocity", velocity, truth), **consistency_row(estimate, truth), **attempt.row},
+                products=velocity_products(pictures, estimate, truth),
+                failure=attempt.failure,
+            )
+
+        known = {
             **_conditions(p, case, measurements),
             **_clouding(case, taken[1].ground_m),
             **_provenance(p, pictures),
         }
-        return CaseResult(
-            outcome=estimate.outcome.name,
-            answered=estimate.velocity_m_s is not None,
-            row=row,
-            products=_products(pictures, estimate, truth),
-        )
+        return case_result(p.algorithms, judge, known)
 
 
 def _checked(parameters: BaseModel) -> FieldTestParameters:
@@ -151,16 +164,6 @@ def measure(
     )
 
 
-def _score(estimate: VelocityEstimate, truth: Float64[np.ndarray, "2"]) -> dict[str, Scalar]:
-    """Horizontal velocity and its error against the truth velocity of the second pair."""
-    estimated = np.full(2, np.nan) if estimate.velocity_m_s is None else estimate.velocity_m_s
-    error = estimated - truth
-    row: dict[str, Scalar] = {"velocity_error_m_s": float(np.hypot(*error))}
-    for kind, values in (("error", error), ("estimated", estimated), ("true", truth)):
-        row |= {f"velocity_{kind}_{axis}_m_s": float(value) for axis, value in zip("xy", values, strict=True)}
-    return row
-
-
 def _conditions(p: FieldTestParameters, case: Case, measurements: DescentMeasurements) -> dict[str, Scalar]:
     """What the case was like, read from the simulated objects."""
     run, numbers = case.run, list(case.triple.pictures)
@@ -226,18 +229,3 @@ def _provenance(p: FieldTestParameters, pictures: Sequence[UInt16[np.ndarray, "r
         "gl_version": process_renderer(p.backend).description(),
         "processor_features": processor_features(),
     }
-
-
-def _products(
-    pictures: Sequence[UInt16[np.ndarray, "rows columns"]],
-    estimate: VelocityEstimate,
-    truth: Float64[np.ndarray, "2"],
-) -> dict[str, object]:
-    """Arrays from which the case's figures are drawn."""
-    kept: dict[str, object] = {f"image_{number}": one for number, one in enumerate(pictures, start=1)}
-    if isinstance(estimate.details, DimesDetails):
-        kept.update(dimes_products(estimate.details))
-    kept["velocity_true_m_s"] = truth
-    if estimate.velocity_m_s is not None:
-        kept["velocity_estimated_m_s"] = estimate.velocity_m_s
-    return kept

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from algorithms.answers import checked_aim, checked_update
 from algorithms.interface import MastAim, TargetTracker, TrackingState
 from algorithms.navigation import NavigationOutcome
 from algorithms.vtt import GoalReached, HandOffOutcome, hand_off
@@ -163,7 +164,7 @@ class _Loop:
         """Points, takes pictures, updates. Why the run is over, or None."""
         run = self.run
         run.time_s += self.p.timing.track_s
-        aim = self.tracker.aim(run.vehicle.estimated, run.rig.calibrated)
+        aim = checked_aim(self.tracker.aim(run.vehicle.estimated, run.rig.calibrated), run.rig.calibrated)
         if aim is None:
             return RunOutcome.OUT_OF_REACH
         stop = self._stop(leg, aim)
@@ -190,7 +191,7 @@ class _Loop:
         )
         measurements = RoverMeasurements(pictures.left, pictures.right, rig.calibrated, *angles, run.vehicle.estimated)
         started = time.process_time()
-        update = self.tracker.update(measurements)
+        update = checked_update(self.tracker.update(measurements))
         taken = time.process_time() - started
         in_head = np.asarray(world_from_head.inv().apply(run.target.point_world.copy()))
         return Stop(

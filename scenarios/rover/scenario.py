@@ -40,17 +40,19 @@ class RoverScenario:
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One run; each algorithm that is compared makes one of its own, with the same draws."""
         p = _checked(parameters)
-        run, row = _tracked(p, streams)
 
         def judge(algorithm: str) -> Judged:
-            if algorithm == p.algorithm:
-                return _judged(run, {**row, **stored_updates(run, p.score.stored_updates)}, products(p, run))
             mine = p.model_copy(update={"algorithm": algorithm})
-            other = attempted(lambda: _judged(*_tracked(mine, streams)), lambda made: cast(Judged, made))
-            nothing = Judged(other.outcome(lambda made: made.outcome), False, {}, failure=other.failure)
-            return nothing if other.answer is None else other.answer
+            attempt = attempted(lambda: _tracked(mine, streams), lambda made: cast(tuple[Run, dict[str, Scalar]], made))
+            if attempt.answer is None:
+                return Judged(attempt.outcome(lambda made: made[0].outcome.name), False, {}, failure=attempt.failure)
+            run, row = attempt.answer
+            if algorithm != p.algorithm:
+                return _judged(run, row)
+            row |= {**stored_updates(run, p.score.stored_updates), **conditions(p, run), **provenance(p, run)}
+            return _judged(run, row, products(p, run))
 
-        return case_result(p.algorithms, judge, {**conditions(p, run), **provenance(p, run)})
+        return case_result(p.algorithms, judge, {})
 
 
 def _tracked(p: RoverScenarioParameters, streams: Streams) -> tuple[Run, dict[str, Scalar]]:

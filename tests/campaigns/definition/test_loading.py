@@ -283,8 +283,45 @@ def test_no_file_ends_in_a_traceback(tmp_path: Path, changes: dict[str, object])
     path = tmp_path / "fuzzed.toml"
     path.write_text(text)
     tomllib.loads(text)
-    with contextlib.suppress(ConfigurationError):
-        load_campaign(str(path))
+    assert all(keys_named(lambda: load_campaign(str(path))))
+
+
+def keys_named(load: Callable[[], object]) -> list[str]:
+    """The keys that a refusal names, one for each problem; none where nothing is refused."""
+    try:
+        load()
+    except ConfigurationError as error:
+        return [problem.key for problem in error.problems]
+    return []
+
+
+#: A valid campaign with something in every table.
+_WHOLE: dict[str, dict[str, object]] = {
+    "limits": {"case_time_s": 10.0, "memory_gb": 1.0, "output_mb": 1.0},
+    "retain": {"products": "worst", "worst": 2, "budget_gb": 1.0},
+    "design": {"kind": "random", "nominal": True},
+    "requirements": {"id": "'v'", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9},
+    "parameters": {"altitude_m": 1900.0, "terrain": 2, "kind": "plain", "heights_m": [1.0, 2.0]},
+}
+
+
+@given(
+    place=st.sampled_from([(table, key) for table, inner in _WHOLE.items() for key in inner]),
+    value=_values,
+    gone=st.booleans(),
+)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_spoilt_value_is_named_by_its_key(tmp_path: Path, place: tuple[str, str], value: object, gone: bool) -> None:
+    table, key = place
+    tables = {name: dict(inner) for name, inner in _WHOLE.items()}
+    tables[table].pop(key) if gone else tables[table].update({key: value})
+    head = 'name = "fake"\nscenario = "fake_scenario:FakeScenario"\ncases = 12\n'
+    texts = [f"{name} = {_toml([inner] if name == 'requirements' else inner)}" for name, inner in tables.items()]
+    path = tmp_path / "spoilt.toml"
+    path.write_text(head + "\n".join(texts))
+    for named in keys_named(lambda: load_campaign(str(path))):
+        # a table that is wrong as a whole is named as such
+        assert named.startswith(table), named
 
 
 @given(override=st.text(max_size=20) | st.builds("{}={}".format, _words, st.text(max_size=8)))

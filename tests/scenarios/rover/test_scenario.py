@@ -134,6 +134,13 @@ def test_a_lost_target_is_no_answer() -> None:
     assert result.row["losses"] == "LOW_MATCH_SCORE"
 
 
+def test_an_answer_that_is_none_is_the_trackers_fault() -> None:
+    result = RoverScenario().run(parameters(algorithm="tests.scenarios.rover.trackers:Wordless"), streams())
+    assert (result.outcome, result.answered) == ("BAD_ANSWER", False)
+    assert result.failure is not None
+    assert "the answer is a NoneType; allowed: a TargetUpdate" in result.failure.error
+
+
 def test_unknown_trackers_and_cameras_are_refused() -> None:
     with pytest.raises(ValueError, match=r"unknown algorithm 'vt'.*did you mean 'vtt'"):
         parameters(algorithm="vt")
@@ -149,12 +156,17 @@ def test_trackers_share_the_pictures_of_a_drive() -> None:
         "targets": [{"across": 0.0, "up": 0.5}, {"across": 0.4, "up": 0.5}],
         "bands": [{"name": "at_10_deg", "least": 10.0, "most": 10.0}],
     }
+    wordless = "tests.scenarios.rover.trackers:Wordless"
+    stated["drive"] = {**stated["drive"], "compared": ["pure-ncc", wordless]}
     fine, coarse = (SharedDriveParameters.model_validate({**stated, "skip": skip}) for skip in (0, 1))
     assert (fine.step, coarse.step) == (5.0, 10.0)
     results = [scenario.run(one, streams(case)) for case, one in enumerate((fine, coarse))]
     assert [result.row["updates"] for result in results] == [3, 2]
     assert [result.row["at_10_deg"] for result in results] == [False, True]
     assert all(result.row["tracked"] for result in results)
+    assert all(result.row["pure_ncc.updates"] == result.row["updates"] for result in results)
+    assert all(result.row["Wordless.outcome"] == "BAD_ANSWER" for result in results)
+    assert [result.failure for result in results] == [None, None]
     drive = shared_drive(fine.of_run(), fine.margin_px, 1, "rover tests", 0)
     other = tracked(SharedDriveParameters.model_validate({**stated, "target": 1}), drive)
     assert other.stops[0].point_px[0] > drive.views[0].pictures.left.corner[0]

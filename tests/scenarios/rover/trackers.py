@@ -1,8 +1,9 @@
-"""Trackers of a user: one that is wrong and does not know it, one that never finds anything."""
+"""Trackers of a user: one that is wrong and does not know it, one that never finds anything, one without answers."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -51,3 +52,11 @@ class Blind(Confident):
             return self.inner.update(measurements)
         position = np.array([3.0, 0.0, 0.3])
         return TargetUpdate(TrackingState.FAILURE, (TargetLoss.LOW_MATCH_SCORE,), position)
+
+
+class Wordless(Confident):
+    """Answers nothing at all."""
+
+    def update(self, measurements: RoverMeasurements) -> Any:
+        """See `TargetTracker`."""
+        self.inner.update(measurements)
