@@ -1,14 +1,14 @@
 # Marsyard's tasks. `make` alone lists them. Each sets up what it needs first; doing so again costs nothing.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format bench docs validate constraints clean distclean
+.PHONY: help setup demo test lint format bench bench-check docs validate constraints clean distclean
 
 BIN := .venv/bin
 # More words for pytest, as in: make test PYTEST_ARGS="-k camera"
 PYTEST_ARGS ?=
 
 help: ## List the tasks
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: ## Install system libraries and the environment in .venv
 	@tools/setup.sh
@@ -33,6 +33,9 @@ bench: setup ## Measure speed and memory
 validate: setup ## Compare with the papers' published results
 	@[ -e benchmarks/validation.py ] || [ -e benchmarks/validation/__main__.py ] || { echo "validate: there is no comparison with published results yet" >&2; exit 1; }
 	$(BIN)/python -m benchmarks.validation
+
+bench-check: setup ## Say whether hot paths are slower than when their ratios were last kept
+	$(BIN)/python -m benchmarks.check
 
 docs: setup ## Build the documentation site into build/docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs

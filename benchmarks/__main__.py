@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 
 from benchmarks import descent, engine, estimators, hda, pictures, vtt
+from benchmarks.page import PAGE, write_page
 from benchmarks.timing import Figure
 from sim.processor import processor_features
 from sim.render import process_renderer
@@ -59,7 +60,8 @@ def keep(figures: list[Figure]) -> None:
     }
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps(record, indent=2) + "\n")
-    print(f"kept in {RESULTS}")
+    write_page(record)
+    print(f"kept in {RESULTS}, shown in {PAGE}")
 
 
 if __name__ == "__main__":

@@ -6,19 +6,16 @@ import itertools
 
 import numpy as np
 
-from benchmarks.pictures import descent_scene
+from benchmarks.pictures import descent_pose, descent_scene
 from benchmarks.stages import stages
 from benchmarks.timing import Figure, core_seconds
 from campaigns.definition.loading import load_campaign
 from scenarios.descent import (
     CameraParameters,
-    DescentScenarioParameters,
     camera_optics,
-    flown_descent,
 )
 from sim.render import process_renderer
 from sim.render.backend import default_backend
-from sim.streams import Streams
 from sim.terrain import TerrainParameters, synthesise
 from sim.terrain.sites import sites
 
@@ -28,7 +25,7 @@ def frame(repeats: int) -> list[Figure]:
     scene, surface = descent_scene()
     optics = camera_optics(CameraParameters())
     renderer = process_renderer(default_backend())
-    pose = flown_descent(DescentScenarioParameters(), surface, Streams(1, "bench", 0)).state(1.0).world_from_body
+    pose = descent_pose(surface)
     return [
         Figure(
             "descent frame, 1024 x 1024",

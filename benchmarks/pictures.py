@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.timing import Figure, core_seconds
 from scenarios.descent import CameraParameters, DescentScenarioParameters, camera_optics, flown_descent
@@ -34,6 +34,22 @@ def descent_scene() -> tuple[Scene, Surface]:
     return Scene(surface, (0.0, 0.0), SUN, Photometry()), surface
 
 
+def descent_exposure() -> Callable[[], object]:
+    """What renders and exposes a picture of the descent scene, its terrain and its shadow built once."""
+    scene, surface = descent_scene()
+    optics = camera_optics(CameraParameters())
+    renderer = process_renderer(default_backend())
+    pose = descent_pose(surface)
+    detector = Detector.drawn(optics.fall_off, DetectorParameters(), np.random.default_rng(0))
+    return lambda: detector.expose(renderer.render(scene, optics.rays, pose).radiance, np.random.default_rng(0))
+
+
+def descent_pose(surface: Surface) -> RigidTransform:
+    """Where the lander of the descent scene is a second after its first picture."""
+    flown = flown_descent(DescentScenarioParameters(), surface, Streams(1, "bench", 0))
+    return flown.motion.state(1.0).world_from_body
+
+
 def beside_pyrender(repeats: int) -> list[Figure]:
     """A sensor-realistic descent frame against pyrender's own shaded frame of the same ground, in turn.
 
@@ -41,16 +57,10 @@ def beside_pyrender(repeats: int) -> list[Figure]:
     mesh holds. It gets a mesh with lines 3 m apart in the middle, twice as coarse as the terrain still, and casts
     shadows, as ours does.
     """
+    ours = descent_exposure()
     scene, surface = descent_scene()
-    optics = camera_optics(CameraParameters())
-    renderer = process_renderer(default_backend())
-    pose = flown_descent(DescentScenarioParameters(), surface, Streams(1, "bench", 0)).state(1.0).world_from_body
-    detector = Detector.drawn(optics.fall_off, DetectorParameters(), np.random.default_rng(0))
-
-    def ours() -> None:
-        detector.expose(renderer.render(scene, optics.rays, pose).radiance, np.random.default_rng(0))
-
-    theirs = _pyrender_shaded(scene, pose.as_matrix() @ _camera_to_gl(), float(optics.rays.focal_px[0]))
+    focal_px = float(camera_optics(CameraParameters()).rays.focal_px[0])
+    theirs = _pyrender_shaded(scene, descent_pose(surface).as_matrix() @ _camera_to_gl(), focal_px)
     paired = [(core_seconds(ours, 1)[0], core_seconds(theirs, 1)[0]) for _ in range(repeats)]
     return [
         Figure("descent frame with shadows and detector", [mine for mine, _ in paired], bar=0.3),
@@ -181,7 +191,7 @@ def wall_seconds_of_a_frame(repeats: int) -> list[Figure]:
     scene, surface = descent_scene()
     optics = camera_optics(CameraParameters())
     renderer = process_renderer(default_backend())
-    pose = flown_descent(DescentScenarioParameters(), surface, Streams(1, "bench", 0)).state(1.0).world_from_body
+    pose = descent_pose(surface)
     times = []
     for _ in range(repeats + 1):
         start = time.perf_counter()

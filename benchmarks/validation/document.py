@@ -18,7 +18,6 @@ ROOT = Path(__file__).parents[2]
 TEMPLATE = Path(__file__).parent / "template.md"
 DOCUMENT = ROOT / "docs" / "validation.md"
 RESULTS = ROOT / "benchmarks" / "results" / "validation.json"
-SPEED = ROOT / "benchmarks" / "results" / "benchmarks.json"
 #: Versions that a figure can depend on.
 PACKAGES = ("marsyard", "numpy", "scipy", "numba", "pyrender2", "trimesh")
 
@@ -66,7 +65,7 @@ def write(checks: Sequence[Check], kept: dict[str, dict]) -> None:
     for section, rows in sections.items():
         head = ["| claim | bar | measured | | how |", "|---|---|---|---|---|"]
         text = text.replace("{" + section + "}", "\n".join(head + rows) if rows else "Not measured yet.")
-    text = text.replace("{environment}", _environments(checks, kept)).replace("{Speed}", _speed())
+    text = text.replace("{environment}", _environments(checks, kept))
     DOCUMENT.write_text(text)
 
 
@@ -89,12 +88,3 @@ def _environments(checks: Sequence[Check], kept: dict[str, dict]) -> str:
     if len(where) == 1:
         return f"Measured on {next(iter(where))}."
     return "\n".join(f"- {', '.join(names)}: measured on {text}." for text, names in where.items())
-
-
-def _speed() -> str:
-    if not SPEED.exists():
-        return "Not measured yet."
-    rows = ["| what | asked | median |", "|---|---|---|"]
-    for name, kept in json.loads(SPEED.read_text())["figures"].items():
-        rows.append(f"| {name} | {kept['asked']} | {kept['median']:.3g} |")
-    return "\n".join(rows)
