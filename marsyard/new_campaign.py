@@ -6,6 +6,8 @@ import json
 from dataclasses import dataclass
 
 from campaigns.errors import CampaignError
+from scenarios.descent.parameters import binned_size_for
+from sim.camera import CameraFileError, read_camera
 
 
 @dataclass(frozen=True)
@@ -142,6 +144,11 @@ bank = 2
         parts.append(f"# Your camera, mounted to look down.\n[parameters.camera]\nmodel = {json.dumps(c.camera)}\n")
     one_row = "# Every row of your camera is read by itself.\n[parameters.detector]\nrows_summed = 1\n"
     parts.append(_detector(c, one_row if c.camera else ""))
+    if c.camera:
+        size = binned_size_for(*_delivered(c.camera))
+        parts.append(
+            f"# DIMES works on pictures binned to about 256 columns.\n[parameters.dimes]\nbinned_size = {list(size)}\n"
+        )
     if c.flight:
         parts.append(f"""# Your trajectory, in place of the dynamics; positions count from the ground at `place`.
 [parameters.flight]
@@ -182,6 +189,14 @@ lead_s = 5.0
     statement = f"The horizontal velocity that is reported is within {c.bound:g} m/s of the true one."
     parts.append(_requirement("VELOCITY", statement, "velocity_error_m_s", c.bound, 0.99, "valid"))
     return [part for part in parts if part]
+
+
+def _delivered(camera: str) -> tuple[int, int]:
+    """Columns and rows of a camera's pictures. Raises CampaignError where the file holds none."""
+    try:
+        return read_camera(camera).size
+    except CameraFileError as error:
+        raise CampaignError(str(error)) from error
 
 
 def _landing(c: Choices) -> list[str]:

@@ -22,6 +22,7 @@ from sim.sensor import (
     DetectorChoice,
     DetectorParameters,
     ImuParameters,
+    OwnCamera,
     OwnCameraChoice,
     RadarParameters,
 )
@@ -215,11 +216,20 @@ class DescentScenarioParameters(ChosenAlgorithms):
         return self
 
     @model_validator(mode="after")
-    def _rows_can_be_summed(self) -> DescentScenarioParameters:
-        rows = self.camera.rows if self.camera.model is None else self.camera.model.rows
+    def _pictures_can_be_binned(self) -> DescentScenarioParameters:
+        """By the detector's rows, and for the room that DIMES has, which every case tells."""
+        camera: CameraParameters | OwnCamera = self.camera if self.camera.model is None else self.camera.model
+        columns, rows = camera.columns, camera.rows
         if rows % self.detector.rows_summed:
             raise ValueError(
                 f"detector.rows_summed {self.detector.rows_summed} does not divide the camera's {rows} rows"
+            )
+        delivered, binned = (columns, rows // self.detector.rows_summed), self.dimes.binned_size
+        if delivered[0] % binned[0] or delivered[1] % binned[1]:
+            near = binned_size_for(*delivered)
+            raise ValueError(
+                f"dimes.binned_size {list(binned)} does not divide the delivered picture of {delivered[0]} x "
+                f"{delivered[1]} pixels; allowed: sizes that do, such as {list(near)}"
             )
         return self
 
@@ -238,6 +248,12 @@ class DescentScenarioParameters(ChosenAlgorithms):
     def preset(self) -> Site | None:
         """The site; None for a plain terrain."""
         return None if self.site is None else site(self.site)
+
+
+def binned_size_for(columns: int, rows: int) -> tuple[int, int]:
+    """The size to which DIMES may bin a delivered picture: square blocks that leave about 256 columns, or no fewer."""
+    factors = [f for f in range(1, max(columns // 256, 1) + 1) if columns % f == 0 and rows % f == 0]
+    return columns // factors[-1], rows // factors[-1]
 
 
 def descent_sites() -> list[str]:

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from scenarios.descent import DescentScenarioParameters
 from scenarios.descent.optics import calibrated_camera, camera_optics
-from scenarios.descent.parameters import CameraParameters
+from scenarios.descent.parameters import CameraParameters, binned_size_for
 from scenarios.descent.world import World
 from sim.sensor import OwnCamera
 from sim.terrain import site
@@ -86,7 +86,7 @@ def test_own_cameras_stand_in_the_campaign(tmp_path: Path) -> None:
         "dark_current_e_s = 20\ndark_temperature_c = 20\nrows = 480\nreadout_s = 0.02\n"
         "[lens]\nf_number = 4\nband_nm = [450, 700]\n"
     )
-    stated = {"camera": {"model": str(calibration)}, "detector": str(sheet)}
+    stated = {"camera": {"model": str(calibration)}, "detector": str(sheet), "dimes": {"binned_size": [320, 240]}}
     p = DescentScenarioParameters.model_validate(stated)
     assert p.camera.model is not None
     assert p.camera.model.size == (640, 480)
@@ -112,6 +112,15 @@ def test_distortion_errors_of_own_cameras_are_the_corners() -> None:
         corner = true.rays(np.array([0.0, 0.0]))[1]
         outwards = np.linalg.norm(believed.project(corner)[0] - 511.5) - np.linalg.norm(true.project(corner)[0] - 511.5)
         assert outwards == pytest.approx(2.0 * drawn, rel=0.02)
+
+
+def test_pictures_that_dimes_cannot_bin_are_refused_with_a_size_that_it_can() -> None:
+    with pytest.raises(ValidationError, match=r"binned_size \[256, 256\] does not divide .* 752 x 480 .*\[376, 240\]"):
+        DescentScenarioParameters.model_validate(
+            {"camera": {"columns": 752, "rows": 480}, "detector": {"rows_summed": 1}}
+        )
+    assert binned_size_for(1024, 1024) == (256, 256)
+    assert binned_size_for(641, 480) == (641, 480)
 
 
 def test_rows_that_cannot_be_summed_are_refused() -> None:
