@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from reports.columns import numbers, primary_metric
 from reports.dimes.shown import DIMES
 from reports.hda.shown import HDA
 from reports.shown import CaseView, System
@@ -18,8 +20,11 @@ from reports.wording import NOTHING
 
 #: Those whose products are looked for in a case, in this order.
 SYSTEMS: tuple[System, ...] = (DIMES, VTT, HDA)
-#: Kept cases whose pictures go into the page; each takes about half a megabyte.
-_MOST_SHOWN = 2
+#: Kept cases of each kind (the worst, those without an answer, others drawn at random) whose pictures go into the page;
+#: each takes about half a megabyte.
+_MOST_OF_A_KIND = 2
+#: The others are drawn from a fixed seed: the same files give the same page.
+_SEED = 20260301
 
 
 @dataclass(frozen=True)
@@ -33,15 +38,33 @@ class ShownCase:
 
 
 def shown_cases(run: StoredRun) -> list[ShownCase]:
-    """The kept cases whose pictures can be drawn, the one chosen for the report first."""
-    shown: list[ShownCase] = []
-    for case in run.showcases:
-        if len(shown) == _MOST_SHOWN:
-            break
-        one = shown_case(run, case)
-        if one is not None:
-            shown.append(one)
-    return shown
+    """Kept cases that can be drawn: the one chosen for the report, the worst, some without an answer, and some
+    others at random; each as far as it is kept.
+    """
+    shown = (shown_case(run, case) for case in gallery_cases(run))
+    return [one for one in shown if one is not None]
+
+
+def gallery_cases(run: StoredRun) -> list[int]:
+    """Which of the kept cases a page shows, in its order."""
+    kept = list(run.showcases)
+    metric = primary_metric(run.frame, run.requirements)
+    if len(kept) <= 1 or metric is None or "case" not in run.whole:
+        return kept[: 3 * _MOST_OF_A_KIND]
+    rows = run.whole[run.whole["case"].isin(kept)]
+    sizes = np.abs(numbers(rows, metric))
+    cases = rows["case"].to_numpy(dtype=np.int64)
+    order = cases[np.argsort(-np.where(np.isfinite(sizes), sizes, -1.0), kind="stable")]
+    silent = set(cases[~np.isfinite(sizes)].tolist())
+    kinds = [
+        [case for case in order.tolist() if case not in silent],
+        [case for case in kept if case in silent],
+        np.random.default_rng(_SEED).permutation(kept).tolist(),
+    ]
+    chosen = dict.fromkeys(kept[:1])
+    for kind in kinds:
+        chosen.update(dict.fromkeys([case for case in kind if case not in chosen][:_MOST_OF_A_KIND]))
+    return list(chosen)
 
 
 def shown_case(run: StoredRun, case: int) -> ShownCase | None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pandas as pd
 
 from reports.explorer import MOST_POINTS, embedded, explorer_data, points_of
 from reports.stored import read_run
+from reports.systems import gallery_cases
 
 Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"
@@ -42,3 +44,16 @@ def test_embedded_data_cannot_end_its_element() -> None:
     text = str(embedded(hostile))
     assert not set("<>&\u2028") & set(text)
     assert json.loads(text) == hostile
+
+
+def test_the_gallery_holds_the_worst_the_silent_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+    frame = make_rows(40)
+    run = replace(read_run(make_run(frame)), showcases=(7, *(case for case in range(40) if case != 7)))
+    chosen = gallery_cases(run)
+    assert chosen[0] == 7
+    assert len(chosen) == len(set(chosen)) == 7
+    worst = frame[METRIC].drop(7).sort_values(ascending=False).index[:2]
+    assert chosen[1:3] == worst.tolist()
+    assert frame[METRIC].iloc[chosen[3:5]].isna().all()
+    assert gallery_cases(replace(run, showcases=(7,))) == [7]
+    assert gallery_cases(replace(run, showcases=())) == []
