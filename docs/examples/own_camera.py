@@ -22,8 +22,9 @@ with tempfile.TemporaryDirectory() as folder:
     (read,) = read_calibrations(path)
     print(f"{type(read.camera).__name__}: {read.residual.rms_px:.2f} px off (RMS), {read.residual.max_px:.2f} at most")
 
-    # in a campaign it stands under camera.model
-    campaign = marsyard.load_campaign("dimes-smoke", {"camera.model": str(path), "detector.rows_summed": 1})
+    # in a campaign it stands under camera.model; DIMES bins whole pixels, so that its size must divide the picture's
+    changes = {"camera.model": str(path), "detector.rows_summed": 1, "dimes.binned_size": [376, 240]}
+    campaign = marsyard.load_campaign("dimes-smoke", changes)
     print("columns:", campaign.configuration.parameters["camera"]["model"]["columns"])
 
 pixel, seen = read.camera.project(np.array([0.2, -0.1, 1.0]))

@@ -58,7 +58,7 @@ def test_stats_of_a_file_say_what_is_real_and_what_was_filled(tile: str) -> None
     [
         (("stats", "jezero"), "no site is called 'jezero'; allowed: pisgah"),
         (("stats", "mars-yard", "--scale", "descent"), "has no terrain at the scale 'descent'"),
-        (("stats", "nowhere.npz"), "does not exist"),
+        (("stats", "nowhere.npz"), "nowhere.npz: no such file"),
     ],
 )
 def test_says_what_is_wrong(arguments: tuple[str, ...], message: str) -> None:

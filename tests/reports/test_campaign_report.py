@@ -141,7 +141,7 @@ def test_small_report_says_what_a_board_asks(
     assert page.tags.count("svg") > 8
     assert twin["exit_code"] == 1
     assert twin["verdicts"][0]["clustered"]["terrains"] == 4
-    assert len(text) < 1_500_000
+    assert len(text) < 2_000_000
 
 
 def test_report_without_requirements(make_rows: Rows, make_run: MakeRun) -> None:

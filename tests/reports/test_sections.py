@@ -226,6 +226,6 @@ def test_page_and_twin_hold_every_section(make_rows: Rows, make_run: MakeRun) ->
     directory = make_run(frame)
     text = write_report(directory).read_text(encoding="utf-8")
     twin: dict[str, Any] = json.loads((directory / "report.json").read_text(encoding="utf-8"))
-    keys = ["answers", "faults", "landing", "sensitivity", "conditions"]
+    keys = ["answers", "scatter", "explained", "convergence", "faults", "landing", "sensitivity", "conditions"]
     assert list(twin["sections"]) == keys
     assert all(f'<section id="{key}"' in text for key in keys)

@@ -203,7 +203,7 @@ def test_motions_that_cannot_be_followed() -> None:
     places = np.zeros((4, 3))
     with pytest.raises(ValueError, match="has 3 poses"):
         RecordedMotion(times[:3], places[:3], still[:3], 3.7)
-    half = Rotation.from_euler("z", [0, 0, 120, 120], degrees=True)
+    half = Rotation.from_euler("z", np.array([[0.0], [0.0], [120.0], [120.0]]), degrees=True)
     with pytest.raises(ValueError, match=r"turns by 120 deg after 1.000000 s \(pose 2\)"):
         RecordedMotion(times, places, half, 3.7)
     with pytest.raises(ValueError, match="time 4 s is not recorded; allowed: 0 to 3 s"):
