@@ -117,9 +117,8 @@ def _changes(history: History, night: int) -> list[Change]:
 
 def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
     """Writes the page, renews the dashboard, and prints the page."""
-    from reports.dashboard.site import write_site
-
     from reports.campaign import write_whole
+    from reports.dashboard.site import write_site
     from reports.night_page import night_text
     from reports.regressions import comparisons_of
 
