@@ -24,7 +24,7 @@ lint: setup ## Run the static checks: ruff, mypy, import-linter
 	@tools/lint.sh
 
 format: setup ## Rewrite the sources in the project's format, mending what can be mended
-	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff check --no-cache --fix-only .
 	$(BIN)/ruff format .
 
 bench: setup ## Measure speed and memory
