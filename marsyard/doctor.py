@@ -37,7 +37,7 @@ from marsyard import gl_probe
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports", "marsyard")
 #: Distributions that import under another name than their own.
-MODULES = {"opencv-python-headless": "cv2", "pyrender2": "pyrender"}
+MODULES = {"opencv-python-headless": "cv2", "pyrender2": "pyrender", "pyyaml": "yaml"}
 #: Distributions that write into the same folder as one of ours, ours first.
 RIVALS = (("pyrender2", "pyrender"), ("opencv-python-headless", "opencv-python"))
 #: The GL backends, the preferred one first, and their Debian packages.

@@ -7,11 +7,14 @@ import importlib.util
 import io
 import os
 import sys
+import tomllib
 from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from rich.console import Console
 
 from marsyard import doctor
@@ -117,6 +120,13 @@ def test_other_owners_of_our_names_and_rivals_are_named(monkeypatch: pytest.Monk
     _, stranger, *rivals = doctor.check_shadowing()
     assert "sim-games also installs a package named sim" in stranger.found
     assert any("pip uninstall -y pyrender pyrender2" in rival.mend for rival in rivals)
+
+
+def test_every_dependency_is_looked_for_under_the_name_it_imports_by() -> None:
+    # From the file and not the installed metadata, which in a developer's environment may be older than the file.
+    needs = tomllib.loads((doctor.ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    modules = [doctor._module(canonicalize_name(Requirement(need).name)) for need in needs]
+    assert [module for module in modules if importlib.util.find_spec(module) is None] == []
 
 
 def test_dependencies_that_are_absent_old_or_broken(monkeypatch: pytest.MonkeyPatch) -> None:
