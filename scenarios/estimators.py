@@ -28,6 +28,7 @@ from algorithms.exchange import (
     Command,
     ExecutableLimits,
     ExecutableSiteEstimator,
+    ExecutableTargetTracker,
     ExecutableVelocityEstimator,
     command_of,
 )
@@ -60,7 +61,7 @@ class Task(Generic[Algorithm, Options]):
     shipped
         How each algorithm that ships is made from the options of the paper's own.
     executable
-        How a program becomes one; None where programs cannot.
+        How a program becomes one.
     offline
         How its answers stand in a table; None where each answer decides what is seen next.
     """
@@ -69,12 +70,12 @@ class Task(Generic[Algorithm, Options]):
     what: str
     methods: tuple[str, ...]
     shipped: Mapping[str, Callable[[Options], Algorithm]]
-    executable: Callable[[Command, ExecutableLimits], Algorithm] | None
+    executable: Callable[[Command, ExecutableLimits], Algorithm]
     offline: OfflineForm[Any] | None = None
 
     def check(self, spec: str) -> None:
         """Raises ValueError where there is no algorithm of this name for the task; the message says what is allowed."""
-        if spec in self.shipped or self._command(spec) is not None:
+        if spec in self.shipped or command_of(spec) is not None:
             return
         if is_offline(spec):
             check_offline(spec, self._form(spec))
@@ -95,8 +96,8 @@ class Task(Generic[Algorithm, Options]):
             return self.shipped[spec](options)
         if is_offline(spec):
             return cast(Algorithm, made_offline(spec, self._form(spec), case))
-        command = self._command(spec)
-        if command is not None and self.executable is not None:
+        command = command_of(spec)
+        if command is not None:
             return self.executable(command, limits)
         return cast(Algorithm, self._class(spec)())
 
@@ -106,12 +107,6 @@ class Task(Generic[Algorithm, Options]):
                 f"'{spec}': a {self.what} cannot be run elsewhere, as each of its answers decides what it sees next"
             )
         return self.offline
-
-    def _command(self, spec: str) -> Command | None:
-        command = command_of(spec)
-        if command is not None and self.executable is None:
-            raise ValueError(f"'{spec}': a {self.what} cannot be a program; allowed: a class, as 'module:Class'")
-        return command
 
     def _class(self, spec: str) -> Any:
         """What stands under a name of another package, or at a path."""
@@ -131,8 +126,8 @@ class Task(Generic[Algorithm, Options]):
         known = [*self.shipped, *installed()]
         near = difflib.get_close_matches(name, known, n=1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
-        own = "'module:Class'" if self.executable is None else "'module:Class' or 'exec:./program'"
-        return f"unknown algorithm '{name}'{hint}; allowed: {', '.join(known)}, or your own as {own}"
+        own = "your own as 'module:Class' or 'exec:./program'"
+        return f"unknown algorithm '{name}'{hint}; allowed: {', '.join(known)}, or {own}"
 
 
 def _pure_ncc(options: VttOptions) -> TargetTracker:
@@ -158,7 +153,7 @@ TRACKING: Task[TargetTracker, VttOptions] = Task(
     what="target tracker",
     methods=("designate", "aim", "update", "clear", "state"),
     shipped={"vtt": VisualTargetTracker, "pure-ncc": _pure_ncc, "lucas-kanade": lucas_kanade_tracker},
-    executable=None,
+    executable=ExecutableTargetTracker,
 )
 
 LANDING: Task[SiteEstimator, HdaOptions] = Task(

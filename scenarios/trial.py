@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-from algorithms.exchange.executable import ProgramDetails
+from algorithms.exchange import ProgramDetails
 from algorithms.faults import AlgorithmError, Fault
 from scenarios.estimators import labels
 from scenarios.interface import CaseResult, Failure, Scalar

@@ -1,8 +1,12 @@
 """Algorithms that are programs of their own: cases as files, answers as JSON (docs/own-algorithms.md)."""
 
-from algorithms.exchange.executable import PREFIXES, ExecutableSiteEstimator, ExecutableVelocityEstimator, command_of
+from algorithms.exchange.command import PREFIXES, command_of
+from algorithms.exchange.executable import ExecutableSiteEstimator, ExecutableVelocityEstimator
 from algorithms.exchange.files import EXCHANGE, Pictures, read_case, write_case
 from algorithms.exchange.process import Command, ExecutableLimits
+from algorithms.exchange.replies import ProgramDetails
+from algorithms.exchange.stops import read_mast, read_pose, read_stop, read_target
+from algorithms.exchange.tracker import ExecutableTargetTracker
 
 __all__ = [
     "EXCHANGE",
@@ -10,9 +14,15 @@ __all__ = [
     "Command",
     "ExecutableLimits",
     "ExecutableSiteEstimator",
+    "ExecutableTargetTracker",
     "ExecutableVelocityEstimator",
     "Pictures",
+    "ProgramDetails",
     "command_of",
     "read_case",
+    "read_mast",
+    "read_pose",
+    "read_stop",
+    "read_target",
     "write_case",
 ]

@@ -13,8 +13,15 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic_descent import Flight, render, tilted
 
 from algorithms.answers import checked_site, checked_velocity
-from algorithms.exchange import ExecutableLimits, ExecutableVelocityEstimator, command_of, read_case, write_case
-from algorithms.exchange.executable import ProgramDetails, end_persistent
+from algorithms.exchange import (
+    ExecutableLimits,
+    ExecutableVelocityEstimator,
+    ProgramDetails,
+    command_of,
+    read_case,
+    write_case,
+)
+from algorithms.exchange.serving import end_persistent
 from algorithms.faults import AlgorithmError, Fault
 from algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from sim.measurements import DescentMeasurements, LandingMeasurements, PoseMeasurement

@@ -8,8 +8,9 @@ import pytest
 
 from algorithms.baselines import HomographyEstimator
 from algorithms.dimes import DimesOptions
-from algorithms.exchange import ExecutableLimits, ExecutableVelocityEstimator
+from algorithms.exchange import ExecutableLimits, ExecutableTargetTracker, ExecutableVelocityEstimator
 from algorithms.interface import VelocityEstimate, VelocityOutcome
+from algorithms.vtt import VttOptions
 from scenarios import estimators
 from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.estimators import LANDING, TRACKING, VELOCITY, check_chosen, labels
@@ -45,13 +46,13 @@ def test_an_entry_point_is_named_like_ours(monkeypatch: pytest.MonkeyPatch) -> N
         VELOCITY.check("their")
 
 
-def test_programs_estimate_and_do_not_track() -> None:
+def test_programs_estimate_and_track() -> None:
     made = VELOCITY.make("exec:cat --number", DimesOptions(), LIMITS)
     assert isinstance(made, ExecutableVelocityEstimator)
     assert made.command.words == ("cat", "--number")
     LANDING.check("serve:cat")
-    with pytest.raises(ValueError, match="a target tracker cannot be a program"):
-        TRACKING.check("exec:cat")
+    TRACKING.check("exec:cat")
+    assert isinstance(TRACKING.make("serve:cat", VttOptions(), LIMITS), ExecutableTargetTracker)
 
 
 def test_labels_tell_algorithms_apart_and_are_names_of_columns() -> None:

@@ -1,0 +1,128 @@
+"""What a target tracker is given, as files and JSON: the mast as calibrated, a stop's pictures, poses, designations."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from algorithms.exchange.files import read_picture, write_picture
+from sim.camera import read_cahvor, write_cahvor
+from sim.frames import rigid
+from sim.measurements import (
+    MastCalibration,
+    MastGeometry,
+    MastImage,
+    PixelTarget,
+    RoverMeasurements,
+    RoverTarget,
+    SiteTarget,
+    TargetDesignation,
+)
+
+MAST_FILE, STOP_FILE = "mast.json", "stop.json"
+
+
+def write_mast(folder: Path, mast: MastCalibration) -> None:
+    """Writes a mast and its two cameras into a folder that is there."""
+    for name, camera in (("left", mast.left), ("right", mast.right)):
+        write_cahvor(camera, folder / f"{name}.cahvor")
+    geometry = mast.geometry
+    told = {
+        "base_m": geometry.base_m.tolist(),
+        "elbow_m": geometry.elbow_m.tolist(),
+        "head_m": geometry.head_m.tolist(),
+        "azimuth_limits_rad": list(geometry.azimuth_limits_rad),
+        "elevation_limits_rad": list(geometry.elevation_limits_rad),
+        "left": {"camera": "left.cahvor", "columns": mast.left.size[0], "rows": mast.left.size[1]},
+        "right": {"camera": "right.cahvor", "columns": mast.right.size[0], "rows": mast.right.size[1]},
+    }
+    (folder / MAST_FILE).write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_mast(folder: Path) -> MastCalibration:
+    """Reads what `write_mast` wrote. Raises ValueError where the folder holds no mast."""
+    path = folder / MAST_FILE
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        offsets = [np.array(told[name], dtype=np.float64) for name in ("base_m", "elbow_m", "head_m")]
+        azimuths, elevations = told["azimuth_limits_rad"], told["elevation_limits_rad"]
+        left, right = (read_cahvor(folder / told[name]["camera"]) for name in ("left", "right"))
+        geometry = MastGeometry(
+            offsets[0], offsets[1], offsets[2], (azimuths[0], azimuths[1]), (elevations[0], elevations[1])
+        )
+    except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
+        raise ValueError(f"{path} is no mast: {error}") from error
+    return MastCalibration(geometry, left, right)
+
+
+def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
+    """Writes a stop's pictures and angles into a folder that is there; the mast is told apart."""
+    told: dict[str, Any] = {
+        "azimuth_rad": measurements.azimuth_rad,
+        "elevation_rad": measurements.elevation_rad,
+        "world_from_rover": told_pose(measurements.world_from_rover),
+    }
+    for name, image in (("left", measurements.left), ("right", measurements.right)):
+        write_picture(folder / f"{name}.pgm", image.counts)
+        rows, columns = image.counts.shape
+        told[name] = {"file": f"{name}.pgm", "corner": list(image.corner), "columns": columns, "rows": rows}
+    (folder / STOP_FILE).write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
+    """Reads what `write_stop` wrote. Raises ValueError where the folder holds no stop."""
+    path = folder / STOP_FILE
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        left, right = (
+            MastImage(
+                read_picture(folder / told[name]["file"]), (int(told[name]["corner"][0]), int(told[name]["corner"][1]))
+            )
+            for name in ("left", "right")
+        )
+        azimuth, elevation = float(told["azimuth_rad"]), float(told["elevation_rad"])
+        pose = read_pose(told["world_from_rover"])
+    except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
+        raise ValueError(f"{path} is no stop: {error}") from error
+    return RoverMeasurements(left, right, mast, azimuth, elevation, pose)
+
+
+def told_pose(pose: RigidTransform) -> dict[str, list[float]]:
+    """A rover's pose: position in the world and unit quaternion, scalar last."""
+    return {
+        "position_world_m": np.asarray(pose.translation).tolist(),
+        "world_from_rover_xyzw": pose.rotation.as_quat().tolist(),
+    }
+
+
+def read_pose(told: Mapping[str, Any]) -> RigidTransform:
+    """Reads what `told_pose` told."""
+    return rigid(
+        Rotation.from_quat(told["world_from_rover_xyzw"]), np.array(told["position_world_m"], dtype=np.float64)
+    )
+
+
+def told_target(target: TargetDesignation) -> dict[str, Any]:
+    """A designation, in one of the three ways."""
+    match target:
+        case PixelTarget():
+            angles = {"azimuth_rad": target.azimuth_rad, "elevation_rad": target.elevation_rad}
+            return {"pixel": target.pixel.tolist(), **angles}
+        case RoverTarget():
+            return {"position_rover": target.position_rover.tolist()}
+        case SiteTarget():
+            return {"position_site": target.position_site.tolist()}
+
+
+def read_target(told: Mapping[str, Any]) -> TargetDesignation:
+    """Reads what `told_target` told."""
+    if "pixel" in told:
+        return PixelTarget(np.array(told["pixel"], dtype=np.float64), told["azimuth_rad"], told["elevation_rad"])
+    if "position_rover" in told:
+        return RoverTarget(np.array(told["position_rover"], dtype=np.float64))
+    return SiteTarget(np.array(told["position_site"], dtype=np.float64))

@@ -1,0 +1,240 @@
+"""Trackers that are programs: answers as if they were none, processes of their own or shared, and faults."""
+
+import gc
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from algorithms.exchange import (
+    ExecutableLimits,
+    ExecutableTargetTracker,
+    ProgramDetails,
+    command_of,
+    read_mast,
+    read_stop,
+    read_target,
+)
+from algorithms.exchange.serving import end_persistent
+from algorithms.exchange.stops import told_target, write_mast, write_stop
+from algorithms.faults import AlgorithmError, Fault
+from algorithms.interface import TargetLoss, TargetTracker, TargetUpdate, TrackingState
+from algorithms.vtt import VisualTargetTracker, VttOptions
+from scenarios.conformance import trackers
+from sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
+
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "target_tracker.py"
+
+#: Serves Marsyard's own tracker over the exchange; its process says its number with every update.
+SERVER = """
+import json, os, sys
+from pathlib import Path
+from algorithms.exchange import read_mast, read_pose, read_stop, read_target
+from algorithms.vtt import VisualTargetTracker, VttOptions
+tracker, masts = VisualTargetTracker(VttOptions()), {}
+def mast(asked):
+    return masts.setdefault(asked["mast"], read_mast(Path(asked["mast"])))
+def box(one):
+    return {"corner": one.corner, "size": one.size}
+print(json.dumps({"exchange": 1, "ready": True}), flush=True)
+for line in sys.stdin:
+    asked = json.loads(line)
+    if asked["do"] == "designate":
+        tracker.designate(read_target(asked["target"]), read_pose(asked["world_from_rover"]))
+        answer = {"state": tracker.state.name}
+    elif asked["do"] == "clear":
+        tracker.clear()
+        answer = {"state": tracker.state.name}
+    elif asked["do"] == "aim":
+        aim = tracker.aim(read_pose(asked["world_from_rover"]), mast(asked))
+        answer = {"aim": aim and {"azimuth_rad": aim.azimuth_rad, "elevation_rad": aim.elevation_rad,
+                                  "left": box(aim.left), "right": box(aim.right)}}
+    else:
+        print(os.getpid(), file=sys.stderr, flush=True)
+        found = tracker.update(read_stop(Path(asked["stop"]), mast(asked)))
+        where = found.position_rover
+        answer = {"state": found.state.name, "losses": [one.name for one in found.losses],
+                  "position_rover": None if where is None else where.tolist()}
+    print(json.dumps({"exchange": 1, **answer}), flush=True)
+"""
+
+
+def tracker(spec: str, time_s: float = 60.0) -> ExecutableTargetTracker:
+    command = command_of(spec)
+    assert command is not None
+    return ExecutableTargetTracker(command, ExecutableLimits(time_s=time_s))
+
+
+def server(folder: Path, text: str = SERVER) -> str:
+    path = folder / "tracker.py"
+    path.write_text(text)
+    return f"{sys.executable} {path}"
+
+
+def process_of(update: TargetUpdate) -> int:
+    assert isinstance(update.details, ProgramDetails)
+    return int(update.details.stderr)
+
+
+@pytest.fixture
+def paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs find Marsyard's packages, as they do where it is installed."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+
+
+@pytest.mark.usefixtures("paths")
+def test_a_program_answers_as_the_same_tracker_in_python(tmp_path: Path) -> None:
+    own = VisualTargetTracker(VttOptions())
+    mine = trackers.drive(own)
+    program = tracker(f"serve:{server(tmp_path)}")
+    its = trackers.drive(program)
+    assert [one.state for one in its] == [TrackingState.NORMAL] * len(mine)
+    for one, other in zip(mine, its, strict=True):
+        assert one.position_rover is not None
+        assert other.position_rover is not None
+        # numbers go over as they are, quaternions normalised again
+        np.testing.assert_allclose(other.position_rover, one.position_rover, rtol=0.0, atol=1e-12)
+    lost, expected = (trackers.stop(one, trackers.pose(2.0), blank=0) for one in (program, own))
+    assert lost is not None
+    assert expected is not None
+    assert lost.state is program.state is TrackingState.LOST
+    assert TargetLoss.LOW_MATCH_SCORE in expected.losses
+    assert lost.losses == expected.losses
+    program.clear()
+    assert cast(TargetTracker, program).state is TrackingState.NO_TARGET
+    end_persistent()
+
+
+@pytest.mark.usefixtures("paths")
+def test_a_process_for_one_run_or_for_many(tmp_path: Path) -> None:
+    words = server(tmp_path)
+    for prefix, shared in (("serve", True), ("exec", False)):
+        processes = []
+        for _ in range(2):
+            one = tracker(f"{prefix}:{words}")
+            processes.append({process_of(update) for update in trackers.drive(one)})
+            del one
+            gc.collect()
+        assert all(len(mine) == 1 for mine in processes)
+        assert (processes[0] == processes[1]) is shared
+    end_persistent()
+    gone = [one for found in processes for one in found if Path(f"/proc/{one}").exists()]
+    assert gone == []
+
+
+@pytest.mark.usefixtures("paths")
+def test_the_example_follows_the_target() -> None:
+    updates = trackers.drive(tracker(f"exec:{sys.executable} {EXAMPLE}"))
+    assert [update.state for update in updates] == [TrackingState.NORMAL] * 4
+    for number, update in enumerate(updates):
+        true = trackers.pose(0.4 * number).inv().apply(trackers.TARGET_M)
+        assert update.position_rover is not None
+        # half a pixel of disparity at 8 m with 0.2 m of baseline is 0.13 m of range; across, it is 7 mm
+        assert np.abs(update.position_rover - true)[0] < 0.27
+        assert np.abs(update.position_rover - true)[1:].max() < 0.05
+
+
+READY = 'import json, sys\nprint(json.dumps({"exchange": 1, "ready": True}), flush=True)\n'
+
+
+@pytest.mark.parametrize(
+    ("answers", "fault", "message"),
+    [
+        ("['{}']", Fault.BAD_ANSWER, "exchange is None; allowed: 1"),
+        ("['{\"exchange\": 1}']", Fault.BAD_ANSWER, "state is None; allowed: NO_TARGET, NORMAL"),
+        ("[]", Fault.CRASHED, "its output ended before it had answered"),
+        ('[OK, \'{"exchange": 1, "aim": 3}\']', Fault.BAD_ANSWER, "aim is 3; allowed: null"),
+        ('[OK, \'{"exchange": 1, "aim": {"azimuth_rad": 0}}\']', Fault.BAD_ANSWER, "aim lacks an angle"),
+        (
+            '[OK, \'{"exchange": 1, "aim": {"azimuth_rad": 0, "elevation_rad": 0, "left": [0, 0, 1024, 1024]}}\']',
+            Fault.BAD_ANSWER,
+            r"left is \[0, 0, 1024, 1024\]; allowed",
+        ),
+        (
+            '[OK, \'{"exchange": 1, "aim": {"azimuth_rad": 9, "elevation_rad": 0, "left": BOX, "right": BOX}}\']',
+            Fault.BAD_ANSWER,
+            "azimuth_rad is 9.0; allowed",
+        ),
+        (
+            '[OK, \'{"exchange": 1, "aim": {"azimuth_rad": 0, "elevation_rad": 0, "left": WIDE, "right": BOX}}\']',
+            Fault.BAD_ANSWER,
+            "allowed: a part of the frame",
+        ),
+        ('[OK, AIM, \'{"exchange": 1, "state": "FOUND"}\']', Fault.BAD_ANSWER, "state is 'FOUND'"),
+        ('[OK, AIM, \'{"exchange": 1, "state": "NORMAL"}\']', Fault.BAD_ANSWER, "position_rover is None"),
+        (
+            '[OK, AIM, \'{"exchange": 1, "state": "LOST", "losses": ["TIRED"]}\']',
+            Fault.BAD_ANSWER,
+            "a loss is 'TIRED'; allowed: LOW_MATCH_SCORE",
+        ),
+        (
+            '[OK, AIM, \'{"exchange": 1, "state": "NORMAL", "position_rover": [1, 2]}\']',
+            Fault.BAD_ANSWER,
+            r"position_rover is '\[1, 2\]'",
+        ),
+    ],
+)
+def test_whatever_a_program_answers_wrong_is_a_fault(tmp_path: Path, answers: str, fault: Fault, message: str) -> None:
+    aim = '{"exchange": 1, "aim": {"azimuth_rad": 0, "elevation_rad": 0, "left": BOX, "right": BOX}}'
+    body = f'OK, AIM = \'{{"exchange": 1, "state": "NORMAL"}}\', \'{aim}\'\nfor answer in {answers}:\n'
+    body += "    sys.stdin.readline()\n    print('hm', file=sys.stderr, flush=True)\n    print(answer, flush=True)\n"
+    text = body.replace("BOX", '{"corner": [0, 0], "size": [64, 64]}')
+    text = text.replace("WIDE", '{"corner": [0, 0], "size": [9999, 64]}')
+    with pytest.raises(AlgorithmError, match=message) as caught:
+        trackers.drive(tracker(f"exec:{server(tmp_path, READY + text)}"))
+    assert caught.value.fault is fault
+    assert caught.value.stderr == ("" if fault is Fault.CRASHED else "hm\n")
+
+
+def test_a_program_that_hangs_is_ended(tmp_path: Path) -> None:
+    one = tracker(f"exec:{server(tmp_path, READY + 'import time; time.sleep(60)')}", time_s=1.0)
+    with pytest.raises(AlgorithmError, match="no answer within 1 s") as caught:
+        one.designate(trackers.designation(), trackers.pose(0.0))
+    assert caught.value.fault is Fault.TIMED_OUT
+
+
+def test_what_a_tracker_is_given_comes_back_as_it_was(tmp_path: Path) -> None:
+    mast = trackers.mast()
+    write_mast(tmp_path, mast)
+    known = read_mast(tmp_path)
+    assert known.geometry.azimuth_limits_rad == mast.geometry.azimuth_limits_rad
+    np.testing.assert_array_equal(known.geometry.head_m, mast.geometry.head_m)
+    for mine, its in ((mast.left, known.left), (mast.right, known.right)):
+        np.testing.assert_array_equal(mine.h, its.h)
+        assert mine.size == its.size
+    aim = VisualTargetTracker(VttOptions())
+    aim.designate(trackers.designation(), trackers.pose(0.0))
+    told = aim.aim(trackers.pose(0.0), mast)
+    assert told is not None
+    turned = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, -0.2, 0.3]))
+    stop = replace(trackers.taken(told, trackers.pose(0.0)), world_from_rover=turned)
+    write_stop(tmp_path, stop)
+    back = read_stop(tmp_path, known)
+    np.testing.assert_array_equal(back.left.counts, stop.left.counts)
+    assert (back.left.corner, back.right.corner) == (stop.left.corner, stop.right.corner)
+    assert (back.azimuth_rad, back.elevation_rad) == (stop.azimuth_rad, stop.elevation_rad)
+    np.testing.assert_allclose(back.world_from_rover.as_matrix(), turned.as_matrix(), atol=1e-15)
+    assert "true" not in (tmp_path / "stop.json").read_text()
+    for path in ("mast.json", "stop.json"):
+        (tmp_path / path).write_text("{}")
+    with pytest.raises(ValueError, match=r"mast\.json is no mast"):
+        read_mast(tmp_path)
+    with pytest.raises(ValueError, match=r"stop\.json is no stop"):
+        read_stop(tmp_path, mast)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        PixelTarget(np.array([500.25, 400.5]), 0.1, -0.2),
+        RoverTarget(np.array([8.0, 0.1, 0.2])),
+        SiteTarget(np.array([1.0, 2.0, -3.0])),
+    ],
+)
+def test_targets_are_told_in_each_of_the_three_ways(target: TargetDesignation) -> None:
+    assert told_target(read_target(told_target(target))) == told_target(target)
+    assert type(read_target(told_target(target))) is type(target)
