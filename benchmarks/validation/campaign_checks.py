@@ -50,26 +50,34 @@ class Silence:
 
 
 def same_rows(quick: bool) -> Iterator[Measure]:
-    """Rows of one campaign run in every way, against those of one worker."""
-    cases, kills = (60, 3) if quick else (400, 10)
+    """Rows of campaigns run in every way, against those of one worker: cases that misbehave, and rendered ones."""
+    share, cases, kills = (0.03, 60, 3) if quick else (0.03, 400, 10)
     with TemporaryDirectory() as name:
         folder = Path(name)
-        file = _written(folder)
-        share = 0.03
         settings = [f"share={share}", f"cases={cases}"]
-        expected = _rows_of(file, folder / "one", Crew(1), settings)
-        ways = {
-            "two workers": lambda: _rows_of(file, folder / "two", Crew(2), settings),
-            "a Dask cluster of two": lambda: _rows_of(file, folder / "cluster", Crew(cluster="local:2"), settings),
-            f"a runner killed {kills} times": lambda: _killed(file, folder / "killed", settings, kills),
-            "single replays": lambda: [dict(replay(folder / "one", case).row) for case in range(0, cases, cases // 8)],
-        }
-        for way, run in ways.items():
-            rows = run()
-            differing = sum(bool(differing_columns(row, expected[int(row["case"])])) for row in rows)
-            missing = 0 if way == "single replays" else cases - len(rows)
-            how = f"{len(rows)} of {cases} cases, {100 * share:g} % of which misbehave; all columns but times"
-            yield Measure(f"rows of {way} that differ from one worker's, or lack", differing + missing, "", 0, how)
+        what = f"cases, {100 * share:g} % of which misbehave"
+        yield from _in_every_way(str(_written(folder)), folder / "chaos", settings, kills, what)
+        rendered = ["cases=8" if quick else "cases=40", "retain.showcase=none"]
+        yield from _in_every_way("dimes-smoke", folder / "rendered", rendered, kills, "rendered descents")
+
+
+def _in_every_way(campaign: str, folder: Path, settings: Sequence[str], kills: int, what: str) -> Iterator[Measure]:
+    folder.mkdir()
+    expected = _rows_of(campaign, folder / "one", Crew(1), settings)
+    cases = len(expected)
+    replayed = range(0, cases, max(cases // 8, 1))
+    ways = {
+        "two workers": lambda: _rows_of(campaign, folder / "two", Crew(2), settings),
+        "a Dask cluster of two": lambda: _rows_of(campaign, folder / "cluster", Crew(cluster="local:2"), settings),
+        f"a runner killed {kills} times": lambda: _killed(campaign, folder / "killed", settings, kills),
+        "single replays": lambda: [dict(replay(folder / "one", case).row) for case in replayed],
+    }
+    for way, run in ways.items():
+        rows = run()
+        differing = sum(bool(differing_columns(row, expected[int(row["case"])])) for row in rows)
+        missing = (len(replayed) if way == "single replays" else cases) - len(rows)
+        how = f"{len(rows)} of {cases} {what}; all columns but times"
+        yield Measure(f"{what}: rows of {way} that differ from one worker's, or lack", differing + missing, "", 0, how)
 
 
 def survival(quick: bool) -> Iterator[Measure]:
@@ -112,16 +120,16 @@ def _written(folder: Path) -> Path:
     return path
 
 
-def _rows_of(file: Path, directory: Path, crew: Crew, settings: Sequence[str]) -> list[dict[str, Any]]:
-    run_campaign(load_campaign(str(file), settings), directory, crew, Silence())
+def _rows_of(campaign: str | Path, directory: Path, crew: Crew, settings: Sequence[str]) -> list[dict[str, Any]]:
+    run_campaign(load_campaign(str(campaign), settings), directory, crew, Silence())
     return read_rows(directory / "cases.parquet")
 
 
-def _killed(file: Path, directory: Path, settings: Sequence[str], kills: int) -> list[dict[str, Any]]:
+def _killed(campaign: str, directory: Path, settings: Sequence[str], kills: int) -> list[dict[str, Any]]:
     """The rows of a campaign whose runner is killed at random moments, and resumed each time."""
     rng = np.random.default_rng(7)
     program = [sys.executable, "-m", "marsyard"]
-    command = [*program, "run", str(file), "--out", str(directory), "--jobs", "2"]
+    command = [*program, "run", campaign, "--out", str(directory), "--jobs", "2"]
     command += [part for setting in settings for part in ("--set", setting)]
     for _ in range(kills):
         runner = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
