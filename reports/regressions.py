@@ -11,8 +11,12 @@ import numpy as np
 from reports.history import History, NightFigure
 from reports.statistics.changes import Sample, difference_p, holm
 
-#: The chance that a night in which nothing changed reports any change at all.
+#: The chance that a night in which nothing changed reports any change at all, at most.
 FALSE_ALARMS = 0.01
+#: Level at which changes are reported. The other half is for nights after a false alarm, which is their history.
+_LEVEL = 0.5 * FALSE_ALARMS
+#: Permutations that are expected to go beyond a change just large enough to be reported.
+_RESOLVED = 10
 
 
 @dataclass(frozen=True)
@@ -57,9 +61,10 @@ class Comparison:
 def changes(comparisons: Sequence[Comparison]) -> list[Change]:
     """The figures of a night that have changed; the family-wise rate of false alarms is at most `FALSE_ALARMS`."""
     pooled = [_pooled(one.before) for one in comparisons]
+    permutations = math.ceil(_RESOLVED * len(comparisons) / _LEVEL)
     p_values = holm(
         [
-            math.nan if before is None else difference_p(one.figure.sample, before)
+            math.nan if before is None else difference_p(one.figure.sample, before, permutations)
             for one, before in zip(comparisons, pooled, strict=True)
         ]
     )
@@ -74,7 +79,7 @@ def changes(comparisons: Sequence[Comparison]) -> list[Change]:
             nights=len(one.before),
         )
         for one, before, p in zip(comparisons, pooled, p_values, strict=True)
-        if before is not None and p <= FALSE_ALARMS
+        if before is not None and p <= _LEVEL
     ]
 
 

@@ -8,21 +8,18 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from scipy import stats
 
+from benchmarks.validation.nights import BEFORE, CASES, KINDS, WORSE, planted_found, quiet_nights
 from benchmarks.validation.records import Check, Measure
-from reports.history import NightFigure
-from reports.regressions import Comparison, changes
-from reports.statistics.changes import Sample
+from reports.history import WINDOW
 from reports.statistics.clusters import clustered_evidence
 from reports.statistics.plane import error_ellipse
-from reports.statistics.proportions import proportion_lower
+from reports.statistics.proportions import proportion_lower, proportion_upper
 from reports.statistics.samples import Interval, mean_interval, quantile_bounds, spread_interval
 from reports.statistics.sequential import confidence_at, looks_of
 
 CONFIDENCE = 0.9
 #: Cases on a terrain, and what is asked and risked in simulated campaigns.
 _ON_TERRAIN = 8
-#: Nights of the nightly's check: cases of each, terrains, nights before, and how much larger planted errors are.
-CASES, TERRAINS, BEFORE, WORSE = 100, 12, 7, 1.75
 
 
 def _least(nominal: float, trials: int) -> float:
@@ -130,38 +127,22 @@ def _passes(rng: np.random.Generator, asked: float, most: int, correlation: floa
     return False
 
 
-def _night(rng: np.random.Generator, pool: tuple[np.ndarray, np.ndarray], worse: float) -> list[NightFigure]:
-    """A night's figures, resampled from a pool of cases on terrains of which some are harder."""
-    terrains = rng.integers(0, TERRAINS, CASES)
-    errors = worse * pool[0][terrains, rng.integers(0, pool[0].shape[1], CASES)]
-    answered = (rng.random(CASES) < pool[1][terrains]).astype(np.float64)
-    rates = (("within 2 m", (errors < 2.0).astype(np.float64)), ("answered", answered))
-    figures = [NightFigure(name, True, float(values.mean()), Sample(values, terrains)) for name, values in rates]
-    return [*figures, NightFigure("error (m)", False, float(np.median(errors)), Sample(errors, terrains))]
-
-
 def run_nights(quick: bool) -> Iterator[Measure]:
     """False alarms of nights in which nothing changed, and regressions found where one was planted."""
-    nights = 200 if quick else 1000
-    rng = np.random.default_rng(4)
-    scale = rng.uniform(0.5, 2.0, TERRAINS)
-    pool = np.abs(rng.normal(size=(TERRAINS, 200))) * scale[:, None], rng.uniform(0.85, 1.0, TERRAINS)
-
-    def found(worse: float) -> set[tuple[str, str]]:
-        comparisons = []
-        for campaign, factor in (("first", worse), ("second", 1.0), ("third", 1.0)):
-            before = [_night(rng, pool, 1.0) for _ in range(BEFORE)]
-            for place, figure in enumerate(_night(rng, pool, factor)):
-                comparisons.append(Comparison(campaign, figure, [night[place].sample for night in before]))
-        return {(one.campaign, one.figure) for one in changes(comparisons)}
-
-    how = (
-        f"{nights} resampled nights of three campaigns of {CASES} cases on {TERRAINS} terrains, {BEFORE} nights before"
-    )
-    yield Measure("nights with a false alarm", sum(bool(found(1.0)) for _ in range(nights)) / nights, "", 0.01, how)
-    named = sum(("first", "error (m)") in found(WORSE) for _ in range(nights)) / nights
-    claim = f"nights that name a regression: errors {WORSE} times as large"
-    yield Measure(claim, named, "", 0.95, how, "at least")
+    in_a_row, planted = (100, 100) if quick else (2000, 1000)
+    alarms = quiet_nights(in_a_row, seed=4)
+    what = f"three campaigns of {CASES} cases: {', '.join(KINDS)}"
+    how = f"{alarms} of {in_a_row} nights in a row, kept in a history, each against up to {WINDOW} before; {what}"
+    yield Measure("nights with a false alarm", alarms / in_a_row, "", 0.01, how)
+    if not quick:
+        bound = proportion_upper(alarms, in_a_row, 0.95)
+        yield Measure(
+            "nights with a false alarm, upper bound at 95 % confidence", bound, "", 0.01, "of the same nights"
+        )
+    for kind, nights, bar in ((KINDS[0], planted, 0.95), (KINDS[1], planted // 4, None)):
+        named = planted_found(kind, nights, seed=5) / nights
+        claim = f"nights that name a regression, errors {WORSE:g} times as large, {kind}"
+        yield Measure(claim, named, "", bar, f"{nights} nights, each against {BEFORE} before; {what}", "at least")
 
 
 CHECKS = (

@@ -28,7 +28,35 @@ def test_errors_on_one_terrain_are_compared_as_by_mann_and_whitney() -> None:
     rng = np.random.default_rng(1)
     now, before = rng.exponential(1.4, 60), rng.exponential(1.0, 200)
     expected = stats.mannwhitneyu(now, before, use_continuity=False, method="asymptotic").pvalue
-    assert difference_p(_one(now), _one(before)) == pytest.approx(expected)
+    # by permutations, of which some fifty go beyond: three standard deviations
+    assert difference_p(_one(now), _one(before)) == pytest.approx(expected, rel=3 / math.sqrt(50))
+    quiet = rng.exponential(1.0, 60)
+    expected = stats.mannwhitneyu(quiet, before, use_continuity=False, method="asymptotic").pvalue
+    assert expected > 0.05
+    assert difference_p(_one(quiet), _one(before)) == pytest.approx(expected)
+
+
+def test_ranks_of_tied_values_are_compared_as_by_all_permutations() -> None:
+    # 5 of 20 against 6 of 140 off by the same amount: the number among the first is hypergeometric. The normal
+    # distribution gives a third of it.
+    now, before = np.repeat([3.0, 0.0], [5, 15]), np.repeat([3.0, 0.0], [6, 134])
+    exact = stats.hypergeom.sf(4, 160, 11, 20)
+    normal = stats.mannwhitneyu(now, before, use_continuity=False, method="asymptotic").pvalue
+    assert normal < exact / 2.5
+    assert difference_p(_one(now), _one(before), 40_000) == pytest.approx(exact, rel=3 / math.sqrt(50))
+    assert difference_p(_one(np.full(20, 3.0)), _one(before), 1_000) == pytest.approx(1 / 1_001)
+
+
+def test_terrains_with_more_cases_are_no_change() -> None:
+    # Means of skewed errors: of one case on each terrain tonight, of twelve before. Most lie lower tonight.
+    rng = np.random.default_rng(5)
+
+    def night(first: int, cases: int) -> Sample:
+        terrains = np.repeat(np.arange(first, first + 40), cases)
+        return _sample(np.exp(1.5 * rng.normal(size=terrains.size)), terrains)
+
+    found = [difference_p(night(0, 1), night(100, 12)) for _ in range(200)]
+    assert np.mean(np.array(found) < 0.05) <= 0.05 + 3 * 0.0154
 
 
 def test_large_counts_agree_with_the_exact_test() -> None:
