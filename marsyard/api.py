@@ -18,34 +18,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from campaigns.definition import loading
-from campaigns.definition.campaign import Campaign
-from scenarios.interface import CaseResult
-from sim.camera import CameraModel, read_camera, read_cameras
+from campaigns.definition.campaign import Campaign as Campaign
+from scenarios.interface import CaseResult as CaseResult
+from sim.camera import CameraModel as CameraModel
+from sim.camera import read_camera as read_camera
+from sim.camera import read_cameras as read_cameras
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from marsyard.render_command import Picture
     from reports.verdicts import Verdict
-
-__all__ = [
-    "CameraModel",
-    "Campaign",
-    "CaseResult",
-    "catalogue",
-    "draw",
-    "draws",
-    "load_campaign",
-    "read_camera",
-    "read_cameras",
-    "render_view",
-    "results",
-    "run_campaign",
-    "run_case",
-    "score",
-    "sites",
-    "verdicts",
-]
 
 
 def catalogue() -> list[str]:
@@ -122,14 +105,14 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
 
     from campaigns.execution.crew import Crew
     from campaigns.running.engine import run_campaign as run
+    from marsyard.outcome import settle
     from marsyard.progress import campaign_progress
     from marsyard.run_log import RunLog
-    from reports.campaign import write_report
 
     folder = Path(directory)
     with campaign_progress(Console(stderr=True)) as progress, RunLog(folder, progress) as log:
         run(campaign, folder, Crew(jobs), log)
-    write_report(folder)
+    settle(folder)
     return folder
 
 
@@ -144,12 +127,11 @@ def results(directory: str | Path) -> pd.DataFrame:
 
 def verdicts(directory: str | Path) -> Sequence[Verdict]:
     """The requirements of a campaign that was run, judged on its rows."""
-    from campaigns.store import record
-    from reports.sampled import sampled
-    from reports.verdicts import judge_campaign
+    from campaigns.store.table import refresh_table
+    from reports.judged import judged
 
-    stored = record.read(Path(directory))
-    return judge_campaign(results(directory), stored["requirements"], sampled(stored["configuration"]))
+    refresh_table(Path(directory))
+    return judged(Path(directory)).verdicts
 
 
 def score(campaign: Campaign, rows: Sequence[CaseResult], metric: str) -> pd.Series[Any]:

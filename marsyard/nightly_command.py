@@ -80,27 +80,20 @@ def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) 
     from campaigns.errors import CampaignError
     from campaigns.running.engine import run_campaign
     from marsyard.nightly_plan import definition_of
+    from marsyard.outcome import settle
     from reports.between import figures_of, sample_of
-    from reports.campaign import write_report
     from reports.history import NightCampaign, NightFigure
-    from reports.sampled import sampled
-    from reports.stored import read_run
-    from reports.verdicts import exit_code, judge_campaign, overall
 
     try:
         campaign = planned.load(now.plan.seed, now.night, folder)
         name = campaign.configuration.name
         directory = now.out / RUNS / f"night-{now.night:05d}-{name}"
         run_campaign(campaign, directory, now.crew, watch)
-        run = read_run(directory)
-        how = sampled(run.configuration)
-        verdicts = judge_campaign(run.whole, run.requirements, how)
-        whole = overall(verdicts, run.whole, how)
-        write_report(directory)
-        frame, figures = figures_of(run)
+        found, _ = settle(directory)
+        frame, figures = figures_of(found.run)
         kept = [NightFigure(one.name, one.larger_is_better, one.level, sample_of(frame, one)) for one in figures]
-        status = exit_code(verdicts, bool(whole.crashed))
-        told = NightCampaign(name, definition_of(campaign), directory.name, whole.word, status, whole.sentence)
+        whole = found.whole
+        told = NightCampaign(name, definition_of(campaign), directory.name, whole.word, found.exit_code, whole.sentence)
     except Exception as error:  # a defect in one campaign must not cost the night its others
         kept = []
         if not isinstance(error, CampaignError):

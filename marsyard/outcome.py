@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from reports.judged import Judged
     from reports.verdicts import Verdict
 
 
@@ -32,39 +33,46 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
     StoreError
         Where the folder holds no campaign with rows, or the report cannot be written.
     """
-    from reports.campaign import write_report
-    from reports.sampled import sampled
     from reports.tables import verdict_table
-    from reports.verdicts import exit_code, judge_campaign, overall
 
     stored = record.read(directory)
     finished = stored["state"] == "finished"
     if not finished:
         refresh_table(directory)
-    frame = read_frame(directory)
-    how = sampled(stored["configuration"])
-    asked = stored["requirements"] if requirements is None else requirements
-    verdicts = judge_campaign(frame, asked, how)
-    whole = overall(verdicts, frame, how)
-    status = exit_code(verdicts, bool(whole.crashed))
-    if finished and requirements is None:
-        record.update(directory, {"exit_code": status})
-    try:
-        page = write_report(directory, requirements)
-    except OSError as error:
-        raise StoreError(f"the report cannot be written: {error}") from error
-    console.print(verdict_table(verdicts))
-    for table in _comparison_tables(how.drawn(frame), asked, verdicts):
+    found, page = settle(directory, requirements)
+    console.print(verdict_table(found.verdicts))
+    for table in _comparison_tables(found.how.drawn(found.run.frame), found.run.requirements, found.verdicts):
         console.print(table)
-    lines = [f"verdict: {whole.word}", whole.sentence, f"report: {page}"]
+    lines = [f"verdict: {found.whole.word}", found.whole.sentence, f"report: {page}"]
     if not finished:
-        lines.insert(
-            0, f"INCOMPLETE: {len(frame)} of {stored['cases']} cases; {_how_it_stands(directory, stored['state'])}"
-        )
+        come = f"{len(found.run.whole)} of {stored['cases']} cases"
+        lines.insert(0, f"INCOMPLETE: {come}; {_how_it_stands(directory, stored['state'])}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     # what has been met so far is not met yet
-    return status if finished else status or Exit.INSUFFICIENT
+    return found.exit_code if finished else found.exit_code or Exit.INSUFFICIENT
+
+
+def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> tuple[Judged, Path]:
+    """Judges a campaign's rows and writes its report; returns what was found, and the page.
+
+    The record keeps the exit status of a campaign that is finished and is judged by its own requirements.
+
+    Raises
+    ------
+    StoreError
+        Where the folder holds no campaign with rows, or the report cannot be written.
+    """
+    from reports.campaign import write_judged
+    from reports.judged import judged
+
+    found = judged(directory, requirements)
+    if requirements is None and found.run.said("state") == "finished":
+        record.update(directory, {"exit_code": found.exit_code})
+    try:
+        return found, write_judged(found)
+    except OSError as error:
+        raise StoreError(f"the report cannot be written: {error}") from error
 
 
 def _comparison_tables(

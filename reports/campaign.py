@@ -28,14 +28,15 @@ from reports.explorer import embedded, explorer_data, script_hash
 from reports.explorer import script as explorer_script
 from reports.faults import faults_section
 from reports.hda.every import HDA_SECTIONS
+from reports.judged import Judged, judged
 from reports.sampled import sampled
 from reports.scatter import scatter_section
 from reports.section import Section, SectionMaker, Subject
-from reports.stored import StoredRun, read_run
+from reports.stored import StoredRun
 from reports.systems import shown_cases
 from reports.tables import error_summaries, outcome_counts
 from reports.traceability import evidence_of, junit_xml, verification_csv
-from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overall
+from reports.verdicts import Overall, Verdict
 from reports.vtt.beside import beside_section
 from reports.vtt.goal import goal_section
 from reports.vtt.kinds import regression_section, terrains_section
@@ -98,16 +99,19 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     OSError
         Where the report cannot be written.
     """
-    run = read_run(directory, requirements)
-    how = sampled(run.configuration)
-    verdicts = judge_campaign(run.whole, run.requirements, how)
-    whole = overall(verdicts, run.whole, how)
+    return write_judged(judged(directory, requirements))
+
+
+def write_judged(found: Judged) -> Path:
+    """Writes the report of a campaign that has been judged into its folder; see `write_report`."""
+    run, how, verdicts, whole = found.run, found.how, found.verdicts, found.whole
+    directory = run.directory
     drawn = replace(run, frame=how.drawn(run.frame), whole=how.drawn(run.whole))
     metric = primary_metric(drawn.frame, run.requirements)
     bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
     subject = Subject(drawn, metric, bound)
     further = [section for make in FURTHER_SECTIONS if (section := make(subject)) is not None]
-    twin = summary(run, subject, verdicts, whole, further)
+    twin = summary(found, subject, further)
     write_whole(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
     write_whole(directory / VERIFICATION_FILE, verification_csv(evidence_of(run.name, verdicts)))
     write_whole(directory / JUNIT_FILE, junit_xml(run.name, verdicts, whole))
@@ -180,11 +184,9 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
     return said
 
 
-def summary(
-    run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], whole: Overall, further: Sequence[Section]
-) -> dict[str, Any]:
+def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict[str, Any]:
     """The report as plain data; NaN and infinities are null."""
-    metric, how = subject.metric, sampled(run.configuration)
+    run, how, whole, metric = found.run, found.how, found.whole, subject.metric
     summaries = error_summaries(subject.whole, metric) if metric is not None else []
     twin = {
         "schema": SCHEMA,
@@ -199,7 +201,7 @@ def summary(
         "sampling": {**asdict(how), "independent": how.independent, "text": how.text},
         "verdict": whole.word,
         "sentence": whole.sentence,
-        "exit_code": exit_code(verdicts, bool(whole.crashed)),
+        "exit_code": found.exit_code,
         "verdicts": [
             {
                 **asdict(verdict),
@@ -207,7 +209,7 @@ def summary(
                 "plain_status": verdict.plain_status,
                 "margin": verdict.margin,
             }
-            for verdict in verdicts
+            for verdict in found.verdicts
         ],
         "outcomes": dict(outcome_counts(run.whole)),
         "metric": metric,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import sys
 from collections.abc import Callable
@@ -47,6 +48,8 @@ def test_an_algorithm_made_worse_is_named_with_its_metric(
     status, first = nightly()
     assert "No figure has a history" in first
     assert (tmp_path / "out" / "site" / "index.html").is_file()
+    record = json.loads((tmp_path / "out" / "runs" / "night-00001-fake" / "campaign.json").read_text())
+    assert record["exit_code"] == status
     # Worse by what the campaign does not state, as an algorithm's code would be.
     monkeypatch.setenv("FAKE_ERROR_SCALE", "4.0")
     worse, second = nightly()

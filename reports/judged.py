@@ -1,0 +1,41 @@
+"""A stored campaign with what its rows show of its requirements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from reports.sampled import Sampled, sampled
+from reports.stored import StoredRun, read_run
+from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overall
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A stored campaign, how its cases were drawn, and its verdicts: each requirement's, and the whole one."""
+
+    run: StoredRun
+    how: Sampled
+    verdicts: Sequence[Verdict]
+    whole: Overall
+
+    @property
+    def exit_code(self) -> int:
+        """The exit status that goes with the verdicts."""
+        return exit_code(self.verdicts, bool(self.whole.crashed))
+
+
+def judged(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Judged:
+    """Judges a campaign's stored rows, by its own requirements or by those given.
+
+    Raises
+    ------
+    campaigns.errors.StoreError
+        Where the folder holds no rows.
+    """
+    run = read_run(directory, requirements)
+    how = sampled(run.configuration)
+    verdicts = judge_campaign(run.whole, run.requirements, how)
+    return Judged(run, how, verdicts, overall(verdicts, run.whole, how))
