@@ -20,6 +20,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Polygon, Rectangle
 from scipy import ndimage
 
+from reports.products import numbers, plane
 from reports.svg import INK, in_page_style
 
 TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
@@ -62,7 +63,7 @@ class Track:
 
 def is_dimes_case(products: Mapping[str, Any]) -> bool:
     """Whether products hold the three pictures of a DIMES case."""
-    return all(_plane(products, f"image_{number}") is not None for number in (1, 2, 3))
+    return all(plane(products.get(f"image_{number}")) is not None for number in (1, 2, 3))
 
 
 def tracks(products: Mapping[str, Any]) -> list[Track]:
@@ -149,8 +150,8 @@ def _draw_rectified(
 ) -> None:
     """One picture of a pair as the virtual camera sees it, at one scale for both; `place` is (pair, side)."""
     pair, side = place
-    lattice = _numbers(products.get(f"rectified_{pair}_{side}"))
-    frame, gsd = _numbers(products.get(f"rectified_frame_{pair}")), _numbers(products.get(f"gsd_{pair}"))
+    lattice = numbers(products.get(f"rectified_{pair}_{side}"))
+    frame, gsd = numbers(products.get(f"rectified_frame_{pair}")), numbers(products.get(f"gsd_{pair}"))
     if lattice is None or lattice.ndim != 3 or lattice.shape[2] != 2 or frame is None or frame.size != 3:
         axes.set_axis_off()
         return
@@ -243,7 +244,7 @@ def _mark(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
 
 def _outline(axes: Axes, products: Mapping[str, Any], pair: int, side: int) -> None:
     """Where the other picture of the pair overlaps the first, and the middle of the zero-phase spot in each."""
-    polygon, spot = _plane(products, f"overlap_{pair}"), _plane(products, f"zero_phase_{pair}")
+    polygon, spot = plane(products.get(f"overlap_{pair}")), plane(products.get(f"zero_phase_{pair}"))
     if side == 0 and polygon is not None and polygon.shape[1] == 2:
         axes.add_patch(Polygon(polygon, fill=False, edgecolor="#f2e35a", linewidth=0.9, linestyle=":"))
     if spot is not None and spot.shape == (2, 2) and np.isfinite(spot[side]).all():
@@ -279,21 +280,21 @@ def _show(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
 def _track(products: Mapping[str, Any], row: Mapping[str, float]) -> Track:
     pair, template = int(row["pair"]), int(row["template"])
     key = f"{pair}_{template}"
-    place = _numbers(products.get(f"match_{key}"))
+    place = numbers(products.get(f"match_{key}"))
     return Track(
         pair=pair,
         template=template,
         valid=row.get("valid", 0.0) == 1.0,
         values=row,
-        patch=_plane(products, f"template_{key}"),
-        window=_plane(products, f"window_{key}"),
+        patch=plane(products.get(f"template_{key}")),
+        window=plane(products.get(f"window_{key}")),
         place=(float(place[0]), float(place[1])) if place is not None and place.size == 2 else None,
     )
 
 
 def _picture(products: Mapping[str, Any], key: str) -> Float[np.ndarray, "_ _"]:
     """A delivered picture with its columns binned in software as DIMES bins them, so that pixels are square."""
-    counts = _plane(products, key)
+    counts = plane(products.get(key))
     if counts is None:
         raise ValueError(f"the products hold no picture '{key}'")
     rows, columns = counts.shape
@@ -301,18 +302,3 @@ def _picture(products: Mapping[str, Any], key: str) -> Float[np.ndarray, "_ _"]:
     if binning < 2 or columns % rows:
         return counts
     return np.asarray(counts.reshape(rows, rows, binning).mean(axis=2), dtype=np.float64)
-
-
-def _plane(products: Mapping[str, Any], key: str) -> Float[np.ndarray, "_ _"] | None:
-    """A two-dimensional array of the products; None where it is missing or is something else."""
-    values = _numbers(products.get(key))
-    return values if values is not None and values.ndim == 2 and values.size else None
-
-
-def _numbers(value: object) -> Float[np.ndarray, "..."] | None:
-    if value is None:
-        return None
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None

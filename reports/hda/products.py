@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from reports.products import numbers, plane
+
 
 @dataclass(frozen=True)
 class TrackedFeatures:
@@ -126,10 +128,8 @@ def is_hda_case(products: Mapping[str, Any]) -> bool:
 
 def pictures(products: Mapping[str, Any]) -> tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]] | None:
     """The two pictures; None where one is missing."""
-    first, second = (numbers(products.get(f"image_{number}")) for number in (1, 2))
-    if first is None or second is None or first.ndim != 2 or second.ndim != 2 or not first.size or not second.size:
-        return None
-    return first, second
+    first, second = (plane(products.get(f"image_{number}")) for number in (1, 2))
+    return None if first is None or second is None else (first, second)
 
 
 def tracked_features(products: Mapping[str, Any]) -> TrackedFeatures | None:
@@ -238,16 +238,6 @@ def true_ground(products: Mapping[str, Any]) -> TrueGround | None:
         safe=known[2] > 0.5,
         covered=known[3] > 0.5,
     )
-
-
-def numbers(value: object) -> Float[np.ndarray, "..."] | None:
-    """A product as float64; None where it is something else."""
-    if value is None:
-        return None
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
 
 
 def _rows(products: Mapping[str, Any], name: str, width: int) -> Float[np.ndarray, "n width"] | None:

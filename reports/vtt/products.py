@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from reports.products import numbers, plane
+
 #: Numbers that stops may have.
 _STOPS = range(1, 1000)
 
@@ -88,8 +90,7 @@ class Way:
 
 def is_vtt_case(products: Mapping[str, Any]) -> bool:
     """Whether products hold a stop's picture and a template's size, as those of a tracking case do."""
-    picture = numbers(products.get("stop_1_left"))
-    return picture is not None and picture.ndim == 2 and template_px(products) is not None
+    return plane(products.get("stop_1_left")) is not None and template_px(products) is not None
 
 
 def template_px(products: Mapping[str, Any]) -> float | None:
@@ -103,7 +104,7 @@ def stops_of(products: Mapping[str, Any]) -> list[StopPictures]:
     found: list[StopPictures] = []
     states = products.get("states")
     for number in _STOPS:
-        left = _plane(products.get(f"stop_{number}_left"))
+        left = plane(products.get(f"stop_{number}_left"))
         if left is None:
             return found
         state = states[number - 1] if isinstance(states, list) and number <= len(states) else ""
@@ -112,7 +113,7 @@ def stops_of(products: Mapping[str, Any]) -> list[StopPictures]:
                 number=number,
                 state=str(state).replace("_", " ").lower(),
                 left=left,
-                right=_plane(products.get(f"stop_{number}_right")),
+                right=plane(products.get(f"stop_{number}_right")),
                 corners=_shaped(products.get(f"stop_{number}_corners"), (2, 2)),
                 window=_shaped(products.get(f"stop_{number}_window"), (4,)),
                 found=_shaped(products.get(f"stop_{number}_found"), (2, 2)),
@@ -139,26 +140,11 @@ def way_of(products: Mapping[str, Any]) -> Way | None:
     return Way(path if path.size else stops, stops, believed, heading, target[:2], estimates, rocks)
 
 
-def numbers(value: object) -> Float[np.ndarray, "..."] | None:
-    """A product as float64; None where it is something else."""
-    if value is None:
-        return None
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-
-
 def _figures(table: object, place: int) -> dict[str, float]:
     if not isinstance(table, Mapping):
         return {}
     arrays = {str(name): numbers(values) for name, values in table.items()}
     return {name: float(a[place]) for name, a in arrays.items() if a is not None and a.ndim == 1 and place < a.size}
-
-
-def _plane(value: object) -> Float[np.ndarray, "_ _"] | None:
-    values = numbers(value)
-    return values if values is not None and values.ndim == 2 and values.size else None
 
 
 def _shaped(value: object, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:

@@ -14,16 +14,8 @@ from algorithms.answers import checked_site, checked_velocity
 from algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from scenarios.conformance import inputs
 from scenarios.conformance.findings import BreachError, Check
-from scenarios.conformance.process import WATCHER, fingerprint, own_copy, surroundings
-from scenarios.conformance.shared import (
-    ADVICE_PROCESS,
-    ADVICE_TRUTH,
-    COPIES,
-    changed,
-    imports_nothing_closed,
-    seed_global_generators,
-)
-from scenarios.estimators import sources_of
+from scenarios.conformance.process import fingerprint, own_copy
+from scenarios.conformance.shared import COPIES, process_checks, seed_global_generators
 from sim.measurements import LandingMeasurements
 
 
@@ -136,8 +128,7 @@ class EstimatorSuite:
             "time", f"answers within {self.limit_s:g} s", "be faster, or allow more with --time-limit", self._time
         )
         if not self.program:
-            yield Check("process", "leaves its process as it is", ADVICE_PROCESS, self._process)
-            yield Check("truth", "reaches for no truth", ADVICE_TRUTH, self._truth)
+            yield from process_checks(self.spec, self._prepared)
 
     def _ask(self, measurements: Any) -> Any:
         return self.protocol.checked(self.make().estimate(own_copy(measurements)))
@@ -189,17 +180,5 @@ class EstimatorSuite:
             raise BreachError(f"it took {taken:.3g} s")
         return f"{taken:.3g} s"
 
-    def _process(self) -> str:
-        estimator, measurements = self.make(), own_copy(self.protocol.measurements())
-        before = surroundings()
-        estimator.estimate(measurements)
-        return changed(before, surroundings())
-
-    def _truth(self) -> str:
-        imports_nothing_closed(self.spec)
-        estimator, measurements = self.make(), own_copy(self.protocol.measurements())
-        with WATCHER.looking(frozenset(str(path) for _, path in sources_of(self.spec))) as seen:
-            estimator.estimate(measurements)
-        if seen:
-            raise BreachError("; ".join(seen))
-        return ""
+    def _prepared(self) -> Callable[[], object]:
+        return partial(self.make().estimate, own_copy(self.protocol.measurements()))

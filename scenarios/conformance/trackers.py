@@ -15,17 +15,9 @@ from algorithms.answers import checked_aim, checked_update
 from algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
 from algorithms.vtt.pointing import mast_angles
 from scenarios.conformance.findings import BreachError, Check
-from scenarios.conformance.process import WATCHER, fingerprint, own_copy, surroundings
-from scenarios.conformance.shared import (
-    ADVICE_PROCESS,
-    ADVICE_TRUTH,
-    COPIES,
-    changed,
-    imports_nothing_closed,
-    seed_global_generators,
-)
+from scenarios.conformance.process import fingerprint, own_copy
+from scenarios.conformance.shared import COPIES, process_checks, seed_global_generators
 from scenarios.conformance.surfaces import MEAN, TexturedPlane
-from scenarios.estimators import sources_of
 from sim.camera import CameraModel
 from sim.frames import rigid
 from sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements
@@ -118,8 +110,7 @@ class TrackerSuite:
             "time", f"updates within {self.limit_s:g} s", "be faster, or allow more with --time-limit", self._time
         )
         if not self.program:
-            yield Check("process", "leaves its process as it is", ADVICE_PROCESS, self._process)
-            yield Check("truth", "reaches for no truth", ADVICE_TRUTH, self._truth)
+            yield from process_checks(self.spec, self._prepared)
 
     def _answers(self) -> str:
         updates = drive(self.make())
@@ -192,20 +183,8 @@ class TrackerSuite:
             raise BreachError(f"an update took {max(times):.3g} s")
         return f"{max(times[1:]):.3g} s"
 
-    def _process(self) -> str:
-        tracker = self.make()
-        before = surroundings()
-        drive(tracker)
-        return changed(before, surroundings())
-
-    def _truth(self) -> str:
-        imports_nothing_closed(self.spec)
-        tracker = self.make()
-        with WATCHER.looking(frozenset(str(path) for _, path in sources_of(self.spec))) as seen:
-            drive(tracker)
-        if seen:
-            raise BreachError("; ".join(seen))
-        return ""
+    def _prepared(self) -> Callable[[], object]:
+        return partial(drive, self.make())
 
 
 def drive(tracker: Any) -> Sequence[TargetUpdate]:

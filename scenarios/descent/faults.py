@@ -10,16 +10,16 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import UInt16
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from scenarios.faults import Size, SizedFaults, ailing
 from sim.measurements import AltitudeMeasurement, AttitudeMeasurement
 from sim.render.clouds import CloudLayer, CloudParameters
 from sim.sensor import DetectorParameters
 from sim.terrain import TerrainParameters
 from sim.terrain.landforms import Dunes
 
-Size = Annotated[float, Field(ge=0.0)]
 #: Noise in a burst on the cable and its length: a third of the picture's signal, over two delivered rows.
 BURST_DN, BURST_PX = 300.0, 2048.0
 #: Dunes as regular as wind makes them.
@@ -28,10 +28,8 @@ REPETITIVE = Dunes(wavelength_m=60.0, height_m=1.0, crest_length=20.0, regularit
 STRUCK = 1
 
 
-class Faults(BaseModel):
-    """Faults of a descent. A size of 0 is no fault."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class Faults(SizedFaults):
+    """Faults of a descent."""
 
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
     bad_pixels: Annotated[
@@ -62,14 +60,6 @@ class Faults(BaseModel):
         Size, Field(le=90.0, description="tilt by which the second attitude is wrong, deg")
     ] = 0.0
 
-    @property
-    def name_and_size(self) -> tuple[str, float]:
-        """The fault and its size; "none" and 0 without one, "several" and NaN where there are more."""
-        present = [(name, float(size)) for name, size in self.model_dump().items() if size]
-        if len(present) > 1:
-            return "several", float("nan")
-        return present[0] if present else ("none", 0.0)
-
 
 def faulty_terrain(faults: Faults, terrain: TerrainParameters) -> TerrainParameters:
     """The terrain, under regular dunes where the fault asks for them."""
@@ -88,18 +78,12 @@ def clouds_over(faults: Faults, ground_m: float, rng: np.random.Generator) -> Cl
 
 def faulty_detector(faults: Faults, detector: DetectorParameters) -> DetectorParameters:
     """The detector with dust, bad pixels and a cable that is struck."""
-    changes: dict[str, BaseModel] = {}
-    if faults.dust_discs:
-        changes["optics"] = detector.optics.model_copy(update={"dust_discs": faults.dust_discs})
-    if faults.bad_pixels:
-        changes["defects"] = detector.defects.model_copy(
-            update={"dead_share": faults.bad_pixels, "hot_share": faults.bad_pixels}
-        )
-    if faults.cable_bursts:
-        changes["bursts"] = detector.bursts.model_copy(
-            update={"bursts": faults.cable_bursts, "length_px": BURST_PX, "amplitude_dn": BURST_DN}
-        )
-    return detector.model_copy(update=changes)
+    bad = {"dead_share": faults.bad_pixels, "hot_share": faults.bad_pixels} if faults.bad_pixels else {}
+    ailed = ailing(detector, faults.dust_discs, bad)
+    if not faults.cable_bursts:
+        return ailed
+    bursts = {"bursts": faults.cable_bursts, "length_px": BURST_PX, "amplitude_dn": BURST_DN}
+    return ailed.model_copy(update={"bursts": detector.bursts.model_copy(update=bursts)})
 
 
 def faulty_times(faults: Faults, times_s: Sequence[float]) -> list[float]:

@@ -10,23 +10,21 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt16
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from scenarios.faults import Size, SizedFaults, ailing
 from scenarios.landing.helicopter import HelicopterParameters
 from sim.sensor import DetectorParameters
 from sim.sensor.rtk import Outage
 
-Size = Annotated[float, Field(ge=0.0)]
 Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 
-class Faults(BaseModel):
-    """Faults of a flight. A size of 0 is no fault.
+class Faults(SizedFaults):
+    """Faults of a flight.
 
     Lost pictures and outages of the receiver are those of a helicopter that is flown.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     black_picture: Annotated[int, Field(ge=0, le=2, description="picture that is delivered black, 1 or 2; 0: none")] = 0
     repeated_picture: Annotated[
@@ -61,14 +59,6 @@ class Faults(BaseModel):
         Field(le=100.0, description="diameter of the disc that casts the own shadow, m; the sun is nearer the zenith"),
     ] = 0.0
 
-    @property
-    def name_and_size(self) -> tuple[str, float]:
-        """The fault and its size; "none" and 0 without one, "several" and NaN where there are more."""
-        present = [(name, float(size)) for name, size in self.model_dump().items() if size]
-        if len(present) > 1:
-            return "several", float("nan")
-        return present[0] if present else ("none", 0.0)
-
 
 def faulty_sun_deg(faults: Faults, elevation_deg: float) -> float:
     """The sun's elevation: where the own shadow is to be seen its distance from the zenith is a quarter.
@@ -80,14 +70,9 @@ def faulty_sun_deg(faults: Faults, elevation_deg: float) -> float:
 
 def faulty_detector(faults: Faults, detector: DetectorParameters) -> DetectorParameters:
     """The detector with dust and bad pixels."""
-    changes: dict[str, BaseModel] = {}
-    if faults.dust_discs:
-        changes["optics"] = detector.optics.model_copy(update={"dust_discs": faults.dust_discs})
     share = max(faults.bad_pixels, faults.listed_bad_pixels)
-    if share:
-        bad = {"dead_share": share, "hot_share": share, "listed": share == faults.listed_bad_pixels}
-        changes["defects"] = detector.defects.model_copy(update=bad)
-    return detector.model_copy(update=changes)
+    bad = {"dead_share": share, "hot_share": share, "listed": share == faults.listed_bad_pixels} if share else {}
+    return ailing(detector, faults.dust_discs, bad)
 
 
 def faulty_helicopter(faults: Faults, helicopter: HelicopterParameters) -> HelicopterParameters:

@@ -1,0 +1,15 @@
+"""What a campaign of landings builds before its flights."""
+
+from __future__ import annotations
+
+import pytest
+
+from scenarios.landing.parameters import LandingScenarioParameters
+from scenarios.landing.scenario import LandingScenario
+from scenarios.landing.world import KEPT_GROUNDS
+
+
+@pytest.mark.parametrize(("bank", "built"), [(1, 1), (KEPT_GROUNDS, KEPT_GROUNDS), (KEPT_GROUNDS + 1, 0), (10_000, 0)])
+def test_terrains_of_a_bank_too_large_to_keep_are_built_by_their_flights(bank: int, built: int) -> None:
+    parameters = LandingScenarioParameters.model_validate({"place": {"bank": bank}})
+    assert LandingScenario().shared_inputs(parameters) == tuple(range(built))
