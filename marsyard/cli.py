@@ -23,10 +23,12 @@ from marsyard.campaign_command import (
     says_what_is_wrong,
 )
 from marsyard.clean_command import clean
+from marsyard.compile_command import compile_kernels
 from marsyard.conformance_command import conformance
 from marsyard.dashboard_command import dashboard
 from marsyard.dataset_command import dataset
 from marsyard.gallery_command import gallery
+from marsyard.ingest_command import ingest
 from marsyard.new_command import new
 from marsyard.nightly_command import nightly
 from marsyard.offline_command import export, score
@@ -48,7 +50,9 @@ for command in (run, resume, append, report, compare, replay, nightly, dashboard
 app.command()(render)
 app.command()(gallery)
 app.command()(new)
+app.command()(ingest)
 app.command()(clean)
+app.command(name="compile")(compile_kernels)
 app.command()(dataset)
 app.command()(conformance)
 for offline in (export, score):

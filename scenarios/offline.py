@@ -215,7 +215,7 @@ def _read(file: Path, required: tuple[str, ...], _time: int, _size: int) -> Mapp
         raise ValueError(f"{file} cannot be read: {error}") from error
     problems = list(_header_problems(header, form))
     if problems:
-        raise ValueError(_listed(file, problems))
+        raise ValueError(listed(file, problems))
     answers: dict[int, Any] = {}
     first_lines: dict[int, int] = {}
     for line, cells in lines:
@@ -228,7 +228,7 @@ def _read(file: Path, required: tuple[str, ...], _time: int, _size: int) -> Mapp
             continue
         answers[case], first_lines[case] = answer, line
     if problems:
-        raise ValueError(_listed(file, problems))
+        raise ValueError(listed(file, problems))
     return answers
 
 
@@ -288,6 +288,7 @@ def _outcome(text: str, numbers: Mapping[str, float], form: OfflineForm[Any]) ->
     return known[text] if text else next(iter(known.values()))
 
 
-def _listed(file: Path, problems: Sequence[str]) -> str:
+def listed(file: Path, problems: Sequence[str]) -> str:
+    """What is wrong with a file as one message, the first problems of very many."""
     more = [f"... and {len(problems) - _TOLD} more"] if len(problems) > _TOLD else []
     return "\n  ".join([f"{file}:", *problems[:_TOLD], *more])

@@ -224,13 +224,7 @@ class DescentScenarioParameters(ChosenAlgorithms):
             raise ValueError(
                 f"detector.rows_summed {self.detector.rows_summed} does not divide the camera's {rows} rows"
             )
-        delivered, binned = (columns, rows // self.detector.rows_summed), self.dimes.binned_size
-        if delivered[0] % binned[0] or delivered[1] % binned[1]:
-            near = binned_size_for(*delivered)
-            raise ValueError(
-                f"dimes.binned_size {list(binned)} does not divide the delivered picture of {delivered[0]} x "
-                f"{delivered[1]} pixels; allowed: sizes that do, such as {list(near)}"
-            )
+        check_binning(self.dimes.binned_size, (columns, rows // self.detector.rows_summed))
         return self
 
     @model_validator(mode="after")
@@ -248,6 +242,15 @@ class DescentScenarioParameters(ChosenAlgorithms):
     def preset(self) -> Site | None:
         """The site; None for a plain terrain."""
         return None if self.site is None else site(self.site)
+
+
+def check_binning(binned: tuple[int, int], delivered: tuple[int, int]) -> None:
+    """Raises ValueError where DIMES cannot bin a delivered picture (columns, rows) to a size."""
+    if delivered[0] % binned[0] or delivered[1] % binned[1]:
+        raise ValueError(
+            f"dimes.binned_size {list(binned)} does not divide the delivered picture of {delivered[0]} x "
+            f"{delivered[1]} pixels; allowed: sizes that do, such as {list(binned_size_for(*delivered))}"
+        )
 
 
 def binned_size_for(columns: int, rows: int) -> tuple[int, int]:

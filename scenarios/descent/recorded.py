@@ -7,25 +7,19 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import Field, model_validator
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from scenarios.own_axes import RecordedAxes
 from scenarios.own_files import OwnFile
 from sim.dynamics.recorded import RecordedMotion
 from sim.dynamics.recorded_files import RecordedPoses, TrajectoryFileError, read_poses
 
-#: Rotations from a file's world axes to ours, which are east, north, up.
-_WORLD = {
-    "enu": Rotation.identity(),
-    "ned": Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])),
-}
-#: OpenCV's camera axes (x right, y down, z forward) in the body's, whose camera looks along -z, its columns along x.
-_CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 #: How long after the last picture the flight must be known, s.
 AFTER_S = 0.5
 
 
-class FlightFile(OwnFile):
+class FlightFile(OwnFile, RecordedAxes):
     """A recorded or computed flight: a CSV, Parquet, TUM or EuRoC file of poses.
 
     Positions are the camera's, unless `lever_m` says where the camera is. The file's time `first_picture_s` is that of
@@ -33,22 +27,10 @@ class FlightFile(OwnFile):
     a simulated one.
     """
 
-    axes: Annotated[Literal["enu", "ned"], Field(description="world axes: east, north, up; or north, east, down")]
     origin: Annotated[
         Literal["place", "terrain"],
         Field(description="positions count from the ground at `place`, or from the terrain's own origin"),
     ] = "place"
-    attitude_of: Annotated[
-        Literal["camera", "body"],
-        Field(description="whose axes: OpenCV's of the camera, or the body's, whose camera looks along -z"),
-    ] = "camera"
-    mounting: Annotated[
-        tuple[float, float, float, float],
-        Field(description="quaternion x, y, z, w from those axes of the camera or body to the recorded vehicle's"),
-    ] = (0.0, 0.0, 0.0, 1.0)
-    lever_m: Annotated[
-        tuple[float, float, float], Field(description="the camera in the recorded vehicle's axes, m")
-    ] = (0.0, 0.0, 0.0)
     first_picture_s: Annotated[
         float | None, Field(description="file's time of the first picture; not stated: `lead_s` after its beginning")
     ] = None
@@ -63,12 +45,6 @@ class FlightFile(OwnFile):
     def hash_of(cls, file: str) -> str:
         """SHA-256 of the file of poses, which are checked."""
         return read_poses(file).sha256
-
-    @model_validator(mode="after")
-    def _mounting_is_a_rotation(self) -> FlightFile:
-        if abs(float(np.linalg.norm(self.mounting)) - 1.0) > 1e-3:
-            raise ValueError(f"mounting {list(self.mounting)} is no quaternion of length 1")
-        return self
 
     @property
     def poses(self) -> RecordedPoses:
@@ -120,12 +96,9 @@ class FlightFile(OwnFile):
         """
         poses = self.poses
         turn = Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0]))
-        world = turn * _WORLD[self.axes]
+        world = turn * self.world
         recorded = world * Rotation.from_quat(poses.quaternions)
-        positions = world.apply(poses.positions_m) + recorded.apply(np.array(self.lever_m))
-        attitudes = recorded * Rotation.from_quat(np.array(self.mounting))
-        if self.attitude_of == "camera":
-            attitudes = attitudes * _CAMERA_IN_BODY.inv()
+        positions = world.apply(poses.positions_m) + self.levers(recorded)
         if self.origin == "place":
             positions = positions + ground_m
-        return RecordedMotion(poses.times_s - self.start_s, positions, attitudes, gravity_m_s2)
+        return RecordedMotion(poses.times_s - self.start_s, positions, self.bodies(recorded), gravity_m_s2)

@@ -14,6 +14,7 @@ from algorithms.interface import SiteEstimate, SiteOutcome
 from scenarios.interface import Scalar
 from scenarios.landing.confusion import MapAtPlaces, hazard_counts, map_errors
 from scenarios.landing.flight import Flight
+from scenarios.landing.motion import motion_errors, solved_row
 from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.landing.pictures import Pair
 from scenarios.landing.truth import GroundTruth
@@ -96,27 +97,9 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
         return row
     if details.tracks is not None:
         row |= _tracks_row(details, flight, pair)
-    true = true_motion(flight, pair)
     if details.motion is not None:
-        found = details.motion.second_from_first
-        length, true_length = (float(np.linalg.norm(one.translation)) for one in (found, true))
-        turned = (found.rotation * true.rotation.inv()).magnitude()
-        off = float(np.linalg.norm(found.translation - true.translation))
-        row |= {
-            "inliers": int(details.motion.inliers.sum()),
-            "parallax_px": details.motion.parallax_px,
-            "rotation_error_deg": float(np.degrees(turned)),
-            "direction_error_deg": float(np.degrees(2.0 * np.arcsin(min(_apart(found, true) / 2.0, 1.0)))),
-            "length_error_m": length - true_length,
-            "baseline_error_share": off / true_length if true_length > 0.0 else NAN,
-            "motion_residual_px": float(np.median(details.motion.residuals_px)),
-        }
-    if details.matches is not None:
-        row |= {"points": len(details.matches.points), "matched_share": float(details.matches.accepted.mean())}
-    if details.ground is not None:
-        rows, columns = details.ground.elevation.elevation_m.shape
-        row |= {"map_rows": rows, "map_columns": columns, "cell_m": details.ground.elevation.cell_m}
-    return row
+        row |= motion_errors(details.motion.second_from_first, true_motion(flight, pair))
+    return row | solved_row(details)
 
 
 def _within_limits(true: RigidTransform, flight: Flight, range_m: float) -> bool:
@@ -126,14 +109,6 @@ def _within_limits(true: RigidTransform, flight: Flight, range_m: float) -> bool
     return bool(
         roll < MOST_ROLL_DEG + 0.5 and max(pitch, yaw) < MOST_TILT_DEG + 0.5 and climb < (MOST_CLIMB + 0.01) * range_m
     )
-
-
-def _apart(one: RigidTransform, other: RigidTransform) -> float:
-    """Distance of the directions of two translations."""
-    a, b = (np.array(each.translation) for each in (one, other))
-    if not (np.any(a) and np.any(b)):
-        return NAN
-    return float(np.linalg.norm(a / np.linalg.norm(a) - b / np.linalg.norm(b)))
 
 
 def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Scalar]:

@@ -15,6 +15,7 @@ from sim.camera.files import read_camera, read_cameras
 from sim.camera.opencv import OpenCVIntrinsics, Residual, from_opencv, from_opencv_fisheye, to_opencv
 from sim.camera.pds4_labels import read_pds4
 from sim.camera.pds_labels import read_pds3
+from sim.camera.pds_products import Pds3Product, read_pds3_product
 from sim.camera.text_files import read_cahvor, write_cahvor
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "CameraFileError",
     "CameraModel",
     "OpenCVIntrinsics",
+    "Pds3Product",
     "Residual",
     "from_opencv",
     "from_opencv_fisheye",
@@ -33,6 +35,7 @@ __all__ = [
     "read_camera",
     "read_cameras",
     "read_pds3",
+    "read_pds3_product",
     "read_pds4",
     "to_opencv",
     "write_cahvor",

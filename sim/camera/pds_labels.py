@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,7 @@ _MOST_BYTES = 1 << 23
 _START = re.compile(rb"^\s*PDS_VERSION_ID\s*=", re.MULTILINE)
 _START_WITHIN = 4096
 _END = re.compile(rb"^END\s*$", re.MULTILINE)
-_BLOCKS = re.compile(
-    r"^[ \t]*(GROUP|OBJECT)[ \t]*=[ \t]*(GEOMETRIC_CAMERA_MODEL|IMAGE|INSTRUMENT_STATE_PARMS)[ \t]*\r?$"
-    r".*?^[ \t]*END_\1\b[^\n]*$",
-    re.MULTILINE | re.DOTALL,
-)
+_BLOCKS = (_GROUP, "IMAGE", "INSTRUMENT_STATE_PARMS")
 _METRES = ("METER", "METERS", "METRE", "METRES", "M", "N/A")
 
 
@@ -49,11 +45,11 @@ def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
         is allowed.
     """
     source = Source(str(path))
-    label = _label(source)
+    label = parsed_blocks(label_text(source), _BLOCKS, source)
     groups = label.getall(_GROUP) if _GROUP in label else []
     if not groups:
         raise source.error(_GROUP, "missing or not closed", "a label with at least one such group")
-    size = _size(label, source)
+    size = picture_size(label, source)
     if not subframe_folded_in:
         _refuse_subframes(label, source)
     return tuple(_camera(group, size, source) for group in groups)
@@ -64,8 +60,8 @@ def is_pds3(head: bytes) -> bool:
     return _START.search(head[:_START_WITHIN]) is not None
 
 
-def _label(source: Source) -> Any:
-    """The label parsed by pvl, having read no further than its END."""
+def label_text(source: Source) -> str:
+    """The text of a PDS3 label, having read no further than its END. Raises CameraFileError where there is none."""
     head = source.head(_FIRST_BYTES)
     if not is_pds3(head):
         raise source.error("PDS_VERSION_ID", "missing at the head of the file", "a PDS3 label or product")
@@ -75,18 +71,26 @@ def _label(source: Source) -> Any:
         end = _END.search(head)
     if end is None:
         raise source.error("END", f"missing in the first {_MOST_BYTES} bytes", "a label closed by a line END")
+    return head[: end.end()].decode("latin-1")
+
+
+def parsed_blocks(text: str, names: Sequence[str], source: Source) -> Any:
+    """The groups and objects of these names in a label, parsed. Raises CameraFileError where they cannot be.
+
+    pvl's strict parser refuses what real labels hold elsewhere (values that begin with a digit and have no quotes), and
+    its lenient one never returns from some damaged labels; the blocks are regular.
+    """
+    blocks = re.compile(
+        rf"^[ \t]*(GROUP|OBJECT)[ \t]*=[ \t]*({'|'.join(names)})[ \t]*\r?$.*?^[ \t]*END_\1\b[^\n]*$",
+        re.MULTILINE | re.DOTALL,
+    )
     try:
-        return _parsed(head[: end.end()].decode("latin-1"))
+        return _parsed("\n".join(block[0] for block in blocks.finditer(text)) + "\nEND\n")
     except Exception as fault:  # pvl raises many kinds, of its own and of Python's
         raise source.error("label", f"cannot be parsed ({fault})", "a PDS3 label") from fault
 
 
 def _parsed(text: str) -> Any:
-    """The blocks that are needed, parsed strictly.
-
-    pvl's strict parser refuses what real labels hold elsewhere (values that begin with a digit and have no quotes), and
-    its lenient one never returns from some damaged labels; the blocks are regular.
-    """
     with warnings.catch_warnings():
         # What pvl says of itself: an optional package is missing, and a class that it uses itself is deprecated.
         warnings.simplefilter("ignore", ImportWarning)
@@ -96,11 +100,11 @@ def _parsed(text: str) -> Any:
         from pvl.parser import ODLParser
 
         grammar = PDSGrammar()
-        parser = ODLParser(grammar=grammar, decoder=PDSLabelDecoder(grammar=grammar))
-        return parser.parse("\n".join(block[0] for block in _BLOCKS.finditer(text)) + "\nEND\n")
+        return ODLParser(grammar=grammar, decoder=PDSLabelDecoder(grammar=grammar)).parse(text)
 
 
-def _size(label: Any, source: Source) -> tuple[int, int]:
+def picture_size(label: Any, source: Source) -> tuple[int, int]:
+    """(columns, rows) of the label's IMAGE object."""
     if "IMAGE" not in label or not isinstance(label["IMAGE"], Mapping):
         raise source.error("IMAGE", "missing", "an object with LINES and LINE_SAMPLES")
     image = label["IMAGE"]

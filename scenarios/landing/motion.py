@@ -1,0 +1,49 @@
+"""The motion that a landing algorithm solved for, in columns: against another motion, and what it rests on."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from algorithms.hda import HdaDetails
+from scenarios.interface import Scalar
+
+NAN = float("nan")
+
+
+def motion_errors(found: RigidTransform, true: RigidTransform) -> dict[str, Scalar]:
+    """A motion from the first to the second camera's frame against the true one."""
+    length, true_length = (float(np.linalg.norm(one.translation)) for one in (found, true))
+    turned = (found.rotation * true.rotation.inv()).magnitude()
+    off = float(np.linalg.norm(found.translation - true.translation))
+    return {
+        "rotation_error_deg": float(np.degrees(turned)),
+        "direction_error_deg": float(np.degrees(2.0 * np.arcsin(min(_apart(found, true) / 2.0, 1.0)))),
+        "length_error_m": length - true_length,
+        "baseline_error_share": off / true_length if true_length > 0.0 else NAN,
+    }
+
+
+def solved_row(details: HdaDetails) -> dict[str, Scalar]:
+    """What motion, structure and map rest on; nothing of what was not reached."""
+    row: dict[str, Scalar] = {}
+    if details.motion is not None:
+        row |= {
+            "inliers": int(details.motion.inliers.sum()),
+            "parallax_px": details.motion.parallax_px,
+            "motion_residual_px": float(np.median(details.motion.residuals_px)),
+        }
+    if details.matches is not None:
+        row |= {"points": len(details.matches.points), "matched_share": float(details.matches.accepted.mean())}
+    if details.ground is not None:
+        rows, columns = details.ground.elevation.elevation_m.shape
+        row |= {"map_rows": rows, "map_columns": columns, "cell_m": details.ground.elevation.cell_m}
+    return row
+
+
+def _apart(one: RigidTransform, other: RigidTransform) -> float:
+    """Distance of the directions of two translations."""
+    a, b = (np.array(each.translation) for each in (one, other))
+    if not (np.any(a) and np.any(b)):
+        return NAN
+    return float(np.linalg.norm(a / np.linalg.norm(a) - b / np.linalg.norm(b)))

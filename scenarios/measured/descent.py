@@ -1,0 +1,122 @@
+"""Three real pictures of a descent: estimate, what the inertial unit says, the truth where it is known."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel
+from scipy.spatial.transform import RigidTransform
+
+from algorithms.answers import checked_velocity
+from algorithms.dimes import DimesDetails
+from algorithms.interface import VelocityEstimate
+from scenarios.estimators import VELOCITY
+from scenarios.interface import CaseResult, Scalar
+from scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, tried
+from scenarios.measured.consistency import agreement_products, agreement_row, agreements, views_of
+from scenarios.measured.parameters import MeasuredVelocityParameters
+from scenarios.measured.store import StoredCase, descent_measurements, images_of
+from scenarios.trial import Judged, case_result
+from scenarios.velocity import consistency_row, velocity_products, velocity_row
+from sim.frames import rigid
+from sim.measurements import DescentMeasurements
+from sim.streams import Streams
+
+
+class MeasuredVelocityScenario(MeasuredScenario):
+    """Three real pictures of a descent with measurements, given to a velocity estimator."""
+
+    name = "measured-velocity"
+    parameters_type = MeasuredVelocityParameters
+    task = VELOCITY
+    algorithm_table = ()
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """One descent."""
+        p = checked(parameters, MeasuredVelocityParameters)
+        images = images_of(p.cases, p.case)
+        measurements = descent_measurements(p.case, images)
+        pairs = agreements(views_of(images, descent_poses(p.case, measurements)))
+        attempts = tried(p, p.dimes, measurements, checked_velocity, streams.case)
+        shown = agreement_products(images, pairs)
+
+        def judge(algorithm: str) -> Judged:
+            attempt = attempts[algorithm]
+            row = answer_row(attempt.answer, p.case, measurements)
+            if algorithm != p.algorithm:
+                row["apart_m_s"] = distance(_velocity(attempt.answer), _velocity(attempts[p.algorithm].answer))
+            kept = velocity_products([image.counts for image in images], attempt.answer, _true(p.case))
+            return Judged(
+                outcome=attempt.outcome(lambda answer: answer.outcome.name),
+                answered=_velocity(attempt.answer) is not None,
+                row={**row, **attempt.row},
+                products={**kept, **shown},
+                failure=attempt.failure,
+            )
+
+        known = {**about(p, images), **_conditions(p.case, measurements), **agreement_row(pairs)}
+        return case_result(p.algorithms, judge, known)
+
+
+def descent_poses(case: StoredCase, measurements: DescentMeasurements) -> list[RigidTransform]:
+    """The body's poses: by measured positions, or by the inertial unit's velocities, whose errors they then have."""
+    times = np.array([image.time_s for image in measurements.images])
+    steps = measurements.interval_velocities_m_s * np.diff(times)[:, None]
+    places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    measured = [picture.position_m for picture in case.pictures]
+    if all(place is not None for place in measured):
+        places = np.array(measured, dtype=np.float64)
+    return [rigid(one.world_from_body, place) for one, place in zip(measurements.attitudes, places, strict=True)]
+
+
+def answer_row(
+    estimate: VelocityEstimate | None, case: StoredCase, measurements: DescentMeasurements
+) -> dict[str, Scalar]:
+    """An answer beside what the inertial unit has, and against the truth where it is known.
+
+    `beside_inertial_m_s` holds the unknown error of the inertial velocity itself. `pair_discrepancy_m_s` does not: it
+    is the change of velocity from the first pair of pictures to the second against the inertial unit's, which DIMES
+    alone tells of.
+    """
+    velocity = _velocity(estimate)
+    details = None if estimate is None else estimate.details
+    chosen = details.chosen if isinstance(details, DimesDetails) else None
+    given = np.full(2, np.nan) if velocity is None else velocity
+    row: dict[str, Scalar] = {
+        "velocity_estimated_x_m_s": float(given[0]),
+        "velocity_estimated_y_m_s": float(given[1]),
+        "beside_inertial_m_s": distance(velocity, measurements.interval_velocities_m_s[1, :2]),
+        "pair_discrepancy_m_s": NAN if chosen is None else chosen.discrepancy_m_s,
+    }
+    if case.truth.velocity_m_s is None:
+        return row
+    true = _true(case)
+    return {**row, **velocity_row("velocity", velocity, true), **consistency_row(estimate, true)}
+
+
+def _velocity(estimate: VelocityEstimate | None) -> Float64[np.ndarray, "2"] | None:
+    return None if estimate is None else estimate.velocity_m_s
+
+
+def _true(case: StoredCase) -> Float64[np.ndarray, "2"]:
+    """NaN where it is not known."""
+    return np.array(case.truth.velocity_m_s or (np.nan, np.nan), dtype=np.float64)
+
+
+def _conditions(case: StoredCase, measurements: DescentMeasurements) -> dict[str, Scalar]:
+    """What the descent was like, as measured."""
+    row: dict[str, Scalar] = {
+        f"altitude_{number}_m": one.altitude_m for number, one in enumerate(measurements.altitudes, start=1)
+    }
+    axes = [
+        image.camera.moved(RigidTransform.from_rotation(attitude.world_from_body)).boresight()
+        for image, attitude in zip(measurements.images, measurements.attitudes, strict=True)
+    ]
+    off_nadir = [float(np.degrees(np.arccos(np.clip(-axis[2], -1.0, 1.0)))) for axis in axes]
+    sun = measurements.sun_direction
+    return {
+        **row,
+        "off_nadir_max_deg": max(off_nadir),
+        "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(sun[2], -1.0, 1.0)))),
+        "truth_known": case.truth.velocity_m_s is not None,
+    }

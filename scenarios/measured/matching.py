@@ -1,0 +1,35 @@
+"""Real pictures held against their measured poses, with no algorithm under test."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel
+
+from scenarios.interface import CaseResult
+from scenarios.measured.case import MeasuredScenario, about, checked, pose
+from scenarios.measured.consistency import agreement_products, agreement_row, agreements, views_of
+from scenarios.measured.parameters import MatchingParameters
+from scenarios.measured.store import images_of
+from sim.streams import Streams
+
+#: Outcomes.
+MATCHED, TOO_FEW = "MATCHED", "TOO_FEW_MATCHES"
+
+
+class MatchingScenario(MeasuredScenario):
+    """Two or more real pictures, held against their measured poses."""
+
+    name = "measured-matching"
+    parameters_type = MatchingParameters
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """One case."""
+        p = checked(parameters, MatchingParameters)
+        images = images_of(p.cases, p.case)
+        pairs = agreements(views_of(images, [pose(picture) for picture in p.case.pictures]))
+        matched = all(pair.residuals_px.size for pair in pairs)
+        return CaseResult(
+            outcome=MATCHED if matched else TOO_FEW,
+            answered=matched,
+            row={**about(p, images), **agreement_row(pairs)},
+            products=agreement_products(images, pairs),
+        )

@@ -1,0 +1,277 @@
+"""Ingested cases on disk: `cases.json`, and beside it pictures, cameras and the flat field that it names with hashes.
+
+Everything is in our conventions: world axes east, north, up; attitudes are the body's; times in seconds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt16
+from pydantic import BaseModel, ConfigDict, ValidationError
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from algorithms.exchange.files import read_picture, write_picture
+from scenarios.measured.layout import TaskName
+from scenarios.own_files import OwnFile
+from sim.camera import CameraModel, read_cahvor, write_cahvor
+from sim.frames import rigid
+from sim.measurements import (
+    AltitudeMeasurement,
+    AttitudeMeasurement,
+    DescentMeasurements,
+    DetectorCalibration,
+    DetectorImage,
+    LandingMeasurements,
+    PoseMeasurement,
+)
+
+#: Version of `cases.json`, and its name.
+SCHEMA = 1
+CASES_FILE = "cases.json"
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class _Plain(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Named(_Plain):
+    """A file beside `cases.json`, and the hash of its contents."""
+
+    file: str
+    sha256: str
+
+
+class StoredPicture(_Plain):
+    """One picture, its size (columns, rows), and what was measured when it was taken."""
+
+    source: str
+    size: tuple[int, int]
+    counts: Named
+    camera: Named
+    time_s: float
+    exposure_s: float
+    world_from_body_xyzw: Quaternion
+    position_m: Vector | None = None
+    altitude_m: float | None = None
+    altitude_time_s: float | None = None
+
+    @property
+    def attitude(self) -> Rotation:
+        """Of the body, in world axes."""
+        return Rotation.from_quat(np.array(self.world_from_body_xyzw))
+
+
+class StoredTruth(_Plain):
+    """What is known beyond what was measured.
+
+    Attributes
+    ----------
+    velocity_m_s
+        Of the camera from the second to the third picture, east and north.
+    poses
+        Of the body at each picture: position, attitude.
+    """
+
+    velocity_m_s: tuple[float, float] | None = None
+    poses: tuple[tuple[Vector, Quaternion], ...] | None = None
+
+
+class StoredCase(_Plain):
+    """One case."""
+
+    name: str
+    pictures: tuple[StoredPicture, ...]
+    interval_velocities_m_s: tuple[Vector, ...] | None = None
+    sun_direction: Vector | None = None
+    slant_range_m: float | None = None
+    site_m: Vector | None = None
+    truth: StoredTruth = StoredTruth()
+
+
+class StoredDetector(_Plain):
+    """What is known of the detector of all pictures."""
+
+    offset_dn: float
+    full_scale_dn: int
+    transfer_row_s: float
+    clear_row_s: float
+    rows_summed: int
+    flat_field: Named | None = None
+
+
+class StoredCases(_Plain):
+    """`cases.json`."""
+
+    schema_version: int
+    name: str
+    description: str = ""
+    task: TaskName
+    folder: str
+    detector: StoredDetector
+    cases: tuple[StoredCase, ...]
+
+
+class CasesFile(OwnFile):
+    """What `marsyard ingest` wrote: all measurements, and the hash of every picture."""
+
+    @classmethod
+    def hash_of(cls, file: str) -> str:
+        """SHA-256 of `cases.json`, which is checked."""
+        return _read(*_version(file))[1]
+
+    @property
+    def stored(self) -> StoredCases:
+        """The cases."""
+        return _read(*_version(self.file))[0]
+
+    @property
+    def folder(self) -> Path:
+        """Where the files lie that it names."""
+        return Path(self.file).parent
+
+
+def _version(file: str) -> tuple[str, int, int]:
+    try:
+        about = Path(file).stat()
+    except OSError as error:
+        raise ValueError(f"{file}: {error.strerror or error}; marsyard ingest writes it") from error
+    return file, about.st_mtime_ns, about.st_size
+
+
+@lru_cache(maxsize=4)
+def _read(file: str, _changed_ns: int, _size: int) -> tuple[StoredCases, str]:
+    """The cases and the file's hash: read once, as all of a campaign's cases ask."""
+    try:
+        contents = Path(file).read_bytes()
+        stored = StoredCases.model_validate_json(contents)
+    except OSError as error:
+        raise ValueError(f"{file}: {error.strerror or error}") from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise ValueError(f"{file}: is not what marsyard ingest wrote: {where}: {first['msg']}") from error
+    if stored.schema_version != SCHEMA:
+        raise ValueError(f"{file}: has schema {stored.schema_version}; this version of Marsyard reads {SCHEMA}")
+    return stored, hashlib.sha256(contents).hexdigest()
+
+
+def write_cases(folder: Path, stored: StoredCases) -> Path:
+    """Writes `cases.json`; returns its path. Raises OSError where that fails."""
+    path = folder / CASES_FILE
+    text = json.dumps(stored.model_dump(mode="json", exclude_defaults=True), indent=1, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")
+    return path
+
+
+def put_picture(folder: Path, name: str, counts: UInt16[np.ndarray, "rows columns"]) -> Named:
+    """Writes a picture beside `cases.json`."""
+    (folder / "pictures").mkdir(exist_ok=True)
+    path = folder / "pictures" / f"{name}.png"
+    write_picture(path, counts)
+    return _named(folder, path)
+
+
+def put_camera(folder: Path, number: int, camera: CameraModel) -> Named:
+    """Writes a camera beside `cases.json`."""
+    (folder / "cameras").mkdir(exist_ok=True)
+    path = folder / "cameras" / f"{number:06d}.cahvor"
+    write_cahvor(camera, path)
+    return _named(folder, path)
+
+
+def put_flat_field(folder: Path, flat: Float64[np.ndarray, "rows columns"]) -> Named:
+    """Writes the flat field beside `cases.json`."""
+    path = folder / "flat_field.npy"
+    np.save(path, flat, allow_pickle=False)
+    return _named(folder, path)
+
+
+def _named(folder: Path, path: Path) -> Named:
+    return Named(file=path.relative_to(folder).as_posix(), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+def _unchanged(folder: Path, named: Named) -> Path:
+    """The file's path. Raises ValueError where it is gone, or not as it was written."""
+    path = folder / named.file
+    try:
+        found = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror or error}; ingest again") from error
+    if found != named.sha256:
+        raise ValueError(f"{path}: has changed since it was ingested")
+    return path
+
+
+def images_of(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]:
+    """The pictures of a case with their cameras in the body frame.
+
+    Raises
+    ------
+    ValueError
+        Where a file has changed or cannot be read.
+    """
+    detector, folder = cases.stored.detector, cases.folder
+    flat = None if detector.flat_field is None else np.load(_unchanged(folder, detector.flat_field), allow_pickle=False)
+    images = []
+    for picture in case.pictures:
+        counts = read_picture(_unchanged(folder, picture.counts))
+        known = DetectorCalibration(
+            flat_field=np.ones(counts.shape) if flat is None else flat,
+            exposure_s=picture.exposure_s,
+            transfer_row_s=detector.transfer_row_s,
+            clear_row_s=detector.clear_row_s,
+            rows_summed=detector.rows_summed,
+            offset_dn=detector.offset_dn,
+            full_scale_dn=detector.full_scale_dn,
+        )
+        camera = read_cahvor(_unchanged(folder, picture.camera))
+        images.append(DetectorImage(counts, picture.time_s, camera, known))
+    return tuple(images)
+
+
+def descent_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> DescentMeasurements:
+    """What a velocity estimator is given."""
+    attitudes = [AttitudeMeasurement(one.attitude, one.time_s) for one in case.pictures]
+    altitudes = [
+        AltitudeMeasurement(
+            math.nan if one.altitude_m is None else one.altitude_m,
+            one.time_s if one.altitude_time_s is None else one.altitude_time_s,
+        )
+        for one in case.pictures
+    ]
+    return DescentMeasurements(
+        images=(images[0], images[1], images[2]),
+        attitudes=(attitudes[0], attitudes[1], attitudes[2]),
+        altitudes=(altitudes[0], altitudes[1], altitudes[2]),
+        interval_velocities_m_s=np.array(case.interval_velocities_m_s, dtype=np.float64),
+        sun_direction=np.array(case.sun_direction, dtype=np.float64),
+    )
+
+
+def pose_of(position_m: Vector, xyzw: Quaternion) -> RigidTransform:
+    """A body's pose in the world."""
+    return rigid(Rotation.from_quat(np.array(xyzw)), np.array(position_m))
+
+
+def landing_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> LandingMeasurements:
+    """What an estimator of landing sites is given."""
+    poses = [
+        PoseMeasurement(pose_of(one.position_m or (0.0, 0.0, 0.0), one.world_from_body_xyzw), one.time_s)
+        for one in case.pictures
+    ]
+    return LandingMeasurements(
+        images=(images[0], images[1]),
+        poses=(poses[0], poses[1]),
+        slant_range_m=math.nan if case.slant_range_m is None else case.slant_range_m,
+        up_body=case.pictures[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0])),
+        apriori_site_world=np.array(case.site_m, dtype=np.float64),
+    )

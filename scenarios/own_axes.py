@@ -1,0 +1,56 @@
+"""What a file of poses leaves unsaid: its world axes, whose axes its attitudes are of, and where the camera is."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from scipy.spatial.transform import Rotation
+
+from sim.frames import SITE_FROM_WORLD
+
+#: Rotations from a file's world axes to ours, which are east, north, up.
+_WORLD = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}
+#: OpenCV's camera axes (x right, y down, z forward) in the body's, whose camera looks along -z, its columns along x.
+_CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+
+
+class RecordedAxes(BaseModel):
+    """The axes of recorded poses, and the camera's place in what was recorded."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    axes: Annotated[Literal["enu", "ned"], Field(description="world axes: east, north, up; or north, east, down")]
+    attitude_of: Annotated[
+        Literal["camera", "body"],
+        Field(description="whose axes: OpenCV's of the camera, or the body's, whose camera looks along -z"),
+    ] = "camera"
+    mounting: Annotated[
+        tuple[float, float, float, float],
+        Field(description="quaternion x, y, z, w from those axes of the camera or body to the recorded vehicle's"),
+    ] = (0.0, 0.0, 0.0, 1.0)
+    lever_m: Annotated[
+        tuple[float, float, float], Field(description="the camera in the recorded vehicle's axes, m")
+    ] = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _mounting_is_a_rotation(self) -> RecordedAxes:
+        if abs(float(np.linalg.norm(self.mounting)) - 1.0) > 1e-3:
+            raise ValueError(f"mounting {list(self.mounting)} is no quaternion of length 1")
+        return self
+
+    @property
+    def world(self) -> Rotation:
+        """From the file's world axes to ours."""
+        return _WORLD[self.axes]
+
+    def bodies(self, world_from_vehicle: Rotation) -> Rotation:
+        """Attitudes of our body from the recorded vehicle's, world axes on both sides being ours."""
+        attitudes = world_from_vehicle * Rotation.from_quat(np.array(self.mounting))
+        return attitudes * _CAMERA_IN_BODY.inv() if self.attitude_of == "camera" else attitudes
+
+    def levers(self, world_from_vehicle: Rotation) -> Float64[np.ndarray, "*batch 3"]:
+        """From the recorded vehicle's places to the camera's, our world axes, m."""
+        return np.asarray(world_from_vehicle.apply(np.array(self.lever_m)))
