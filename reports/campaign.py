@@ -29,6 +29,7 @@ from reports.explorer import script as explorer_script
 from reports.faults import faults_section
 from reports.hda.every import HDA_SECTIONS
 from reports.judged import Judged, judged
+from reports.measured.agreement import agreement_section
 from reports.sampled import sampled
 from reports.scatter import scatter_section
 from reports.section import Section, SectionMaker, Subject
@@ -51,6 +52,7 @@ SCHEMA = 2
 #: Sections that a page has where the rows hold their columns, in the page's order.
 FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
     field_test_section,
+    agreement_section,
     table_1_section,
     beside_section,
     updates_section,

@@ -31,7 +31,8 @@ from reports.hda.products import (
     tracked_features,
     true_ground,
 )
-from reports.svg import INK, MUTED, in_page_style
+from reports.pictures import show_picture
+from reports.svg import MUTED, in_page_style
 
 T = TypeVar("T")
 
@@ -67,8 +68,8 @@ def draw_tracks(products: Mapping[str, Any]) -> Figure:
     shown, tracks = _known(pictures(products), "pictures"), _known(tracked_features(products), "tracks")
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _show(left, shown[0])
-    _show(right, shown[1])
+    show_picture(left, shown[0])
+    show_picture(right, shown[1])
     _draw_features(left, tracks.first, tracks)
     moved = np.stack([tracks.first, tracks.second], axis=1)[tracks.accepted]
     right.plot(*np.moveaxis(moved, -1, 0).transpose(0, 2, 1), color=FOUND, linewidth=0.8, alpha=0.9)
@@ -102,8 +103,8 @@ def draw_epipolar(products: Mapping[str, Any]) -> Figure:
     chosen = _thinned(matches)
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _show(left, shown[0])
-    _show(right, shown[1])
+    show_picture(left, shown[0])
+    show_picture(right, shown[1])
     _draw_squares(left, matches.grid[chosen], "#ff4b3e")
     segments = np.stack([matches.starts, matches.ends], axis=1)[chosen]
     right.plot(*np.moveaxis(segments, -1, 0).transpose(0, 2, 1), color="#35d46b", linewidth=0.8)
@@ -178,7 +179,7 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
     grid = figure.add_gridspec(1, 3)
     plain, over = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
     for axes in (plain, over):
-        _show(axes, shown[0])
+        show_picture(axes, shown[0])
     limits = over.get_xlim(), over.get_ylim()
     if np.isfinite(maps.pixels).all():
         known = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
@@ -242,18 +243,6 @@ def _known(part: T | None, name: str) -> T:
     if part is None:
         raise ValueError(f"the products hold no {name}")
     return part
-
-
-def _show(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
-    """A picture in grey, its contrast stretched between the 1 % and the 99 % quantile."""
-    finite = picture[np.isfinite(picture)]
-    low, high = np.quantile(finite, (0.01, 0.99)) if finite.size else (0.0, 1.0)
-    axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="antialiased")
-    axes.set(xticks=[], yticks=[], facecolor=INK)
-    axes.autoscale(enable=False)
-    axes.grid(visible=False)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
 
 
 def _draw_features(axes: Axes, pixels: Float[np.ndarray, "n 2"], tracks: TrackedFeatures, *, lost: bool = True) -> None:

@@ -1,0 +1,1 @@
+"""Real cases: how their pictures and measured poses agree."""

@@ -1,0 +1,82 @@
+"""What the page shows of a real case: its pictures with their matches, then what its task's own system shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reports.dimes.shown import DIMES
+from reports.hda.case_figures import FIGURES, figures_reached
+from reports.measured.case_figures import (
+    MatchedPair,
+    draw_pair,
+    is_measured_case,
+    matched_pairs,
+    write_measured_figures,
+)
+from reports.plates import plate
+from reports.shown import CaseView, System, TableRow
+from reports.wording import number
+
+#: Pairs whose pictures go into the page.
+_MOST_PAIRS = 4
+#: Figures of a landing that need no truth.
+_WITHOUT_TRUTH = ("fig1-tracks", "fig3-epipolar", "fig4-elevation")
+_LEGEND = (
+    "Features matched between one picture and the next, coloured by how far they lie from where the measured poses "
+    "allow them; grey crosses: matches that no rigid motion explains, which are left out. Offsets are those of the "
+    "later picture: spread tells of the matching and of the lens, a common offset of an attitude that is off. "
+)
+
+
+def view(products: Mapping[str, Any], key: str) -> CaseView:
+    """A real case."""
+    pairs = matched_pairs(products)
+    plates = [plate(draw_pair(pair), f"{key}matches{pair.number}", f"{pair.told}.", wide=True) for pair in pairs]
+    left_out = len(plates) - _MOST_PAIRS
+    facts = [("Pairs not shown", str(left_out))] if left_out > 0 else []
+    plates = plates[:_MOST_PAIRS]
+    if DIMES.is_case(products) and "tracks" in products:
+        theirs = DIMES.view(products, key)
+        return CaseView([*facts, *theirs.facts], [*plates, *theirs.plates], theirs.head, theirs.rows)
+    plates += [plate(FIGURES[name](products), f"{key}{name[:4]}", f"{name}.", wide=True) for name in _landing(products)]
+    head = [
+        "Pictures",
+        "Matches",
+        "Wrong",
+        "Median residual (px)",
+        "90 % (px)",
+        "Offset right (px)",
+        "Offset down (px)",
+    ]
+    return CaseView(facts, plates, head, [_row(pair) for pair in pairs])
+
+
+def _row(pair: MatchedPair) -> TableRow:
+    residuals, offsets = pair.residuals_px, pair.offsets[pair.right]
+    told = [f"{pair.number} and {pair.number + 1}", f"{residuals.size:,}", f"{int((~pair.right).sum()):,}"]
+    if not residuals.size:
+        return TableRow([*told, *4 * ["–"]], succeeded=False)
+    values = [np.median(residuals), np.quantile(residuals, 0.9, method="higher"), *np.nanmedian(offsets, axis=0)]
+    return TableRow([*told, *(number(float(value)) for value in values)], succeeded=True)
+
+
+def _landing(products: Mapping[str, Any]) -> list[str]:
+    return [name for name in figures_reached(products) if name in _WITHOUT_TRUTH]
+
+
+def _write(directory: Path, products: Mapping[str, Any]) -> list[Path]:
+    written = write_measured_figures(directory, products)
+    if DIMES.is_case(products) and "tracks" in products:
+        return [*written, *DIMES.write(directory, products)]
+    for name in _landing(products):
+        path = directory / f"{name}.png"
+        FIGURES[name](products).savefig(path, dpi=130, facecolor="#ffffff", metadata={"Software": None})
+        written.append(path)
+    return written
+
+
+MEASURED = System(is_measured_case, view, _write, _LEGEND)
