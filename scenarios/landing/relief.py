@@ -1,9 +1,10 @@
 """The exact ground of a landing, rocks and all, and what it is like under a lander: the truth about hazards.
 
-Slope and roughness are defined as the algorithm defines them (section III of the paper): the angle of the
-least-median-of-squares plane over the lander's footprint, and the greatest distance from it, upwards or downwards. They
-are taken from the terrain's own heights and its rocks' triangles, over the very footprint in question: nothing is
-interpolated between footprints.
+Slope is the angle of the plane of least absolute deviations over the lander's footprint, roughness the greatest
+distance from it, upwards or downwards. As the paper's plane of least median of squares (section III), by which the
+algorithm maps, it stays with the ground where a rock stands on it; but there is only one, it needs no random trials, and
+it moves continuously with the ground, as a truth must (docs/adr/0028). Heights are the terrain's own and those of its
+rocks' triangles, over the very footprint in question: nothing is interpolated between footprints.
 """
 
 from __future__ import annotations
@@ -24,11 +25,6 @@ from scenarios.views import SiteGround
 SPACING_DIAMETERS = 1.0 / 80.0
 #: Every so many of these are used to lay planes: 20 points across, some 310 in all.
 FITTED_EVERY = 4
-#: Random triples of points for a plane. With a third of the points off the plane all of 60 miss it in one footprint of
-#: three billion, with half of them off in one of three thousand.
-PLANE_TRIALS = 60
-#: Of the triples, always the same: truth is a function of the ground.
-SEED = 2005
 
 
 @dataclass(frozen=True)
@@ -141,10 +137,9 @@ class Relief:
         if np.any(middles < reach) or np.any(middles >= np.array(self.heights_m.shape) - reach):
             raise ValueError("a footprint reaches beyond the ground whose heights are known")
         slopes, roughness, exceeding = (np.empty(len(middles)) for _ in range(3))
-        triples = np.random.default_rng(SEED).random((PLANE_TRIALS, 3))
         rows, columns = middles.T.copy()
         kernels.footprints(
-            self.heights_m, rows, columns, offsets, fitted, self.spacing_m, triples, limits.max_roughness_m,
+            self.heights_m, rows, columns, offsets, fitted, self.spacing_m, limits.max_roughness_m,
             slopes, roughness, exceeding,
         )  # fmt: skip
         shape = places.shape[:-1]
