@@ -10,9 +10,11 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from sim.cache import cache_directory
+from sim.processor import processor_features
 
 #: The folders that hold kernels, side by side in the tree and where they are installed.
 _FOLDERS = ("sim", "algorithms", "scenarios")
@@ -33,6 +35,31 @@ def use_own_folder() -> None:
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(folder)
+
+
+def kernels_are_ready(user: str) -> bool:
+    """Whether a user of the kernels (a scenario) has run to its end with those that are there, on this processor.
+
+    False where nothing can be kept: then each process compiles them anew.
+    """
+    mark = _mark(user)
+    return mark is not None and mark.exists()
+
+
+def note_ready(user: str) -> None:
+    """Notes that this user's kernels are compiled."""
+    mark = _mark(user)
+    if mark is not None:
+        with suppress(OSError):
+            mark.parent.mkdir(parents=True, exist_ok=True)
+            mark.touch()
+
+
+def _mark(user: str) -> Path | None:
+    # numba keeps one compiled form for each kind of processor, as compiled code runs on its own kind only
+    folder = os.environ.get("NUMBA_CACHE_DIR")
+    digest = hashlib.sha256(f"{user} {processor_features()}".encode())
+    return None if folder is None else Path(folder) / f"{digest.hexdigest()[:16]}.ready"
 
 
 def _kernel_sources() -> list[Path]:

@@ -136,6 +136,12 @@ check_rendering() {
     [ -n "$works" ] || fail "no GL backend renders a picture: $either"
 }
 
+# Otherwise the first run of each system waits for it.
+compile_kernels() {
+    say "compiling numeric kernels (about a minute)"
+    "$venv/bin/marsyard" compile >/dev/null </dev/null || say "kernels were not compiled: 'marsyard compile' says why; the first runs will"
+}
+
 # One set-up at a time in one folder.
 if command -v flock >/dev/null; then
     exec 9<"$PWD"
@@ -157,6 +163,7 @@ install_compiler
 install_browser
 install_packages
 check_rendering
+compile_kernels
 rm -f "$unfinished"
 printf '%s %s' "$(foundation)" "$(contents)" >"$stamp"
 say "done"

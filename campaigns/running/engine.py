@@ -28,7 +28,8 @@ from campaigns.store.retention import ProductStore, keep_while_running
 from campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from campaigns.store.table import TABLE_FILE, write_table
 from campaigns.store.worst import showcase_case, worst_cases
-from scenarios.registry import UnknownScenarioError, scenario
+from scenarios.registry import SCENARIOS, UnknownScenarioError, scenario
+from sim.kernel_cache import kernels_are_ready, note_ready
 
 #: What a requirement without a bound, and a population, ask a column to be.
 FLAG = "column of true and false"
@@ -269,6 +270,8 @@ def _run_cases(work: _Work, workers: Workers, parts: Sequence[Sequence[int]]) ->
     products = ProductStore(work.directory, configuration.retain.budget_gb)
     keep = keep_while_running(configuration)
     cases = itertools.chain.from_iterable(parts)
+    if configuration.scenario in SCENARIOS and not kernels_are_ready(configuration.scenario):
+        watch.note("the first cases wait for kernels to be compiled, once on this machine (ahead: marsyard compile)")
     watch.begin("cases", total)
     checked = False
     for ended in run_cases(workers, configuration, cases, keep=keep, total=total):
@@ -278,6 +281,7 @@ def _run_cases(work: _Work, workers: Workers, parts: Sequence[Sequence[int]]) ->
         finished = next((one.row for one in ended if one.row["outcome"] not in UNFINISHED), None)
         if not checked and finished is not None:
             check_metrics(configuration, finished, work.directory)
+            note_ready(configuration.scenario)
             checked = True
         for _ in ended:
             watch.step()

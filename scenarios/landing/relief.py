@@ -2,9 +2,9 @@
 
 Slope is the angle of the plane of least absolute deviations over the lander's footprint, roughness the greatest
 distance from it, upwards or downwards. As the paper's plane of least median of squares (section III), by which the
-algorithm maps, it stays with the ground where a rock stands on it; but there is only one, it needs no random trials, and
-it moves continuously with the ground, as a truth must (docs/adr/0028). Heights are the terrain's own and those of its
-rocks' triangles, over the very footprint in question: nothing is interpolated between footprints.
+algorithm maps, it stays with the ground where a rock stands on it; but there is only one, it needs no random trials,
+and it moves continuously with the ground, as a truth must (docs/adr/0028). Heights are the terrain's own and those of
+its rocks' triangles, over the very footprint in question: nothing is interpolated between footprints.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from sim.kernel_cache import kernels_are_ready, note_ready
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -37,3 +39,21 @@ def test_a_changed_kernel_is_compiled_anew_with_all_that_call_it(kernels: str, t
 
 def test_the_users_own_choice_stands(tmp_path: Path) -> None:
     assert _folder(ROOT, tmp_path, NUMBA_CACHE_DIR="/somewhere") == "/somewhere"
+
+
+def test_who_has_run_with_the_kernels_is_noted_until_they_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "one"))
+    assert not kernels_are_ready("descent")
+    note_ready("descent")
+    assert kernels_are_ready("descent")
+    assert not kernels_are_ready("landing")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "two"))
+    assert not kernels_are_ready("descent")
+
+
+def test_where_nothing_can_be_kept_nobody_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    note_ready("descent")
+    assert not kernels_are_ready("descent")

@@ -1,0 +1,40 @@
+"""`marsyard compile`: compiles the numeric kernels ahead of the first run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+
+import typer
+
+from marsyard.campaign_command import says_what_is_wrong
+
+#: A case of each system, with settings that make it small: together they call all kernels that campaigns call.
+SMALL: Mapping[str, Sequence[str]] = {
+    "dimes-smoke": ("terrain.samples=512",),
+    "vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5"),
+    "hda-benign": ("terrain.samples=512",),
+}
+
+
+@says_what_is_wrong
+def compile_kernels() -> None:
+    """Compile the numeric kernels now, so that the first run does not wait for it.
+
+    Each system runs a small case. What is compiled stays on disk until the code changes (`marsyard clean` tells where).
+    """
+    from campaigns.definition.loading import load_campaign
+    from campaigns.execution.worker_process import limit_threads
+    from sim.kernel_cache import kernels_are_ready, note_ready
+
+    limit_threads()
+    for name, settings in SMALL.items():
+        campaign = load_campaign(name, settings)
+        scenario = campaign.configuration.scenario
+        if kernels_are_ready(scenario):
+            typer.echo(f"{scenario}: compiled before")
+            continue
+        began = time.monotonic()
+        campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
+        note_ready(scenario)
+        typer.echo(f"{scenario}: compiled, {time.monotonic() - began:.0f} s")

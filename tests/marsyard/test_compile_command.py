@@ -1,0 +1,30 @@
+"""`marsyard compile`: small cases of every system, none where it was done before; runs say when they wait for it."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from campaigns.definition.loading import load_campaign
+from marsyard.cli import app
+from marsyard.compile_command import SMALL
+from scenarios.registry import SCENARIOS
+from sim.kernel_cache import note_ready
+
+
+def test_every_system_has_a_small_case_that_the_catalogue_takes() -> None:
+    scenarios = {load_campaign(name, settings).configuration.scenario for name, settings in SMALL.items()}
+    # the field test, recorded drives and real pictures call the kernels of these
+    others = {"fieldtest", "rover-drive", "measured-velocity", "measured-landing", "measured-matching"}
+    assert scenarios == set(SCENARIOS) - others
+
+
+def test_what_is_compiled_is_not_compiled_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    for scenario in ("descent", "rover", "landing"):
+        note_ready(scenario)
+    done = CliRunner().invoke(app, ["compile"])
+    assert (done.exit_code, done.output) == (
+        0,
+        "descent: compiled before\nrover: compiled before\nlanding: compiled before\n",
+    )
