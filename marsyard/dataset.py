@@ -1,7 +1,8 @@
 """Data sets for learning: a campaign's pictures and their truth, in shards that any WebDataset reader takes.
 
 A shard is a tar of whole cases. Of each picture it holds, under one key, the 16-bit picture (`image.png`), range
-(`range.npy`, m), normals (`normal.npy`, world axes), masks (`rocks.png`; `hazard.png`: 0 safe, 1 not, 255 not known),
+(`range.npy`, m), normals (`normal.npy`, world axes), masks (`rocks.png`; of landings `hazard.png`: 0 safe, 1 not, 255
+not known),
 the camera (`cahvor`) and all else (`json`). A shard that is there is whole, and never written again: a data set that
 was interrupted is gone on with, and the same campaign makes the same bytes.
 """
@@ -35,9 +36,8 @@ def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: 
         Where the scenario gives no samples, the folder holds another data set, or cannot be written.
     """
     if not isinstance(campaign.scenario, GivesSamples):
-        raise CampaignError(
-            f"the scenario '{campaign.configuration.scenario}' has no hazard maps to learn from; allowed: landing"
-        )
+        named = campaign.configuration.scenario
+        raise CampaignError(f"the scenario '{named}' gives no samples to learn from; allowed: descent, landing")
     _claim(campaign, folder, cases_per_shard)
     total = campaign.configuration.total_cases
     starts = range(0, total, cases_per_shard)
@@ -109,7 +109,8 @@ def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
         yield f"{key}.range.npy", _npy(sample.range_m)
         yield f"{key}.normal.npy", _npy(sample.normal)
         yield f"{key}.rocks.png", _png(sample.rocks)
-        yield f"{key}.hazard.png", _png(sample.hazard)
+        if sample.hazard is not None:
+            yield f"{key}.hazard.png", _png(sample.hazard)
         yield f"{key}.cahvor", _camera(sample)
         yield f"{key}.json", json.dumps({**told, "bits": sample.bits, **sample.about}, indent=1).encode()
 

@@ -31,7 +31,7 @@ class Sample:
     rocks
         1 where the pixel sees a rock or another body, 0 where ground.
     hazard
-        What a lander would stand on there: 0 safe, 1 not, 255 not all in sight.
+        What a lander would stand on there: 0 safe, 1 not, 255 not all in sight; None where no lander is asked about.
     camera
         In the body's axes.
     about
@@ -43,9 +43,14 @@ class Sample:
     range_m: Float32[np.ndarray, "rows columns"]
     normal: Float32[np.ndarray, "rows columns 3"]
     rocks: UInt8[np.ndarray, "rows columns"]
-    hazard: UInt8[np.ndarray, "rows columns"]
+    hazard: UInt8[np.ndarray, "rows columns"] | None
     camera: CameraModel
     about: Mapping[str, Any]
+
+
+def summed_rows(rows_summed: int) -> slice:
+    """The rows of a frame whose truth stands for that of a picture's rows: the middle one of each that are summed."""
+    return slice(rows_summed // 2, None, rows_summed)
 
 
 @runtime_checkable

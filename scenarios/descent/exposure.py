@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, UInt16
@@ -29,12 +30,32 @@ def expose(
     streams: Streams,
 ) -> list[UInt16[np.ndarray, "rows columns"]]:
     """The pictures of these states as they are delivered, in their order."""
+    taken = exposures(p, world, states, optics, detector, streams)
+    return delivered(p.faults, [one.counts for one in taken])
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """A picture as the detector made it, and the frame that it saw."""
+
+    counts: UInt16[np.ndarray, "rows columns"]
+    frame: Frame
+
+
+def exposures(
+    p: DescentScenarioParameters,
+    world: World,
+    states: Sequence[State],
+    optics: Optics,
+    detector: Detector,
+    streams: Streams,
+) -> Iterator[Exposure]:
+    """The pictures of these states before faults of their delivery, one after the other."""
     renderer = process_renderer(p.render.backend)
     scene = _scene(p, world, states, optics, streams)
     mounting = _mounting(p, streams)
     shield = _shield(p, states[0], streams)
     noise = streams.generator("detector noise")
-    pictures = []
     for state in states:
         frame = renderer.render(scene, optics.rays, state.world_from_body * mounting, time_s=state.time_s)
         # the camera sits at the body's origin: its mounting turns it, but moves it nowhere
@@ -45,8 +66,7 @@ def expose(
             state.velocity_m_s,
             state.attitude.apply(state.body_rate_rad_s),
         )
-        pictures.append(detector.expose(_light(p, world, frame, shield, state.time_s), noise, motion))
-    return delivered(p.faults, pictures)
+        yield Exposure(detector.expose(_light(p, world, frame, shield, state.time_s), noise, motion), frame)
 
 
 def _scene(

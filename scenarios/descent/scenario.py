@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from pydantic import BaseModel
 
 from algorithms.answers import checked_velocity
@@ -13,6 +15,7 @@ from scenarios.descent.measurement import Instruments, measure
 from scenarios.descent.optics import camera_optics
 from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.descent.room import room
+from scenarios.descent.samples import descent_samples
 from scenarios.descent.score import (
     carried_to_firing,
     conditions,
@@ -25,6 +28,7 @@ from scenarios.descent.score import (
 from scenarios.descent.world import World
 from scenarios.estimators import VELOCITY
 from scenarios.interface import CaseResult
+from scenarios.samples import Sample
 from scenarios.trial import Judged, attempted, case_result
 from scenarios.velocity import consistency_row, velocity_row
 from sim.sensor import Detector
@@ -48,6 +52,10 @@ class DescentScenario:
         """Builds one terrain of the bank."""
         p = _checked(parameters)
         TerrainBank(p.terrain, p.place.bank_seed).terrain(shared_input)
+
+    def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
+        """The three pictures of a case with the truth of their pixels."""
+        return descent_samples(_checked(parameters), streams)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One descent."""

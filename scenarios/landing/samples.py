@@ -13,7 +13,7 @@ from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.landing.pictures import Pair, take_pictures
 from scenarios.landing.truth import GroundTruth
 from scenarios.landing.world import World, camera_optics
-from scenarios.samples import Sample
+from scenarios.samples import Sample, summed_rows
 from sim.streams import Streams
 
 #: Values of a hazard map: a lander's footprint about the pixel's point is safe, is not, or is not all in sight.
@@ -34,7 +34,7 @@ def _sample(
     p: LandingScenarioParameters, world: World, flight: Flight, pair: Pair, truth: GroundTruth, number: int
 ) -> Sample:
     frame, image, state = pair.frames[number], pair.images[number], flight.states[number]
-    rows = np.s_[p.detector.rows_summed // 2 :: p.detector.rows_summed]  # the truth of summed rows' middle one
+    rows = summed_rows(p.detector.rows_summed)
     points = frame.points_world()[rows]
     about: dict[str, Any] = {
         "site": p.site,

@@ -6,6 +6,7 @@ import io
 import json
 import tarfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from campaigns.definition.loading import load_campaign
 from marsyard.cli import app
+from scenarios.descent.parameters import DescentScenarioParameters
+from scenarios.descent.world import World
 from sim.camera import read_cahvor
 
 CAMPAIGN = """name = "samples"
@@ -52,6 +56,15 @@ def contents(path: Path) -> dict[str, bytes]:
         return {one.name: shard.extractfile(one).read() for one in shard.getmembers()}  # type: ignore[union-attr]
 
 
+def points_of(told: dict[str, Any], camera_file: Path, distance: np.ndarray) -> np.ndarray:
+    """World points of a sample's pixels, from its pose, camera and ranges."""
+    camera = read_cahvor(camera_file)
+    origins, directions = camera.rays(camera.pixel_grid())
+    turn = Rotation.from_quat(told["world_from_body_xyzw"])
+    seen = (origins + distance[..., None] * directions).reshape(-1, 3)
+    return (np.array(told["position_m"]) + turn.apply(seen)).reshape(*distance.shape, 3)
+
+
 def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: Path) -> None:
     status, output = made(tmp_path)
     assert status == 0, output
@@ -76,11 +89,7 @@ def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: P
     # pose, camera and range give world points; of flat parts the height changes as the normals say
     path = tmp_path / "camera.cahvor"
     path.write_bytes(files["0000001-0.cahvor"])
-    camera = read_cahvor(path)
-    origins, directions = camera.rays(camera.pixel_grid())
-    turn = Rotation.from_quat(told["world_from_body_xyzw"])
-    points = np.array(told["position_m"]) + turn.apply((origins + distance[..., None] * directions).reshape(-1, 3))
-    points = points.reshape(normal.shape)
+    points = points_of(told, path, distance)
     bare = rocks[:-1, :-1] + rocks[1:, :-1] + rocks[:-1, 1:] == 0
     across, along = points[:-1, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, :-1]
     fitted = np.cross(along, across)
@@ -99,10 +108,39 @@ def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: P
     assert "holds another data set (configuration_sha256 differs)" in output
 
 
-def test_campaigns_without_hazards_are_refused(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["dataset", "dimes-smoke", "--out", str(tmp_path / "set")])
+def test_descents_give_their_three_pictures(tmp_path: Path) -> None:
+    settings = ["terrain.samples=512", "place.bank=8"]
+    words = [part for setting in settings for part in ("--set", setting)]
+    out = tmp_path / "set"
+    result = CliRunner().invoke(app, ["dataset", "dimes-smoke", "-n", "1", "--jobs", "1", "--out", str(out), *words])
+    assert result.exit_code == 0, result.output
+    files = contents(out / "shard-000000.tar")
+    kinds = {name.partition(".")[2] for name in files}
+    assert kinds == {"image.png", "range.npy", "normal.npy", "rocks.png", "cahvor", "json"}
+    assert {name.partition(".")[0] for name in files} == {f"0000000-{number}" for number in range(3)}
+
+    campaign = load_campaign("dimes-smoke", settings)
+    parameters = campaign.parameters(0)
+    assert isinstance(parameters, DescentScenarioParameters)
+    surface = World.of(parameters).surface
+    path = tmp_path / "camera.cahvor"
+    for number in range(3):
+        told = json.loads(files[f"0000000-{number}.json"])
+        path.write_bytes(files[f"0000000-{number}.cahvor"])
+        distance = np.load(io.BytesIO(files[f"0000000-{number}.range.npy"]))
+        points = points_of(told, path, distance)
+        seen = np.isfinite(distance)
+        assert seen.mean() > 0.9
+        x, y, z = points[seen].T
+        # within what a pixel's level of detail smooths of the ground: its own size, some 2 m at 2000 m
+        assert np.median(abs(z - surface.height(x, y))) < 0.2
+        assert told["velocity_m_s"][2] < -60.0
+
+
+def test_scenarios_without_samples_are_refused(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["dataset", "vtt-montecarlo", "--out", str(tmp_path / "set")])
     assert result.exit_code == 2
-    assert "has no hazard maps to learn from; allowed: landing" in result.output
+    assert "gives no samples to learn from; allowed: descent, landing" in result.output
 
 
 @pytest.mark.parametrize("words", [("--shard", "0"), ("--jobs", "0")])

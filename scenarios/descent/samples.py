@@ -1,0 +1,59 @@
+"""What of a descent's pictures a network can learn from: each with what is true of its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from scenarios.descent.exposure import Exposure, exposures
+from scenarios.descent.faults import faulty_detector
+from scenarios.descent.flight import flown_descent, picture_states
+from scenarios.descent.optics import camera_optics
+from scenarios.descent.parameters import DescentScenarioParameters
+from scenarios.descent.world import World
+from scenarios.samples import Sample, summed_rows
+from sim.camera import CameraModel
+from sim.dynamics import State
+from sim.sensor import Detector
+from sim.streams import Streams
+
+
+def descent_samples(p: DescentScenarioParameters, streams: Streams) -> Iterator[Sample]:
+    """The three pictures of a case as the detector made them, with the truth of their pixels."""
+    world = World.of(p)
+    states = picture_states(p, flown_descent(p, world.surface, streams).motion)
+    optics = camera_optics(p.camera)
+    detector = Detector.drawn(
+        optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector response")
+    )
+    taken = exposures(p, world, states, optics, detector, streams)
+    camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
+    for state, exposure in zip(states, taken, strict=True):
+        yield _sample(p, world, state, exposure, camera)
+
+
+def _sample(
+    p: DescentScenarioParameters, world: World, state: State, exposure: Exposure, camera: CameraModel
+) -> Sample:
+    frame, rows = exposure.frame, summed_rows(p.detector.rows_summed)
+    about: dict[str, Any] = {
+        "site": p.site or "plain",
+        "time_s": state.time_s,
+        # the camera's axes are the body's, turned by the error of its alignment
+        "position_m": np.asarray(frame.world_from_body.translation).tolist(),
+        "world_from_body_xyzw": frame.world_from_body.rotation.as_quat().tolist(),
+        "velocity_m_s": state.velocity_m_s.tolist(),
+        "sun_direction": world.sun.direction.tolist(),
+    }
+    return Sample(
+        image=exposure.counts,
+        bits=p.detector.bits,
+        range_m=frame.range_m[rows].astype(np.float32),
+        normal=frame.normal[rows],
+        rocks=(frame.body[rows] >= 0).astype(np.uint8),
+        hazard=None,
+        camera=camera,
+        about=about,
+    )
