@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks import descent, engine, estimators, hda, pictures, vtt
+from benchmarks import descent, engine, estimators, hda, pictures, reporting, vtt
 from benchmarks.page import PAGE, write_page
 from benchmarks.timing import Figure
 from sim.processor import processor_features
@@ -40,6 +40,7 @@ def main() -> None:
         *vtt.figures(9),
         *hda.figures(9),
         *engine.figures(),
+        *reporting.figures(),
     ]
     print(f"{'core-seconds, unless said otherwise':<52}{'median':>8}{'least':>8}{'most':>8}  {'bar':<8}")
     for figure in figures:

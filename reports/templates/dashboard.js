@@ -45,4 +45,6 @@
   form.addEventListener("input", apply);
   form.addEventListener("submit", (event) => event.preventDefault());
   form.addEventListener("reset", () => setTimeout(apply));
+  // what was chosen before a reload or a way back, or before this ran
+  window.addEventListener("pageshow", apply);
 })();

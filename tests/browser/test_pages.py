@@ -139,6 +139,16 @@ def test_campaigns_are_filtered(campaigns: Path, open_page: Open) -> None:
     assert seen.complaints == []
 
 
+def test_a_filter_stands_on_the_way_back(campaigns: Path, open_page: Open) -> None:
+    page, seen = open_page(_index(campaigns))
+    page.locator("select[name=site]").select_option("meridiani")
+    page.locator(".campaigns tbody tr:visible a").first.click()
+    page.go_back()
+    chosen, shown = page.locator("select[name=site]").input_value(), page.locator(".campaigns tbody tr:visible").count()
+    assert (chosen, shown) in {("meridiani", 1), ("", 3)}
+    assert seen.complaints == []
+
+
 def test_two_clicks_lead_from_a_requirement_to_the_worst_cases_pictures(campaigns: Path, open_page: Open) -> None:
     page, seen = open_page(_index(campaigns))
     page.locator("input[name=until]").fill("2026-01-01")
