@@ -5,8 +5,8 @@ given which the draws are independent: failures by the exact distribution of Man
 hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int. Statist.
 37, 1960). Where they have few terrains in common, whole terrains are compared, each by the mean of as many cases.
 
-Small probabilities of ranks are those of permutations: where many values are tied, as shares of a few cases on a terrain
-are, the sum of ranks is skewed, and its normal approximation is too small by a factor of two to three at 0.001.
+Small probabilities of ranks are those of permutations: where many values are tied, as shares of a few cases on a
+terrain are, the sum of ranks is skewed, and its normal approximation is too small by a factor of two to three at 0.001.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def difference_p(now: Sample, before: Sample, permutations: int = PERMUTATIONS) 
 
 
 def _whole_terrains(now: Sample, before: Sample) -> tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]:
-    """The means of both sets' terrains, each of as many cases: means of few and of many differ where nothing changed."""
+    """The means of both sets' terrains, each of as many cases: means of few and of many differ by themselves."""
     enough = [np.quantile(one.cases_on_terrains(), 1.0 - _FULL, method="lower") for one in (now, before)]
     cases = int(min(enough))
     return now.terrain_means(cases), before.terrain_means(cases)
