@@ -121,7 +121,7 @@ install_packages() {
     : >"$unfinished"
     # setuptools first, from the same pins: building in isolation would fetch another one, past the constraints
     "${install[@]}" pip setuptools
-    "${install[@]}" --no-build-isolation -e '.[dask,dev,docs,geo]'
+    "${install[@]}" --no-build-isolation -e '.[dask,dev,docs,geo,spice]'
 }
 
 check_rendering() {

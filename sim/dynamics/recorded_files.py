@@ -1,8 +1,9 @@
-"""Files of recorded poses: CSV and Parquet tables, TUM's text files, EuRoC's ground truth.
+"""Files of recorded poses: CSV and Parquet tables, TUM's text files, EuRoC's ground truth, and SPICE kernels.
 
 CSV and Parquet have the columns time_s, x_m, y_m, z_m, qx, qy, qz, qw, in any order and among others. TUM's lines are
 ``timestamp tx ty tz qx qy qz qw``, seconds and metres, those with # left out; EuRoC's files begin with ``#timestamp``,
-in nanoseconds, then position, then the quaternion with its scalar part first. Quaternions turn the recorded body's axes
+in nanoseconds, then position, then the quaternion with its scalar part first. Kernels are named in a file that ends in
+``.spice.toml`` (`sim.dynamics.spice`). Quaternions turn the recorded body's axes
 into those of the world; what axes these are no format says, and whoever uses the poses states it.
 """
 
@@ -19,6 +20,7 @@ import pandas as pd
 from jaxtyping import Float64
 
 from sim.dynamics.recorded import LEAST_INSTANTS
+from sim.dynamics.spice import SUFFIX, is_spice, spice_poses
 
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 #: A quaternion's length may be off 1 by this, as written with three digits.
@@ -27,8 +29,8 @@ UNIT_TOLERANCE = 5e-3
 MOST_BYTES = 1 << 29
 _KEPT_FILES = 4
 _ALLOWED = (
-    f"a CSV or Parquet table with the columns {', '.join(COLUMNS)}; TUM's lines of timestamp tx ty tz qx qy qz qw; or "
-    "EuRoC's ground truth, whose header begins with #timestamp"
+    f"a CSV or Parquet table with the columns {', '.join(COLUMNS)}; TUM's lines of timestamp tx ty tz qx qy qz qw; "
+    f"EuRoC's ground truth, whose header begins with #timestamp; or SPICE kernels, named in a file *{SUFFIX}"
 )
 
 
@@ -77,6 +79,8 @@ def read_poses(path: str | Path) -> RecordedPoses:
 
 @lru_cache(maxsize=_KEPT_FILES)
 def _read(path: str, _changed_ns: int, size: int) -> RecordedPoses:
+    if is_spice(path):
+        return _from_kernels(path)
     if size > MOST_BYTES:
         raise TrajectoryFileError(f"{path}: is larger than {MOST_BYTES >> 20} MiB; {_ALLOWED} is needed")
     try:
@@ -96,6 +100,19 @@ def _read(path: str, _changed_ns: int, size: int) -> RecordedPoses:
         said = " ".join(str(fault).split())[:200]
         raise TrajectoryFileError(f"{path}: cannot be read as a table ({said}); allowed: {_ALLOWED}") from fault
     return _checked(path, digest, values)
+
+
+def _from_kernels(path: str) -> RecordedPoses:
+    try:
+        return _checked(path, *spice_poses(path))
+    except ImportError as fault:
+        raise TrajectoryFileError(
+            f"{path}: SPICE kernels need the package spiceypy: pip install marsyard[spice]"
+        ) from fault
+    except (OSError, ValueError) as fault:
+        if isinstance(fault, TrajectoryFileError):
+            raise
+        raise TrajectoryFileError(f"{path}: {fault}") from fault
 
 
 def _values(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:

@@ -1,0 +1,162 @@
+"""Flights from SPICE kernels, which NAIF's own library writes here for a motion in closed form."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import spiceypy
+from scipy.spatial.transform import Rotation
+
+from sim.dynamics.recorded_files import TrajectoryFileError, read_poses
+
+LANDER, SITE, MARS = -999, 399999, 499
+CAMERA_FRAME, SITE_FRAME = -999001, 1499901
+BEGIN, STEP_S, COUNT = "2030-01-01T00:00:00", 0.5, 81
+
+LEAPSECONDS = """KPL/LSK
+\\begindata
+DELTET/DELTA_T_A = 32.184
+DELTET/K         = 1.657D-3
+DELTET/EB        = 1.671D-2
+DELTET/M         = ( 6.239996D0 1.99096871D-7 )
+DELTET/DELTA_AT  = ( 36, @2015-JUL-1, 37, @2017-JAN-1 )
+"""
+#: A clock that ticks 65,536 times a second from J2000 on.
+CLOCK = """KPL/SCLK
+\\begindata
+SCLK_KERNEL_ID           = ( @2030-01-01/12:00:00 )
+SCLK_DATA_TYPE_999       = ( 1 )
+SCLK01_TIME_SYSTEM_999   = ( 1 )
+SCLK01_N_FIELDS_999      = ( 2 )
+SCLK01_MODULI_999        = ( 4294967296 65536 )
+SCLK01_OFFSETS_999       = ( 0 0 )
+SCLK01_OUTPUT_DELIM_999  = ( 1 )
+SCLK_PARTITION_START_999 = ( 0.0 )
+SCLK_PARTITION_END_999   = ( 2.8147497671065E+14 )
+SCLK01_COEFFICIENTS_999  = ( 0.0 0.0 1.0 )
+"""
+#: Site axes that are turned against J2000's, so that a forgotten rotation is seen.
+FRAMES = f"""KPL/FK
+\\begindata
+FRAME_SITE_ENU          = {SITE_FRAME}
+FRAME_{SITE_FRAME}_NAME     = 'SITE_ENU'
+FRAME_{SITE_FRAME}_CLASS    = 4
+FRAME_{SITE_FRAME}_CLASS_ID = {SITE_FRAME}
+FRAME_{SITE_FRAME}_CENTER   = {MARS}
+TKFRAME_{SITE_FRAME}_RELATIVE = 'J2000'
+TKFRAME_{SITE_FRAME}_SPEC     = 'ANGLES'
+TKFRAME_{SITE_FRAME}_UNITS    = 'DEGREES'
+TKFRAME_{SITE_FRAME}_AXES     = ( 3, 2, 3 )
+TKFRAME_{SITE_FRAME}_ANGLES   = ( 20.0, -35.0, 50.0 )
+FRAME_LANDER_CAMERA     = {CAMERA_FRAME}
+FRAME_{CAMERA_FRAME}_NAME     = 'LANDER_CAMERA'
+FRAME_{CAMERA_FRAME}_CLASS    = 3
+FRAME_{CAMERA_FRAME}_CLASS_ID = {CAMERA_FRAME}
+FRAME_{CAMERA_FRAME}_CENTER   = {LANDER}
+CK_{CAMERA_FRAME}_SCLK        = {LANDER}
+CK_{CAMERA_FRAME}_SPK         = {LANDER}
+"""
+STATED = f"""kernels = ["leap.tls", "lander.tsc", "site.tf", "lander.bsp", "lander.bc"]
+target = "{LANDER}"
+observer = "{MARS}"
+world = "SITE_ENU"
+axes = "LANDER_CAMERA"
+begin = "{BEGIN}"
+end = "2030-01-01T00:00:40"
+step_s = {STEP_S}
+"""
+
+
+def flown(times_s: np.ndarray) -> tuple[np.ndarray, Rotation]:
+    """A descent in site axes, m, and the camera's attitude in them."""
+    east, north = 20.0 * times_s, -5.0 * times_s + 0.1 * times_s**2
+    positions = np.stack([east, north, 2000.0 - 75.0 * times_s + 0.2 * times_s**2], axis=-1)
+    rotation = Rotation.from_rotvec(np.array([0.3, 0.0, 0.0])) * Rotation.from_rotvec(
+        np.outer(0.05 * times_s, [0.0, 0.0, 1.0])
+    )
+    return positions, rotation
+
+
+@pytest.fixture(scope="module")
+def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the kernels of the flight and the file that names them."""
+    folder = tmp_path_factory.mktemp("kernels")
+    for name, text in (("leap.tls", LEAPSECONDS), ("lander.tsc", CLOCK), ("site.tf", FRAMES)):
+        (folder / name).write_text(text)
+    (folder / "flight.spice.toml").write_text(STATED)
+    with spiceypy.KernelPool([str(folder / name) for name in ("leap.tls", "lander.tsc", "site.tf")]):
+        begin = spiceypy.str2et(BEGIN)
+        times = STEP_S * np.arange(-4, COUNT + 4)
+        positions, attitudes = flown(times)
+        turn = spiceypy.pxform("SITE_ENU", "J2000", begin)
+        velocities = np.gradient(positions, times, axis=0)
+        states = 1e-3 * np.concatenate([positions @ turn.T, velocities @ turn.T], axis=1)
+        spk = spiceypy.spkopn(str(folder / "lander.bsp"), "descent", 0)
+        span = (begin + times[0], begin + times[-1])
+        spiceypy.spkw09(spk, LANDER, MARS, "J2000", *span, "descent", 7, len(times), states.tolist(), begin + times)
+        spiceypy.spkcls(spk)
+        ticks = [spiceypy.sce2c(LANDER, begin + time) for time in times]
+        # C matrices turn vectors from J2000's axes into the camera's; SPICE's quaternions have their scalar first
+        turns = [spiceypy.m2q(np.ascontiguousarray((turn @ one.as_matrix()).T)) for one in attitudes]
+        ck = spiceypy.ckopn(str(folder / "lander.bc"), "descent", 0)
+        rates = np.zeros((len(times), 3))
+        ends = (ticks[0], ticks[-1])
+        spiceypy.ckw03(
+            ck, *ends, CAMERA_FRAME, "J2000", True, "descent", len(times), ticks, turns, rates, 1, [ticks[0]]
+        )
+        spiceypy.ckcls(ck)
+    return folder
+
+
+def test_kernels_give_the_flight_that_was_written(kernels: Path) -> None:
+    poses = read_poses(kernels / "flight.spice.toml")
+    assert poses.times_s.size == COUNT
+    np.testing.assert_allclose(poses.times_s, STEP_S * np.arange(COUNT))
+    positions, attitudes = flown(poses.times_s)
+    np.testing.assert_allclose(poses.positions_m, positions, atol=1e-6)
+    assert (attitudes.inv() * Rotation.from_quat(poses.quaternions)).magnitude().max() < 1e-8
+
+
+def test_the_pool_of_kernels_is_left_as_it_was(kernels: Path) -> None:
+    before = spiceypy.ktotal("ALL")
+    read_poses(kernels / "flight.spice.toml")
+    assert spiceypy.ktotal("ALL") == before
+
+
+def test_the_hash_is_that_of_all_files(kernels: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "kernels"
+    shutil.copytree(kernels, copy)
+    assert read_poses(copy / "flight.spice.toml").sha256 == read_poses(kernels / "flight.spice.toml").sha256
+    other = tmp_path / "others"
+    shutil.copytree(kernels, other)
+    with (other / "site.tf").open("a") as file:
+        file.write("\\begintext\nanother remark\n")
+    assert read_poses(other / "flight.spice.toml").sha256 != read_poses(kernels / "flight.spice.toml").sha256
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ('"leap.tls", ', '"missing.tls", ', "the kernel .*missing.tls is not there"),
+        ('"leap.tls", ', "", "SPICE: .*"),
+        ('target = "-999"', 'target = "-998"', "SPICE: .*-998"),
+        ('world = "SITE_ENU"', 'world = "SITE_NED"', "SPICE: .*SITE_NED"),
+        ("00:00:40", "00:10:00", "SPICE: "),
+        ("00:00:40", "00:00:00", "make 1 poses; allowed: 2 to"),
+        ('begin = "2030-01-01T00:00:00"', 'begin = "yesterday"', "SPICE: .*UNPARSEDTIME"),
+        ("step_s = 0.5", "step_s = -1.0", "step_s: .*greater than 0"),
+        ('world = "SITE_ENU"', 'word = "SITE_ENU"', "world: Field required"),
+        ('world = "SITE_ENU"', "world = SITE", "Invalid value"),
+    ],
+)
+def test_what_is_wrong_is_told(kernels: Path, tmp_path: Path, before: str, after: str, message: str) -> None:
+    copy = tmp_path / "kernels"
+    shutil.copytree(kernels, copy)
+    path = copy / "flight.spice.toml"
+    path.write_text(STATED.replace(before, after))
+    with pytest.raises(TrajectoryFileError, match=f"flight.spice.toml: .*{message}") as caught:
+        read_poses(path)
+    assert "\n" not in str(caught.value)
