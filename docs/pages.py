@@ -1,4 +1,4 @@
-"""Pages of the site that are written from the program itself: command line, parameters of scenarios, catalogue."""
+"""Pages of the site that are written from the program itself: commands, parameters, catalogue, ingested folders."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from campaigns.definition.loading import catalogue
+from campaigns.definition.catalogue import catalogue
+from scenarios.measured.layout import COLUMNS, IngestFile
 from scenarios.registry import scenario, scenario_names
 
 #: Where they are written, and what each begins with.
@@ -28,6 +29,7 @@ def write_pages() -> None:
     FOLDER.mkdir(exist_ok=True)
     (FOLDER / "cli.md").write_text(command_line_page())
     (FOLDER / "catalogue.md").write_text(catalogue_page())
+    (FOLDER / "real-pictures.md").write_text(real_pictures_page())
     for name in scenario_names():
         (FOLDER / f"parameters-{name}.md").write_text(parameters_page(name))
 
@@ -65,6 +67,35 @@ def parameters_page(name: str) -> str:
         for key, field in _fields(scenario(name).parameters_type)
     ]
     return "\n".join([*head, "| key | kind, allowed | default | what |", "|---|---|---|---|", *rows, ""])
+
+
+def real_pictures_page() -> str:
+    """Every key and column of a folder that `marsyard ingest` reads."""
+    keys = [
+        f"| `{key}` | {_kind(field)} | {_default(field)} | {field.description or ''} |"
+        for key, field in _fields(IngestFile)
+    ]
+    columns = [f"| `{one.name}` | {', '.join(one.tasks)} | {one.needed or 'no'} | {one.what} |" for one in COLUMNS]
+    return "\n".join(
+        [
+            "# Keys and columns of real pictures",
+            "",
+            "What `marsyard ingest` reads in a folder; see [real pictures](../../real-pictures.md).",
+            "",
+            "## `ingest.toml`",
+            "",
+            "| key | kind, allowed | default | what |",
+            "|---|---|---|---|",
+            *keys,
+            "",
+            "## `pictures.csv`",
+            "",
+            "| column | tasks | needed | what |",
+            "|---|---|---|---|",
+            *columns,
+            "",
+        ]
+    )
 
 
 def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:

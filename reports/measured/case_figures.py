@@ -85,7 +85,7 @@ def is_measured_case(products: Mapping[str, Any]) -> bool:
 @in_page_style
 def draw_pair(pair: MatchedPair) -> Figure:
     """Both pictures with the matches, coloured by their residuals, and the offsets."""
-    figure = Figure(figsize=(12.0, 4.9), layout="constrained")
+    figure = Figure(figsize=(12.0, 5.2), layout="constrained")
     left, right, scatter = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 0.8))
     lengths = np.hypot(*pair.offsets[pair.right].T)
     for side, axes in enumerate((left, right)):

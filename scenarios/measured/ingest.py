@@ -45,6 +45,8 @@ from sim.frames import SITE_FROM_WORLD
 from sim.sensor.own_camera import looking_down
 
 POSITION = ("x_m", "y_m", "z_m")
+#: Relative response of the brightest pixel, at most: noise makes it a little more than 1.
+_MOST_FLAT = 1.5
 
 
 @dataclass(frozen=True)
@@ -132,20 +134,19 @@ def _detector(folder: _Folder) -> StoredDetector:
 
 
 def _flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
-    """Relative response, its largest 1."""
+    """Relative response: of numbers as they are, of a picture over its largest count."""
     head = file_head(path)
     try:
-        found = np.load(path, allow_pickle=False) if head.startswith(b"\x93NUMPY") else _any_picture(path)
-        response = np.asarray(found, dtype=np.float64)
+        if head.startswith(b"\x93NUMPY"):
+            response = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+        else:
+            counts = read_counts(path, picture_size(path))
+            response = counts / max(int(counts.max()), 1)
     except (ValueError, EOFError) as error:
         raise IngestError(f"{path}: is no flat field: {error}") from error
-    if response.ndim != 2 or not np.all(np.isfinite(response)) or response.min() <= 0.0:
-        raise IngestError(f"{path}: is no flat field; allowed: two dimensions, finite numbers above 0")
-    return np.asarray(response / response.max())
-
-
-def _any_picture(path: Path) -> UInt16[np.ndarray, "rows columns"]:
-    return read_counts(path, picture_size(path))
+    if response.ndim != 2 or not np.all(np.isfinite(response)) or response.min() <= 0.0 or response.max() > _MOST_FLAT:
+        raise IngestError(f"{path}: is no flat field; allowed: two dimensions, numbers above 0, about 1 at the largest")
+    return response
 
 
 def _case(folder: _Folder, number: int, case: CaseRows) -> StoredCase:

@@ -67,7 +67,10 @@ class DetectorTable(BaseModel):
     rows_summed: Annotated[int, Field(ge=1, le=64, description="physical rows in a delivered one")] = 1
     flat_field: Annotated[
         str | None,
-        Field(description="relative response of each pixel: `.npy` of numbers, or a picture; its largest becomes 1"),
+        Field(
+            description="relative response of each pixel: `.npy` of numbers about 1 at the brightest, or a picture, "
+            "over its largest count"
+        ),
     ] = None
 
 
@@ -170,7 +173,7 @@ def _columns(names: str, tasks: tuple[str, ...], needed: str, what: str) -> list
 
 #: All columns, in the order of the documentation.
 COLUMNS: tuple[Column, ...] = (
-    Column("case", _ALL, "every", "name of the case; its rows stand together, in the order of time"),
+    Column("case", _ALL, "every", "name of the case; its rows stand in the order of time"),
     Column("file", _ALL, "every", "the picture: PNG, PGM or TIFF of 8 or 16 bits and one band, or a PDS3 product"),
     Column("camera", _ALL, "", "camera file of this picture, in place of `camera.file`"),
     Column("time_s", _ALL, _LABELLED, "middle of the exposure"),

@@ -80,7 +80,7 @@ def _offset(text: str, source: Source) -> int:
 
 
 def _counts(
-    image: Mapping[str, Any], size: tuple[int, int], offset: int, source: Source
+    image: Any, size: tuple[int, int], offset: int, source: Source
 ) -> UInt16[np.ndarray, "rows columns"]:
     bits, kind = image.get("SAMPLE_BITS"), str(image.get("SAMPLE_TYPE", ""))
     order = _ORDERS.get(kind.split("_")[0])

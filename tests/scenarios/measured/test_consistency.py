@@ -1,0 +1,70 @@
+"""Offsets of matches from where poses allow them, against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scenarios.measured.consistency import PairAgreement, agreement_row, offsets_px
+from sim.camera import Cahv, Cahvor
+from sim.frames import rigid
+
+CAMERA = Cahvor.from_cahv(
+    Cahv(
+        np.zeros(3),
+        np.array([0.0, 0.0, -1.0]),
+        np.array([800.0, 0.0, -320.0]),
+        np.array([0.0, -800.0, -240.0]),
+        (640, 480),
+    ),
+    r=np.array([0.0, 0.05, -0.01]),
+)
+TURN = Rotation.from_euler("xyz", [3.0, -2.0, 20.0], degrees=True)
+
+
+@pytest.mark.parametrize("moved_m", [0.0, 0.05, 40.0])
+def test_points_seen_by_right_poses_lie_where_they_may(moved_m: float) -> None:
+    rng = np.random.default_rng(1)
+    second = CAMERA.moved(rigid(TURN, moved_m * np.array([1.0, 0.4, 0.1])))
+    points = np.stack([rng.uniform(-30, 30, 400), rng.uniform(-25, 25, 400), -100.0 - rng.uniform(0, 50, 400)], axis=1)
+    if moved_m == 0.0:
+        points *= 1e4  # whatever the distance
+    ours, theirs = CAMERA.project(points)[0], second.project(points)[0]
+    assert np.abs(offsets_px(CAMERA, second, ours, theirs)).max() < 1e-5
+
+
+def test_an_error_across_the_line_is_the_offset_and_along_it_none() -> None:
+    """A camera that moves along its columns sees the epipolar lines as rows, near the middle of the picture."""
+    pinhole = Cahv(CAMERA.c, CAMERA.a, CAMERA.h, CAMERA.v, CAMERA.size)
+    second = pinhole.moved(rigid(Rotation.identity(), np.array([5.0, 0.0, 0.0])))
+    points = np.array([[0.0, 0.0, -100.0], [10.0, -6.0, -120.0], [-4.0, 7.0, -90.0]])
+    ours, theirs = pinhole.project(points)[0], second.project(points)[0]
+    across = offsets_px(pinhole, second, ours, theirs + np.array([0.0, 2.0]))
+    along = offsets_px(pinhole, second, ours, theirs + np.array([3.0, 0.0]))
+    assert np.allclose(across, [0.0, 2.0], atol=0.05)  # nearest in angle, not in pixels
+    assert np.allclose(along, 0.0, atol=1e-6)
+    # but a match behind infinity is off by what parts it from there
+    infinity = second.project(1e9 * pinhole.rays(ours)[1])[0]
+    beyond = offsets_px(pinhole, second, ours, infinity + np.array([4.0, 0.0]))
+    assert np.allclose(beyond, [4.0, 0.0], atol=0.05)
+
+
+def test_a_turn_alone_is_a_point() -> None:
+    second = CAMERA.moved(rigid(TURN, np.zeros(3)))
+    ours = np.array([[300.0, 200.0], [400.0, 260.0]])
+    theirs = second.project(1e3 * CAMERA.rays(ours)[1])[0]
+    found = offsets_px(CAMERA, second, ours, theirs + np.array([1.5, -2.0]))
+    assert np.allclose(found, [1.5, -2.0], atol=1e-4)
+
+
+def test_rows_tell_of_right_matches_alone() -> None:
+    offsets = np.full((40, 2), [3.0, 4.0])
+    right = np.arange(40) < 20
+    offsets[~right] = 500.0
+    told = agreement_row([PairAgreement(np.zeros((2, 40, 2)), right, offsets)])
+    assert (told["matches"], told["residual_median_px"], told["residual_90_percent_px"]) == (20, 5.0, 5.0)
+    assert told["matches_wrong_share"] == 0.5
+    few = agreement_row([PairAgreement(np.zeros((2, 40, 2)), np.arange(40) < 10, offsets)])
+    assert np.isnan(few["residual_median_px"])
+    assert few["pairs_matched"] == 0

@@ -1,0 +1,164 @@
+"""Folders that cannot be used are refused, by file and line; the Opportunity frames and other formats are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from folders import landing_folder, read_rows, velocity_folder, write_texts
+
+from scenarios.conformance import inputs
+from scenarios.measured import MatchingScenario
+from scenarios.measured.ingest import ingest
+from scenarios.measured.layout import IngestError
+from scenarios.measured.store import CasesFile, images_of
+from sim.streams import Streams
+
+Rows = list[dict[str, str]]
+
+
+def refused(folder: Path, tmp_path: Path) -> str:
+    out = tmp_path / "out"
+    out.mkdir()
+    with pytest.raises(ValueError, match=str(tmp_path)) as caught:
+        ingest(folder, out)
+    return str(caught.value)
+
+
+def changed(rows: Rows, place: int, **cells: str) -> Rows:
+    return [row | cells if number == place else row for number, row in enumerate(rows)]
+
+
+def without(rows: Rows, *names: str) -> Rows:
+    return [{name: cell for name, cell in row.items() if name not in names} for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda rows: changed(rows, 1, file="lost.png"), "lost.png: No such file"),
+        (lambda rows: changed(rows, 1, qx="nan"), "line 3: qx is 'nan'; allowed: a finite number"),
+        (lambda rows: changed(rows, 1, qw="2.0"), "line 3: the quaternion qx to qw has the length"),
+        (lambda rows: changed(rows, 1, qw=""), "line 3: qx is given, but qw is not"),
+        (lambda rows: changed(rows, 2, time_s="100.0"), "line 4: time goes from 103.75 to 100 s"),
+        (lambda rows: changed(rows, 0, altitude_m="-3"), "line 2: altitude_m is -3; allowed: above 0"),
+        (lambda rows: changed(rows, 0, altitude_m=""), "line 2: altitude_m is empty"),
+        (lambda rows: changed(rows, 0, qx="1", qy="0", qz="0", qw="0"), "line 2: the camera looks up, 90.0 deg"),
+        (lambda rows: rows[:2], "line 2: case 'drop' has 2 pictures; allowed for velocity: 3"),
+        (lambda rows: without(rows, "vx_m_s", "vy_m_s", "vz_m_s"), "neither vx_m_s to vz_m_s nor positions"),
+        (lambda rows: without(rows, "sun_azimuth_deg", "sun_elevation_deg"), "line 2: no sun"),
+        (lambda rows: without(rows, "altitude_m"), "the column 'altitude_m' is missing"),
+        (lambda rows: [{**row, "altitude_ft": "1"} for row in rows], "'altitude_ft' (did you mean 'altitude_m'?)"),
+        (lambda rows: [{**row, "slant_range_m": "1"} for row in rows], "unknown column 'slant_range_m'"),
+        (lambda rows: changed(rows, 0, camera="none.cahvor"), "none.cahvor: file: cannot be read"),
+    ],
+)
+def test_tables_that_cannot_be_used(tmp_path: Path, change: Callable[[Rows], Rows], said: str) -> None:
+    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    write_texts(folder, change(read_rows(folder)))
+    assert said in refused(folder, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("write", "said"),
+    [
+        (lambda path: cv2.imwrite(str(path), np.zeros((480, 640), np.uint16)), "has 640 x 480 pixels; its camera has"),
+        (lambda path: path.write_bytes(b""), "is empty (0 bytes)"),
+        (lambda path: path.write_bytes(b"GIF89a" + bytes(100)), "is no picture that is read; allowed: PNG"),
+        (lambda path: cv2.imwrite(str(path), np.full((256, 1024), 5000, np.uint16)), "bits = 12 allows 4095"),
+        (lambda path: cv2.imwrite(str(path), np.zeros((256, 1024, 3), np.uint8)), "has 3 bands"),
+        (lambda path: path.write_bytes(path.read_bytes()[:900]), "cannot be decoded"),
+        # a header alone of 6 gigapixels: nothing of it is decoded
+        (lambda path: path.write_bytes(b"P5 80000 80000 65535\n"), "has 80000 x 80000 pixels; its camera has"),
+    ],
+)
+def test_pictures_that_cannot_be_used(tmp_path: Path, write: Callable[[Path], object], said: str) -> None:
+    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    write(folder / "drop-1.png")
+    message = refused(folder, tmp_path)
+    assert "drop-1.png" in message
+    assert said in message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("bits = 12", "bits = 20", "detector.bits: Input should be less than or equal to 16, got 20"),
+        ("bits = 12", "", "detector.bits: required, but missing"),
+        ("bits = 12", "bits = 12\nblack = 3", "detector.black: unknown key"),
+        ('axes = "enu"', 'axes = "xyz"', "poses.axes: Input should be 'enu' or 'ned', got 'xyz'"),
+        ('attitude_of = "body"', "", 'poses.attitude_of must be "body"'),
+        ("[poses]", "[poses", "not valid TOML"),
+        ("flat.npy", "camera.cahvor", "camera.cahvor: is no picture that is read"),
+    ],
+)
+def test_settings_that_cannot_be_used(tmp_path: Path, old: str, new: str, said: str) -> None:
+    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    path = folder / "ingest.toml"
+    path.write_text(path.read_text().replace(old, new))
+    assert said in refused(folder, tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".pgm"])
+def test_other_formats_hold_the_same_counts(tmp_path: Path, suffix: str) -> None:
+    given = inputs.landing()
+    folder = landing_folder(tmp_path / "in", given, "matching")
+    rows = read_rows(folder)
+    for row, image in zip(rows, given.images, strict=True):
+        row["file"] = Path(row["file"]).stem + suffix
+        cv2.imwrite(str(folder / row["file"]), image.counts)
+    write_texts(folder, rows)
+    (tmp_path / "out").mkdir()
+    path, stored = ingest(folder, tmp_path / "out")
+    images = images_of(CasesFile(file=str(path)), stored.cases[0])
+    for image, original in zip(images, given.images, strict=True):
+        assert np.array_equal(image.counts, original.counts)
+        assert image.camera == original.camera
+
+
+def test_the_opportunity_frames(tmp_path: Path, shared_data: Path) -> None:
+    """Two frames of one place with the mast turned: their labels' cameras agree with what they show to a pixel."""
+    folder = tmp_path / "opportunity"
+    folder.mkdir()
+    frames = shared_data / "mer_opportunity"
+    hazcam = "1F483288473EFFCMUFP1214L0M1.IMG"
+    (folder / "ingest.toml").write_text('name = "opportunity"\ntask = "matching"\n[detector]\nbits = 12\n')
+    lines = [f"navcam,{frames}/1N491020{time}ILFCNY9P0706L0M1.IMG\n" for time in (376, 519)]
+    (folder / "pictures.csv").write_text("case,file\n" + "".join(lines))
+    (tmp_path / "out").mkdir()
+    path, _ = ingest(folder, tmp_path / "out")
+    parameters = MatchingScenario.parameters_type.model_validate({"cases": {"file": str(path)}})
+    row = MatchingScenario().run(parameters, Streams(seed=0, campaign="opportunity", case=0)).row
+    assert row["matches"] >= 80
+    assert 0.2 < row["residual_median_px"] < 1.0
+    assert row["residual_90_percent_px"] < 2.0
+    # by the mast's encoders: azimuth from -0.340 to 0.254 rad, elevation from -0.110 to -0.209
+    assert 33.0 < row["turned_most_deg"] < 36.0
+    assert np.isclose(row["moved_most_m"], 0.0671, atol=1e-3)
+    # the label says when: 143 s apart; and the fisheye's single frame cannot be a case of its own
+    assert np.isclose(row["lasted_s"], 143.258)
+    (folder / "pictures.csv").write_text(f"case,file\nhazcam,{frames}/{hazcam}\n")
+    with pytest.raises(IngestError, match="case 'hazcam' has 1 pictures; allowed for matching: 2 to 50"):
+        ingest(folder, tmp_path / "out")
+
+
+def test_the_hazcam_frame_with_the_attitude_of_its_label_looks_down(tmp_path: Path, shared_data: Path) -> None:
+    """One frame of a fisheye, given twice: no residual is left between a picture and itself."""
+    folder = tmp_path / "hazcam"
+    folder.mkdir()
+    frame = shared_data / "mer_opportunity" / "1F483288473EFFCMUFP1214L0M1.IMG"
+    (folder / "ingest.toml").write_text('name = "hazcam"\ntask = "matching"\n[detector]\nbits = 12\n')
+    (folder / "pictures.csv").write_text(f"case,file,time_s\nhazcam,{frame},0\nhazcam,{frame},1\n")
+    (tmp_path / "out").mkdir()
+    path, stored = ingest(folder, tmp_path / "out")
+    picture = stored.cases[0].pictures[0]
+    cases = CasesFile(file=str(path))
+    image = images_of(cases, stored.cases[0])[0]
+    assert picture.attitude.apply(image.camera.boresight())[2] < -0.3
+    parameters = MatchingScenario.parameters_type.model_validate({"cases": {"file": str(path)}})
+    row = MatchingScenario().run(parameters, Streams(seed=0, campaign="hazcam", case=0)).row
+    assert row["matches"] > 500
+    assert row["residual_90_percent_px"] < 1e-3

@@ -1,0 +1,108 @@
+"""Ingested cases give the answers of the measurements that they were laid out from, and know right poses from wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from folders import landing_folder, read_rows, velocity_folder, write_texts
+from scipy.spatial.transform import Rotation
+
+from algorithms.dimes import DimesEstimator
+from scenarios.conformance import inputs
+from scenarios.interface import CaseResult
+from scenarios.measured import MatchingScenario, MeasuredLandingScenario, MeasuredVelocityScenario
+from scenarios.measured.ingest import ingest
+from sim.streams import Streams
+
+STREAMS = Streams(seed=1, campaign="measured", case=0)
+TRUE = inputs.DESCENT_VELOCITY_M_S[:2]
+
+
+def ran(folder: Path, out: Path, **parameters: object) -> CaseResult:
+    out.mkdir()
+    path, stored = ingest(folder, out)
+    scenarios = {one.name: one for one in (MatchingScenario(), MeasuredLandingScenario(), MeasuredVelocityScenario())}
+    scenario = scenarios[f"measured-{stored.task}"]
+    return scenario.run(scenario.parameters_type.model_validate({"cases": {"file": str(path)}, **parameters}), STREAMS)
+
+
+@pytest.mark.parametrize("ned", [False, True])
+def test_descents_come_through_as_they_were_measured(tmp_path: Path, ned: bool) -> None:
+    given = inputs.descent()
+    expected = DimesEstimator().estimate(given)
+    assert expected.velocity_m_s is not None
+    folder = velocity_folder(tmp_path / "in", {"drop": given}, {"drop": TRUE}, ned=ned)
+    result = ran(folder, tmp_path / "out", compared=["phase-correlation"])
+    row = result.row
+    found = [row["velocity_estimated_x_m_s"], row["velocity_estimated_y_m_s"]]
+    # what turns in rounding: the axes there and back
+    assert np.allclose(found, expected.velocity_m_s, rtol=0.0, atol=1e-6)
+    assert np.isclose(row["velocity_error_m_s"], np.hypot(*(expected.velocity_m_s - TRUE)), atol=1e-6)
+    assert np.isclose(row["beside_inertial_m_s"], np.hypot(*(expected.velocity_m_s - TRUE - [9.0, -4.0])), atol=1e-6)
+    assert row["pair_discrepancy_m_s"] < 1.0
+    other = np.array([row[f"phase_correlation.velocity_estimated_{axis}_m_s"] for axis in "xy"], dtype=np.float64)
+    assert np.isclose(row["phase_correlation.apart_m_s"], np.linalg.norm(other - found))
+    assert result.outcome == "VALID"
+    assert row["measured_case"] == "drop"
+
+
+def test_without_truth_no_error_is_told(tmp_path: Path) -> None:
+    row = ran(velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {}), tmp_path / "out").row
+    assert not [name for name in row if "error_" in name or "true_" in name]
+    assert row["truth_known"] is False
+
+
+def test_positions_stand_in_for_inertial_velocities_and_for_truth(tmp_path: Path) -> None:
+    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    rows = read_rows(folder)
+    for number, row in enumerate(rows):
+        for axis in "xyz":
+            row.pop(f"v{axis}_m_s")
+        place = 3.75 * number * inputs.DESCENT_VELOCITY_M_S
+        row |= {f"{axis}_m": str(value) for axis, value in zip("xyz", place, strict=True)}
+        row |= {f"true_{axis}_m": str(value) for axis, value in zip("xyz", place, strict=True)}
+    write_texts(folder, rows)
+    row = ran(folder, tmp_path / "out").row
+    assert np.isclose(row["velocity_true_x_m_s"], TRUE[0])
+    assert np.isclose(row["beside_inertial_m_s"], row["velocity_error_m_s"])
+    # the poses are exact: what is left is the matching of pictures with noise, rows summed by four
+    assert row["residual_median_px"] < 1.0
+    assert row["matches"] > 100
+
+
+def test_landings_are_held_against_measured_and_true_poses(tmp_path: Path) -> None:
+    row = ran(landing_folder(tmp_path / "in", inputs.landing(), "landing", true_poses=True), tmp_path / "out").row
+    assert row["site_reported"]
+    assert row["rotation_error_deg"] == row["rotation_beside_poses_deg"]
+    assert row["rotation_error_deg"] < 0.5
+    assert row["residual_median_px"] < 0.5
+    assert np.isclose(row["moved_most_m"], np.linalg.norm([1.2, 0.2, -0.2]))
+
+
+@pytest.mark.parametrize(("turned_deg", "least", "most"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])
+def test_wrong_attitudes_show(tmp_path: Path, turned_deg: float, least: float, most: float) -> None:
+    """An error about the direction of motion moves every match off its line by its angle in pixels."""
+    folder = landing_folder(tmp_path / "in", inputs.landing(), "matching")
+    rows = read_rows(folder)
+    turn = Rotation.from_euler("x", turned_deg, degrees=True)
+    wrong = (turn * Rotation.from_quat([float(rows[1][f"q{axis}"]) for axis in "xyzw"])).as_quat()
+    rows[1] |= {f"q{axis}": repr(float(value)) for axis, value in zip("xyzw", wrong, strict=True)}
+    write_texts(folder, rows)
+    result = ran(folder, tmp_path / "out")
+    assert result.outcome == "MATCHED"
+    assert least <= result.row["residual_median_px"] <= most
+    table = result.products["matches_1"]
+    assert table.shape[1] == 7
+
+
+def test_a_picture_that_has_changed_is_not_run(tmp_path: Path) -> None:
+    folder = landing_folder(tmp_path / "in", inputs.landing(), "matching")
+    out = tmp_path / "out"
+    ran(folder, out)
+    picture = out / "pictures" / "000000-2.png"
+    picture.write_bytes(picture.read_bytes() + b"\0")
+    parameters = MatchingScenario.parameters_type.model_validate({"cases": {"file": str(out / "cases.json")}})
+    with pytest.raises(ValueError, match=r"000000-2\.png: has changed since it was ingested"):
+        MatchingScenario().run(parameters, STREAMS)
