@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from campaigns.definition import catalogue as shipped
 from campaigns.definition import loading
 from campaigns.definition.campaign import Campaign as Campaign
 from scenarios.interface import CaseResult as CaseResult
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 def catalogue() -> list[str]:
     """Names of the campaigns that ship with Marsyard."""
-    return list(loading.catalogue())
+    return list(shipped.catalogue())
 
 
 def sites() -> dict[str, str]:

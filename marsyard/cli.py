@@ -65,8 +65,8 @@ def list_campaigns(
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
 ) -> None:
     """List the campaigns of the catalogue."""
-    from campaigns.definition.loading import catalogue
-    from marsyard.showing import catalogue_data, catalogue_table
+    from campaigns.definition.catalogue import catalogue
+    from marsyard.listing import catalogue_data, catalogue_table
 
     if as_json:
         typer.echo(json.dumps(catalogue_data(catalogue()), indent=2))

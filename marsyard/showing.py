@@ -1,10 +1,9 @@
-"""Campaigns on the terminal: the catalogue, one campaign in full, and what its dispersions draw."""
+"""A campaign on the terminal: in full, and what its dispersions draw."""
 
 from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,35 +30,6 @@ _EXTENT = ("least", "mean", "greatest")
 #: Probabilities at which a distribution is taken as a whole, for the figure.
 _QUANTILES = 2000
 _FIGURES = (".svg", ".png")
-
-
-def catalogue_table(campaigns: Mapping[str, Path]) -> Table:
-    """The campaigns of the catalogue, a row each."""
-    table = _table("", "campaign", "scenario", "cases", "description")
-    for name, path in campaigns.items():
-        stated = _as_stated(path)
-        texts = (str(stated.get(key, "")) for key in ("scenario", "cases", "description"))
-        table.add_row(*(Text(text) for text in (name, *texts)))
-    return table
-
-
-def catalogue_data(campaigns: Mapping[str, Path]) -> list[dict[str, Any]]:
-    """The campaigns of the catalogue as plain data."""
-    told = []
-    for name, path in campaigns.items():
-        stated = _as_stated(path)
-        told.append(
-            {"name": name, "file": str(path), **{k: stated.get(k) for k in ("scenario", "cases", "description")}}
-        )
-    return told
-
-
-def _as_stated(path: Path) -> dict[str, Any]:
-    """A campaign's file as it stands; what is wrong with it is said by whoever runs it."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        return {"description": f"cannot be read: {error}"}
 
 
 def show_campaign(campaign: Campaign, console: Console) -> None:

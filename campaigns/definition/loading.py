@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from campaigns.definition.campaign import Campaign
+from campaigns.definition.catalogue import catalogue
 from campaigns.definition.checking import sampling_problems
 from campaigns.definition.configuration import CampaignConfiguration, Key, key_text, problems_of
 from campaigns.definition.requirements import completed
@@ -19,8 +20,6 @@ from campaigns.errors import ConfigurationError, Problem, not_allowed
 from campaigns.sampling.correlation import KINDS
 from scenarios.interface import Scenario, TakesAlgorithms
 from scenarios.registry import UnknownScenarioError, scenario
-
-CATALOGUE = Path(__file__).resolve().parents[2] / "scenarios" / "catalogue"
 
 _TABLES = ("parameters", "dispersions", "design", "retain", "limits")
 _PLAIN = ("cases", "seed", "name", "description", "scenario", "correlations")
@@ -44,11 +43,6 @@ class _Document:
             if shared and key[:shared] == path[:shared]:
                 return Problem(option, key_text(key), message)
         return Problem(self.where, key_text(key), message)
-
-
-def catalogue() -> dict[str, Path]:
-    """The campaigns that ship with Marsyard, by name."""
-    return {path.stem: path for path in sorted(CATALOGUE.glob("*.toml"))}
 
 
 def find_campaign(name_or_path: str) -> Path:

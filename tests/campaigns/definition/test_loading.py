@@ -11,7 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from campaigns.definition.loading import catalogue, find_campaign, load_campaign
+from campaigns.definition.catalogue import catalogue
+from campaigns.definition.loading import find_campaign, load_campaign
 from campaigns.errors import ConfigurationError
 
 CampaignFile = Callable[..., Path]

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from fake_campaign import write_campaign
 
-from campaigns.definition.loading import catalogue, load_campaign
+from campaigns.definition.catalogue import catalogue
+from campaigns.definition.loading import load_campaign
 from campaigns.definition.requirements import (
     applicable,
     read_requirements,

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from campaigns.definition.loading import catalogue, load_campaign
+from campaigns.definition.catalogue import catalogue
+from campaigns.definition.loading import load_campaign
 from scenarios.interface import CaseResult
 from sim.streams import Streams
 from tests.scenarios.descent.settings import DESCENT, FLAT, PERFECT, WORLD, run
