@@ -100,10 +100,17 @@ def _options(stored: StoredCases) -> str:
     """What the paper's algorithm must know of the pictures."""
     if stored.task != "velocity":
         return ""
+    size = binned_size(stored.cases[0].pictures[0].size, stored.detector.rows_summed)
+    about = "# DIMES works on square pixels, binned to about 256 columns."
+    return f"{about}\n[parameters.dimes]\nbinned_size = {list(size)}\n"
+
+
+def binned_size(delivered: tuple[int, int], rows_summed: int) -> tuple[int, int]:
+    """The size (columns, rows) that DIMES bins delivered pictures to, whose rows are summed already."""
     from scenarios.descent.parameters import binned_size_for
 
-    size = binned_size_for(*stored.cases[0].pictures[0].size)
-    return f"# DIMES works on pictures binned to about 256 columns.\n[parameters.dimes]\nbinned_size = {list(size)}\n"
+    columns, rows = binned_size_for(delivered[0], delivered[1] * rows_summed)
+    return (columns, rows) if delivered[1] % rows == 0 else delivered
 
 
 def _requirement(stored: StoredCases) -> str:

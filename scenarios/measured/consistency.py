@@ -10,6 +10,7 @@ the nearest place of that curve. Of two pictures taken from one place the curve 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,38 +37,43 @@ _STRETCH = (0.005, 0.995)
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A picture with its camera in the world."""
-
-    image: DetectorImage
-    camera: CameraModel
-
-
-@dataclass(frozen=True, eq=False)
-class PairAgreement:
-    """Two pictures, and how their matches agree with the poses.
+class PairMatches:
+    """Features matched between two pictures.
 
     Attributes
     ----------
     pixels
-        Of the matches in the earlier and in the later picture, (u, v) of the delivered pictures, shape (2, n, 2).
+        In the earlier and in the later picture, (u, v) as delivered, shape (2, n, 2).
     right
         Which of them some rigid motion explains, shape (n,).
+    """
+
+    pixels: Float64[np.ndarray, "2 n 2"]
+    right: Bool[np.ndarray, "n"]
+
+
+@dataclass(frozen=True, eq=False)
+class PairAgreement:
+    """How the matches of two pictures agree with poses.
+
+    Attributes
+    ----------
+    matches
+        The matches.
     offsets
         From where the poses put a match to where it is in the later picture, pixels, shape (n, 2); NaN where the later
         camera cannot see that place.
     """
 
-    pixels: Float64[np.ndarray, "2 n 2"]
-    right: Bool[np.ndarray, "n"]
+    matches: PairMatches
     offsets: Float64[np.ndarray, "n 2"]
 
     @cached_property
     def residuals_px(self) -> Float64[np.ndarray, "k"]:
         """Lengths of the offsets of the right matches; none where they are too few to tell."""
-        if np.count_nonzero(self.right) < LEAST_MATCHES:
+        if np.count_nonzero(self.matches.right) < LEAST_MATCHES:
             return np.empty(0)
-        lengths = np.hypot(*self.offsets[self.right].T)
+        lengths = np.hypot(*self.offsets[self.matches.right].T)
         return np.asarray(np.where(np.isfinite(lengths), lengths, np.inf))
 
     @property
@@ -76,17 +82,23 @@ class PairAgreement:
         return float(np.median(self.residuals_px)) if self.residuals_px.size else float("nan")
 
 
-def views_of(images: Sequence[DetectorImage], poses: Sequence[RigidTransform]) -> list[View]:
-    """Pictures with their cameras moved from the body into the world."""
-    return [View(image, image.camera.moved(pose)) for image, pose in zip(images, poses, strict=True)]
-
-
-def agreements(views: Sequence[View]) -> list[PairAgreement]:
-    """Each picture against the one before it."""
-    features = [_features(view.image) for view in views]
+def matched(images: Sequence[DetectorImage]) -> list[PairMatches]:
+    """Features of each picture, found again in the next."""
+    features = [_features(image) for image in images]
     return [
-        _agreement(views[place], views[place + 1], *_matched(features[place], features[place + 1]))
-        for place in range(len(views) - 1)
+        _pair(images[place], images[place + 1], *_nearest(features[place], features[place + 1]))
+        for place in range(len(images) - 1)
+    ]
+
+
+def agreements(
+    images: Sequence[DetectorImage], pairs: Sequence[PairMatches], poses: Sequence[RigidTransform]
+) -> list[PairAgreement]:
+    """The matches of a case's pictures, held against the body's pose at each."""
+    cameras = [image.camera.moved(pose) for image, pose in zip(images, poses, strict=True)]
+    return [
+        PairAgreement(one, offsets_px(before, after, one.pixels[0], one.pixels[1]))
+        for one, (before, after) in zip(pairs, itertools.pairwise(cameras), strict=True)
     ]
 
 
@@ -95,9 +107,9 @@ def agreement_row(pairs: Sequence[PairAgreement]) -> dict[str, Scalar]:
     residuals = np.concatenate([pair.residuals_px for pair in pairs])
     told = residuals.size > 0
     return {
-        "matches": sum(int(pair.right.sum()) for pair in pairs),
-        "matches_wrong_share": 1.0 - float(np.concatenate([pair.right for pair in pairs]).mean())
-        if any(pair.right.size for pair in pairs)
+        "matches": sum(int(pair.matches.right.sum()) for pair in pairs),
+        "matches_wrong_share": 1.0 - float(np.concatenate([pair.matches.right for pair in pairs]).mean())
+        if any(pair.matches.right.size for pair in pairs)
         else float("nan"),
         "pairs_matched": sum(pair.residuals_px.size > 0 for pair in pairs),
         "residual_median_px": float(np.median(residuals)) if told else float("nan"),
@@ -114,7 +126,7 @@ def agreement_products(images: Sequence[DetectorImage], pairs: Sequence[PairAgre
     """
     products: dict[str, object] = {f"image_{number}": image.counts for number, image in enumerate(images, start=1)}
     for number, pair in enumerate(pairs, start=1):
-        columns = [*pair.pixels, pair.offsets, pair.right[:, None].astype(np.float64)]
+        columns = [*pair.matches.pixels, pair.offsets, pair.matches.right[:, None].astype(np.float64)]
         products[f"matches_{number}"] = np.concatenate(columns, axis=1)
     return products
 
@@ -153,7 +165,7 @@ def _eight_bits(signal: Float64[np.ndarray, "rows columns"]) -> UInt8[np.ndarray
     return np.asarray(np.clip((signal - low) / max(high - low, 1e-9) * 255.0, 0.0, 255.0).astype(np.uint8))
 
 
-def _matched(first: _Features, second: _Features) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]:
+def _nearest(first: _Features, second: _Features) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]:
     """Pixels of features that are each other's nearest, and nearer than the second nearest by the ratio."""
     none = np.empty((0, 2))
     if len(first.pixels) < 2 or len(second.pixels) < 2:
@@ -173,14 +185,10 @@ def _matched(first: _Features, second: _Features) -> tuple[Float64[np.ndarray, "
     return np.asarray(first.pixels[ours]), np.asarray(second.pixels[theirs])
 
 
-def _agreement(
-    first: View, second: View, ours: Float64[np.ndarray, "n 2"], theirs: Float64[np.ndarray, "n 2"]
-) -> PairAgreement:
-    return PairAgreement(
-        pixels=np.stack([ours, theirs]),
-        right=_explained(first.image.camera, second.image.camera, ours, theirs),
-        offsets=offsets_px(first.camera, second.camera, ours, theirs),
-    )
+def _pair(
+    first: DetectorImage, second: DetectorImage, ours: Float64[np.ndarray, "n 2"], theirs: Float64[np.ndarray, "n 2"]
+) -> PairMatches:
+    return PairMatches(np.stack([ours, theirs]), _explained(first.camera, second.camera, ours, theirs))
 
 
 def _explained(

@@ -13,7 +13,7 @@ from algorithms.interface import VelocityEstimate
 from scenarios.estimators import VELOCITY
 from scenarios.interface import CaseResult, Scalar
 from scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, tried
-from scenarios.measured.consistency import agreement_products, agreement_row, agreements, views_of
+from scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
 from scenarios.measured.parameters import MeasuredVelocityParameters
 from scenarios.measured.store import StoredCase, descent_measurements, images_of
 from scenarios.trial import Judged, case_result
@@ -36,12 +36,13 @@ class MeasuredVelocityScenario(MeasuredScenario):
         p = checked(parameters, MeasuredVelocityParameters)
         images = images_of(p.cases, p.case)
         measurements = descent_measurements(p.case, images)
-        pairs = agreements(views_of(images, descent_poses(p.case, measurements)))
+        matches = matched(images)
         attempts = tried(p, p.dimes, measurements, checked_velocity, streams.case)
-        shown = agreement_products(images, pairs)
 
         def judge(algorithm: str) -> Judged:
             attempt = attempts[algorithm]
+            poses = descent_poses(p.case, measurements, _velocity(attempt.answer))
+            pairs = agreements(images, matches, poses)
             row = answer_row(attempt.answer, p.case, measurements)
             if algorithm != p.algorithm:
                 row["apart_m_s"] = distance(_velocity(attempt.answer), _velocity(attempts[p.algorithm].answer))
@@ -49,19 +50,27 @@ class MeasuredVelocityScenario(MeasuredScenario):
             return Judged(
                 outcome=attempt.outcome(lambda answer: answer.outcome.name),
                 answered=_velocity(attempt.answer) is not None,
-                row={**row, **attempt.row},
-                products={**kept, **shown},
+                row={**row, **agreement_row(pairs), **attempt.row},
+                products={**kept, **agreement_products(images, pairs)},
                 failure=attempt.failure,
             )
 
-        known = {**about(p, images), **_conditions(p.case, measurements), **agreement_row(pairs)}
-        return case_result(p.algorithms, judge, known)
+        return case_result(p.algorithms, judge, {**about(p, images), **_conditions(p.case, measurements)})
 
 
-def descent_poses(case: StoredCase, measurements: DescentMeasurements) -> list[RigidTransform]:
-    """The body's poses: by measured positions, or by the inertial unit's velocities, whose errors they then have."""
+def descent_poses(
+    case: StoredCase, measurements: DescentMeasurements, answered: Float64[np.ndarray, "2"] | None
+) -> list[RigidTransform]:
+    """The body's poses: by measured positions; where there are none by the inertial unit's velocities.
+
+    Those carry an unknown constant error, which an answer tells: with it, the second interval's horizontal velocity is
+    the answer's, and the first one's follows by the inertial change. Pictures then are held against the answer too.
+    """
+    velocities = measurements.interval_velocities_m_s.copy()
+    if answered is not None:
+        velocities[:, :2] += answered - velocities[1, :2]
     times = np.array([image.time_s for image in measurements.images])
-    steps = measurements.interval_velocities_m_s * np.diff(times)[:, None]
+    steps = velocities * np.diff(times)[:, None]
     places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     measured = [picture.position_m for picture in case.pictures]
     if all(place is not None for place in measured):

@@ -69,7 +69,7 @@ class _Folder:
     file: IngestFile
     target: Path
     cameras: dict[CameraModel, Named] = field(default_factory=dict)
-    flat_shape: tuple[int, ...] | None = None
+    flat_fields: dict[Path, tuple[Named, tuple[int, ...]]] = field(default_factory=dict)
 
     def error(self, row: PictureRow, message: str) -> IngestError:
         """What is wrong with a row of the table."""
@@ -94,7 +94,6 @@ def ingest(source: Path, target: Path) -> tuple[Path, StoredCases]:
     table = source / TABLE_FILE
     rows = read_table(table, file.task)
     folder = _Folder(source, file, target)
-    detector = _detector(folder)
     cases: list[StoredCase] = []
     problems: list[str] = []
     for number, case in enumerate(rows):
@@ -110,26 +109,20 @@ def ingest(source: Path, target: Path) -> tuple[Path, StoredCases]:
         description=file.description,
         task=file.task,
         folder=str(source.resolve()),
-        detector=detector,
+        detector=_detector(file),
         cases=tuple(cases),
     )
     return write_cases(target, stored), stored
 
 
-def _detector(folder: _Folder) -> StoredDetector:
-    stated = folder.file.detector
-    flat = None
-    if stated.flat_field is not None:
-        response = _flat_field(folder.source / stated.flat_field)
-        folder.flat_shape = response.shape
-        flat = put_flat_field(folder.target, response)
+def _detector(file: IngestFile) -> StoredDetector:
+    stated = file.detector
     return StoredDetector(
         offset_dn=stated.offset_dn,
         full_scale_dn=(1 << stated.bits) - 1,
         transfer_row_s=stated.transfer_row_s,
         clear_row_s=stated.clear_row_s,
         rows_summed=stated.rows_summed,
-        flat_field=flat,
     )
 
 
@@ -245,16 +238,28 @@ def _camera(folder: _Folder, row: PictureRow, product: Path | None) -> CameraMod
 
 def _check_counts(folder: _Folder, row: PictureRow, path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> None:
     full_scale = (1 << folder.file.detector.bits) - 1
-    rows, columns = counts.shape
     if counts.max() > full_scale:
         raise folder.error(
             row,
             f"{path}: holds counts up to {counts.max()}; detector.bits = {folder.file.detector.bits} allows "
             f"{full_scale}",
         )
-    if folder.flat_shape not in (None, counts.shape):
-        flat_rows, flat_columns = folder.flat_shape or (0, 0)
-        raise folder.error(row, f"{path}: has {columns} x {rows} pixels, the flat field {flat_columns} x {flat_rows}")
+
+
+def _flat(folder: _Folder, row: PictureRow, counts: UInt16[np.ndarray, "rows columns"]) -> Named | None:
+    """The picture's flat field, written once; None where none is known."""
+    stated = row.texts.get("flat_field", folder.file.detector.flat_field)
+    if stated is None:
+        return None
+    path = folder.source / stated
+    if path not in folder.flat_fields:
+        response = _flat_field(path)
+        named = put_flat_field(folder.target, len(folder.flat_fields), response)
+        folder.flat_fields[path] = named, response.shape
+    named, shape = folder.flat_fields[path]
+    if shape != counts.shape:
+        raise folder.error(row, f"{path}: has {shape[1]} x {shape[0]} pixels; {row.texts['file']} has others")
+    return named
 
 
 def _check_view(folder: _Folder, row: PictureRow, camera: CameraModel, attitude: Rotation) -> None:
@@ -284,6 +289,7 @@ def _stored(folder: _Folder, name: str, taken: _Taken) -> StoredPicture:
         size=taken.camera.size,
         counts=put_picture(folder.target, name, taken.counts),
         camera=camera,
+        flat_field=_flat(folder, row, taken.counts),
         time_s=taken.time_s,
         exposure_s=folder.file.detector.exposure_s if exposure is None else exposure,
         world_from_body_xyzw=_quaternion(taken.attitude),

@@ -15,7 +15,7 @@ from scenarios.estimators import LANDING
 from scenarios.interface import CaseResult, Scalar
 from scenarios.landing.motion import motion_errors, solved_row
 from scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, pose, tried
-from scenarios.measured.consistency import agreement_products, agreement_row, agreements, views_of
+from scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
 from scenarios.measured.parameters import MeasuredLandingParameters
 from scenarios.measured.store import StoredCase, images_of, landing_measurements, pose_of
 from scenarios.trial import Judged, case_result
@@ -36,7 +36,7 @@ class MeasuredLandingScenario(MeasuredScenario):
         p = checked(parameters, MeasuredLandingParameters)
         images = images_of(p.cases, p.case)
         measurements = landing_measurements(p.case, images)
-        pairs = agreements(views_of(images, [pose(picture) for picture in p.case.pictures]))
+        pairs = agreements(images, matched(images), [pose(picture) for picture in p.case.pictures])
         attempts = tried(p, p.hda, measurements, checked_site, streams.case)
         shown = agreement_products(images, pairs)
 

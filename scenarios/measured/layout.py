@@ -176,6 +176,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("case", _ALL, "every", "name of the case; its rows stand in the order of time"),
     Column("file", _ALL, "every", "the picture: PNG, PGM or TIFF of 8 or 16 bits and one band, or a PDS3 product"),
     Column("camera", _ALL, "", "camera file of this picture, in place of `camera.file`"),
+    Column("flat_field", _ALL, "", "flat field of this picture, in place of `detector.flat_field`"),
     Column("time_s", _ALL, _LABELLED, "middle of the exposure"),
     Column("exposure_s", _ALL, "", "exposure time, in place of `detector.exposure_s`"),
     *_columns("qx qy qz qw", _ALL, _LABELLED, _QUATERNION),
@@ -212,4 +213,4 @@ COLUMNS: tuple[Column, ...] = (
 )
 
 #: Names that hold text.
-TEXTS = ("case", "file", "camera")
+TEXTS = ("case", "file", "camera", "flat_field")

@@ -6,7 +6,7 @@ from pydantic import BaseModel
 
 from scenarios.interface import CaseResult
 from scenarios.measured.case import MeasuredScenario, about, checked, pose
-from scenarios.measured.consistency import agreement_products, agreement_row, agreements, views_of
+from scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
 from scenarios.measured.parameters import MatchingParameters
 from scenarios.measured.store import images_of
 from sim.streams import Streams
@@ -25,11 +25,11 @@ class MatchingScenario(MeasuredScenario):
         """One case."""
         p = checked(parameters, MatchingParameters)
         images = images_of(p.cases, p.case)
-        pairs = agreements(views_of(images, [pose(picture) for picture in p.case.pictures]))
-        matched = all(pair.residuals_px.size for pair in pairs)
+        pairs = agreements(images, matched(images), [pose(picture) for picture in p.case.pictures])
+        told = all(pair.residuals_px.size for pair in pairs)
         return CaseResult(
-            outcome=MATCHED if matched else TOO_FEW,
-            answered=matched,
+            outcome=MATCHED if told else TOO_FEW,
+            answered=told,
             row={**about(p, images), **agreement_row(pairs)},
             products=agreement_products(images, pairs),
         )

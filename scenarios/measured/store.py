@@ -1,4 +1,4 @@
-"""Ingested cases on disk: `cases.json`, and beside it pictures, cameras and the flat field that it names with hashes.
+"""Ingested cases on disk: `cases.json`, and beside it pictures, cameras and flat fields that it names with hashes.
 
 Everything is in our conventions: world axes east, north, up; attitudes are the body's; times in seconds.
 """
@@ -57,6 +57,7 @@ class StoredPicture(_Plain):
     size: tuple[int, int]
     counts: Named
     camera: Named
+    flat_field: Named | None = None
     time_s: float
     exposure_s: float
     world_from_body_xyzw: Quaternion
@@ -105,7 +106,6 @@ class StoredDetector(_Plain):
     transfer_row_s: float
     clear_row_s: float
     rows_summed: int
-    flat_field: Named | None = None
 
 
 class StoredCases(_Plain):
@@ -188,9 +188,10 @@ def put_camera(folder: Path, number: int, camera: CameraModel) -> Named:
     return _named(folder, path)
 
 
-def put_flat_field(folder: Path, flat: Float64[np.ndarray, "rows columns"]) -> Named:
-    """Writes the flat field beside `cases.json`."""
-    path = folder / "flat_field.npy"
+def put_flat_field(folder: Path, number: int, flat: Float64[np.ndarray, "rows columns"]) -> Named:
+    """Writes a flat field beside `cases.json`."""
+    (folder / "flat_fields").mkdir(exist_ok=True)
+    path = folder / "flat_fields" / f"{number:06d}.npy"
     np.save(path, flat, allow_pickle=False)
     return _named(folder, path)
 
@@ -220,12 +221,12 @@ def images_of(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]:
         Where a file has changed or cannot be read.
     """
     detector, folder = cases.stored.detector, cases.folder
-    flat = None if detector.flat_field is None else np.load(_unchanged(folder, detector.flat_field), allow_pickle=False)
     images = []
     for picture in case.pictures:
         counts = read_picture(_unchanged(folder, picture.counts))
+        flat = picture.flat_field
         known = DetectorCalibration(
-            flat_field=np.ones(counts.shape) if flat is None else flat,
+            flat_field=np.ones(counts.shape) if flat is None else np.load(_unchanged(folder, flat), allow_pickle=False),
             exposure_s=picture.exposure_s,
             transfer_row_s=detector.transfer_row_s,
             clear_row_s=detector.clear_row_s,

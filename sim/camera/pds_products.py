@@ -79,9 +79,7 @@ def _offset(text: str, source: Source) -> int:
     return (int(pointer[1]) - 1) * int(record[1])
 
 
-def _counts(
-    image: Any, size: tuple[int, int], offset: int, source: Source
-) -> UInt16[np.ndarray, "rows columns"]:
+def _counts(image: Any, size: tuple[int, int], offset: int, source: Source) -> UInt16[np.ndarray, "rows columns"]:
     bits, kind = image.get("SAMPLE_BITS"), str(image.get("SAMPLE_TYPE", ""))
     order = _ORDERS.get(kind.split("_")[0])
     if bits not in (8, 16) or order is None or not kind.endswith("INTEGER"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenarios.measured.consistency import PairAgreement, agreement_row, offsets_px
+from scenarios.measured.consistency import PairAgreement, PairMatches, agreement_row, offsets_px
 from sim.camera import Cahv, Cahvor
 from sim.frames import rigid
 
@@ -62,9 +62,9 @@ def test_rows_tell_of_right_matches_alone() -> None:
     offsets = np.full((40, 2), [3.0, 4.0])
     right = np.arange(40) < 20
     offsets[~right] = 500.0
-    told = agreement_row([PairAgreement(np.zeros((2, 40, 2)), right, offsets)])
+    told = agreement_row([PairAgreement(PairMatches(np.zeros((2, 40, 2)), right), offsets)])
     assert (told["matches"], told["residual_median_px"], told["residual_90_percent_px"]) == (20, 5.0, 5.0)
     assert told["matches_wrong_share"] == 0.5
-    few = agreement_row([PairAgreement(np.zeros((2, 40, 2)), np.arange(40) < 10, offsets)])
+    few = agreement_row([PairAgreement(PairMatches(np.zeros((2, 40, 2)), np.arange(40) < 10), offsets)])
     assert np.isnan(few["residual_median_px"])
     assert few["pairs_matched"] == 0

@@ -1,0 +1,77 @@
+"""`marsyard ingest` makes a campaign that runs and is reported, or says what is wrong and leaves nothing behind."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from folders import landing_folder, read_rows, velocity_folder, write_texts
+from typer.testing import CliRunner
+
+from campaigns.definition.loading import load_campaign
+from marsyard.cli import app
+from scenarios.conformance import inputs
+
+
+def told(*words: str) -> tuple[int, str]:
+    result = CliRunner().invoke(app, list(words))
+    return result.exit_code, result.output
+
+
+def test_real_pictures_are_run_and_reported(tmp_path: Path) -> None:
+    folder, cases, run = (
+        landing_folder(tmp_path / "in", inputs.landing(), "matching"),
+        tmp_path / "out",
+        tmp_path / "run",
+    )
+    status, output = told("ingest", str(folder), "--out", str(cases))
+    assert (status, "1 cases of 2 pictures" in output) == (0, True)
+    status, output = told("run", str(cases / "campaign.toml"), "--out", str(run), "--jobs", "1")
+    assert status == 0, output
+    frame = pd.read_parquet(run / "cases.parquet")
+    assert frame["outcome"].tolist() == ["MATCHED"]
+    report = json.loads((run / "report.json").read_text())
+    assert np.isclose(report["sections"]["agreement"]["median_of_medians_px"], frame["residual_median_px"][0])
+    page = (run / "report.html").read_text()
+    assert "Pictures against measured poses" in page
+    assert 'aria-label="Pictures 1 and 2: ' in page
+    status, output = told("replay", str(run), "0", "--out", str(tmp_path / "again"))
+    assert (status, "the row equals the stored one" in output) == (0, True)
+    assert (tmp_path / "again" / "matches-1.png").stat().st_size > 10_000
+
+
+def test_a_campaign_with_truth_asks_for_errors_by_the_estimate(tmp_path: Path) -> None:
+    given = inputs.descent()
+    folder = velocity_folder(tmp_path / "in", {"one": given, "two": given}, {"two": inputs.DESCENT_VELOCITY_M_S[:2]})
+    assert told("ingest", str(folder), "--out", str(tmp_path / "out"))[0] == 0
+    path = tmp_path / "out" / "campaign.toml"
+    written = tomllib.loads(path.read_text())
+    (asked,) = written["requirements"]
+    # pictures of 1024 x 256 pixels, four rows summed: binned as the descent camera's own are
+    assert written["parameters"]["dimes"]["binned_size"] == [256, 256]
+    assert (asked["decide_by"], asked["population"]) == ("estimate", "valid and truth_known")
+    campaign = load_campaign(str(path))
+    assert campaign.configuration.total_cases == 2
+    assert [campaign.parameters(case).case.name for case in range(2)] == ["one", "two"]  # type: ignore[attr-defined]
+    # the hash of all pictures is in what the campaign is known by
+    assert len(campaign.configuration.parameters["cases"]["sha256"]) == 64
+
+
+def test_what_is_wrong_ends_with_2_and_leaves_nothing(tmp_path: Path) -> None:
+    folder = landing_folder(tmp_path / "in", inputs.landing(), "matching")
+    rows = read_rows(folder)
+    rows[1]["file"] = "lost.png"
+    write_texts(folder, rows)
+    status, output = told("ingest", str(folder), "--out", str(tmp_path / "out"))
+    assert status == 2
+    assert "lost.png: No such file or directory" in output
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("mine")
+    status, output = told("ingest", str(folder), "--out", str(tmp_path / "full"))
+    assert (status, "is not empty" in output) == (2, True)
+    status, output = told("ingest", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
+    assert (status, "ingest.toml: cannot be read" in output) == (2, True)
