@@ -14,7 +14,7 @@ STAGES: dict[str, tuple[tuple[str, str], ...]] = {
     "flight": (("descent/flight.py", "flown_descent"),),
     "mesh and OpenGL": (("render/renderer.py", "_load"), ("render/renderer.py", "_draw")),
     "what rays meet": (("kernels/sight.py", "look"),),
-    "shadow of the ground": (("render/renderer.py", "_ground_shadow"),),
+    "shadow of the ground": (("render/ground_shadow.py", "ground_shadow"),),
     "shading": (("kernels/shading.py", "shade"),),
     "pixels with edges, but for their shading": (
         ("render/edges.py", "edge_pixels"),

@@ -299,8 +299,7 @@ class _Frame:
         return found.x, found.fun
 
     def gaps(self, unknown: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6"]:
-        gaps: Float64[np.ndarray, "6"] = self._gaps(unknown[None])[0]
-        return gaps
+        return self._lowest(unknown)[0]
 
     def gap_slopes(self, unknown: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6 6"]:
         return self.gaps_and_slopes(unknown)[1]
@@ -308,23 +307,38 @@ class _Frame:
     def gaps_and_slopes(
         self, unknown: Float64[np.ndarray, "6"]
     ) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 6"]]:
-        """The gaps, and by differences how they change with each unknown."""
-        beside = _DIFFERENCE * np.eye(6)
-        all_gaps = self._gaps(np.concatenate([unknown[None], unknown - beside, unknown + beside]))
-        slopes: Float64[np.ndarray, "6 6"] = ((all_gaps[7:] - all_gaps[1:7]) / (2.0 * _DIFFERENCE)).T
-        return all_gaps[0], slopes
+        """The gaps, and by differences how they change with each unknown.
 
-    def _gaps(self, unknown: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
-        """Least height of each wheel's tread above the ground."""
-        turn = self.rotation(unknown).as_matrix()
-        centres = _wheel_centres(self.rover, unknown[:, 3:])
+        A wheel's gap changes as the height of that place of its tread which is lowest: only there are the differences
+        taken.
+        """
+        gaps, places = self._lowest(unknown)
+        beside = _DIFFERENCE * np.eye(6)
+        ends = self._heights(np.concatenate([unknown - beside, unknown + beside]), places[:, None])[..., 0]
+        slopes: Float64[np.ndarray, "6 6"] = ((ends[6:] - ends[:6]) / (2.0 * _DIFFERENCE)).T
+        return gaps, slopes
+
+    def _lowest(self, unknown: Float64[np.ndarray, "6"]) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 3"]]:
+        """Least height of each tread above the ground, and the place on the tread, from its wheel's middle."""
+        heights = self._heights(unknown[None], self.tread[None])[0]
+        lowest = heights.argmin(axis=1)
+        return heights[np.arange(6), lowest], self.tread[lowest]
+
+    @cached_property
+    def tread(self) -> Float64[np.ndarray, "places 3"]:
+        """Places of a wheel's tread that may touch the ground, from its centre."""
         angle, line = np.meshgrid(_TREAD_RAD, _TREAD_LINES)
         radius, width = self.rover.wheel_radius_m, self.rover.wheel_width_m
-        tread = np.stack([radius * np.sin(angle), width * line, -radius * np.cos(angle)], axis=-1).reshape(-1, 3)
-        points = np.einsum("nij,nwtj->nwti", turn, centres[:, :, None, :] + tread)
-        world = (
-            points + np.concatenate([np.tile(self.place_m, (len(unknown), 1)), unknown[:, :1]], axis=1)[:, None, None]
-        )
-        ground = self.ground.height(world[..., 0], world[..., 1])
-        gaps: Float64[np.ndarray, "n 6"] = (world[..., 2] - ground).min(axis=2)
-        return gaps
+        return np.stack([radius * np.sin(angle), width * line, -radius * np.cos(angle)], axis=-1).reshape(-1, 3)
+
+    def _heights(
+        self, unknown: Float64[np.ndarray, "n 6"], treads: Float64[np.ndarray, "wheels places 3"]
+    ) -> Float64[np.ndarray, "n 6 places"]:
+        """Heights above the ground of places of the wheels' treads, the same for all wheels or each wheel's own."""
+        turn = self.rotation(unknown).as_matrix()
+        points = _wheel_centres(self.rover, unknown[:, 3:])[:, :, None, :] + treads
+        world = np.einsum("nij,nwtj->nwti", turn, points)
+        world[..., :2] += self.place_m
+        world[..., 2] += unknown[:, 0, None, None]
+        heights: Float64[np.ndarray, "n 6 places"] = world[..., 2] - self.ground.height(world[..., 0], world[..., 1])
+        return heights

@@ -127,7 +127,7 @@ class Objects:
 
     @cached_property
     def hierarchy(self) -> Hierarchy:
-        """The tree in which shadows look for triangles."""
+        """The tree in which rays look for triangles."""
         order = np.argsort(morton_codes(self.triangles), kind="stable")
         return self.triangles, order, node_boxes(self.triangles, order)
 

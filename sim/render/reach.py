@@ -6,8 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation
 
+from sim.render.kernels.casters import Casters, listed_casters
 from sim.render.kernels.shading import Reach
-from sim.render.objects import spheres_in_cone
+from sim.render.objects import Objects, spheres_in_cone
+from sim.render.photometry import Sun
 
 #: A cone: where its tip is, the unit vector along its middle, and its half angle in radians.
 Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]
@@ -49,6 +51,17 @@ def shade_reach(spheres: Float64[np.ndarray, "bodies 4"], sun: Float64[np.ndarra
     column, row = np.floor((places - corner) / cell).astype(int).T
     touched[row, column] = True
     return binary_dilation(touched, np.ones((3, 3), dtype=np.bool_)), float(corner[0]), float(corner[1]), 1.0 / cell
+
+
+def casters_towards(objects: Objects, sun: Sun) -> Casters:
+    """The triangles of objects, listed by where they lie across the rays to a sun."""
+    towards = np.asarray(sun.direction, dtype=np.float64)
+    across = np.cross(towards, np.eye(3)[int(np.argmin(np.abs(towards)))])
+    across /= np.linalg.norm(across)
+    # the kernel's rays run exactly along the sun's direction, as the third axis
+    axes = np.stack([across, np.cross(towards, across), towards])
+    casters: Casters = listed_casters(objects.triangles, objects.first_triangle, axes)
+    return casters
 
 
 def concerned(

@@ -20,21 +20,20 @@ from scipy.spatial.transform import RigidTransform
 from sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
 from sim.render.clouds import CloudLayer, no_cover
 from sim.render.edges import Sight, edge_pixels, look_within, rays_within
-from sim.render.kernels.ground import height_range
+from sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow
+from sim.render.kernels.casters import Casters
+from sim.render.kernels.ground import Bounds, height_range
 from sim.render.kernels.shading import Clouds, Reach, shade
 from sim.render.kernels.sight import look
-from sim.render.kernels.sun import Shadow, heights_in_rows, sweep_shadow
+from sim.render.kernels.sun import Shadow
 from sim.render.mesh import graded_offsets, ground_mesh, lines_in_view
 from sim.render.objects import Objects
 from sim.render.photometry import Photometry, Sun, Texture
 from sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
-from sim.render.reach import EVERYWHERE, Cone, concerned, shade_reach
+from sim.render.reach import EVERYWHERE, Cone, casters_towards, concerned, shade_reach
 from sim.terrain import Surface
 
 NO_TEXTURE = Texture()
-#: Most posts along a side of the grid on which the ground's shadow is swept.
-SHADOW_SIDE = 4096
-NO_SHADOW = ((np.full((1, 1), -np.inf, dtype=np.float32), np.zeros((1, 1), dtype=np.uint8), False), 1.0, 0)
 NO_CLOUDS = (no_cover(), np.zeros(5))
 
 #: Direction of the sun, the numbers of the law and of the sky, and clouds, as the kernel takes them.
@@ -70,6 +69,8 @@ class Scene:
         it the places where they may fall are found before, which spares all others the search (`sim.render.reach`).
     edge_rays
         Rays along each side of a pixel that holds an edge (`sim.render.edges`); 1 draws every pixel by one ray.
+    shown_m
+        Least and greatest x, least and greatest y of what pictures show; None where they may show anything.
     """
 
     surface: Surface
@@ -87,6 +88,7 @@ class Scene:
     mesh_lines: int = 513
     among_objects: bool = False
     edge_rays: int = 2
+    shown_m: Bounds | None = None
 
     @cached_property
     def mesh_offsets(self) -> Float64[np.ndarray, "lines"]:
@@ -107,12 +109,16 @@ class Scene:
         return other
 
     def within(self, cones: Sequence[Cone]) -> Scene:
-        """The scene with those objects alone that pictures within these cones may show, or show the shadows of."""
+        """The scene with those objects alone that pictures within these cones may show, or show the shadows of.
+
+        The ground's shadow is found only where these pictures may show it.
+        """
         sun, lowest = np.asarray(self.sun.direction, dtype=np.float64), self.height_range_m[0]
         kept = np.zeros(len(self.objects), dtype=np.bool_)
         for cone in cones:
             kept |= concerned(self.objects.spheres, sun, lowest, cone)
-        return self.with_objects(self.objects.only(kept))
+        less = replace(self, objects=self.objects.only(kept), shown_m=ground_in_cones(cones, lowest))
+        return self._knowing(less, "mesh_offsets", "height_range_m")
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
@@ -131,7 +137,12 @@ class Scene:
         """The ground's shadow on the grid of a level of the surface, the grid's spacing, and the level."""
         if not self.ground_shadows or self.sun.direction[2] <= 0.0:
             return NO_SHADOW
-        return _ground_shadow(self.surface, self.sun, self.height_range_m)
+        return ground_shadow(self.surface, self.sun, self.height_range_m, self.shown_m)
+
+    @cached_property
+    def casters(self) -> Casters:
+        """The objects' triangles as shadows look for them."""
+        return casters_towards(self.objects, self.sun)
 
     @cached_property
     def reach(self) -> Reach:
@@ -152,22 +163,6 @@ class Scene:
         sky = self.photometry.sky_numbers(self.sun)
         towards = np.asarray(self.sun.direction, dtype=np.float64)
         return towards, photometry.law(self.sun, self.caster_diameter_m), sky, drifting
-
-
-def _ground_shadow(surface: Surface, sun: Sun, height_range_m: tuple[float, float]) -> tuple[Shadow, float, int]:
-    """Sweeps the shadow along whichever axis the sun's azimuth is nearer to."""
-    level = int(np.argmax([one.shape[0] <= SHADOW_SIDE for one in surface.levels]))
-    spacing = surface.spacing_m * 2.0**level
-    east, north, up = sun.direction
-    along_x = abs(east) > abs(north)
-    main, side = (east, north) if along_x else (north, east)
-    if main == 0.0:
-        return NO_SHADOW
-    drop = spacing * up / abs(main)
-    reach = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, len(surface.levels[level])))
-    height = heights_in_rows(surface.levels[level], along_x)
-    swept, away = sweep_shadow(height, float(np.sign(main)), drop, side / abs(main), reach)
-    return (swept, away, along_x), spacing, level
 
 
 @dataclass(frozen=True)
@@ -380,7 +375,7 @@ def _shaded(
         scene.objects.normals,
         scene.objects.body_of_triangle,
         scene.objects.albedo,
-        scene.objects.hierarchy,
+        scene.casters,
         scene.reach,
         radiance,
         body,

@@ -221,35 +221,3 @@ def in_beam(
         if node == 0:
             return count
         node += 1
-
-
-@njit(cache=True)
-def anything_hit(tree: Hierarchy, x: float, y: float, z: float, direction: Array, clearance: float) -> bool:
-    """Whether a ray meets a triangle farther away than `clearance`."""
-    triangles, order, boxes = tree
-    if order.size == 0:
-        return False
-    dx = direction[0]
-    dy = direction[1]
-    dz = direction[2]
-    ix = 1.0 / (dx if abs(dx) > 1e-12 else 1e-12)
-    iy = 1.0 / (dy if abs(dy) > 1e-12 else 1e-12)
-    iz = 1.0 / (dz if abs(dz) > 1e-12 else 1e-12)
-    first_leaf = boxes.shape[0] // 2
-    # depth first without a stack, which would cost more than the walk: after a subtree comes its right neighbour
-    node = 0
-    while True:
-        if _entry(boxes, node, x, y, z, ix, iy, iz) < math.inf:
-            if node < first_leaf:
-                node = 2 * node + 1
-                continue
-            start = (node - first_leaf) * LEAF
-            for k in range(start, min(start + LEAF, order.size)):
-                t, second, third = hit_triangle(triangles, order[k], x, y, z, dx, dy, dz)
-                if clearance < t < math.inf and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
-                    return True
-        while node > 0 and node % 2 == 0:
-            node = (node - 1) // 2
-        if node == 0:
-            return False
-        node += 1

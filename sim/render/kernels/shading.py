@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sim.render.kernels.casters import Casters, hides_sun
 from sim.render.kernels.ground import Array32, world_ray
-from sim.render.kernels.hierarchy import Hierarchy, anything_hit
 from sim.render.kernels.sight import FLATTEST, Ints
 from sim.render.kernels.sky import sky_brightness
 from sim.render.kernels.sun import (
@@ -81,7 +81,7 @@ def shade(
     normals: Array,
     body_of_triangle: Ints,
     albedos: Array,
-    tree: Hierarchy,
+    casters: Casters,
     reach: Reach,
     radiance: Array32,
     body: Ints,
@@ -117,9 +117,9 @@ def shade(
         Height that no ground exceeds.
     ground_texture, object_texture
         Coarsest cell and amplitudes of octaves.
-    normals, body_of_triangle, albedos, tree
+    normals, body_of_triangle, albedos, casters
         Triangles that stand on the ground: normals at their corners, the body of each, the bodies' albedos, and the
-        triangles themselves with the tree in which shadows look for them.
+        lists in which shadows look for them.
     reach
         Where the ground may lie in those shadows: a grid, its west and south border, and cells a metre; 0: everywhere.
     radiance, body, normal
@@ -134,7 +134,7 @@ def shade(
     top_level = len(levels) - 1
     shadowed = shadow[0].shape[0] > 1
     finest = levels[0]
-    things = tree[0].shape[0] > 0
+    things = casters[0].shape[0] > 0
     for n in range(directions.shape[0]):
         x0, y0, z0, dx, dy, dz = world_ray(world_from_body, position, origins, directions, n)
         t = distance[n]
@@ -217,7 +217,7 @@ def shade(
             if lit > 0.0 and things and (triangle >= 0 or _in_reach(reach, x, y)):
                 # lifted off its own facet, so that this and those beside do not shade it by rounding
                 lift = 1e-4 + (0.05 * t * pixel_angles[n] if triangle >= 0 else 0.0)
-                if anything_hit(tree, x + lift * nx, y + lift * ny, z + lift * nz, sun, 0.0):
+                if hides_sun(casters, x + lift * nx, y + lift * ny, z + lift * nz):
                     lit = 0.0
             cos_g = min(max(-(dx * sun[0] + dy * sun[1] + dz * sun[2]), -1.0), 1.0)
             if caster > 0.0 and cos_g > 0.9:

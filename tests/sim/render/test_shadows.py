@@ -8,6 +8,10 @@ from benchmarks.validation.raycast import Ground, meet_triangles
 from sim.camera import Cahv
 from sim.frames import direction, rigid
 from sim.render import Frame, Objects, Photometry, PixelRays, Scene, Sun
+from sim.render.ground_shadow import ground_in_cones, ground_shadow
+from sim.render.kernels.casters import hides_sun
+from sim.render.kernels.ground import height_range
+from sim.render.reach import casters_towards
 from sim.terrain import Surface, TerrainParameters, synthesise
 from sim.terrain.rocks import RockField, RockParameters
 
@@ -95,3 +99,56 @@ def test_penumbra_of_a_ridge(renderer, descent_camera) -> None:
     # a metre wide, pixels of 3 cm
     assert 0.1 < np.mean((expected > 0.0) & (expected < 1.0)) < 0.3
     np.testing.assert_allclose(lit, expected, atol=0.01)
+
+
+@pytest.mark.parametrize("elevation", [-0.2, 0.15, 1.0, np.pi / 2])
+def test_places_are_hidden_from_the_sun_as_all_triangles_say(elevation: float) -> None:
+    """Triangles of all sizes and any shape, some of them upright, in bodies that overlap."""
+    rng = np.random.default_rng(8)
+    middles = rng.uniform(-5.0, 5.0, (60, 1, 1, 3))
+    triangles = (middles + 10.0 ** rng.uniform(-1.5, 0.3, (60, 1, 1, 1)) * rng.normal(size=(60, 7, 3, 3))).reshape(
+        -1, 3
+    )
+    faces = np.arange(len(triangles), dtype=np.int32).reshape(-1, 3)
+    names = np.repeat(np.arange(60, dtype=np.int32), 7)
+    objects = Objects.of_mesh(triangles, np.zeros_like(triangles), faces, names, ALBEDO)
+    sun = Sun(direction(0.7, elevation))
+    places = rng.uniform(-9.0, 9.0, (3000, 3))
+    casters = casters_towards(objects, sun)
+    found = np.array([hides_sun(casters, *place) for place in places])
+    rays = np.broadcast_to(sun.direction, places.shape)
+    expected = np.isfinite(meet_triangles(objects, places, rays, nearest=0.0))
+    assert 0.1 < np.mean(expected) < 0.9
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 200.0, 290.0, 45.0])
+def test_a_shadow_swept_where_it_is_seen_is_the_whole_ground_s_there(rough: Surface, azimuth_deg: float) -> None:
+    """Also over the border of the terrain's period."""
+    sun = Sun(direction(np.radians(azimuth_deg), np.radians(35.0)))
+    heights = height_range(rough.levels[0])
+    shown = (-40.0, 60.0, 700.0, 760.0)
+    (whole, _, along_x), spacing, level = ground_shadow(rough, sun, heights)
+    (part, _, part_along_x), part_spacing, part_level = ground_shadow(rough, sun, heights, shown)
+    assert (along_x, spacing, level) == (part_along_x, part_spacing, part_level)
+    assert len(part) < len(whole)
+    x, y = (np.arange(int(a / spacing) - 1, int(b / spacing) + 3) for a, b in (shown[:2], shown[2:]))
+    rows, columns = (x, y) if along_x else (y, x)
+    of_whole, of_part = (each[np.ix_(rows & (len(each) - 1), columns & (len(each) - 1))] for each in (whole, part))
+    np.testing.assert_array_equal(of_part, of_whole)
+
+
+def test_ground_in_cones_holds_all_places_in_them() -> None:
+    rng = np.random.default_rng(2)
+    tip, half = np.array([3.0, -2.0, 1.5]), 0.12
+    axis = direction(2.0, -0.3)
+    bounds = ground_in_cones([(tip, axis, half)], -0.4)
+    assert bounds is not None
+    rays = axis + np.tan(half) * rng.uniform(-1.0, 1.0, (20000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = rays[rays @ axis >= np.cos(half)]
+    places = tip + (rng.uniform(0.0, 1.0, len(rays)) ** 0.1 * (-0.4 - tip[2]) / rays[:, 2])[:, None] * rays
+    low, high = np.array(bounds).reshape(2, 2).T
+    assert np.all((places[:, :2] > low) & (places[:, :2] < high))
+    assert np.all(high - low < 1.1 * np.ptp(np.vstack([places, tip])[:, :2], axis=0))
+    assert ground_in_cones([(tip, direction(2.0, -0.1), half)], -0.4) is None
