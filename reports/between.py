@@ -87,7 +87,10 @@ def figures_of(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
             chosen = members(frame, str(asked.get("population", "all")))
         except ValueError:
             continue
-        success = succeeded(frame, metric, float(bound) if isinstance(bound, int | float) else math.nan)
+        limit, scale = (
+            float(one) if isinstance(one, int | float) else math.nan for one in (bound, asked.get("scale", 1))
+        )
+        success = succeeded(frame, metric, limit, scale)
         found[name] = Figure(name, True, np.where(chosen, success.astype(np.float64), np.nan))
         if isinstance(bound, int | float):
             metrics[metric] = None

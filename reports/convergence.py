@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from reports.columns import magnitude_label, numbers
 from reports.plates import plate
@@ -19,6 +19,8 @@ from reports.statistics.samples import quantile_bounds
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from reports.verdicts import judge_campaign
 
+#: Up to this ratio of the most cases to the fewest an axis has ticks within its decades too.
+_FEW_DECADES = 50
 #: Numbers of cases at which figures are taken, evenly spread in their logarithm, and the least of them.
 POINTS, FEWEST = 12, 8
 QUANTILE, CONFIDENCE = 0.95, 0.9
@@ -115,6 +117,8 @@ def curve_figure(points: Sequence[Point], name: str, asked: float | None) -> Fig
     if asked is not None and math.isfinite(asked):
         axes.axhline(asked, color=REQUIREMENT, linewidth=1.4, linestyle="--")
     axes.set(xscale="log", xlabel="cases", ylabel=name)
+    if cases[-1] < _FEW_DECADES * cases[0]:
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())
     return figure

@@ -16,7 +16,7 @@ from reports.sections import Grid
 from reports.statistics.changes import holm
 from reports.statistics.drivers import Driver, driver
 from reports.verdicts import succeeded, terrain_groups
-from reports.wording import number, percent, stated
+from reports.wording import coefficient, percent, stated
 
 CONFIDENCE = 0.9
 #: Conditions that are ranked, and cases that are looked at: the first ones, which tell as much as they need to.
@@ -72,8 +72,8 @@ def _grid(ranked: Ranked) -> Grid:
         [
             label(column),
             f"{one.n:,}",
-            number(one.correlation),
-            f"{number(one.lower)} to {number(one.upper)}",
+            coefficient(one.correlation),
+            f"{coefficient(one.lower)} to {coefficient(one.upper)}",
             percent(one.share),
             f"{percent(one.share_lower)} to {percent(one.share_upper)}",
             "< 0.001" if p < 0.001 else "–" if math.isnan(p) else f"{p:.3f}",

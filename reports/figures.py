@@ -173,15 +173,20 @@ def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | 
     top = max(top, 1.12 * bound) if bound is not None and top > 0.6 * bound else top
     top = min(top, _FARTHEST * bound) if bound else top
     top = top or 1.0
-    for kind in categories(frame, metric, bound):
+    kinds = categories(frame, metric, bound)
+    for kind in kinds:
         chosen = kind.chosen & known
         _draw_points(axes, x[chosen], np.minimum(magnitude[chosen], top), kind)
+    if len(kinds) > 1 and not axis_columns(metric, [str(name) for name in frame.columns]):
+        # no scatter on the page tells them apart
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, handletextpad=0.2)
     _conditional_curves(axes, x[known], np.minimum(magnitude[known], top))
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
     raster = bool(silent.sum() > LARGEST_VECTOR_SAMPLE)
     axes.plot(x[silent], np.full(silent.sum(), top), "|", color=INK, markersize=9, clip_on=False, rasterized=raster)
     axes.set(xlabel=label(driver), ylabel=magnitude_label(metric), ylim=(0.0, top))
+    axes.xaxis.set_major_locator(MaxNLocator(5))
     return figure
 
 

@@ -19,7 +19,7 @@ from reports.figures import (
     worth_a_closer_look,
 )
 from reports.plates import Plate, plate
-from reports.wording import count, number
+from reports.wording import coefficient, count
 
 
 def error_plates(frame: pd.DataFrame, whole: pd.DataFrame, metric: str, bound: float | None) -> list[Plate]:
@@ -51,7 +51,7 @@ def _ranks(frame: pd.DataFrame, metric: str, driver: str) -> str:
     correlation = rank_correlation(numbers(frame, driver), np.abs(numbers(frame, metric)))
     if np.isnan(correlation):
         return f"{label(driver)}."
-    return f"{label(driver)}: rank correlation {number(correlation)}."
+    return f"{label(driver)}: rank correlation {coefficient(correlation)}."
 
 
 def outcome_plates(frame: pd.DataFrame) -> list[Plate]:

@@ -126,7 +126,7 @@ def worst_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> 
 
 
 def silent_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
-    """Cases that ran to their end without an error to score: no answer was given."""
+    """Cases that ran to their end without an error to score."""
     silent = ~np.isfinite(numbers(run.whole, metric)) & members(run.whole, "completed")
     order = np.flatnonzero(silent)
     return _case_table(run, order[:_MOST_CASES].tolist(), [], metric, max(0, order.size - _MOST_CASES), pictured)

@@ -18,7 +18,11 @@ class Asked(Protocol):
 
     @property
     def bound(self) -> float | None:
-        """Largest magnitude of the metric."""
+        """Largest magnitude of the metric times the scale."""
+
+    @property
+    def scale(self) -> float:
+        """What the metric is multiplied by."""
 
     @property
     def probability(self) -> float:
@@ -40,7 +44,8 @@ class Asked(Protocol):
 def asked_text(asked: Asked, metric: str) -> str:
     """What a requirement asks of a metric, which is named as the reader should see it."""
     unbounded = asked.bound is None or math.isnan(asked.bound)
-    what = metric if unbounded else f"|{metric}| ≤ {asked.bound:g}"
+    scaled = "" if asked.scale == 1.0 else f"{asked.scale:g} × "
+    what = metric if unbounded else f"{scaled}|{metric}| ≤ {asked.bound:g}"
     confidence = f"{stated(asked.confidence)} confidence"
     how = f"by the estimate, bounds at {confidence}" if asked.decide_by == "estimate" else f"at {confidence}"
     return f"{what} in at least {stated(asked.probability)} of {population_text(asked.population)}, {how}"
@@ -57,12 +62,21 @@ def population_text(population: str) -> str:
 def number(value: float) -> str:
     """A number with about three significant digits; a dash where there is none.
 
-    >>> number(1.23456), number(123.456), number(0.0)
-    ('1.235', '123.5', '0.000')
+    >>> number(1.23456), number(123.456), number(0.0123456), number(0.0)
+    ('1.235', '123.5', '0.0123', '0.000')
     """
     if math.isnan(value):
         return NOTHING
     return _digits(value).replace("-", "−")
+
+
+def coefficient(value: float) -> str:
+    """A correlation, to three decimals; a dash where there is none.
+
+    >>> coefficient(-0.25), coefficient(1e-5)
+    ('−0.250', '0.000')
+    """
+    return NOTHING if math.isnan(value) else f"{value:z.3f}".replace("-", "−")
 
 
 def _digits(value: float) -> str:
@@ -71,7 +85,8 @@ def _digits(value: float) -> str:
     magnitude = abs(value)
     if magnitude != 0.0 and (magnitude >= 1e5 or magnitude < 1e-3):
         return f"{value:.2e}"
-    return f"{value:.{3 if magnitude < 10 else 2 if magnitude < 100 else 1}f}"
+    places = ((0.0, 3), (0.01, 5), (0.1, 4), (10.0, 3), (100.0, 2), (math.inf, 1))
+    return f"{value:.{next(digits for below, digits in places if magnitude <= below)}f}"
 
 
 def interval(lower: float, upper: float) -> str:

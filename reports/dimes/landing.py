@@ -41,7 +41,7 @@ def landing_section(subject: Subject) -> Section | None:
     }
     if is_flag(landed, IN_TIME):
         punctual = members(landed, IN_TIME)
-        shares["answer there when thrusters fired, of all landings"] = share_of(punctual, landed)
+        shares["computed before the thrusters fired, of all landings"] = share_of(punctual, landed)
     rows = [
         [name, f"{one.hits:,} of {one.n:,}", percent(one.share), f"{percent(one.lower)} to {percent(one.upper)}"]
         for name, one in shares.items()

@@ -21,11 +21,13 @@
     else verdict.textContent = "no campaign fits";
     evidence.textContent = latest ? latest.evidence : "\u2013";
     if (latest) {
-      const about = document.createElement("span"), link = document.createElement("a");
+      const [about, link, date] = ["span", "a", "span"].map((name) => document.createElement(name));
       about.className = "asked";
       link.href = `c/${latest.slug}/index.html`;
       link.textContent = latest.name;
-      about.append(link, `, ${latest.date}`);
+      date.className = "date";
+      date.textContent = latest.date;
+      about.append(link, ", ", date);
       evidence.append(about);
     }
     margin.textContent = latest ? latest.margin : "\u2013";

@@ -35,7 +35,8 @@ def test_draws_of_their_own_are_compared_as_two_samples(make_rows: Rows, make_ru
     assert min(one.p_value for one in found.values()) > 0.01
     _, changed = _contrasts(first, make_run(make_rows(300, seed=2, answered=0.6, spread=2.0), name="worse", seed=8))
     assert changed["answered"].p_value < 1e-6
-    assert changed["velocity error (m/s)"].p_value < 1e-6
+    # of 10,000 permutations none goes as far
+    assert changed["velocity error (m/s)"].p_value < 1e-3
     grid = contrast_grid(["a", "b"], list(changed.values()))
     assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
 
