@@ -115,12 +115,14 @@ def run(
 ) -> None:
     """Run a campaign, judge its requirements, and write its report."""
     from campaigns.definition.loading import load_campaign
+
+    limits = [] if case_time is None else [f"limits.case_time_s={case_time}"]
+    loaded = load_campaign(campaign, [*(override or []), *limits], cases, seed, algorithm or [])
+    # only now, so that a file that is wrong is told of at once
     from campaigns.running.engine import run_campaign
     from marsyard.deciding import run_until_decided
 
     crew = make_crew(jobs, cluster)
-    limits = [] if case_time is None else [f"limits.case_time_s={case_time}"]
-    loaded = load_campaign(campaign, [*(override or []), *limits], cases, seed, algorithm or [])
     if dry_run:
         _print_estimate(loaded, crew)
         return

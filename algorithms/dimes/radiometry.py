@@ -22,8 +22,8 @@ tracks stay valid and no velocity is reported, over terrain of 15 % contrast err
 from __future__ import annotations
 
 import numpy as np
+import scipy  # its signal is slow to import, and so left until it is called
 from jaxtyping import Float
-from scipy.signal import lfilter
 
 from algorithms.dimes.binning import View
 from sim.measurements import DetectorCalibration
@@ -36,7 +36,7 @@ def _row_sums(
     signal: Float[np.ndarray, "rows columns"], own: float, before: float
 ) -> Float[np.ndarray, "rows_and_one columns"]:
     """P_0 = 0, P_(R+1) = P_R + x_R with x_R = (y_R - before P_R) / own, shape (rows + 1, columns)."""
-    sums = lfilter([1.0 / own], [1.0, before / own - 1.0], signal, axis=0)
+    sums = scipy.signal.lfilter([1.0 / own], [1.0, before / own - 1.0], signal, axis=0)
     return np.concatenate([np.zeros((1, signal.shape[1])), sums])
 
 

@@ -33,11 +33,12 @@ _TEXT = (
     "residual is how far off it is. It holds the errors of poses, lens and matching together: a few tenths of a pixel "
     "are what matching alone leaves, more is the poses' or the camera's."
 )
-_NOTE = (
+_INERTIAL = (
     "Velocities beside the inertial one hold its own constant error; the discrepancy of pairs, the change of velocity "
-    "from the first pair of pictures to the second against the inertial one, does not. Cases that were measured are no "
-    "random draws: nothing here is a probability."
+    "from the first pair of pictures to the second against the inertial one, does not. Without measured positions the "
+    "residual is that of the answer: its velocity stands for the inertial one's constant part. "
 )
+_NO_DRAWS = "Cases that were measured are no random draws: nothing here is a probability."
 
 
 def agreement_section(subject: Subject) -> Section | None:
@@ -51,6 +52,7 @@ def agreement_section(subject: Subject) -> Section | None:
     plates = []
     if np.count_nonzero(np.isfinite(numbers(frame, MEDIAN))) >= _LEAST_DRAWN:
         plates.append(plate(residual_figure(frame), "agreement", "Residuals of the cases, the smallest median first."))
+    note = (_INERTIAL if "beside_inertial_m_s" in names else "") + _NO_DRAWS
     grid = Grid(head, rows, max(0, len(frame) - _MOST_ROWS))
     medians = numbers(frame, MEDIAN)
     data = {
@@ -59,7 +61,7 @@ def agreement_section(subject: Subject) -> Section | None:
         "median_of_medians_px": float(np.nanmedian(medians)) if np.isfinite(medians).any() else None,
         "apart": {name: float(np.nanmedian(numbers(frame, name))) for name in names if _is_apart(name)},
     }
-    blocks = [Block(text=_TEXT, plates=plates, grid=grid, note=_NOTE)]
+    blocks = [Block(text=_TEXT, plates=plates, grid=grid, note=note)]
     return Section("agreement", "Agreement", "Pictures against measured poses", blocks, data)
 
 

@@ -14,9 +14,9 @@ import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Float64
 
 from sim.dynamics.recorded import LEAST_INSTANTS
@@ -117,6 +117,8 @@ def _from_kernels(path: str) -> RecordedPoses:
 
 def _values(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
     """Time, position, quaternion (x, y, z, w) of each row."""
+    import pandas as pd  # slow to import: for campaigns that have such a file
+
     text = head.decode("utf-8", errors="replace")
     first = text.lstrip("\ufeff").split("\n", 1)[0].strip()
     if head.startswith(b"PAR1"):
@@ -137,12 +139,12 @@ def _values(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
     return values.reshape(-1, 8)
 
 
-def _columns(path: str, frame: pd.DataFrame) -> Float64[np.ndarray, "n 8"]:
+def _columns(path: str, frame: Any) -> Float64[np.ndarray, "n 8"]:
     frame = frame.rename(columns=lambda name: str(name).strip())
     missing = [name for name in COLUMNS if name not in frame.columns]
     if missing:
         raise TrajectoryFileError(f"{path}: has no column {', '.join(missing)}; allowed: {_ALLOWED}")
-    return frame[list(COLUMNS)].to_numpy(dtype=np.float64)
+    return np.asarray(frame[list(COLUMNS)].to_numpy(dtype=np.float64))
 
 
 def _checked(path: str, digest: str, values: Float64[np.ndarray, "n 8"]) -> RecordedPoses:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its signal is slow to import, and so left until it is called
 from jaxtyping import Float64
 from scipy.interpolate import make_interp_spline
-from scipy.signal import lfilter
 
 #: Knots per correlation time. Straight lines between them lose at most 1 % of the variance, half-way between two.
 KNOTS_PER_CORRELATION = 50
@@ -51,7 +51,9 @@ class GaussMarkov:
         kept = np.exp(-step / correlation_s)
         innovations = rng.standard_normal((count, sd.size))
         innovations[1:] *= np.sqrt(1.0 - kept**2)
-        values: Float64[np.ndarray, "knots channels"] = sd * lfilter([1.0], [1.0, -kept], innovations, axis=0)
+        values: Float64[np.ndarray, "knots channels"] = sd * scipy.signal.lfilter(
+            [1.0], [1.0, -kept], innovations, axis=0
+        )
         return cls(first + step * np.arange(count), values)
 
     def at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n channels"]:

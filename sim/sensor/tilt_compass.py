@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+import scipy  # its signal is slow to import, and so left until it is called
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.signal import lfilter
 
 from sim.dynamics import Trajectory
 from sim.sensor.clock import Clock, ClockParameters
@@ -150,7 +150,7 @@ class TiltCompass:
         # exact for a force that is constant about the middle of each step
         kept = np.exp(-(grid[1] - grid[0]) / lag)
         middle = 0.5 * (felt[1:] + felt[:-1])
-        lagged, _ = lfilter([1.0 - kept], [1.0, -kept], middle, axis=0, zi=kept * felt[:1])
+        lagged, _ = scipy.signal.lfilter([1.0 - kept], [1.0, -kept], middle, axis=0, zi=kept * felt[:1])
         followed = np.concatenate([felt[:1], lagged])
         columns = [np.interp(times_s, grid, followed[:, axis]) for axis in range(3)]
         return _unit(np.stack(columns, axis=1))

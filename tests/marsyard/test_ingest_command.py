@@ -18,6 +18,8 @@ from scenarios.conformance import inputs
 
 def told(*words: str) -> tuple[int, str]:
     result = CliRunner().invoke(app, list(words))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
     return result.exit_code, result.output
 
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
+import scipy  # its signal is slow to import, and so left until it is called
 from jaxtyping import Float64, Int64
-from scipy.signal import lfilter
 
 from sim.dynamics.rotorcraft import kernels
 from sim.dynamics.rotorcraft.kernels import CARRIED, PLACE, SIZE, THRUST
@@ -51,7 +51,9 @@ class Air:
         shocks = rng.standard_normal((int(np.ceil(duration_s / step_s)) + 2, 3))
         shocks[1:] *= np.sqrt(1.0 - kept**2)
         sizes = np.array([p.gust_m_s, p.gust_m_s, p.vertical_gust_m_s])
-        return cls(np.array([p.east_m_s, p.north_m_s, 0.0]), sizes * lfilter([1.0], [1.0, -kept], shocks, axis=0))
+        return cls(
+            np.array([p.east_m_s, p.north_m_s, 0.0]), sizes * scipy.signal.lfilter([1.0], [1.0, -kept], shocks, axis=0)
+        )
 
     def check_lasts(self, knots: int) -> None:
         """Raises ValueError where there are gusts for fewer knots than a flight may take."""

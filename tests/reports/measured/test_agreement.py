@@ -1,0 +1,75 @@
+"""The section and the figures of real cases, from rows and products that hold much, little or nothing of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from reports.measured.agreement import agreement_section
+from reports.measured.case_figures import matched_pairs
+from reports.measured.shown import MEASURED
+from reports.section import Subject
+from reports.stored import StoredRun
+from reports.systems import SYSTEMS
+
+
+def subject(**columns: object) -> Subject:
+    frame = pd.DataFrame({"case": range(4), "outcome": ["VALID"] * 4, **columns})
+    return Subject(StoredRun(Path("run"), frame, frame, {}, ()), None, None)
+
+
+def products(matches: int) -> dict[str, object]:
+    rng = np.random.default_rng(1)
+    table = np.concatenate(
+        [rng.uniform(0, 60, (matches, 4)), rng.normal(0, 0.5, (matches, 2)), np.ones((matches, 1))], 1
+    )
+    table[: matches // 4, 6] = 0.0
+    pictures = {f"image_{k}": rng.integers(0, 4095, (48, 64)).astype(np.uint16) for k in (1, 2)}
+    return {**pictures, "matches_1": table}
+
+
+def test_the_section_tells_cases_and_what_is_apart() -> None:
+    residuals = [0.4, np.nan, 0.6, 1.5]
+    section = agreement_section(
+        subject(
+            measured_case=["a", "b", "c", "d"],
+            residual_median_px=residuals,
+            residual_90_percent_px=[1.0, np.nan, 1.2, 3.0],
+            matches=[120, 3, 90, 80],
+            **{"mine.apart_m_s": [0.1, np.nan, 0.3, 0.2]},
+        )
+    )
+    assert section is not None
+    assert (section.data["cases"], section.data["unmatched"]) == (4, 1)
+    assert section.data["median_of_medians_px"] == 0.6
+    assert section.data["apart"] == {"mine.apart_m_s": 0.2}
+    (block,) = section.blocks
+    assert block.grid is not None
+    assert list(block.grid.rows[0][:4]) == ["0", "a", "VALID", "120"]
+    assert block.grid.rows[1][4] == "–"
+    assert len(block.plates) == 1
+
+
+def test_no_section_without_real_cases() -> None:
+    assert agreement_section(subject(residual_median_px=[1.0] * 4)) is None
+
+
+def test_a_case_without_matches_is_shown_all_the_same(tmp_path: Path) -> None:
+    view = MEASURED.view(products(0), "k")
+    assert view.rows[0].succeeded is False
+    assert "0 matches" in view.plates[0].caption
+    (path,) = MEASURED.write(tmp_path, products(40))
+    assert path.stat().st_size > 5000
+
+
+def test_pairs_are_read_with_care() -> None:
+    whole = products(40)
+    (pair,) = matched_pairs(whole)
+    assert np.count_nonzero(pair.right) == 30
+    assert pair.told.startswith("Pictures 1 and 2: 30 matches, median residual ")
+    assert matched_pairs({**whole, "matches_1": np.zeros((4, 3))}) == []
+    assert matched_pairs({**whole, "image_2": None}) == []
+    # a real case is known before the systems whose pictures it may hold too
+    assert next(one for one in SYSTEMS if one.is_case(whole)) is MEASURED
