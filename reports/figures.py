@@ -89,7 +89,10 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
     known = np.isfinite(points).all(axis=1)
     if not known.any():
         return None
+    ellipse = error_ellipse(points, ELLIPSE)
     reach = _reach(points[known], bound, close)
+    if close and ellipse is not None:
+        reach = max(reach, ellipse.reach)
     figure, axes = new_axes(5.0, 4.9)
     for kind in categories(frame, metric, bound):
         x, y = np.clip(points[kind.chosen & known], -reach, reach).T
@@ -98,7 +101,6 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
         axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
         if bound <= reach * math.sqrt(2.0):  # else the circle lies outside of all four corners
             axes.plot([], [], "--", color=REQUIREMENT, label=f"requirement {bound:g} {split_unit(metric)[1]}")
-    ellipse = error_ellipse(points, ELLIPSE)
     if ellipse is not None:
         outline: dict[str, Any] = {"fill": False, "color": INK, "linewidth": 1.4, "linestyle": ":", "zorder": 3}
         size = (2.0 * ellipse.semi_major, 2.0 * ellipse.semi_minor)

@@ -40,6 +40,14 @@ class ErrorEllipse:
     probability: float
     inside: float
 
+    @property
+    def reach(self) -> float:
+        """Half the side of the least square about no error that holds the ellipse, sides along the parts."""
+        turn = math.radians(self.angle_deg)
+        across = math.hypot(self.semi_major * math.cos(turn), self.semi_minor * math.sin(turn))
+        up = math.hypot(self.semi_major * math.sin(turn), self.semi_minor * math.cos(turn))
+        return max(abs(self.centre[0]) + across, abs(self.centre[1]) + up)
+
 
 def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> ErrorEllipse | None:
     """The prediction ellipse of two-dimensional errors; None for fewer than five or where all lie on a point.

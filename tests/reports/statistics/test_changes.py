@@ -92,7 +92,8 @@ def test_terrains_of_their_own_are_compared_whole(rates: bool) -> None:
 
     found = [(night(0), night(100)) for _ in range(300)]
     assert np.mean([difference_p(*pair) < 0.05 for pair in found]) <= 0.05 + 3 * 0.0126
-    assert np.mean([difference_p(_one(a.values), _one(b.values)) < 0.05 for a, b in found]) > 0.2
+    # pooled, in 40 of them
+    assert np.mean([difference_p(_one(a.values), _one(b.values)) < 0.05 for a, b in found[:40]]) > 0.2
 
 
 def test_nothing_can_be_said_of_next_to_nothing() -> None:

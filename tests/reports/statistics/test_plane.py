@@ -1,11 +1,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from reports.statistics.plane import circular_error, error_ellipse
+from reports.statistics.plane import ErrorEllipse, circular_error, error_ellipse
 
 
 def _turned(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -53,3 +54,10 @@ def test_circular_error_probable_of_a_normal_scatter() -> None:
     found = circular_error(points, 0.5, 0.95)
     assert found.estimate == pytest.approx(math.sqrt(2 * math.log(2)), abs=0.03)
     assert found.lower < math.sqrt(2 * math.log(2)) < found.upper
+
+
+def test_the_square_about_an_ellipse_touches_it() -> None:
+    # Half axes 3 and 1, turned by 30 deg: sqrt((3 cos 30)^2 + (sin 30)^2) = 2.6458 across, 1.7321 up.
+    ellipse = ErrorEllipse((0.5, -2.0), 3.0, 1.0, 30.0, 0.95, 0.9)
+    assert ellipse.reach == pytest.approx(2.0 + math.sqrt(3.0))
+    assert replace(ellipse, centre=(-1.5, 0.0)).reach == pytest.approx(1.5 + math.sqrt(7.0))
