@@ -65,10 +65,17 @@ def attempted(ask: Callable[[], object], check: Callable[[object], Answer]) -> A
     except Exception as error:
         failure = Failure(Fault.CRASHED.name, f"{type(error).__name__}: {error}", traceback.format_exc())
         return Attempt(None, failure, _time(started))
+    row: dict[str, Scalar] = {"estimation_time_s": answer_time_s(answer, taken)}
     details = getattr(answer, "details", None)
     if isinstance(details, ProgramDetails):
-        return Attempt(answer, None, {"estimation_time_s": details.time_s, STDERR: details.stderr})
-    return Attempt(answer, None, {"estimation_time_s": taken})
+        row[STDERR] = details.stderr
+    return Attempt(answer, None, row)
+
+
+def answer_time_s(answer: object, taken_s: float) -> float:
+    """The time that an answer took: processor time, as measured around it; of a program, the wall-clock time it tells."""
+    details = getattr(answer, "details", None)
+    return details.time_s if isinstance(details, ProgramDetails) else taken_s
 
 
 def _time(started: float) -> dict[str, Scalar]:

@@ -154,7 +154,9 @@ def _lines(frame: pd.DataFrame) -> Sequence[tuple[str, pd.DataFrame]]:
         if column in frame and frame[column].nunique() > 1:
             unit = " px" if column.endswith("_px") else ""
             kinds = sorted(frame[column].dropna().unique(), reverse=column == "algorithm")
-            return [(f"{kind:g}{unit}" if unit else str(kind), frame[frame[column].eq(kind)]) for kind in kinds]
+            # an algorithm's label in the rows has underscores, its name hyphens
+            named = [f"{kind:g}{unit}" if unit else str(kind).replace("_", "-") for kind in kinds]
+            return [(name, frame[frame[column].eq(kind)]) for name, kind in zip(named, kinds, strict=True)]
     return [("", frame)]
 
 

@@ -22,6 +22,7 @@ from scenarios.rover.stops import RunOutcome, Stop
 from scenarios.rover.target import ChosenTarget, choose_target
 from scenarios.rover.vehicle import Vehicle
 from scenarios.rover.world import RunWorld
+from scenarios.trial import answer_time_s
 from sim.dynamics.driving import Drive
 from sim.measurements import DriveCommand, RoverMeasurements
 from sim.streams import Streams
@@ -192,7 +193,7 @@ class _Loop:
         measurements = RoverMeasurements(pictures.left, pictures.right, rig.calibrated, *angles, run.vehicle.estimated)
         started = time.process_time()
         update = checked_update(self.tracker.update(measurements))
-        taken = time.process_time() - started
+        taken = answer_time_s(update, time.process_time() - started)
         in_head = np.asarray(world_from_head.inv().apply(run.target.point_world.copy()))
         return Stop(
             leg=leg,

@@ -192,7 +192,6 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "camera": p.camera.preset,
         "navcam": p.camera.preset.endswith("navcam"),
         "pancam": p.camera.preset.endswith("pancam"),
-        "algorithm": p.algorithm,
         "search_px": p.vtt.search_px,
         "rock_diameter_m": rock.diameter_m,
         "rock_height_m": rock.height_m,

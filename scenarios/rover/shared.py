@@ -36,7 +36,7 @@ from scenarios.rover.stops import RunOutcome, Stop
 from scenarios.rover.target import in_view, point_on, rock_of, told_by_pixel
 from scenarios.rover.vehicle import Vehicle
 from scenarios.rover.world import RunWorld, terrain_parameters
-from scenarios.trial import Judged, attempted, case_result
+from scenarios.trial import Judged, answer_time_s, attempted, case_result
 from sim.camera import CameraModel
 from sim.dynamics import Stance
 from sim.measurements import RoverMeasurements
@@ -266,7 +266,7 @@ def tracked(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None 
         )
         started = time.process_time()
         update = checked_update(tracker.update(measurements))
-        taken = time.process_time() - started
+        taken = answer_time_s(update, time.process_time() - started)
         in_head = np.asarray(view.world_from_head.inv().apply(point.copy()))
         run.stops.append(
             Stop(

@@ -47,7 +47,7 @@ def test_measured_accuracy_is_three_times_the_rms_by_camera() -> None:
 def _shared(skips: int = 5) -> pd.DataFrame:
     """Two trackers, steps of 1 - 0.95^(n+1), ten targets each: pure NCC tracks fewer with every step."""
     frames = []
-    for algorithm in ("vtt", "pure-ncc"):
+    for algorithm in ("vtt", "pure_ncc"):
         for skip in range(skips):
             tracked = np.arange(10) < (10 if algorithm == "vtt" else 8 - skip)
             frames.append(rows(10, algorithm=algorithm, skip=skip, step=1.0 - 0.95 ** (skip + 1), tracked=tracked))
