@@ -73,7 +73,7 @@ def attempted(ask: Callable[[], object], check: Callable[[object], Answer]) -> A
 
 
 def answer_time_s(answer: object, taken_s: float) -> float:
-    """The time that an answer took: processor time, as measured around it; of a program, the wall-clock time it tells."""
+    """The time that an answer took: processor time, measured around it; of a program, the wall-clock time it tells."""
     details = getattr(answer, "details", None)
     return details.time_s if isinstance(details, ProgramDetails) else taken_s
 
