@@ -27,7 +27,6 @@ def ingest(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="New folder for the cases and their campaign.")],
 ) -> None:
     """Make a campaign of real cases from pictures with measured attitude and altitude."""
-    from campaigns.definition.loading import load_campaign
     from campaigns.errors import CampaignError, StoreError
     from scenarios.measured.ingest import ingest as ingested
 
@@ -47,6 +46,8 @@ def ingest(
         raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
+    from campaigns.definition.loading import load_campaign
+
     try:
         load_campaign(str(out / CAMPAIGN_FILE))
     except CampaignError:

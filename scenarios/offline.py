@@ -24,15 +24,13 @@ from algorithms.answers import checked_site, checked_velocity
 from algorithms.exchange import write_case
 from algorithms.faults import AlgorithmError, Fault
 from algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
+from scenarios.own_files import listed
 from sim.measurements import DescentMeasurements, LandingMeasurements
 
 EXPORT, ANSWERS = "export:", "answers:"
 
 #: Folder of the cases in what is exported.
 CASES = "cases"
-
-#: Problems of a table that are told at once.
-_TOLD = 20
 
 #: Sizes beyond which a number is taken to be in another unit than its column's name says.
 _MOST = {"_m_s": 1e3, "_m2_s2": 1e6, "_m": 1e6}
@@ -286,9 +284,3 @@ def _outcome(text: str, numbers: Mapping[str, float], form: OfflineForm[Any]) ->
     if text and text not in known:
         raise ValueError(f"outcome is '{text}'; allowed: {', '.join(known)}")
     return known[text] if text else next(iter(known.values()))
-
-
-def listed(file: Path, problems: Sequence[str]) -> str:
-    """What is wrong with a file as one message, the first problems of very many."""
-    more = [f"... and {len(problems) - _TOLD} more"] if len(problems) > _TOLD else []
-    return "\n  ".join([f"{file}:", *problems[:_TOLD], *more])

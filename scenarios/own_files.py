@@ -1,12 +1,16 @@
-"""Parameters that name a file: a campaign knows it again by the hash of its contents."""
+"""A user's own files: a campaign knows one again by the hash of its contents; what is wrong with one is listed."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+#: Problems of a file that are told at once.
+_TOLD = 20
 
 
 class OwnFile(BaseModel):
@@ -34,3 +38,9 @@ class OwnFile(BaseModel):
         if self.sha256 != self.hash_of(self.file):
             raise ValueError(f"{self.file}: has changed since the campaign was made from it")
         return self
+
+
+def listed(file: Path, problems: Sequence[str]) -> str:
+    """What is wrong with a file as one message, the first problems of very many."""
+    more = [f"... and {len(problems) - _TOLD} more"] if len(problems) > _TOLD else []
+    return "\n  ".join([f"{file}:", *problems[:_TOLD], *more])

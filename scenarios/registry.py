@@ -16,9 +16,9 @@ SCENARIOS: Mapping[str, str] = {
     "rover": "scenarios.rover:RoverScenario",
     "rover-drive": "scenarios.rover:SharedDriveScenario",
     "landing": "scenarios.landing:LandingScenario",
-    "measured-velocity": "scenarios.measured:MeasuredVelocityScenario",
-    "measured-landing": "scenarios.measured:MeasuredLandingScenario",
-    "measured-matching": "scenarios.measured:MatchingScenario",
+    "measured-velocity": "scenarios.measured.descent:MeasuredVelocityScenario",
+    "measured-landing": "scenarios.measured.landing:MeasuredLandingScenario",
+    "measured-matching": "scenarios.measured.matching:MatchingScenario",
 }
 
 

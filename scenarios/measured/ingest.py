@@ -38,11 +38,10 @@ from scenarios.measured.store import (
     write_cases,
 )
 from scenarios.measured.table import CaseRows, PictureRow, read_table
-from scenarios.offline import listed
-from sim.camera import CameraModel, Pds3Product, read_cameras, read_pds3_product
+from scenarios.own_files import listed
+from sim.camera import CameraModel, Pds3Product, looking_down, read_cameras, read_pds3_product
 from sim.camera.pds_labels import is_pds3
 from sim.frames import SITE_FROM_WORLD
-from sim.sensor.own_camera import looking_down
 
 POSITION = ("x_m", "y_m", "z_m")
 #: Relative response of the brightest pixel, at most: noise makes it a little more than 1.

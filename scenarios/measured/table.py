@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from scenarios.measured.layout import COLUMNS, PICTURES, TEXTS, IngestError
-from scenarios.offline import listed
+from scenarios.own_files import listed
 
 #: A quaternion's length may be off 1 by this, as written with three digits.
 UNIT_TOLERANCE = 5e-3

@@ -12,6 +12,7 @@ from sim.camera.cahvor import Cahvor
 from sim.camera.cahvore import Cahvore
 from sim.camera.calibrations import Calibration, read_calibrations
 from sim.camera.files import read_camera, read_cameras
+from sim.camera.mounting import looking_down
 from sim.camera.opencv import OpenCVIntrinsics, Residual, from_opencv, from_opencv_fisheye, to_opencv
 from sim.camera.pds4_labels import read_pds4
 from sim.camera.pds_labels import read_pds3
@@ -30,6 +31,7 @@ __all__ = [
     "Residual",
     "from_opencv",
     "from_opencv_fisheye",
+    "looking_down",
     "read_cahvor",
     "read_calibrations",
     "read_camera",

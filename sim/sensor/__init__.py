@@ -22,7 +22,7 @@ from sim.sensor.mast import (
 from sim.sensor.motion import ImageMotion
 from sim.sensor.odometry import Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
 from sim.sensor.optics import natural_fall_off
-from sim.sensor.own_camera import NamedOrOwnCamera, OwnCamera, OwnCameraChoice, looking_down
+from sim.sensor.own_camera import NamedOrOwnCamera, OwnCamera, OwnCameraChoice
 from sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, Preset, preset
 from sim.sensor.radar import RadarAltimeter, RadarParameters
 from sim.sensor.ranging import height_above_ground
@@ -84,7 +84,6 @@ __all__ = [
     "WarmUp",
     "auto_expose",
     "height_above_ground",
-    "looking_down",
     "natural_fall_off",
     "preset",
     "read_datasheet",

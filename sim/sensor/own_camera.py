@@ -12,9 +12,8 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.camera import Cahv, Cahvor, Cahvore, CameraModel, read_cameras
+from sim.camera import Cahv, Cahvor, Cahvore, CameraModel, looking_down, read_cameras
 
 Vector = tuple[float, float, float]
 _FILES = ("file", "number", "subframe_folded_in")
@@ -87,23 +86,6 @@ class OwnCamera(BaseModel):
             **vectors,
             **origin,
         )
-
-
-def looking_down(camera: CameraModel) -> CameraModel:
-    """A camera put at the origin and turned so that A is -z and the columns grow along +x.
-
-    Raises
-    ------
-    ValueError
-        If the picture is a mirror image, which no rotation brings there.
-    """
-    if not camera.right_handed:
-        raise ValueError("the camera's picture is mirrored: u right, v down and A forward must be right-handed")
-    axis = camera.a / np.linalg.norm(camera.a)
-    right = camera.right - (camera.right @ axis) * axis
-    right /= np.linalg.norm(right)
-    turn = Rotation.from_matrix(np.stack([right, np.cross(right, axis), -axis]))
-    return camera.moved(RigidTransform.from_components(-turn.apply(camera.c.copy()), turn))
 
 
 def _read(stated: object) -> object:

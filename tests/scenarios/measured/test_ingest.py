@@ -11,9 +11,9 @@ import pytest
 from folders import landing_folder, read_rows, velocity_folder, write_texts
 
 from scenarios.conformance import inputs
-from scenarios.measured import MatchingScenario
 from scenarios.measured.ingest import ingest
 from scenarios.measured.layout import IngestError
+from scenarios.measured.matching import MatchingScenario
 from scenarios.measured.store import CasesFile, images_of
 from sim.streams import Streams
 

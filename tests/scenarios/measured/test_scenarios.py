@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 from algorithms.dimes import DimesEstimator
 from scenarios.conformance import inputs
 from scenarios.interface import CaseResult
-from scenarios.measured import MatchingScenario, MeasuredLandingScenario, MeasuredVelocityScenario
+from scenarios.measured.descent import MeasuredVelocityScenario
 from scenarios.measured.ingest import ingest
+from scenarios.measured.landing import MeasuredLandingScenario
+from scenarios.measured.matching import MatchingScenario
 from sim.streams import Streams
 
 STREAMS = Streams(seed=1, campaign="measured", case=0)
