@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int, UInt32
+from jaxtyping import Float, Int
 from scipy.optimize import brentq
+from scipy.spatial import ConvexHull
 
 from sim.terrain import Surface
 
@@ -30,20 +29,80 @@ def graded_offsets(reach_m: float, finest_m: float, count: int) -> Float[np.ndar
     return offsets
 
 
-def ground_mesh(surface: Surface, x: Float[np.ndarray, "columns"], y: Float[np.ndarray, "rows"]) -> trimesh.Trimesh:
+def ground_mesh(
+    surface: Surface,
+    x: Float[np.ndarray, "columns"],
+    y: Float[np.ndarray, "rows"],
+    spans: Int[np.ndarray, "strips 2"] | None = None,
+) -> trimesh.Trimesh:
     """The ground as triangles over the grid of these lines, in world coordinates.
 
     Each vertex takes its height from the level of the surface whose samples are about as far apart as the grid's lines
     there, so that the mesh does not alias the terrain.
+
+    Parameters
+    ----------
+    surface
+        The terrain.
+    x, y
+        World coordinates of the grid's lines, metres.
+    spans
+        Of each strip of cells between two lines of y the first cell that is drawn, and the one after the last; by
+        default all are.
     """
-    level = np.maximum(_levels_of_lines(surface, y)[:, None], _levels_of_lines(surface, x)[None, :])
-    across, along = np.meshgrid(x, y)
+    if spans is None:
+        spans = np.tile([0, x.size - 1], (y.size - 1, 1))
+    first, end = spans.T
+    # a line has the corners of the cells to both its sides; where none is drawn it has none
+    left = np.minimum(np.append(first, x.size), np.append(x.size, first))
+    counts = np.maximum(np.maximum(np.append(end, -1), np.append(-1, end)) + 1 - left, 0)
+    starts = np.cumsum(counts) - counts
+    row, column = _ragged(left, counts)
+    level = np.maximum(_levels_of_lines(surface, y)[row], _levels_of_lines(surface, x)[column])
+    across, along = x[column], y[row]
     z = np.empty_like(across)
     for one in np.unique(level):
         chosen = level == one
         z[chosen] = surface.height(across[chosen], along[chosen], int(one))
-    vertices = np.stack([across, along, z], axis=-1).reshape(-1, 3)
-    return trimesh.Trimesh(vertices, grid_faces(y.size, x.size), process=False, validate=False)
+    strip, cell = _ragged(first, end - first)
+    corner, above = (starts - left)[strip] + cell, (starts - left)[strip + 1] + cell
+    faces = np.empty((2, strip.size, 3), dtype=np.uint32)
+    # counter-clockwise seen from above
+    for triangle, corners in enumerate(((corner, corner + 1, above + 1), (corner, above + 1, above))):
+        for place, number in enumerate(corners):
+            faces[triangle, :, place] = number
+    vertices = np.stack([across, along, z], axis=-1)
+    return trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False, validate=False)
+
+
+def _ragged(
+    first: Int[np.ndarray, "rows"], counts: Int[np.ndarray, "rows"]
+) -> tuple[Int[np.ndarray, "items"], Int[np.ndarray, "items"]]:
+    """Row and column of each item of rows of so many items that begin at a column each."""
+    row = np.repeat(np.arange(counts.size), counts)
+    return row, np.arange(row.size) + np.repeat(first - (np.cumsum(counts) - counts), counts)
+
+
+def cells_in_hull(
+    x: Float[np.ndarray, "columns"],
+    y: Float[np.ndarray, "rows"],
+    places: Float[np.ndarray, "places 2"],
+) -> Int[np.ndarray, "strips 2"]:
+    """The spans of a grid's cells, for `ground_mesh`, that reach into the convex hull of places not all on one line."""
+    hull = places[ConvexHull(places).vertices]
+    (x0, y0), (x1, y1) = hull.T, np.roll(hull, -1, axis=0).T
+    low, high = y[:-1, None], y[1:, None]
+    # each side of the hull from where it enters a strip to where it leaves it
+    rise = np.where(y1 == y0, 1.0, y1 - y0)
+    enters, leaves = (x0 + np.clip((level - y0) / rise, 0.0, 1.0) * (x1 - x0) for level in (low, high))
+    flat = y1 == y0
+    enters, leaves = np.where(flat, x0, enters), np.where(flat, x1, leaves)
+    beside = (np.minimum(y0, y1) > high) | (np.maximum(y0, y1) < low)
+    least = np.where(beside, np.inf, np.minimum(enters, leaves)).min(axis=1)
+    greatest = np.where(beside, -np.inf, np.maximum(enters, leaves)).max(axis=1)
+    first = np.clip(np.searchsorted(x, least, side="right") - 1, 0, x.size - 1)
+    end = np.clip(np.searchsorted(x, greatest), first, x.size - 1)
+    return np.column_stack([first, end])
 
 
 def _levels_of_lines(surface: Surface, lines: Float[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:
@@ -51,18 +110,6 @@ def _levels_of_lines(surface: Surface, lines: Float[np.ndarray, "count"]) -> Int
         np.floor(np.log2(np.gradient(lines) / surface.spacing_m)), 0, len(surface.levels) - 1
     ).astype(int)
     return level
-
-
-@lru_cache(maxsize=4)
-def grid_faces(rows: int, columns: int) -> UInt32[np.ndarray, "faces 3"]:
-    """Triangles of a grid of vertices stored row by row, counter-clockwise seen from above."""
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)[None, :]).ravel()
-    right, above = corner + 1, corner + columns
-    lower = np.column_stack([corner, right, above + 1])
-    upper = np.column_stack([corner, above + 1, above])
-    faces = np.concatenate([lower, upper]).astype(np.uint32)
-    faces.setflags(write=False)
-    return faces
 
 
 def lines_in_view(lines: Float[np.ndarray, "count"], low: float, high: float) -> Float[np.ndarray, "kept"]:

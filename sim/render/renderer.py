@@ -26,7 +26,7 @@ from sim.render.kernels.ground import Bounds, height_range
 from sim.render.kernels.shading import Clouds, Reach, shade
 from sim.render.kernels.sight import look
 from sim.render.kernels.sun import Shadow
-from sim.render.mesh import graded_offsets, ground_mesh, lines_in_view
+from sim.render.mesh import cells_in_hull, graded_offsets, ground_mesh, lines_in_view
 from sim.render.objects import Objects
 from sim.render.photometry import Photometry, Sun, Texture
 from sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
@@ -310,11 +310,12 @@ class Renderer:
         position: Float64[np.ndarray, "3"],
     ) -> None:
         """Loads the ground and the objects that this picture shows."""
-        (west, east), (south, north) = _seen(scene, rays, rotation, position)
+        places = _seen(scene, rays, rotation, position)
+        (west, south), (east, north) = places.min(axis=0), places.max(axis=0)
         x = lines_in_view(scene.centre_m[0] + scene.mesh_offsets, west, east)
         y = lines_in_view(scene.centre_m[1] + scene.mesh_offsets, south, north)
         numbers = scene.objects.in_cone(position, rotation @ rays.axis, rays.half_angle_rad)
-        ground = ground_mesh(scene.surface, x, y)
+        ground = ground_mesh(scene.surface, x, y, cells_in_hull(x, y, places))
         self._view_renderer(rays.view_side_px).load(ground, scene.objects.triangles[numbers], numbers)
         if self._last is not scene:
             self._last = scene
@@ -400,8 +401,8 @@ _PROBES = 9
 
 def _seen(
     scene: Scene, rays: PixelRays, rotation: Float64[np.ndarray, "3 3"], position: Float64[np.ndarray, "3"]
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Bounds in x and y of the ground that a picture can show.
+) -> Float64[np.ndarray, "places 2"]:
+    """Places whose convex hull holds the ground that a picture can show.
 
     The ground lies between two planes; a ray that meets the lower one has seen nothing beyond. A ray that never does
     sees as far as the mesh reaches.
@@ -416,8 +417,8 @@ def _seen(
     places = np.concatenate([position[:2] + end[:, None] * directions[:, :2] for end in ends])
     # between the probes the border bulges by at most a part of what they span
     margin = 0.02 * (places.max(axis=0) - places.min(axis=0)) + 2.0 * scene.mesh_finest_m
-    lowest, highest = places.min(axis=0) - margin, places.max(axis=0) + margin
-    return (float(lowest[0]), float(highest[0])), (float(lowest[1]), float(highest[1]))
+    corners = margin * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+    return np.asarray((places[:, None] + corners).reshape(-1, 2))
 
 
 @cache

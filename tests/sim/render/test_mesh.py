@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sim.render.mesh import graded_offsets, ground_mesh
+from sim.render.mesh import cells_in_hull, graded_offsets, ground_mesh
 
 
 @given(finest=st.floats(0.5, 20.0), stretch=st.floats(1.01, 1000.0), count=st.integers(8, 200).map(lambda n: 2 * n + 1))
@@ -32,3 +32,36 @@ def test_mesh_is_closed_faces_up_and_follows_the_ground(rough) -> None:
     middle = np.abs(mesh.vertices[:, :2] - [120.0, -40.0]).max(axis=1) < 50.0
     near = mesh.vertices[middle]
     np.testing.assert_allclose(near[:, 2], rough.height(near[:, 0], near[:, 1], level=2), atol=1e-9)
+
+
+@given(st.lists(st.tuples(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0)), min_size=3, max_size=9), st.integers(0, 9))
+def test_cells_of_a_hull_hold_all_of_it_and_little_else(corners: list[tuple[float, float]], seed: int) -> None:
+    """Also where it reaches beyond the grid, or between two of its lines."""
+    places = np.array(corners) + np.array([[0.0, 0.0], [0.3, 0.1], [0.1, 0.4], *[[0.0, 0.0]] * (len(corners) - 3)])
+    assume(np.linalg.matrix_rank(places - places[0], tol=1e-3) == 2)
+    lines = graded_offsets(20.0, 0.2, 61)
+    spans = cells_in_hull(lines, lines, places)
+    weights = np.random.default_rng(seed).dirichlet(np.ones(len(places)), 500)
+    inside = weights @ places
+    inside = inside[np.abs(inside).max(axis=1) < 20.0]
+    column, row = (np.searchsorted(lines, inside) - 1).T
+    assert np.all((spans[row, 0] <= column) & (column < spans[row, 1]))
+    # every cell that is drawn reaches into the box about the places
+    low, high = places.min(axis=0), places.max(axis=0)
+    for strip in np.flatnonzero(spans[:, 1] > spans[:, 0]):
+        assert lines[strip] <= high[1]
+        assert lines[strip + 1] >= low[1]
+        assert lines[spans[strip, 0]] <= high[0]
+        assert lines[spans[strip, 1]] >= low[0]
+
+
+def test_some_cells_of_a_mesh_are_those_of_the_whole(rough) -> None:
+    """The spans leave strips out, overlap by a corner, and do not touch at all."""
+    lines = graded_offsets(300.0, 5.0, 17)
+    spans = np.zeros((16, 2), dtype=int)
+    spans[3:6] = [[2, 5], [7, 9], [0, 16]]
+    spans[15] = [15, 16]
+    some, whole = ground_mesh(rough, lines, lines, spans), ground_mesh(rough, lines, lines)
+    wanted = [row * 16 + column for row, (first, end) in enumerate(spans) for column in range(first, end)]
+    expected = whole.triangles[np.concatenate([wanted, np.array(wanted) + 256])]
+    np.testing.assert_array_equal(some.triangles, expected)
