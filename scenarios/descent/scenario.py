@@ -23,11 +23,11 @@ from scenarios.descent.score import (
     instrument_errors,
     landing_row,
     products,
-    provenance,
 )
 from scenarios.descent.world import World
 from scenarios.estimators import VELOCITY
 from scenarios.interface import CaseResult
+from scenarios.provenance import rendered
 from scenarios.samples import Sample
 from scenarios.trial import Judged, attempted, case_result
 from scenarios.velocity import consistency_row, velocity_row
@@ -80,7 +80,7 @@ class DescentScenario:
             **instrument_conditions(instruments),
             **instrument_errors(world, states, measurements),
             **flown.row,
-            **provenance(p, pictures),
+            **rendered(p.render.backend, pictures),
         }
 
         def judge(algorithm: str) -> Judged:

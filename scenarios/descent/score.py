@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,8 +19,6 @@ from scenarios.interface import Scalar
 from scenarios.velocity import velocity_products
 from sim.dynamics import State
 from sim.measurements import DescentMeasurements
-from sim.processor import processor_features
-from sim.render import process_renderer
 from sim.sensor import height_above_ground
 
 Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
@@ -121,19 +118,6 @@ def landing_row(landed: Touchdown) -> dict[str, Scalar]:
         "touchdown_speed_with_m_s": float(np.hypot(*landed.with_answer)),
         "touchdown_speed_without_m_s": float(np.hypot(*landed.without_answer)),
         "answer_punctual": landed.punctual,
-    }
-
-
-def provenance(p: DescentScenarioParameters, pictures: Pictures) -> dict[str, Scalar]:
-    """Hash of the pictures, and what their last bits depend on."""
-    digest = hashlib.sha256()
-    for counts in pictures:
-        digest.update(np.ascontiguousarray(counts).tobytes())
-    return {
-        "image_hash": digest.hexdigest(),
-        "gl_backend": p.render.backend,
-        "gl_version": process_renderer(p.render.backend).description(),
-        "processor_features": processor_features(),
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,12 +18,11 @@ from scenarios.fieldtest.pictures import cloud_transmittances, field_optics, tak
 from scenarios.fieldtest.run import Run, RunKey, worked_out
 from scenarios.fieldtest.triples import Category, Triple
 from scenarios.interface import CaseResult, Scalar
+from scenarios.provenance import rendered
 from scenarios.trial import Judged, attempted, case_result
 from scenarios.velocity import consistency_row, velocity_products, velocity_row
 from sim.dynamics import State
 from sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
-from sim.processor import processor_features
-from sim.render import process_renderer
 from sim.sensor import Detector
 from sim.sensor.ranging import height_above_ground
 from sim.streams import Streams
@@ -88,7 +86,7 @@ class FieldTestScenario:
         known = {
             **_conditions(p, case, measurements),
             **_clouding(case, taken[1].ground_m),
-            **_provenance(p, pictures),
+            **rendered(p.backend, pictures),
         }
         return case_result(p.algorithms, judge, known)
 
@@ -216,16 +214,3 @@ def _clouding(case: Case, ground_m: Float64[np.ndarray, "m n 3"]) -> dict[str, S
 def _off_nadir_deg(state: State) -> float:
     """Angle between the camera's axis and nadir."""
     return float(np.degrees(np.arccos(np.clip(state.attitude.as_matrix()[2, 2], -1.0, 1.0))))
-
-
-def _provenance(p: FieldTestParameters, pictures: Sequence[UInt16[np.ndarray, "rows columns"]]) -> dict[str, Scalar]:
-    """Hash of the pictures, and what their last bits depend on."""
-    digest = hashlib.sha256()
-    for picture in pictures:
-        digest.update(np.ascontiguousarray(picture).tobytes())
-    return {
-        "image_hash": digest.hexdigest(),
-        "gl_backend": p.backend,
-        "gl_version": process_renderer(p.backend).description(),
-        "processor_features": processor_features(),
-    }

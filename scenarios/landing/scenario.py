@@ -16,9 +16,10 @@ from scenarios.landing.measurement import measure
 from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.landing.pictures import take_pictures
 from scenarios.landing.samples import landing_samples
-from scenarios.landing.score import conditions, map_row, motion_row, products, provenance, site_row, times_row
+from scenarios.landing.score import conditions, map_row, motion_row, products, site_row, times_row
 from scenarios.landing.truth import GroundTruth
 from scenarios.landing.world import KEPT_GROUNDS, World, camera_optics
+from scenarios.provenance import rendered
 from scenarios.samples import Sample
 from scenarios.trial import Judged, attempted, case_result
 from sim.streams import Streams
@@ -81,7 +82,7 @@ class LandingScenario:
                 failure=attempt.failure,
             )
 
-        known = {**conditions(p, world, flight, pair, measurements, truth), **provenance(p, pair)}
+        known = {**conditions(p, world, flight, pair, measurements, truth), **rendered(p.render.backend, pair.counts)}
         return case_result(p.algorithms, judge, known)
 
 

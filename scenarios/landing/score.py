@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,6 @@ from scenarios.landing.pictures import Pair
 from scenarios.landing.truth import GroundTruth
 from scenarios.landing.world import World
 from sim.measurements import LandingMeasurements
-from sim.processor import processor_features
-from sim.render import process_renderer
 from sim.sensor import height_above_ground
 
 NAN = float("nan")
@@ -217,19 +214,6 @@ def conditions(
 
 def _median_deg(truth: GroundTruth, covered: np.ndarray) -> float:
     return float(np.degrees(np.median(truth.footprints.slope_rad[covered]))) if np.any(covered) else NAN
-
-
-def provenance(p: LandingScenarioParameters, pair: Pair) -> dict[str, Scalar]:
-    """Hash of the pictures, and what their last bits depend on."""
-    digest = hashlib.sha256()
-    for counts in pair.counts:
-        digest.update(np.ascontiguousarray(counts).tobytes())
-    return {
-        "image_hash": digest.hexdigest(),
-        "gl_backend": p.render.backend,
-        "gl_version": process_renderer(p.render.backend).description(),
-        "processor_features": processor_features(),
-    }
 
 
 def products(

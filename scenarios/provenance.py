@@ -1,0 +1,27 @@
+"""What a row says of its pictures: their hash, and what their last bits depend on."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import UInt16
+
+from scenarios.interface import Scalar
+from sim.processor import processor_features
+from sim.render import process_renderer
+from sim.render.backend import Backend
+
+
+def rendered(backend: Backend, pictures: Iterable[UInt16[np.ndarray, "rows columns"]]) -> dict[str, Scalar]:
+    """Columns of a row whose pictures this backend rendered."""
+    digest = hashlib.sha256()
+    for counts in pictures:
+        digest.update(np.ascontiguousarray(counts).tobytes())
+    return {
+        "image_hash": digest.hexdigest(),
+        "gl_backend": backend,
+        "gl_version": process_renderer(backend).description(),
+        "processor_features": processor_features(),
+    }
