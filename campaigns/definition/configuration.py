@@ -57,6 +57,11 @@ class Requirement(BaseModel):
     scale: Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)] = 1.0
 
     @property
+    def metric_columns(self) -> tuple[str, ...]:
+        """Columns that the metric is made of: one of true and false, or those of numbers that are summed."""
+        return (self.metric,) if self.bound is None else tuple(self.metric.split(" + "))
+
+    @property
     def population_columns(self) -> tuple[str, ...]:
         """Columns of true and false that the population takes its members from."""
         return tuple(part for part in self.population.split(" and ") if part not in POPULATIONS)

@@ -325,14 +325,14 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
     """
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
-    numbers = [name for name in numbers if "time" not in name]
     problems = []
     for place, requirement in enumerate(configuration.requirements):
         key = f"requirements[{place}]"
         kind, allowed = ("column of numbers", numbers) if requirement.bound is not None else (FLAG, flags)
-        if requirement.metric not in allowed:
-            message = not_allowed(kind, requirement.metric, allowed)
-            problems.append(Problem(configuration.name, f"{key}.metric", message))
+        for name in requirement.metric_columns:
+            if name not in allowed:
+                message = not_allowed(kind, name, allowed)
+                problems.append(Problem(configuration.name, f"{key}.metric", message))
         for name in requirement.population_columns:
             if name not in flags:
                 message = not_allowed(FLAG, name, (*POPULATIONS, *flags))

@@ -130,6 +130,7 @@ def test_a_metric_that_no_case_has_stops_the_campaign_early(
     [
         ("metric='velocity_error_m_s'", "[0].metric: unknown column of true and false 'velocity_error_m_s'"),
         ("metric='answered'\nbound=1", "[0].metric: unknown column of numbers 'answered'"),
+        ("metric='velocity_error_m_s + speed_m_s'\nbound=1", "[0].metric: unknown column of numbers 'speed_m_s'"),
         ("metric='answered'\npopulation='valid and rom'", "[0].population: unknown column of true and false 'rom'"),
     ],
 )
@@ -139,6 +140,14 @@ def test_requirements_ask_for_columns_of_their_kind(campaign_file: CampaignFile,
     row = {"case": 0, "answered": True, "velocity_error_m_s": 1.0}
     with pytest.raises(ConfigurationError, match=re.escape(said)):
         check_metrics(configuration, row, Path("runs"))
+
+
+def test_requirements_may_ask_for_sums_and_for_times(campaign_file: CampaignFile) -> None:
+    asked = "metric='matching_time_s + search_time_s'\nbound=1"
+    requirement = f"[[requirements]]\nid='a'\nprobability=0.9\nconfidence=0.9\n{asked}"
+    configuration = load_campaign(str(campaign_file(requirement=requirement))).configuration
+    row = {"case": 0, "answered": True, "matching_time_s": 0.1, "search_time_s": 0.2}
+    check_metrics(configuration, row, Path("runs"))
 
 
 def test_where_every_case_crashes_the_metric_still_has_its_column(

@@ -1,0 +1,60 @@
+"""Requirements of the catalogue's campaigns ask for columns that their cases have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from campaigns.definition.catalogue import catalogue
+from campaigns.definition.loading import load_campaign
+from campaigns.running.engine import check_metrics
+from campaigns.store.columns import Row
+from marsyard.compile_command import SMALL
+from scenarios.rover import SharedDriveParameters, SharedDriveScenario
+from sim.streams import Streams
+
+
+def _row_of(scenario: str) -> Row:
+    """The row of a small case."""
+    if scenario == "rover-drive":
+        result = SharedDriveScenario().run(_short_drive(), Streams(1, "catalogue", 0))
+    else:
+        small = {
+            load_campaign(name, settings).configuration.scenario: (name, settings) for name, settings in SMALL.items()
+        }
+        campaign = load_campaign(*small.get(scenario, ("dimes-fieldtest", ())))
+        result = campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
+    return {"case": 0, "outcome": result.outcome, "answered": result.answered, **result.row}
+
+
+def _short_drive() -> SharedDriveParameters:
+    """A drive of one step, with the bands of all campaigns."""
+    names = {band["name"] for campaign in _campaigns("rover-drive") for band in _stated(campaign)["bands"]}
+    return SharedDriveParameters.model_validate(
+        {
+            "drive": {
+                "world": {"samples": 512, "bank": 1},
+                "start": {"distance_m": 3.6},
+                "legs": [{"motion": "circle", "step_deg": 5.0, "steps": 1}],
+            },
+            "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
+            "targets": [{"across": 0.0, "up": 0.5}],
+            "bands": [{"name": name, "least": 0.0, "most": 10.0} for name in sorted(names)],
+        }
+    )
+
+
+def _stated(campaign: str) -> dict[str, list[dict[str, str]]]:
+    return dict(load_campaign(campaign).configuration.parameters)
+
+
+def _campaigns(scenario: str) -> list[str]:
+    return [name for name in catalogue() if load_campaign(name).configuration.scenario == scenario]
+
+
+@pytest.mark.parametrize("scenario", ["descent", "fieldtest", "rover", "rover-drive", "landing"])
+def test_requirements_ask_for_columns_that_cases_have(scenario: str) -> None:
+    row = _row_of(scenario)
+    for name in _campaigns(scenario):
+        check_metrics(load_campaign(name).configuration, row, Path(name))
