@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marsyard.render_command import WRONG, Shot, take
+from marsyard.render_command import Shot, says_why_not, take
 
 if TYPE_CHECKING:
     import numpy as np
@@ -74,21 +74,13 @@ def gallery(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a gallery that is there.")] = False,
 ) -> None:
     """Render every site through the cameras that fit it: one page, and a contact sheet. Takes about a minute."""
-    from sim.render.backend import RenderingError
-
-    try:
+    with says_why_not(out):
         _check_folder(out, overwrite)
         plates = []
         for number, (site, camera, settings) in enumerate(PLATES, start=1):
             typer.echo(f"{number} of {len(PLATES)}: {site}, {camera}", err=True)
             plates.append(plate(number, Shot.usual(site, camera, **settings)))
         typer.echo(write_gallery(plates, out))
-    except (ValueError, RenderingError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(WRONG) from None
-    except OSError as error:
-        typer.echo(f"error: cannot write to {out}: {error}", err=True)
-        raise typer.Exit(WRONG) from None
 
 
 def plate(number: int, shot: Shot) -> Plate:

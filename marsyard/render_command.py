@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -169,9 +170,7 @@ def render(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
 ) -> None:
     """Render a site: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; -left and -right for a pair."""
-    from sim.render.backend import RenderingError
-
-    try:
+    with says_why_not(out):
         shot = Shot.usual(
             site,
             camera,
@@ -188,6 +187,15 @@ def render(
         _check_files(out, camera, overwrite)
         for picture in take(shot, detector=detector):
             typer.echo(", ".join(str(path) for path in write(picture, shot, out)))
+
+
+@contextmanager
+def says_why_not(out: Path) -> Iterator[None]:
+    """Ends a command with what kept it from making pictures, or from writing them there."""
+    from sim.render.backend import RenderingError
+
+    try:
+        yield
     except (ValueError, RenderingError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(WRONG) from None
