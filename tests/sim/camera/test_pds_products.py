@@ -1,0 +1,107 @@
+"""Pictures in PDS3 products, against Opportunity's own statistics in their labels and against products made here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim.camera import CameraFileError, read_pds3_product
+
+COUNTS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 300
+LABEL = """PDS_VERSION_ID = PDS3
+RECORD_BYTES = 512
+^IMAGE = {pointer}
+SPACECRAFT_CLOCK_START_COUNT = "100.25"
+SPACECRAFT_CLOCK_STOP_COUNT = "100.75"
+OBJECT = IMAGE
+  LINES = 3
+  LINE_SAMPLES = 4
+  SAMPLE_TYPE = {kind}
+  SAMPLE_BITS = {bits}
+  BANDS = 1
+END_OBJECT = IMAGE
+GROUP = ROVER_COORDINATE_SYSTEM
+  ORIGIN_OFFSET_VECTOR = (1.0, 2.0, 3.0)
+  ORIGIN_ROTATION_QUATERNION = {quaternion}
+END_GROUP = ROVER_COORDINATE_SYSTEM
+END
+"""
+
+
+def product(
+    folder: Path,
+    sample: str = ">i2",
+    pointer: str = "3",
+    kind: str = "MSB_INTEGER",
+    bits: int = 16,
+    quaternion: str = "(0.8, 0.0, 0.0, 0.6)",
+    counts: np.ndarray = COUNTS,
+) -> Path:
+    """A product whose picture begins at its third record."""
+    path = folder / "made.img"
+    label = LABEL.format(pointer=pointer, kind=kind, bits=bits, quaternion=quaternion).encode()
+    path.write_bytes(label.ljust(1024, b" ") + counts.astype(sample).tobytes())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("sample", "pointer", "kind", "bits"),
+    [
+        (">i2", "3", "MSB_INTEGER", 16),
+        (">u2", "1025 <BYTES>", "MSB_UNSIGNED_INTEGER", 16),
+        ("<i2", "3", "LSB_INTEGER", 16),
+        ("u1", "3", "UNSIGNED_INTEGER", 8),
+    ],
+)
+def test_samples_of_all_kinds(tmp_path: Path, sample: str, pointer: str, kind: str, bits: int) -> None:
+    counts = COUNTS // 16 if bits == 8 else COUNTS
+    found = read_pds3_product(product(tmp_path, sample, pointer, kind, bits, counts=counts))
+    assert np.array_equal(found.counts, counts)
+    assert found.time_s == 100.5
+    assert found.site_from_rover is not None
+    # scalar first: a turn about down by 2 acos 0.8, to the right
+    forward = found.site_from_rover.rotation.apply(np.array([1.0, 0.0, 0.0]))
+    assert np.allclose(forward, [0.8**2 - 0.6**2, 2 * 0.8 * 0.6, 0.0])
+    assert np.allclose(found.site_from_rover.translation, [1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"pointer": '("other.img", 3)'}, r"\^IMAGE: missing, or points to another file"),
+        ({"kind": "IEEE_REAL"}, "SAMPLE_TYPE, SAMPLE_BITS: IEEE_REAL, 16; allowed: integers of 8 or 16 bits"),
+        ({"bits": 32}, "MSB_INTEGER, 32"),
+        ({"pointer": "4"}, "ends after 0 bytes; allowed: 4 x 3 samples"),
+        ({"counts": np.full((3, 4), -1)}, "holds counts down to -1"),
+        ({"quaternion": "(1.0, 1.0, 0.0, 0.0)"}, "is not of length 1"),
+        ({"quaternion": "(1.0, 0.0)"}, "4 numbers"),
+    ],
+)
+def test_products_that_cannot_be_used(tmp_path: Path, changes: dict[str, object], said: str) -> None:
+    with pytest.raises(CameraFileError, match=said) as caught:
+        read_pds3_product(product(tmp_path, **changes))  # type: ignore[arg-type]
+    assert "made.img" in str(caught.value)
+
+
+def test_a_picture_that_is_cut_short_is_refused(tmp_path: Path) -> None:
+    path = product(tmp_path)
+    path.write_bytes(path.read_bytes()[:1030])
+    with pytest.raises(CameraFileError, match="IMAGE: ends after 6 bytes"):
+        read_pds3_product(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "most", "mean"),
+    [
+        ("1F483288473EFFCMUFP1214L0M1.IMG", 5, 4046, 840.053),
+        ("1N491020376ILFCNY9P0706L0M1.IMG", 517, 4029, 1421.71),
+    ],
+)
+def test_opportunitys_pictures_have_their_labels_statistics(
+    shared_data: Path, name: str, least: int, most: int, mean: float
+) -> None:
+    counts = read_pds3_product(shared_data / "mer_opportunity" / name).counts
+    assert (counts.shape, counts.min(), counts.max()) == ((1024, 1024), least, most)
+    assert abs(counts.mean() - mean) < 0.005
