@@ -7,8 +7,9 @@ draws. One scene serves all pictures taken close to its eye: a stereo pair, or a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from types import MappingProxyType
 from typing import Literal
 
@@ -184,21 +185,34 @@ def rocks_in_sight(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> 
         return Objects.none()
     smallest_rad, pixel_rad = smallest_rock_rad(field, eye), _pixel_of_detail_rad(field, eye)
     reach = min(farthest_m, eye.reach_m)
-    parts = []
+    meshes = []
     for low, members in _size_classes(field):
         # from above, even rocks right below are far away
         horizontal = np.sqrt(max((low * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - eye.height_m**2, 0.0))
         radius = float(min(horizontal, reach))
-        if radius > 0.0:
-            mesh = _subset(field, members).near(
-                eye.east_m, eye.north_m, radius, above_m=eye.height_m, pixel_rad=pixel_rad
-            )
-            seen = _in_sector(mesh, eye)
-            names = members[mesh.rock_of_face[seen]].astype(np.int32)
-            albedo = ground.site.photometry.rock_albedo
-            bodies = mesh.body_of_face[seen]
-            parts.append(Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces[seen], names, albedo, bodies))
-    return Objects.joined(parts) if parts else Objects.none()
+        some = members[_near_sector(field, members, eye, radius)]
+        if some.size:
+            mesh = _subset(field, some).near(eye.east_m, eye.north_m, radius, above_m=eye.height_m, pixel_rad=pixel_rad)
+            meshes.append(replace(mesh, rock_of_face=some[mesh.rock_of_face].astype(np.int32)))
+    return _in_sight(meshes, eye, ground.site.photometry.rock_albedo)
+
+
+def _in_sight(meshes: Sequence[RockMesh], eye: Eye, albedo: float) -> Objects:
+    """What of some meshes lies in the eye's sector or close beside it."""
+    if not meshes:
+        return Objects.none()
+    seen = [_in_sector(mesh, eye) for mesh in meshes]
+    vertices = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    bodies = np.cumsum([0] + [int(mesh.body_of_face.max(initial=-1)) + 1 for mesh in meshes])
+    kept = list(zip(meshes, seen, vertices.astype(np.int32), bodies.astype(np.int32), strict=False))
+    return Objects.of_mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.vertex_normals for mesh in meshes]),
+        np.concatenate([mesh.faces[some] + first for mesh, some, first, _ in kept]),
+        np.concatenate([mesh.rock_of_face[some] for mesh, some, _, _ in kept]),
+        albedo,
+        np.concatenate([mesh.body_of_face[some] + first for mesh, some, _, first in kept]),
+    )
 
 
 def smallest_rock_rad(field: RockField, eye: Eye) -> float:
@@ -309,6 +323,27 @@ def _subset(field: RockField, members: Int64[np.ndarray, "members"]) -> RockFiel
     """The field of some of its rocks, which are counted anew."""
     arrays = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up")
     return replace(field, names={}, **{name: getattr(field, name)[members] for name in arrays})
+
+
+def _near_sector(
+    field: RockField, members: Int64[np.ndarray, "members"], eye: Eye, radius_m: float
+) -> Bool[np.ndarray, "members"]:
+    """Which rocks may reach, where they lie or repeat within a radius of the eye, to what `_in_sector` keeps."""
+    period, near = field.period_m, np.zeros(members.size, dtype=np.bool_)
+    # wider than any shape, leaning as far as the ground may
+    wide = field.diameter_m[members] + field.height_m[members]
+    close = max(_BESIDE_HEIGHTS * eye.height_m, _BESIDE_M)
+    here = np.array([eye.east_m, eye.north_m])
+    first = field.position_m[members, :2] + np.floor(here / period) * period - here
+    repeated = range(-int(np.ceil(radius_m / period)), int(np.ceil(radius_m / period)) + 1)
+    for column, row in product(repeated, repeated):
+        away = first + np.array([column, row]) * period
+        distance = np.hypot(*away.T)
+        turned = np.abs((np.arctan2(away[:, 0], away[:, 1]) - eye.azimuth_rad + np.pi) % (2.0 * np.pi) - np.pi)
+        widening = np.arcsin(np.minimum(wide / np.maximum(distance, 1e-9), 1.0))
+        within = (turned <= eye.half_width_rad + widening) | (distance <= close + wide)
+        near |= within & (distance <= radius_m)
+    return near
 
 
 def _in_sector(mesh: RockMesh, eye: Eye) -> Bool[np.ndarray, "triangles"]:

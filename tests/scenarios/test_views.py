@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -154,3 +156,20 @@ def test_scene_renders_from_mast_and_from_above(ground: SiteGround) -> None:
         assert np.mean(off > 0.02) < 0.005
         assert np.isfinite(frame.radiance).all()
         assert (frame.body >= 0).any()
+
+
+@pytest.mark.parametrize("azimuth", [0.4, -2.8])
+def test_a_sector_s_rocks_are_those_of_the_whole_circle_that_lie_in_it(azimuth: float) -> None:
+    """Triangle for triangle, also where rocks repeat after the terrain's period."""
+    ground = SiteGround.of(_small("gusev", 512), "ground", seed=3)
+    all_round = Eye(0.4, 1.0, 1.2, 4e-3, reach_m=1.4 * ground.surface.period_m)
+    eye = replace(all_round, azimuth_rad=azimuth, half_width_rad=0.3)
+    whole, some = (rocks_in_sight(ground, one) for one in (all_round, eye))
+    away = whole.triangles[:, 0, :2] - (0.4, 1.0)
+    turned = np.abs((np.arctan2(away[:, 0], away[:, 1]) - azimuth + np.pi) % (2.0 * np.pi) - np.pi)
+    inside = (turned <= 0.3) | (np.hypot(*away.T) <= 5.0)
+    assert 0.05 < np.mean(inside) < 0.6
+    np.testing.assert_array_equal(some.triangles, whole.triangles[inside])
+    np.testing.assert_array_equal(some.normals, whole.normals[inside])
+    names = np.repeat(whole.names, np.diff(whole.first_triangle))[inside]
+    np.testing.assert_array_equal(np.repeat(some.names, np.diff(some.first_triangle)), names)
