@@ -39,28 +39,23 @@ damps, with the ratio (kappa - a) / (2 V omega), omega^2 = kappa / l; with a sma
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.integrate import OdeSolution, solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from sim.dynamics.chain import Modes, SwingParameters, chain_of
-from sim.dynamics.kernels import AXIS, CANOPY, LINE, SIZE, Chain, packed, slope, truth
+from sim.dynamics.integration import Path, StateVector
+from sim.dynamics.kernels import AXIS, CANOPY, LINE, Chain, truth
 from sim.dynamics.state import State
 from sim.dynamics.trajectory import Motion
 from sim.dynamics.wind import Wind
 
 Vector = Float64[np.ndarray, "3"]
-StateVector = Float64[np.ndarray, "22"]
 
-#: Tolerances of the integration, with which finite differences of the flight reproduce its derivatives to 1e-6.
-RELATIVE_TOLERANCE = 1e-9
-ABSOLUTE_TOLERANCE = 1e-9
 #: The flight is followed until the camera is this far below the thrusters' firing, m, for more than a second.
 BEYOND_FIRING_M = 90.0
 #: Followed backwards, what is damped grows: a nod of 60 deg/s to twice that in half a minute.
@@ -89,8 +84,8 @@ class SwingDescent:
         The world's z of the ground, from which altitudes count.
     chain
         Constants of the equations of motion.
-    before, after
-        Solutions before and after time 0.
+    path
+        The states flown through.
     """
 
     parameters: SwingParameters
@@ -98,8 +93,7 @@ class SwingDescent:
     wind: Wind
     ground_height_m: float
     chain: Chain
-    before: OdeSolution
-    after: OdeSolution
+    path: Path
 
     @classmethod
     def flown(
@@ -155,25 +149,17 @@ class SwingDescent:
             return _camera_height(y, chain) - lowest + BEYOND_FIRING_M
 
         longest_s = 3.0 * (start_m[2] - ground_height_m) / p.descent_rate_m_s
-        constants = packed(chain, wind.field)
-        return cls(
-            p,
-            start_m,
-            wind,
-            ground_height_m,
-            chain,
-            before=_integrated(state, -lead_s, constants, None),
-            after=_integrated(state, longest_s, constants, height_left),
-        )
+        path = Path.followed(state, lead_s, longest_s, height_left, chain, wind.field)
+        return cls(p, start_m, wind, ground_height_m, chain, path)
 
     @property
     def span_s(self) -> tuple[float, float]:
         """First and last time at which the flight is known."""
-        return float(self.before.t_min), float(self.after.t_max)
+        return self.path.span_s
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Truth at many times. Raises ValueError outside of the span."""
-        positions, velocities, matrices, rates, forces = truth(self.states(times_s), self.chain, self.wind.field)
+        positions, velocities, matrices, rates, forces = truth(self.path.at(times_s), self.chain, self.wind.field)
         return Motion(times_s, positions, velocities, Rotation.from_matrix(matrices, assume_valid=True), rates, forces)
 
     def state(self, time_s: float) -> State:
@@ -188,25 +174,12 @@ class SwingDescent:
             specific_force_m_s2=m.specific_forces_m_s2[0],
         )
 
-    def states(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 22"]:
-        """State vectors of the chain (`sim.dynamics.kernels`). Raises ValueError outside of the span."""
-        first, last = self.span_s
-        outside = times_s[(times_s < first) | (times_s > last)]
-        if outside.size:
-            raise ValueError(f"time {outside[0]:.6g} s is outside of the flight; allowed: {first:.6g} to {last:.6g} s")
-        rows = np.empty((times_s.size, SIZE))
-        early = times_s < 0.0
-        for solution, chosen in ((self.before, early), (self.after, ~early)):
-            if chosen.any():
-                rows[chosen] = solution(times_s[chosen]).T
-        return rows
-
     def time_of_altitude(self, altitude_m: float) -> float:
         """When the camera passes an altitude above `ground_height_m`. Raises ValueError if it does not in the span."""
         first, last = self.span_s
 
         def excess(time_s: float) -> float:
-            return _camera_height(self.states(np.array([time_s]))[0], self.chain) - self.ground_height_m - altitude_m
+            return _camera_height(self.path.at(np.array([time_s]))[0], self.chain) - self.ground_height_m - altitude_m
 
         if not excess(last) <= 0.0 <= excess(first):
             highest, lowest = altitude_m + excess(first), altitude_m + excess(last)
@@ -219,31 +192,6 @@ class SwingDescent:
     def thruster_firing_s(self) -> float:
         """When the thrusters fire: at `thruster_firing_m` above the ground."""
         return self.time_of_altitude(self.parameters.thruster_firing_m)
-
-
-def _integrated(
-    state: StateVector,
-    end_s: float,
-    constants: tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "m 7"]],
-    ending: Callable[..., float] | None,
-) -> OdeSolution:
-    """The flight from a state at time 0 until a time or, if that is sooner, until `ending` passes zero."""
-    if ending is not None:
-        ending.terminal = True  # type: ignore[attr-defined]
-    solution = solve_ivp(
-        slope,
-        (0.0, end_s),
-        state,
-        method="DOP853",
-        dense_output=True,
-        rtol=RELATIVE_TOLERANCE,
-        atol=ABSOLUTE_TOLERANCE,
-        events=ending,
-        args=constants,
-    )
-    if solution.sol is None or not solution.success:
-        raise ValueError(f"the descent cannot be followed beyond {solution.t[-1]:.6g} s: {solution.message}")
-    return solution.sol
 
 
 def _camera_height(y: StateVector, chain: Chain) -> float:

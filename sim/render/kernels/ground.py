@@ -39,39 +39,6 @@ def world_ray(
     return position[0] + x, position[1] + y, position[2] + z, dx, dy, dz
 
 
-@njit(cache=True, inline="always")
-def meet_ground(
-    field: Level,
-    inverse_spacing: float,
-    x0: float,
-    y0: float,
-    z0: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    start: float,
-) -> float:
-    """Distance along a ray to the surface near a first guess, by Newton's method; the guess itself where it fails."""
-    t = start
-    bound = 0.05 * start
-    # A step that short leaves, by the surface's greatest curvature of about one over its spacing, less than 1e-6 of
-    # the distance.
-    short = math.sqrt(2e-6 * start / inverse_spacing)
-    for _ in range(8):
-        height, slope_x, slope_y, _albedo = sample(field, inverse_spacing, x0 + t * dx, y0 + t * dy)
-        miss = z0 + t * dz - height
-        closing = dz - slope_x * dx - slope_y * dy
-        if closing > -1e-3:
-            return start
-        step = miss / closing
-        t -= step
-        if abs(t - start) > bound:
-            return start
-        if abs(step) < short:
-            break
-    return t
-
-
 @njit(cache=True)
 def cross_ground(
     field: Level,
@@ -190,7 +157,6 @@ __all__ = [
     "cross_ground",
     "first_ground",
     "height_range",
-    "meet_ground",
     "turned",
     "way_out",
     "world_ray",

@@ -9,9 +9,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sim.render.kernels.casters import Casters, hides_sun
-from sim.render.kernels.ground import Array32, world_ray
 from sim.render.kernels.sight import FLATTEST, Ints
 from sim.render.kernels.sky import sky_brightness
+from sim.render.kernels.strips import ROW, STRIP, Array32, Matrix, Near, fetch_levels, no_cells, numbers, spline, times
 from sim.render.kernels.sun import (
     UNSURE,
     Shadow,
@@ -21,7 +21,7 @@ from sim.render.kernels.sun import (
     shadow_clearance,
     sun_over_ground,
 )
-from sim.render.kernels.texture import texture
+from sim.render.kernels.texture import add_texture
 from sim.terrain.kernels import Array, Level, sample
 
 #: Cover of a layer of clouds, and its numbers.
@@ -32,15 +32,17 @@ Reach = tuple[NDArray[np.bool_], float, float, float]
 GROUND, SKY = -1, -2
 #: Footprint, in samples, up to which the finest level is taken: the B-spline itself holds nothing finer than this.
 SHARP_UNTIL = 1.2
-
-
-@njit(cache=True, inline="always")
-def _brightness(law: Array, cos_i: float, cos_e: float, cos_g: float) -> float:
-    """Radiance factor of ground of unit albedo under the sun alone: Lunar-Lambert with an opposition surge."""
-    tan_half = math.sqrt(max(1.0 - cos_g, 0.0) / max(1.0 + cos_g, 1e-9))
-    surge = 1.0 + law[1] / (1.0 + tan_half / law[2])
-    brightness: float = law[3] * surge * (2.0 * law[0] * cos_i / (cos_i + cos_e) + (1.0 - law[0]) * cos_i)
-    return brightness
+#: Rows of what is kept of a strip of pixels: the place seen and the direction to it, its pixel's footprint (infinite
+#: where no ground is seen), the terrain there, the normal, how texture changes albedo, cosines of incidence, emission
+#: and phase, and the share of the sun that is seen.
+X, Y, Z, DX, DY, DZ, FOOTPRINT, HEIGHT, SLOPE_X, SLOPE_Y, ALBEDO, NX, NY, NZ, CHANGE, COS_I, COS_E, COS_G, LIT = (
+    ROW * n for n in range(19)
+)
+#: Rows of the ground's level: its samples to the metre, the share of the next coarser level, and the terrain there.
+SCALE, BLEND, COARSE_HEIGHT, COARSE_SLOPE_X, COARSE_SLOPE_Y, COARSE_ALBEDO = (ROW * n for n in range(19, 25))
+#: Rows of things alone: places, footprints and changes.
+THING_X, THING_Y, THING_Z, THING_FOOTPRINT, THING_CHANGE = (ROW * n for n in range(25, 30))
+ROWS = 30
 
 
 @njit(cache=True, inline="always")
@@ -54,8 +56,125 @@ def _in_reach(reach: Reach, x: float, y: float) -> bool:
     return bool(0 <= row < cells.shape[0] and 0 <= column < cells.shape[1] and cells[row, column])
 
 
-# Fused multiplications round differently, but the same way every time on the same processor.
-@njit(cache=True, fastmath={"contract"})
+# Fused multiplications round differently, but the same way every time on the same processor: below, "contract".
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _place(
+    rotation: Matrix,
+    centre: tuple[float, float, float],
+    origins: Array32,
+    directions: Array32,
+    pixel_angles: Array32,
+    distance: Array,
+    width: int,
+    work: Array,
+) -> None:
+    """Places that the pixels of a strip see, and footprints as on the ground; its sky is taken to be at the camera."""
+    for k in range(min(width, STRIP)):
+        dx, dy, dz = times(rotation, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2])
+        x, y, z = times(rotation, origins[3 * k], origins[3 * k + 1], origins[3 * k + 2])
+        t = distance[k] if distance[k] < math.inf else 0.0
+        work[X + k] = centre[0] + x + t * dx
+        work[Y + k] = centre[1] + y + t * dy
+        work[Z + k] = centre[2] + z + t * dz
+        work[DX + k] = dx
+        work[DY + k] = dy
+        work[DZ + k] = dz
+        work[FOOTPRINT + k] = t * pixel_angles[k] / math.sqrt(max(-dz, FLATTEST))
+        work[CHANGE + k] = 0.0
+        work[LIT + k] = 1.0
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _ground(near: Near, width: int, out: Array) -> None:
+    """Height, slopes and albedo of the terrain at the places of a strip, a row of `out` each; slopes by sample."""
+    for k in range(min(width, STRIP)):
+        out[k], out[ROW + k], out[2 * ROW + k], out[3 * ROW + k] = spline(near[0], near[1], k)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _blend(width: int, work: Array) -> None:
+    """Mixes the terrain of the next coarser level into that of the finer, by shares."""
+    for k in range(min(width, STRIP)):
+        blend, scale = work[BLEND + k], work[SCALE + k]
+        slope_x, slope_y, albedo = work[SLOPE_X + k] * scale, work[SLOPE_Y + k] * scale, work[ALBEDO + k]
+        to_x = 0.5 * scale * work[COARSE_SLOPE_X + k] - slope_x
+        to_y = 0.5 * scale * work[COARSE_SLOPE_Y + k] - slope_y
+        to_albedo = work[COARSE_ALBEDO + k] - albedo
+        mixed = blend > 0.0
+        work[SLOPE_X + k] = slope_x + blend * to_x if mixed else slope_x
+        work[SLOPE_Y + k] = slope_y + blend * to_y if mixed else slope_y
+        work[ALBEDO + k] = albedo + blend * to_albedo if mixed else albedo
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _face(width: int, work: Array) -> None:
+    """Normals of the ground, from its slopes."""
+    for k in range(min(width, STRIP)):
+        slope_x, slope_y = work[SLOPE_X + k], work[SLOPE_Y + k]
+        nz = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+        work[NX + k] = -slope_x * nz
+        work[NY + k] = -slope_y * nz
+        work[NZ + k] = nz
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _thing(normals: Array, triangle: int, second: float, third: float, k: int, work: Array) -> None:
+    """Normal of a triangle at a place with these weights of its second and third corner."""
+    rest = 1.0 - second - third
+    nx = rest * normals[triangle, 0, 0] + second * normals[triangle, 1, 0] + third * normals[triangle, 2, 0]
+    ny = rest * normals[triangle, 0, 1] + second * normals[triangle, 1, 1] + third * normals[triangle, 2, 1]
+    nz = rest * normals[triangle, 0, 2] + second * normals[triangle, 1, 2] + third * normals[triangle, 2, 2]
+    length = math.sqrt(nx * nx + ny * ny + nz * nz)
+    work[NX + k] = nx / length
+    work[NY + k] = ny / length
+    work[NZ + k] = nz / length
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _thing_footprint(across: float, k: int, work: Array) -> float:
+    """Footprint on a thing of a pixel that is so wide across its line of sight."""
+    facing = -(work[DX + k] * work[NX + k] + work[DY + k] * work[NY + k] + work[DZ + k] * work[NZ + k])
+    footprint: float = across / math.sqrt(max(facing, 0.05))
+    return footprint
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _lean(sun: tuple[float, float, float], width: int, work: Array) -> None:
+    """Cosines of incidence, emission and phase."""
+    for k in range(min(width, STRIP)):
+        dx, dy, dz = work[DX + k], work[DY + k], work[DZ + k]
+        nx, ny, nz = work[NX + k], work[NY + k], work[NZ + k]
+        work[COS_I + k] = sun[0] * nx + sun[1] * ny + sun[2] * nz
+        work[COS_E + k] = max(-(dx * nx + dy * ny + dz * nz), 1e-3)
+        work[COS_G + k] = min(max(-(dx * sun[0] + dy * sun[1] + dz * sun[2]), -1.0), 1.0)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _reflect(law: tuple[float, float, float, float, float, float], width: int, work: Array, radiance: Array32) -> None:
+    """Radiance factor of ground under sun and sky: Lunar-Lambert with an opposition surge."""
+    lunar, amplitude, surge_width, normalisation, sky_share, bounced = law
+    for k in range(min(width, STRIP)):
+        nz, cos_i, cos_g = work[NZ + k], work[COS_I + k], work[COS_G + k]
+        tan_half = math.sqrt(max(1.0 - cos_g, 0.0) / max(1.0 + cos_g, 1e-9))
+        surge = 1.0 + amplitude / (1.0 + tan_half / surge_width)
+        brightness = normalisation * surge * (2.0 * lunar * cos_i / (cos_i + work[COS_E + k]) + (1.0 - lunar) * cos_i)
+        value = sky_share * 0.5 * (1.0 + nz) + bounced * 0.5 * (1.0 - nz)
+        value += work[LIT + k] * brightness if cos_i > 0.0 else 0.0
+        radiance[k] = work[ALBEDO + k] * value
+
+
+@njit(cache=True)
+def _keep_normals(width: int, work: Array, normal: Array32) -> None:
+    """Writes the normals of a strip, three numbers each."""
+    for k in range(min(width, STRIP)):
+        normal[3 * k] = work[NX + k]
+        normal[3 * k + 1] = work[NY + k]
+        normal[3 * k + 2] = work[NZ + k]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def shade(
     levels: tuple[Level, ...],
     spacing: float,
@@ -125,84 +244,138 @@ def shade(
     radiance, body, normal
         Outputs: radiance factor; number of the thing seen (GROUND, SKY); unit normal in world axes.
     """
-    sky_share, bounced, caster, sun_radius = law[4], law[5], law[6], law[7]
+    towards = (sun[0], sun[1], sun[2])
+    rotation = numbers(world_from_body)
+    centre = (position[0], position[1], position[2])
+    reflectance = (law[0], law[1], law[2], law[3], law[4], law[5])
+    caster, sun_radius = law[6], law[7]
     cover, drift = clouds
     dimmed = drift[4] > 0.0
     across = math.sqrt(sun[0] * sun[0] + sun[1] * sun[1])
     row_m = shadow_spacing / max(abs(sun[0]), abs(sun[1]), 1e-9)
     inverse_spacing = 1.0 / spacing
-    top_level = len(levels) - 1
     shadowed = shadow[0].shape[0] > 1
     finest = levels[0]
     things = casters[0].shape[0] > 0
-    for n in range(directions.shape[0]):
-        x0, y0, z0, dx, dy, dz = world_ray(world_from_body, position, origins, directions, n)
-        t = distance[n]
-        triangle = triangle_of_pixel[n]
-        smooth = max(level_of_pixel[n], 0)
-        met = level_of_pixel[n] == 0
-        if t == math.inf:
-            cos_g = dx * sun[0] + dy * sun[1] + dz * sun[2]
-            radiance[n] = sky_brightness(sky, sun[2], sun_radius, dz, cos_g, pixel_angles[n])
-            body[n] = SKY
-            normal[n] = 0.0
-            continue
-        x = x0 + t * dx
-        y = y0 + t * dy
-        z = z0 + t * dz
-        if triangle >= 0:
-            second = weights[n, 0]
-            third = weights[n, 1]
-            rest = 1.0 - second - third
-            nx = rest * normals[triangle, 0, 0] + second * normals[triangle, 1, 0] + third * normals[triangle, 2, 0]
-            ny = rest * normals[triangle, 0, 1] + second * normals[triangle, 1, 1] + third * normals[triangle, 2, 1]
-            nz = rest * normals[triangle, 0, 2] + second * normals[triangle, 1, 2] + third * normals[triangle, 2, 2]
-            length = math.sqrt(nx * nx + ny * ny + nz * nz)
-            nx /= length
-            ny /= length
-            nz /= length
-            body[n] = body_of_triangle[triangle]
-            albedo = albedos[body[n]]
-            cos_e = max(-(dx * nx + dy * ny + dz * nz), 1e-3)
-            footprint = t * pixel_angles[n] / math.sqrt(max(cos_e, 0.05))
-            change = texture(x, y, z, footprint, object_texture[0], object_texture[1])
-        else:
-            # the level whose samples are as far apart as the pixel's footprint, blended between the two nearest
-            footprint = t * pixel_angles[n] / math.sqrt(max(-dz, FLATTEST))
-            if smooth == 0 and footprint <= SHARP_UNTIL * spacing:
-                _height, slope_x, slope_y, albedo = sample(finest, inverse_spacing, x, y)
-            else:
-                fractional = max(math.log2(max(footprint / (SHARP_UNTIL * spacing), 1.0)), float(smooth))
-                lower = min(int(fractional), top_level)
-                blend = min(fractional - lower, 1.0)
-                scale = inverse_spacing / (1 << lower)
-                _height, slope_x, slope_y, albedo = sample(levels[lower], scale, x, y)
-                if blend > 0.0 and lower < top_level:
-                    _height, slope_x2, slope_y2, albedo2 = sample(levels[lower + 1], 0.5 * scale, x, y)
-                    slope_x += blend * (slope_x2 - slope_x)
-                    slope_y += blend * (slope_y2 - slope_y)
-                    albedo += blend * (albedo2 - albedo)
-            nz = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
-            nx = -slope_x * nz
-            ny = -slope_y * nz
-            cos_e = max(-(dx * nx + dy * ny + dz * nz), 1e-3)
+    flat_origins, flat_directions, flat_normals = origins.reshape(-1), directions.reshape(-1), normal.reshape(-1)
+    work = np.empty(ROWS * ROW)
+    near = no_cells()
+    level_of = np.empty(STRIP, dtype=np.int64)
+    ground = np.empty(STRIP, dtype=np.int64)
+    mixed = np.empty(STRIP, dtype=np.int64)
+    other = np.empty(STRIP, dtype=np.int64)
+    top_level = len(levels) - 1
+    count = directions.shape[0]
+    for first in range(0, count, STRIP):
+        width = min(STRIP, count - first)
+        last = first + width
+        _place(
+            rotation,
+            centre,
+            flat_origins[3 * first : 3 * last],
+            flat_directions[3 * first : 3 * last],
+            pixel_angles[first:last],
+            distance[first:last],
+            width,
+            work,
+        )
+        n_ground = 0
+        n_other = 0
+        n_mixed = 0
+        for k in range(width):
+            n = first + k
             body[n] = GROUND
-            change = texture(x, y, z, footprint, ground_texture[0], ground_texture[1])
-        if change != 0.0:
-            albedo *= math.exp(change)
-        normal[n, 0] = nx
-        normal[n, 1] = ny
-        normal[n, 2] = nz
-        value = sky_share * 0.5 * (1.0 + nz) + bounced * 0.5 * (1.0 - nz)
-        cos_i = sun[0] * nx + sun[1] * ny + sun[2] * nz
-        if cos_i > 0.0:
+            work[BLEND + k] = 0.0
+            if distance[n] == math.inf or triangle_of_pixel[n] >= 0:
+                other[n_other] = k
+                n_other += 1
+                continue
+            # the level whose samples are as far apart as the pixel's footprint, blended between the two nearest
+            lower = 0
+            if level_of_pixel[n] > 0 or work[FOOTPRINT + k] > SHARP_UNTIL * spacing:
+                suited = math.log2(max(work[FOOTPRINT + k] / (SHARP_UNTIL * spacing), 1.0))
+                fractional = max(suited, float(level_of_pixel[n]))
+                lower = min(int(fractional), top_level)
+                if lower < top_level and fractional > lower:
+                    work[BLEND + k] = min(fractional - lower, 1.0)
+                    mixed[n_mixed] = k
+                    n_mixed += 1
+            level_of[k] = lower
+            work[SCALE + k] = inverse_spacing / (1 << lower)
+            ground[n_ground] = k
+            n_ground += 1
+        if n_ground > 0:
+            x, y = work[X : X + ROW], work[Y : Y + ROW]
+            fetch_levels(levels, inverse_spacing, level_of, ground, n_ground, x, y, near)
+            _ground(near, width, work[HEIGHT : HEIGHT + 4 * ROW])
+            if n_mixed > 0:
+                for m in range(n_mixed):
+                    level_of[mixed[m]] += 1
+                fetch_levels(levels, inverse_spacing, level_of, mixed, n_mixed, x, y, near)
+                _ground(near, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
+            _blend(width, work)
+        _face(width, work)
+        seen = 0
+        for m in range(n_other):
+            k = other[m]
+            n = first + k
+            if distance[n] == math.inf:
+                body[n] = SKY
+                work[FOOTPRINT + k] = math.inf
+                work[NX + k] = 0.0
+                work[NY + k] = 0.0
+                work[NZ + k] = 0.0
+            elif triangle_of_pixel[n] >= 0:
+                _thing(normals, triangle_of_pixel[n], weights[n, 0], weights[n, 1], k, work)
+                body[n] = body_of_triangle[triangle_of_pixel[n]]
+                work[ALBEDO + k] = albedos[body[n]]
+                work[FOOTPRINT + k] = math.inf
+                work[THING_X + seen] = work[X + k]
+                work[THING_Y + seen] = work[Y + k]
+                work[THING_Z + seen] = work[Z + k]
+                work[THING_FOOTPRINT + seen] = _thing_footprint(distance[n] * pixel_angles[n], k, work)
+                work[THING_CHANGE + seen] = 0.0
+                other[seen] = k
+                seen += 1
+        _lean(towards, width, work)
+        add_texture(
+            work[X : X + width],
+            work[Y : Y + width],
+            work[Z : Z + width],
+            work[FOOTPRINT : FOOTPRINT + width],
+            ground_texture[0],
+            ground_texture[1],
+            work[CHANGE : CHANGE + width],
+        )
+        if seen > 0:
+            add_texture(
+                work[THING_X : THING_X + seen],
+                work[THING_Y : THING_Y + seen],
+                work[THING_Z : THING_Z + seen],
+                work[THING_FOOTPRINT : THING_FOOTPRINT + seen],
+                object_texture[0],
+                object_texture[1],
+                work[THING_CHANGE : THING_CHANGE + seen],
+            )
+            for m in range(seen):
+                work[CHANGE + other[m]] = work[THING_CHANGE + m]
+        for k in range(width):
+            if work[CHANGE + k] != 0.0:
+                work[ALBEDO + k] *= math.exp(work[CHANGE + k])
+        for k in range(width):
+            n = first + k
+            if work[COS_I + k] <= 0.0 or body[n] == SKY:
+                continue
+            px, py, pz = work[X + k], work[Y + k], work[Z + k]
+            triangle = triangle_of_pixel[n]
+            met = level_of_pixel[n] == 0
             lit = 1.0
             if shadowed:
                 if triangle < 0 and not met:
                     # the terrain itself, where the pixel saw it smoothed: its own bumps must not shade a smooth ground
-                    height, _slope_x, _slope_y, _albedo = sample(levels[shadow_level], 1.0 / shadow_spacing, x, y)
-                    z = max(z, height)
-                clear, rows = shadow_clearance(shadow, 1.0 / shadow_spacing, x, y, z)
+                    height, _slope_x, _slope_y, _albedo = sample(levels[shadow_level], 1.0 / shadow_spacing, px, py)
+                    pz = max(pz, height)
+                clear, rows = shadow_clearance(shadow, 1.0 / shadow_spacing, px, py, pz)
                 # half the depth of the penumbra, which a disc casts past what is so far away
                 soft = sun_radius * rows * row_m / across
                 if triangle >= 0 or not met:
@@ -212,21 +385,27 @@ def shade(
                 elif clear < UNSURE * shadow_spacing + soft:
                     # at the shadow's edge the swept grid is too coarse: look towards the sun from here
                     lit = sun_over_ground(
-                        finest, inverse_spacing, shadow, shadow_spacing, row_m, x, y, z, sun, sun_radius, highest
+                        finest, inverse_spacing, shadow, shadow_spacing, row_m, px, py, pz, sun, sun_radius, highest
                     )
-            if lit > 0.0 and things and (triangle >= 0 or _in_reach(reach, x, y)):
+            if lit > 0.0 and things and (triangle >= 0 or _in_reach(reach, px, py)):
                 # lifted off its own facet, so that this and those beside do not shade it by rounding
-                lift = 1e-4 + (0.05 * t * pixel_angles[n] if triangle >= 0 else 0.0)
-                if hides_sun(casters, x + lift * nx, y + lift * ny, z + lift * nz):
+                lift = 1e-4 + (0.05 * distance[n] * pixel_angles[n] if triangle >= 0 else 0.0)
+                nx, ny, nz = work[NX + k], work[NY + k], work[NZ + k]
+                if hides_sun(casters, px + lift * nx, py + lift * ny, pz + lift * nz):
                     lit = 0.0
-            cos_g = min(max(-(dx * sun[0] + dy * sun[1] + dz * sun[2]), -1.0), 1.0)
+            cos_g = work[COS_G + k]
             if caster > 0.0 and cos_g > 0.9:
-                lit *= 1.0 - disc_overlap(0.5 * caster / t, sun_radius, math.acos(cos_g))
+                lit *= 1.0 - disc_overlap(0.5 * caster / distance[n], sun_radius, math.acos(cos_g))
             if dimmed:
-                up = max(drift[1] - z, 0.0) / sun[2]
+                up = max(drift[1] - pz, 0.0) / sun[2]
                 lit *= 1.0 - drift[4] * cloud_cover(
-                    cover, drift[0], x + up * sun[0] - drift[2], y + up * sun[1] - drift[3]
+                    cover, drift[0], px + up * sun[0] - drift[2], py + up * sun[1] - drift[3]
                 )
-            if lit > 0.0:
-                value += lit * _brightness(law, cos_i, cos_e, cos_g)
-        radiance[n] = albedo * value
+            work[LIT + k] = lit
+        _reflect(reflectance, width, work, radiance[first:last])
+        _keep_normals(width, work, flat_normals[3 * first : 3 * last])
+        for k in range(width):
+            n = first + k
+            if body[n] == SKY:
+                cos_g = work[DX + k] * sun[0] + work[DY + k] * sun[1] + work[DZ + k] * sun[2]
+                radiance[n] = sky_brightness(sky, sun[2], sun_radius, work[DZ + k], cos_g, pixel_angles[n])

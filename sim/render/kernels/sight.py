@@ -8,44 +8,50 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, Bounds, first_ground, turned, world_ray
+from sim.render.kernels.ground import Bounds, first_ground
 from sim.render.kernels.hierarchy import Hierarchy, nearest_hit
 from sim.render.kernels.intersection import hit_triangle
-from sim.terrain.kernels import Array, Level, sample
+from sim.render.kernels.strips import (
+    ROW,
+    STRIP,
+    Array32,
+    Longs,
+    Matrix,
+    Near,
+    fetch_levels,
+    no_cells,
+    numbers,
+    spline,
+    times,
+)
+from sim.terrain.kernels import Array, Level
 
 Ints = NDArray[np.int32]
-Longs = NDArray[np.int64]
 #: Sine of the flattest angle at which a pixel's footprint on the ground is still drawn out in full.
 FLATTEST = 0.01
 #: Samples of the terrain up to which a footprint is met by the terrain itself, not by a smoothed level of it.
 FINE_UNTIL = 8.0
 #: Sine of the angle below which a ray may pass over crests that the mesh does not hold.
 GRAZING = 0.4
-#: Rays that are followed side by side: the processor works on several at once, and what is kept of them stays near it.
-STRIP = 256
 #: Most steps of Newton's method, the share of the first guess that they may change it by, and the shallowest closing.
 STEPS, FARTHEST, CLOSING = 8, 0.05, -1e-3
 #: Slack of a triangle's edge, as a share: so that no ray slips between two triangles.
 SLACK = 1e-9
+#: Rows of what is kept of a strip of rays: origins and directions in world axes; where in a view's picture they point
+#: (first counted in samples, then as shares between four of them), and how far forward; the depths of these four.
+X0, Y0, Z0, DX, DY, DZ, U, V, FORWARD, UPPER_LEFT, UPPER_RIGHT, LOWER_LEFT, LOWER_RIGHT = (ROW * n for n in range(13))
+#: The first guess of each ray's distance, and the pixel's footprint along the line of sight there; then, while the
+#: ground is sought, the distance, where the search began, places, samples to the metre, and whether it goes on.
+GUESS, STRETCHED, MET, START, X, Y, SCALE, GOING = (ROW * n for n in range(13, 21))
+ROWS = 21
 
 
-@njit(cache=True, inline="always")
-def _ground_depth(depth: Array32, ids: Ints, shown: int, face: int, i: int, j: int, fu: float, fv: float) -> float:
-    """Depth of the ground between four samples of a depth picture; 0 where none of them shows ground.
+@njit(cache=True)
+def _nearest_depth(depth: Array32, ids: Ints, shown: int, face: int, i: int, j: int, fu: float, fv: float) -> float:
+    """Depth of the nearest sample of ground among the four around a place between samples; 0 where there is none.
 
-    Where all of them show one stretch of ground its inverse depth, linear over a plane's picture, is interpolated;
-    across an edge the nearest sample of the ground is taken. `shown` is 0 where none of them shows a triangle.
+    `shown` is 0 where none of them shows a triangle.
     """
-    a = depth[face, i, j]
-    b = depth[face, i, j + 1]
-    c = depth[face, i + 1, j]
-    d = depth[face, i + 1, j + 1]
-    smallest = min(min(a, b), min(c, d))
-    largest = max(max(a, b), max(c, d))
-    if smallest > 0.0 and largest < 1.1 * smallest and shown == 0:
-        above = (1.0 - fu) / a + fu / b
-        below = (1.0 - fu) / c + fu / d
-        return float(1.0 / ((1.0 - fv) * above + fv * below))
     nearest = 0.0
     least = math.inf
     for di in range(2):
@@ -99,47 +105,129 @@ def _meet_object(
     return best, best_triangle, best_second, best_third
 
 
-@njit(cache=True, error_model="numpy")
-def _meet_ground(field: Level, scale: float, ray: Array, going: Longs, count: int, met: Array) -> None:
-    """Brings some rays from a first guess onto the ground, by Newton's method; the guess stays where it fails.
+# Fused multiplications round differently, but the same way every time on the same processor: below, "contract".
 
-    All rays take a step before any takes the next, so that the processor need not finish one before it begins another,
-    nor guess which ends first.
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _aim(
+    rotation: Matrix, centre: tuple[float, float, float], origins: Array32, directions: Array32, width: int, work: Array
+) -> None:
+    """Rays of a strip in world axes."""
+    for k in range(min(width, STRIP)):
+        work[DX + k], work[DY + k], work[DZ + k] = times(
+            rotation, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2]
+        )
+        x, y, z = times(rotation, origins[3 * k], origins[3 * k + 1], origins[3 * k + 2])
+        work[X0 + k] = centre[0] + x
+        work[Y0 + k] = centre[1] + y
+        work[Z0 + k] = centre[2] + z
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _project(
+    view: Matrix, focal: float, middle: float, directions: Array32, u: Array, v: Array, forward: Array
+) -> None:
+    """Where rays meet a view's picture, and how far they go forward."""
+    for k in range(min(u.size, STRIP)):
+        x, y, z = times(view, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2])
+        u[k] = focal * x / z + middle
+        v[k] = focal * y / z + middle
+        forward[k] = z
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _guess(pixel_angles: Array32, width: int, work: Array) -> None:
+    """First guesses from four samples of one stretch of ground each, and footprints there; 0 where it is not one.
+
+    Inverse depth, linear over a plane's picture, is interpolated.
+    """
+    for k in range(min(width, STRIP)):
+        a, b, c, d = work[UPPER_LEFT + k], work[UPPER_RIGHT + k], work[LOWER_LEFT + k], work[LOWER_RIGHT + k]
+        fu, fv = work[U + k], work[V + k]
+        smallest = min(min(a, b), min(c, d))
+        largest = max(max(a, b), max(c, d))
+        above = (1.0 - fu) / a + fu / b
+        below = (1.0 - fu) / c + fu / d
+        seen = 1.0 / ((1.0 - fv) * above + fv * below)
+        t = seen / work[FORWARD + k] if smallest > 0.0 and largest < 1.1 * smallest else 0.0
+        work[GUESS + k] = t
+        work[STRETCHED + k] = t * pixel_angles[k] / max(-work[DZ + k], FLATTEST)
+
+
+@njit(cache=True, error_model="numpy")
+def _reach_out(width: int, work: Array) -> None:
+    """Where rays are at their distances."""
+    for k in range(min(width, STRIP)):
+        work[X + k] = work[X0 + k] + work[MET + k] * work[DX + k]
+        work[Y + k] = work[Y0 + k] + work[MET + k] * work[DY + k]
+
+
+@njit(cache=True, error_model="numpy")
+def _step(near: Near, width: int, work: Array) -> None:
+    """One step of Newton's method for the rays that are followed; `GOING` tells which go on, 1 or 0."""
+    for k in range(min(width, STRIP)):
+        height, slope_x, slope_y, _albedo = spline(near[0], near[1], k)
+        t, start, scale, dz = work[MET + k], work[START + k], work[SCALE + k], work[DZ + k]
+        miss = work[Z0 + k] + t * dz - height
+        closing = dz - slope_x * scale * work[DX + k] - slope_y * scale * work[DY + k]
+        step = miss / closing
+        failed = closing > CLOSING or abs(t - step - start) > FARTHEST * start
+        # A step that short leaves, by the surface's greatest curvature of about one over its spacing, less than
+        # 1e-6 of the distance.
+        far = step * step >= 2e-6 * start / scale
+        going = work[GOING + k] > 0.0
+        work[MET + k] = (start if failed else t - step) if going else t
+        work[GOING + k] = 1.0 if going and far and not failed else 0.0
+
+
+@njit(cache=True)
+def _meet_ground(
+    levels: tuple[Level, ...],
+    inverse_spacing: float,
+    level_of: Longs,
+    going: Longs,
+    count: int,
+    width: int,
+    work: Array,
+    near: Near,
+) -> None:
+    """Brings some rays of a strip from a first guess onto the ground by Newton's method; it stays where that fails.
+
+    All rays take a step before any takes the next, so that the processor works on several at once.
 
     Parameters
     ----------
-    field, scale
-        A level of the surface and its samples to the metre.
-    ray
-        Origins and directions in world axes, shape (6, rays).
+    levels, inverse_spacing
+        The surface's pyramid, and samples of its level 0 to the metre.
+    level_of
+        The level on which each ray meets the ground.
     going, count
         Numbers of the rays that are followed, and how many; overwritten.
-    met
-        First guesses, changed to where rays meet the ground.
+    width, work
+        The strip, first guesses in `MET`; changed to where rays meet the ground.
+    near
+        Room for control values.
     """
-    start = met.copy()
+    for k in range(width):
+        work[START + k] = work[MET + k]
+        work[GOING + k] = 0.0
+    for m in range(count):
+        work[GOING + going[m]] = 1.0
+        work[SCALE + going[m]] = inverse_spacing / (1 << level_of[going[m]])
     for _ in range(STEPS):
+        if count == 0:
+            break
+        _reach_out(width, work)
+        fetch_levels(levels, inverse_spacing, level_of, going, count, work[X : X + ROW], work[Y : Y + ROW], near)
+        _step(near, width, work)
         left = 0
         for m in range(count):
             k = going[m]
-            t = met[k]
-            dx, dy, dz = ray[3, k], ray[4, k], ray[5, k]
-            height, slope_x, slope_y, _albedo = sample(field, scale, ray[0, k] + t * dx, ray[1, k] + t * dy)
-            miss = ray[2, k] + t * dz - height
-            closing = dz - slope_x * dx - slope_y * dy
-            step = miss / closing
-            failed = closing > CLOSING or abs(t - step - start[k]) > FARTHEST * start[k]
-            met[k] = start[k] if failed else t - step
-            # A step that short leaves, by the surface's greatest curvature of about one over its spacing, less than
-            # 1e-6 of the distance.
             going[left] = k
-            left += not failed and step * step >= 2e-6 * start[k] / scale
+            left += work[GOING + k] > 0.0
         count = left
-        if count == 0:
-            break
 
 
-# Fused multiplications round differently, but the same way every time on the same processor.
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def look(
     levels: tuple[Level, ...],
@@ -186,83 +274,99 @@ def look(
         second and third corner there; level of the terrain on which the ground was met, -1 where it was not met and the
         mesh's own distance stands.
     """
-    middle = depth.shape[1] / 2.0 - 0.5
     side = depth.shape[1]
+    middle = side / 2.0 - 0.5
     inverse_spacing = 1.0 / spacing
     top_level = len(levels) - 1
     things = ids.shape[1] > 0
-    ray = np.empty((6, STRIP))
-    guess = np.empty(STRIP)
-    met = np.empty(STRIP)
+    rotation = numbers(world_from_body)
+    centre = (position[0], position[1], position[2])
+    flat_origins, flat_directions = origins.reshape(-1), directions.reshape(-1)
+    work = np.empty(ROWS * ROW)
+    near = no_cells()
     row = np.empty(STRIP, dtype=np.int64)
     column = np.empty(STRIP, dtype=np.int64)
     shown = np.zeros(STRIP, dtype=np.int32)
     smooth = np.empty(STRIP, dtype=np.int64)
     onto = np.empty(STRIP, dtype=np.int64)
-    going = np.empty(STRIP, dtype=np.int64)
     count = directions.shape[0]
     for first in range(0, count, STRIP):
         width = min(STRIP, count - first)
-        left = 0
-        lowest, highest = top_level, 0
-        for k in range(width):
-            n = first + k
-            ray[0, k], ray[1, k], ray[2, k], ray[3, k], ray[4, k], ray[5, k] = world_ray(
-                world_from_body, position, origins, directions, n
+        last = first + width
+        _aim(rotation, centre, flat_origins[3 * first : 3 * last], flat_directions[3 * first : 3 * last], width, work)
+        start = first
+        while start < last:
+            # pixels of one view stand in a row
+            face = face_of_pixel[start]
+            end = start + 1
+            while end < last and face_of_pixel[end] == face:
+                end += 1
+            here, there = start - first, end - first
+            _project(
+                numbers(view_from_body[face]),
+                focal[face],
+                middle,
+                flat_directions[3 * start : 3 * end],
+                work[U + here : U + there],
+                work[V + here : V + there],
+                work[FORWARD + here : FORWARD + there],
             )
-            face = face_of_pixel[n]
-            px, py, pz = turned(view_from_body[face], directions, n)
-            u = focal[face] * px / pz + middle
-            v = focal[face] * py / pz + middle
+            start = end
+        for k in range(width):
+            face = face_of_pixel[first + k]
+            u, v = work[U + k], work[V + k]
             i = min(max(math.floor(v), 0), side - 2)
             j = min(max(math.floor(u), 0), side - 2)
             row[k] = i
             column[k] = j
+            work[U + k] = u - j
+            work[V + k] = v - i
+            work[UPPER_LEFT + k] = depth[face, i, j]
+            work[UPPER_RIGHT + k] = depth[face, i, j + 1]
+            work[LOWER_LEFT + k] = depth[face, i + 1, j]
+            work[LOWER_RIGHT + k] = depth[face, i + 1, j + 1]
             if things:
                 shown[k] = ids[face, i, j] | ids[face, i, j + 1] | ids[face, i + 1, j] | ids[face, i + 1, j + 1]
-            smooth[k] = 0
-            t = math.inf
-            seen = _ground_depth(depth, ids, shown[k], face, i, j, u - j, v - i)
-            guess[k] = -1.0
-            if seen > 0.0:
-                # Far away and at a flat angle a pixel takes in many samples along its line of sight: it sees them
-                # smoothed.
-                t = seen / pz
-                stretched = t * pixel_angles[n] / max(-ray[5, k], FLATTEST)
-                guess[k] = t
-                if stretched > FINE_UNTIL * spacing:
-                    smooth[k] = min(int(math.log2(stretched / (FINE_UNTIL * spacing))) + 1, top_level)
-                lowest = min(lowest, smooth[k])
-                highest = max(highest, smooth[k])
-                onto[left] = k
-                left += 1
-            met[k] = t
-        for m in range(left):
-            k = onto[m]
-            if ray[5, k] > -GRAZING:
-                scale = inverse_spacing / (1 << smooth[k])
-                met[k] = first_ground(
-                    levels[smooth[k]],
-                    scale,
-                    bounds,
-                    ray[0, k],
-                    ray[1, k],
-                    ray[2, k],
-                    ray[3, k],
-                    ray[4, k],
-                    ray[5, k],
-                    met[k],
-                )
-        for level in range(lowest, highest + 1):
-            together = 0
-            for m in range(left):
-                going[together] = onto[m]
-                together += smooth[onto[m]] == level
-            _meet_ground(levels[level], inverse_spacing / (1 << level), ray, going, together, met)
+        _guess(pixel_angles[first:last], width, work)
+        left = 0
         for k in range(width):
             n = first + k
-            t = met[k]
-            on_terrain = smooth[k] == 0 and t != guess[k]
+            if shown[k] != 0 or work[GUESS + k] == 0.0:
+                seen = _nearest_depth(
+                    depth, ids, shown[k], face_of_pixel[n], row[k], column[k], work[U + k], work[V + k]
+                )
+                work[GUESS + k] = seen / work[FORWARD + k]
+                work[STRETCHED + k] = work[GUESS + k] * pixel_angles[n] / max(-work[DZ + k], FLATTEST)
+            smooth[k] = 0
+            if work[GUESS + k] == 0.0:
+                work[GUESS + k] = -1.0
+                work[MET + k] = math.inf
+                continue
+            # Far away and at a flat angle a pixel takes in many samples along its line of sight: it sees them
+            # smoothed.
+            if work[STRETCHED + k] > FINE_UNTIL * spacing:
+                smooth[k] = min(int(math.log2(work[STRETCHED + k] / (FINE_UNTIL * spacing))) + 1, top_level)
+            work[MET + k] = work[GUESS + k]
+            if work[DZ + k] > -GRAZING:
+                work[MET + k] = first_ground(
+                    levels[smooth[k]],
+                    inverse_spacing / (1 << smooth[k]),
+                    bounds,
+                    work[X0 + k],
+                    work[Y0 + k],
+                    work[Z0 + k],
+                    work[DX + k],
+                    work[DY + k],
+                    work[DZ + k],
+                    work[GUESS + k],
+                )
+            onto[left] = k
+            left += 1
+        _meet_ground(levels, inverse_spacing, smooth, onto, left, width, work, near)
+        for k in range(width):
+            n = first + k
+            t = work[MET + k]
+            on_terrain = smooth[k] == 0 and t != work[GUESS + k]
             level_of_pixel[n] = 0 if on_terrain else (smooth[k] if smooth[k] > 0 else -1)
             triangle = -1
             if shown[k] != 0:
@@ -272,12 +376,12 @@ def look(
                     row[k],
                     column[k],
                     tree,
-                    ray[0, k],
-                    ray[1, k],
-                    ray[2, k],
-                    ray[3, k],
-                    ray[4, k],
-                    ray[5, k],
+                    work[X0 + k],
+                    work[Y0 + k],
+                    work[Z0 + k],
+                    work[DX + k],
+                    work[DY + k],
+                    work[DZ + k],
                 )
                 if triangle >= 0 and t_thing < t:
                     t = t_thing

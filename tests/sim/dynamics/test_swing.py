@@ -377,3 +377,21 @@ def test_says_what_is_allowed() -> None:
         SwingDescent.flown(SwingParameters(), START, np.random.default_rng(0), ground_height_m=GROUND_M, lead_s=60.0)
     with pytest.raises(ValidationError, match="bridle_length_m is 60; allowed: up to line_length_m, 47"):
         SwingParameters(bridle_length_m=60.0)
+
+
+def test_compiled_steps_are_those_of_scipy() -> None:
+    """The flight as SciPy's own DOP853 takes it, to what rounding in sums makes of it."""
+    descent = _flown(**WILD)
+    state = descent.path.at(np.zeros(1))[0]
+    for end_s in (-9.0, 12.0):
+        expected = solve_ivp(
+            lambda _t, y: derivatives(y, descent.chain, descent.wind.field),
+            (0.0, end_s),
+            state,
+            method="DOP853",
+            dense_output=True,
+            rtol=1e-9,
+            atol=1e-9,
+        )
+        times = np.linspace(0.0, end_s, 200)
+        np.testing.assert_allclose(descent.path.at(times), expected.sol(times).T, rtol=0.0, atol=1e-8)

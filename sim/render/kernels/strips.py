@@ -1,0 +1,165 @@
+"""Rays side by side: what compiled kernels keep of some rays, so that the processor works on several at once.
+
+The compiler makes vector instructions of a loop over rays if the loop does not branch, reads and writes rows of one
+buffer that lie a fixed way apart, and has a fixed bound: `for k in range(min(width, STRIP))`. What a ray needs from
+somewhere in memory is therefore brought into rows first, one ray at a time, and worked on after that.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sim.terrain.kernels import Array, Level, bspline_weights
+
+Array32 = NDArray[np.float32]
+Longs = NDArray[np.int64]
+#: Control values around the places of a strip, the places' shares of their cells, and room for numbers of places.
+Near = tuple[Array32, Array, Longs]
+#: Nine numbers of a matrix, row by row.
+Matrix = tuple[float, float, float, float, float, float, float, float, float]
+
+#: Rays worked on side by side: what is kept of them stays in the nearest cache.
+STRIP = 128
+#: Numbers from one row of a buffer to the next: a little more, so that rows do not meet in the same lines of the cache.
+ROW = STRIP + 8
+#: Control values around a place: heights and albedos, four rows of four.
+CELLS = 2 * 16 * ROW
+
+
+@njit(cache=True)
+def no_cells() -> Near:
+    """Room for the control values around the places of a strip."""
+    return np.empty(CELLS, dtype=np.float32), np.empty(2 * ROW), np.empty(STRIP, dtype=np.int64)
+
+
+@njit(cache=True, inline="always")
+def numbers(matrix: Array) -> Matrix:
+    """The numbers of a 3 x 3 matrix, read once before a loop."""
+    return (
+        matrix[0, 0],
+        matrix[0, 1],
+        matrix[0, 2],
+        matrix[1, 0],
+        matrix[1, 1],
+        matrix[1, 2],
+        matrix[2, 0],
+        matrix[2, 1],
+        matrix[2, 2],
+    )
+
+
+@njit(cache=True, inline="always")
+def times(m: Matrix, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A matrix times a vector."""
+    return (
+        m[0] * x + m[1] * y + m[2] * z,
+        m[3] * x + m[4] * y + m[5] * z,
+        m[6] * x + m[7] * y + m[8] * z,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def fetch_cells(
+    field: Level, scale: float, x: Array, y: Array, which: Longs, count: int, cells: Array32, shares: Array
+) -> None:
+    """Brings the sixteen control values around some places of a level into rows, and the places' shares of their cells.
+
+    Parameters
+    ----------
+    field, scale
+        The level and its samples to the metre.
+    x, y
+        Places, metres.
+    which, count
+        Numbers of the places that are wanted, and how many.
+    cells, shares
+        Outputs of `CELLS` and 2 `ROW` numbers, each place's at its own number.
+    """
+    side = field.shape[0]
+    mask = side - 1
+    pairs = field.reshape(-1).view(np.int64)
+    kept = cells.view(np.int64)
+    for m in range(count):
+        k = which[m]
+        gx = x[k] * scale
+        gy = y[k] * scale
+        fx = math.floor(gx)
+        fy = math.floor(gy)
+        shares[k] = gx - fx
+        shares[ROW + k] = gy - fy
+        j = int(fx)
+        i = int(fy)
+        j0, j1, j2, j3 = (j - 1) & mask, j & mask, (j + 1) & mask, (j + 2) & mask
+        for row in range(4):
+            line = ((i + row - 1) & mask) * side
+            place = np.uint64(4 * row * ROW + k)
+            kept[place] = pairs[np.uint64(line + j0)]
+            kept[place + np.uint64(ROW)] = pairs[np.uint64(line + j1)]
+            kept[place + np.uint64(2 * ROW)] = pairs[np.uint64(line + j2)]
+            kept[place + np.uint64(3 * ROW)] = pairs[np.uint64(line + j3)]
+
+
+@njit(cache=True)
+def fetch_levels(
+    levels: tuple[Level, ...],
+    inverse_spacing: float,
+    level_of: Longs,
+    which: Longs,
+    count: int,
+    x: Array,
+    y: Array,
+    near: Near,
+) -> None:
+    """As `fetch_cells`, each place on a level of its own.
+
+    Parameters
+    ----------
+    levels, inverse_spacing
+        The surface's pyramid, and samples of its level 0 to the metre.
+    level_of
+        Each place's level.
+    which, count, x, y
+        As for `fetch_cells`.
+    near
+        Outputs `cells` and `shares` of `fetch_cells`; the last is overwritten.
+    """
+    cells, shares, alike = near
+    lowest, highest = len(levels) - 1, 0
+    for m in range(count):
+        lowest = min(lowest, level_of[which[m]])
+        highest = max(highest, level_of[which[m]])
+    for level in range(lowest, highest + 1):
+        found = 0
+        for m in range(count):
+            alike[found] = which[m]
+            found += level_of[which[m]] == level
+        fetch_cells(levels[level], inverse_spacing / (1 << level), x, y, alike, found, cells, shares)
+
+
+@njit(cache=True, inline="always")
+def spline(cells: Array32, shares: Array, k: int) -> tuple[float, float, float, float]:
+    """Height, slopes along x and y by sample, and albedo, from the control values around the k-th place.
+
+    The numbers are those of `sim.terrain.kernels.sample`, by the same sums in the same order.
+    """
+    wx0, wx1, wx2, wx3, dx0, dx1, dx2, dx3 = bspline_weights(shares[k])
+    wy0, wy1, wy2, wy3, dy0, dy1, dy2, dy3 = bspline_weights(shares[ROW + k])
+    height = 0.0
+    slope_x = 0.0
+    slope_y = 0.0
+    albedo = 0.0
+    for first, weight, change in ((0, wy0, dy0), (8 * ROW, wy1, dy1), (16 * ROW, wy2, dy2), (24 * ROW, wy3, dy3)):
+        h0, a0 = cells[first + 2 * k], cells[first + 2 * k + 1]
+        h1, a1 = cells[first + 2 * ROW + 2 * k], cells[first + 2 * ROW + 2 * k + 1]
+        h2, a2 = cells[first + 4 * ROW + 2 * k], cells[first + 4 * ROW + 2 * k + 1]
+        h3, a3 = cells[first + 6 * ROW + 2 * k], cells[first + 6 * ROW + 2 * k + 1]
+        across = wx0 * h0 + wx1 * h1 + wx2 * h2 + wx3 * h3
+        height += weight * across
+        slope_y += change * across
+        slope_x += weight * (dx0 * h0 + dx1 * h1 + dx2 * h2 + dx3 * h3)
+        albedo += weight * (wx0 * a0 + wx1 * a1 + wx2 * a2 + wx3 * a3)
+    return height, slope_x, slope_y, albedo

@@ -1,0 +1,27 @@
+"""Places side by side: the same numbers as one by one."""
+
+import numpy as np
+
+from sim.render.kernels.strips import ROW, STRIP, fetch_levels, no_cells, spline
+from sim.terrain import Surface
+from sim.terrain.kernels import sample
+
+SIDE, SPACING_M = 64, 0.5
+SAMPLES = np.random.default_rng(3).normal(size=(SIDE, SIDE, 2)).astype(np.float32)
+SURFACE = Surface.from_samples(SAMPLES, SPACING_M)
+
+
+def test_spline_of_places_on_levels_of_their_own() -> None:
+    rng = np.random.default_rng(4)
+    # within the terrain, on its border and beyond it, for it repeats
+    x, y = rng.uniform(-40.0, 40.0, (2, ROW))
+    x[:4], y[:4] = [0.0, -0.25, 31.75, 32.0], [31.9, 0.0, -0.1, 16.0]
+    level_of = rng.integers(0, len(SURFACE.levels), STRIP)
+    which = np.sort(rng.permutation(STRIP)[:100])
+    near = no_cells()
+    fetch_levels(SURFACE.levels, 1.0 / SPACING_M, level_of, which, which.size, x, y, near)
+    for k in which:
+        scale = 1.0 / SPACING_M / 2.0 ** level_of[k]
+        height, slope_x, slope_y, albedo = spline(near[0], near[1], int(k))
+        expected = sample(SURFACE.levels[level_of[k]], scale, x[k], y[k])
+        np.testing.assert_allclose((height, slope_x * scale, slope_y * scale, albedo), expected, rtol=0.0, atol=1e-14)
