@@ -61,9 +61,10 @@ class Objects:
         changes = np.flatnonzero(np.diff(name_of_face if body_of_face is None else body_of_face)) + 1
         first = np.concatenate([[0], changes, [len(faces)]]).astype(np.int64) if len(faces) else np.zeros(1, np.int64)
         counts = np.diff(first)
+        # taken, not indexed: several times faster for a scene's million triangles
         return cls(
-            triangles=np.asarray(vertices, dtype=np.float64)[faces],
-            normals=np.asarray(vertex_normals, dtype=np.float64)[faces],
+            triangles=np.take(np.asarray(vertices, dtype=np.float64), faces, axis=0),
+            normals=np.take(np.asarray(vertex_normals, dtype=np.float64), faces, axis=0),
             body_of_triangle=np.repeat(np.arange(counts.size, dtype=np.int32), counts),
             first_triangle=first,
             albedo=np.full(counts.size, float(albedo)),
@@ -116,8 +117,8 @@ class Objects:
         counts = np.diff(self.first_triangle)
         triangles = np.flatnonzero(np.repeat(kept, counts))
         some = Objects(
-            triangles=self.triangles[triangles],
-            normals=self.normals[triangles],
+            triangles=np.take(self.triangles, triangles, axis=0),
+            normals=np.take(self.normals, triangles, axis=0),
             body_of_triangle=np.repeat(np.arange(np.count_nonzero(kept), dtype=np.int32), counts[kept]),
             first_triangle=np.concatenate([[0], np.cumsum(counts[kept])]).astype(np.int64),
             albedo=self.albedo[kept],

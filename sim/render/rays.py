@@ -164,13 +164,27 @@ def _focal_length(
     directions: Float64[np.ndarray, "rows columns 3"], axes: Float64[np.ndarray, "3 3"], side: int
 ) -> float:
     """The focal length at which these rays just fill a view."""
-    in_view = directions.reshape(-1, 3) @ axes.T
-    extent = np.abs(in_view[:, :2] / in_view[:, 2:]).max()
+    x, y, z = (directions.reshape(-1, 3) @ axes.T).T.copy()
+    extent = max(np.abs(x / z).max(), np.abs(y / z).max())
     return float((side / 2.0 - MARGIN_PX) / extent)
 
 
 def _pixel_angles(directions: Float64[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "pixels"]:
-    along_row, along_column = np.gradient(directions, axis=(1, 0))
-    solid_angle = np.linalg.norm(np.cross(along_row, along_column), axis=-1)
-    angles: Float32[np.ndarray, "pixels"] = np.sqrt(solid_angle).astype(np.float32).ravel()
+    # component by component: arrays of three-vectors are several times slower to go through
+    x, y, z = np.moveaxis(directions, -1, 0).copy()
+    along_row = [_gradient_along_row(one) for one in (x, y, z)]
+    along_column = [_gradient_along_row(one.T).T for one in (x, y, z)]
+    squared = np.zeros_like(x)
+    for one, other in ((1, 2), (2, 0), (0, 1)):
+        squared += (along_row[one] * along_column[other] - along_row[other] * along_column[one]) ** 2
+    angles: Float32[np.ndarray, "pixels"] = np.sqrt(np.sqrt(squared)).astype(np.float32).ravel()
     return angles
+
+
+def _gradient_along_row(values: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarray, "rows columns"]:
+    """Central differences from pixel to pixel, at the ends one-sided, as `numpy.gradient` takes them."""
+    steps = np.empty_like(values)
+    steps[:, 1:-1] = (values[:, 2:] - values[:, :-2]) / 2.0
+    steps[:, 0] = values[:, 1] - values[:, 0]
+    steps[:, -1] = values[:, -1] - values[:, -2]
+    return steps
