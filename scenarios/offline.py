@@ -7,8 +7,6 @@ answers what its table says of the case. All around them is a campaign as any ot
 from __future__ import annotations
 
 import csv
-import difflib
-import math
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +22,7 @@ from algorithms.answers import checked_site, checked_velocity
 from algorithms.exchange import write_case
 from algorithms.faults import AlgorithmError, Fault
 from algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
+from scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems
 from scenarios.own_files import listed
 from sim.measurements import DescentMeasurements, LandingMeasurements
 
@@ -232,44 +231,23 @@ def _read(file: Path, required: tuple[str, ...], _time: int, _size: int) -> Mapp
 
 def _header_problems(header: Sequence[str], form: OfflineForm[Any]) -> Iterator[str]:
     """What is wrong with the names of the columns."""
-    if not header:
-        yield "it is empty"
-    for name in ("case", *form.required):
-        if header and name not in header:
-            yield f"the column '{name}' is missing"
-    for name in header:
-        if name not in form.columns:
-            near = difflib.get_close_matches(name, form.columns, n=1, cutoff=0.6)
-            hint = f" (did you mean '{near[0]}'?)" if near else ""
-            yield f"unknown column '{name}'{hint}; allowed: {', '.join(form.columns)}; units are those of the names"
-        if header.count(name) > 1:
-            yield f"the column '{name}' stands there twice"
+    said = f"allowed: {', '.join(form.columns)}; units are those of the names"
+    return header_problems(header, ("case", *form.required), form.columns, said)
 
 
 def _line(header: Sequence[str], cells: Sequence[str], form: OfflineForm[Any]) -> tuple[int, Any]:
     """A line's case and answer."""
-    if len(cells) != len(header):
-        raise ValueError(f"it has {len(cells)} cells; the first line has {len(header)}")
-    stated = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
+    stated = {name: cell.strip() for name, cell in cells_by_column(header, cells).items()}
     if not stated["case"].isdecimal():
         raise ValueError(f"case is '{stated['case']}'; allowed: a whole number from 0")
     numbers = {name: _number(name, text) for name, text in stated.items() if name in form.columns[2:] and text}
-    for group in (form.required, form.optional):
-        there = [name for name in group if name in numbers]
-        if there and len(there) < len(group):
-            lacking = next(name for name in group if name not in numbers)
-            raise ValueError(f"{there[0]} is given, but {lacking} is not")
+    check_together((form.required, form.optional), numbers)
     return int(stated["case"]), form.answer(_outcome(stated.get("outcome", ""), numbers, form), numbers)
 
 
 def _number(name: str, text: str) -> float:
     """A finite number in the column's unit."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{name} is '{text}'; allowed: a finite number, or nothing where the outcome is a failure")
+    value = finite_number(name, text, ", or nothing where the outcome is a failure")
     unit, most = next((unit, most) for unit, most in _MOST.items() if name.endswith(unit))
     if abs(value) > most:
         raise ValueError(f"{name} is {text}, beyond {most:g}; is it in the unit that the name ends with ({unit})?")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import csv
-import difflib
 import itertools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems
 from scenarios.measured.layout import COLUMNS, PICTURES, TEXTS, IngestError
 from scenarios.own_files import listed
 
@@ -117,27 +116,13 @@ def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def _header_problems(header: Sequence[str], task: str) -> Iterator[str]:
-    if not header:
-        yield "it is empty"
-        return
     allowed = [column.name for column in COLUMNS if task in column.tasks]
     needed = [column.name for column in COLUMNS if task in column.tasks and column.needed == "every"]
-    for name in needed:
-        if name not in header:
-            yield f"the column '{name}' is missing"
-    for name in dict.fromkeys(header):
-        if name not in allowed:
-            near = difflib.get_close_matches(name, allowed, n=1, cutoff=0.6)
-            hint = f" (did you mean '{near[0]}'?)" if near else ""
-            yield f"unknown column '{name}'{hint}; allowed for {task}: {', '.join(allowed)}"
-        if header.count(name) > 1:
-            yield f"the column '{name}' stands there twice"
+    return header_problems(header, needed, allowed, f"allowed for {task}: {', '.join(allowed)}")
 
 
 def _row(line: int, header: Sequence[str], cells: Sequence[str]) -> PictureRow:
-    if len(cells) != len(header):
-        raise ValueError(f"it has {len(cells)} cells; the first line has {len(header)}")
-    stated = {name: cell for name, cell in zip(header, cells, strict=True) if cell}
+    stated = {name: cell for name, cell in cells_by_column(header, cells).items() if cell}
     row = PictureRow(
         line,
         {name: cell for name, cell in stated.items() if name in TEXTS},
@@ -146,23 +131,14 @@ def _row(line: int, header: Sequence[str], cells: Sequence[str]) -> PictureRow:
     for name in ("case", "file"):
         if name not in row.texts:
             raise ValueError(f"{name} is empty")
-    for names in _TOGETHER:
-        there = [name for name in names if name in row.numbers]
-        if there and len(there) < len(names):
-            lacking = next(name for name in names if name not in row.numbers)
-            raise ValueError(f"{there[0]} is given, but {lacking} is not")
+    check_together(_TOGETHER, row.numbers)
     for prefix in ("", "true_"):
         _check_quaternion(row.vector([f"{prefix}q{axis}" for axis in "xyzw"]), f"{prefix}qx to {prefix}qw")
     return row
 
 
 def _number(name: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{name} is '{text}'; allowed: a finite number")
+    value = finite_number(name, text)
     if name in _POSITIVE and value <= 0.0:
         raise ValueError(f"{name} is {text}; allowed: above 0")
     return value
