@@ -19,8 +19,13 @@ def rendered(backend: Backend, pictures: Iterable[UInt16[np.ndarray, "rows colum
     digest = hashlib.sha256()
     for counts in pictures:
         digest.update(np.ascontiguousarray(counts).tobytes())
+    return rendered_as(backend, digest.hexdigest())
+
+
+def rendered_as(backend: Backend, image_hash: str) -> dict[str, Scalar]:
+    """The same columns where the hash of the pictures is known."""
     return {
-        "image_hash": digest.hexdigest(),
+        "image_hash": image_hash,
         "gl_backend": backend,
         "gl_version": process_renderer(backend).description(),
         "processor_features": processor_features(),

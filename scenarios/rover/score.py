@@ -11,11 +11,10 @@ from jaxtyping import Float64
 from algorithms.vtt.accuracy import stereo_range_error_m
 from algorithms.vtt.stereo import disparity_px_m
 from scenarios.interface import Scalar
+from scenarios.provenance import rendered_as
 from scenarios.rover.parameters import RoverScenarioParameters
 from scenarios.rover.run import Run
 from scenarios.rover.stops import RunOutcome, Stop
-from sim.processor import processor_features
-from sim.render import process_renderer
 
 _FULL_TURN_DEG = 360.0
 
@@ -232,12 +231,7 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
 def provenance(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     """Hash of the pictures, and what their last bits depend on."""
     digest = hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops))
-    return {
-        "image_hash": digest.hexdigest(),
-        "gl_backend": p.backend,
-        "gl_version": process_renderer(p.backend).description(),
-        "processor_features": processor_features(),
-    }
+    return rendered_as(p.backend, digest.hexdigest())
 
 
 def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
