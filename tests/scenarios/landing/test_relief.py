@@ -31,7 +31,7 @@ def test_a_block_is_a_hazard_where_the_footprint_reaches_it_and_only_there() -> 
     relief = _relief(slope=0.1, block=0.3)
     under = relief.footprints(np.array([[0.0, 0.0], [1.0, 0.0], [1.2, 0.0]]), LIMITS)
     # the plane is that of the ground: the block is two thousandths of the footprint
-    # a deviation of less than 0.1 mm counts by its square: so much of it, by the block's share of the points, moves the plane
+    # deviations below 0.1 mm count by their squares: the share of it that the block has of the points moves the plane
     np.testing.assert_allclose(under.roughness_m, [0.3, 0.3, 0.0], atol=1e-5)
     np.testing.assert_array_equal(under.safe, [False, False, True])
     # eight points each way are within 10 cm, less the edges
