@@ -6,6 +6,7 @@ be scored as if it were none.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,8 +28,15 @@ from sim.measurements import MastCalibration
 _ROUNDING = 1e-9
 
 
-def checked_velocity(answer: object) -> VelocityEstimate:
+def checked_velocity(answer: object, tags_s: Sequence[float] | None = None) -> VelocityEstimate:
     """The answer, if it is a valid `VelocityEstimate`.
+
+    Parameters
+    ----------
+    answer
+        What an algorithm returned.
+    tags_s
+        Time tags of the pictures that it has, between which its span must lie; None where they are not known.
 
     Raises
     ------
@@ -49,6 +57,10 @@ def checked_velocity(answer: object) -> VelocityEstimate:
             raise _bad("covariance_m2_s2 is given without a velocity")
         _check_numbers("covariance_m2_s2", answer.covariance_m2_s2, (2, 2))
         _check_covariance(answer.covariance_m2_s2)
+    if answer.span_s is not None:
+        _check_span(answer.span_s, tags_s)
+    elif tags_s is not None and len(tags_s) < 2 and answer.velocity_m_s is not None:
+        raise _bad("of one picture there is no last interval; allowed: a velocity with a span_s, or a failure")
     return answer
 
 
@@ -116,6 +128,15 @@ def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> None:
         raise _bad(f"{name} has the shape {value.shape}; allowed: {shape}")
     if not np.all(np.isfinite(value)):
         raise _bad(f"{name} is not finite: {value.tolist()}")
+
+
+def _check_span(span: Any, tags_s: Sequence[float] | None) -> None:
+    if not isinstance(span, tuple) or len(span) != 2 or not all(isinstance(one, float | int) for one in span):
+        raise _bad(f"span_s is {span!r}; allowed: a tuple of two time tags, or None")
+    if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
+        raise _bad(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
+    if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
+        raise _bad(f"span_s is {span}; allowed: within the pictures' tags, {tags_s[0]} to {tags_s[-1]} s")
 
 
 def _check_covariance(matrix: np.ndarray) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
 from sim.measurements import (
+    DescentFrame,
     DescentMeasurements,
     LandingMeasurements,
     MastCalibration,
@@ -37,19 +38,28 @@ class VelocityEstimate:
     outcome
         How the estimation ended.
     velocity_m_s
-        Horizontal velocity (east, north) in m/s: the mean velocity of the camera between the second and the third
-        picture; None unless the outcome is VALID.
+        Horizontal velocity (east, north) in m/s: the mean velocity of the camera over `span_s`; None unless the outcome
+        is VALID.
     details
         The algorithm's intermediate products for figures and diagnosis; None where it keeps none.
     covariance_m2_s2
         Covariance of the velocity's error as the algorithm has it, (east, north), m2/s2; None where it states none.
         Errors are then held against it as well.
+    span_s
+        Begin and end of what the velocity is the mean of, as time tags, from the first picture's to the last one's that
+        the algorithm has; equal ones mean the velocity at that instant. None: the last interval, which is from the
+        second to the third picture where there are three.
+    after_pictures
+        Of a stream (`VelocityStream`) what it answered after each picture, None where nothing; filled in by whoever
+        runs it. Empty of others.
     """
 
     outcome: VelocityOutcome
     velocity_m_s: Float[np.ndarray, "2"] | None
     details: object | None = None
     covariance_m2_s2: Float[np.ndarray, "2 2"] | None = None
+    span_s: tuple[float, float] | None = None
+    after_pictures: tuple[VelocityEstimate | None, ...] = ()
 
 
 class VelocityEstimator(Protocol):
@@ -57,6 +67,25 @@ class VelocityEstimator(Protocol):
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """The estimate; never raises for a picture, attitude or altitude that an instrument can deliver."""
+        ...
+
+
+class VelocityStream(Protocol):
+    """Estimates horizontal velocity from any number of descent pictures, given one by one as they are taken.
+
+    `algorithms.streams.StreamedEstimator` makes it a `VelocityEstimator`. It has no `estimate` of its own.
+    """
+
+    def start(self) -> None:
+        """A new descent begins: forgets all of the one before."""
+        ...
+
+    def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
+        """Takes the next picture; what is known by now, or None. Never raises, as `VelocityEstimator.estimate`."""
+        ...
+
+    def finish(self) -> VelocityEstimate:
+        """The answer to the descent; no further picture comes. A failure where there were too few."""
         ...
 
 

@@ -7,6 +7,7 @@ An algorithm is named by
 - ``module:Class``, or ``module:function``: what is found there is called without arguments and gives the algorithm. The
   module may lie in the current folder;
 - ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: a program of its own (docs/own-algorithms.md);
+  ``exec-stream:`` or ``serve-stream:`` one that takes pictures one by one;
 - ``answers:FILE.csv``: one that was run elsewhere (`scenarios.offline`).
 """
 
@@ -30,11 +31,13 @@ from algorithms.exchange import (
     ExecutableSiteEstimator,
     ExecutableTargetTracker,
     ExecutableVelocityEstimator,
+    ExecutableVelocityStream,
     command_of,
 )
 from algorithms.hda import HdaEstimator, HdaOptions
 from algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
+from algorithms.streams import STREAM_METHODS, StreamedEstimator
 from algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
 from scenarios.dotted import found_at, sources_at
 from scenarios.offline import SITE_FORM, VELOCITY_FORM, OfflineForm, check_offline, is_offline, made_offline
@@ -64,6 +67,8 @@ class Task(Generic[Algorithm, Options]):
         How a program becomes one.
     offline
         How its answers stand in a table; None where each answer decides what is seen next.
+    streamed
+        Makes an algorithm of one that takes pictures one by one; None where there is no such thing.
     """
 
     name: str
@@ -72,16 +77,23 @@ class Task(Generic[Algorithm, Options]):
     shipped: Mapping[str, Callable[[Options], Algorithm]]
     executable: Callable[[Command, ExecutableLimits], Algorithm]
     offline: OfflineForm[Any] | None = None
+    streamed: Callable[[Any], Algorithm] | None = None
 
     def check(self, spec: str) -> None:
         """Raises ValueError where there is no algorithm of this name for the task; the message says what is allowed."""
-        if spec in self.shipped or command_of(spec) is not None:
+        if spec in self.shipped:
+            return
+        command = command_of(spec)
+        if command is not None:
+            if command.stream and self.streamed is None:
+                raise ValueError(f"'{spec}': a {self.what} takes no stream of pictures; allowed: exec:, serve:")
             return
         if is_offline(spec):
             check_offline(spec, self._form(spec))
             return
         found = self._class(spec)
-        missing = [method for method in self.methods if not hasattr(found, method)]
+        methods = STREAM_METHODS if self._is_stream(found) else self.methods
+        missing = [method for method in methods if not hasattr(found, method)]
         if not callable(found):
             raise ValueError(f"'{spec}' is no {self.what}: it is a {type(found).__name__}, not a class or function")
         if missing and isinstance(found, type):
@@ -99,7 +111,26 @@ class Task(Generic[Algorithm, Options]):
         command = command_of(spec)
         if command is not None:
             return self.executable(command, limits)
-        return cast(Algorithm, self._class(spec)())
+        made = self._class(spec)()
+        if self.streamed is not None and self._is_stream(made):
+            return self.streamed(made)
+        return cast(Algorithm, made)
+
+    def takes_stream(self, spec: str) -> bool | None:
+        """Whether an algorithm takes any number of pictures; None where only making it tells. Raises as `check`."""
+        if spec in self.shipped:
+            return False
+        command = command_of(spec)
+        if command is not None:
+            return command.stream
+        if is_offline(spec):
+            return True
+        found = self._class(spec)
+        return self._is_stream(found) if isinstance(found, type) else None
+
+    def _is_stream(self, thing: object) -> bool:
+        """Whether a class or an object is one that takes pictures one by one."""
+        return self.streamed is not None and hasattr(thing, "picture") and not hasattr(thing, "estimate")
 
     def _form(self, spec: str) -> OfflineForm[Any]:
         if self.offline is None:
@@ -135,6 +166,13 @@ def _pure_ncc(options: VttOptions) -> TargetTracker:
     return VisualTargetTracker(replace(options, scale=PURE_NCC.scale, roll=PURE_NCC.roll, affine=PURE_NCC.affine))
 
 
+def _executable_velocity(command: Command, limits: ExecutableLimits) -> VelocityEstimator:
+    """A program that gets three pictures at once, or as many as there are one by one."""
+    if command.stream:
+        return StreamedEstimator(ExecutableVelocityStream(command, limits))
+    return ExecutableVelocityEstimator(command, limits)
+
+
 VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
     name="velocity",
     what="velocity estimator",
@@ -144,8 +182,9 @@ VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
         "phase-correlation": lambda _: PhaseCorrelationEstimator(),
         "homography": lambda _: HomographyEstimator(),
     },
-    executable=ExecutableVelocityEstimator,
+    executable=_executable_velocity,
     offline=VELOCITY_FORM,
+    streamed=StreamedEstimator,
 )
 
 TRACKING: Task[TargetTracker, VttOptions] = Task(
@@ -209,7 +248,7 @@ def labels(specs: Sequence[str]) -> tuple[str, ...]:
 
 def _short(spec: str) -> str:
     """The last part of a name, as an identifier."""
-    program = re.match(r"(?:exec|serve|answers|export):\s*(\S+)", spec)
+    program = re.match(r"(?:(?:exec|serve)(?:-stream)?|answers|export):\s*(\S+)", spec)
     last = Path(program[1]).stem if program else spec.rpartition(":")[2]
     label = re.sub(r"\W", "_", last, flags=re.ASCII)
     return label if label[:1].isalpha() else f"a_{label}"

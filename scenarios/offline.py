@@ -32,7 +32,7 @@ EXPORT, ANSWERS = "export:", "answers:"
 CASES = "cases"
 
 #: Sizes beyond which a number is taken to be in another unit than its column's name says.
-_MOST = {"_m_s": 1e3, "_m2_s2": 1e6, "_m": 1e6}
+_MOST = {"_m_s": 1e3, "_m2_s2": 1e6, "_m": 1e6, "_s": 1e6}
 
 Answer = TypeVar("Answer")
 
@@ -46,7 +46,7 @@ class OfflineForm(Generic[Answer]):
     required
         Columns of numbers beside `case` and `outcome`: all are filled, or none.
     optional
-        Columns of numbers that may be left out, likewise.
+        Groups of columns of numbers that may be left out, each group likewise.
     outcomes
         What `outcome` may be; left empty where the required numbers are there: the first of them.
     answer
@@ -55,30 +55,34 @@ class OfflineForm(Generic[Answer]):
         What one that only writes cases down answers.
     completed
         An answer with what a table leaves out of it.
+    note
+        What columns mean beyond their names, for whoever answers.
     """
 
     required: tuple[str, ...]
-    optional: tuple[str, ...]
+    optional: tuple[tuple[str, ...], ...]
     outcomes: type[Enum]
     answer: Callable[[Enum, Mapping[str, float]], Answer]
     nothing: Callable[[Any], Answer]
     completed: Callable[[Answer, Any], Answer] = lambda answer, _: answer
+    note: str = ""
 
     @property
     def columns(self) -> tuple[str, ...]:
         """All that there may be."""
-        return ("case", "outcome", *self.required, *self.optional)
+        return ("case", "outcome", *self.required, *(name for group in self.optional for name in group))
 
 
 def _velocity(outcome: Enum, numbers: Mapping[str, float]) -> VelocityEstimate:
     east, north = (numbers.get(name) for name in VELOCITY_FORM.required)
-    first, mixed, second = (numbers.get(name) for name in VELOCITY_FORM.optional)
+    first, mixed, second, start, end = (numbers.get(name) for group in VELOCITY_FORM.optional for name in group)
     stated = VelocityEstimate(
         outcome=VelocityOutcome(outcome),
         velocity_m_s=None if east is None or north is None else np.array([east, north]),
         covariance_m2_s2=None
         if first is None or mixed is None or second is None
         else np.array([[first, mixed], [mixed, second]]),
+        span_s=None if start is None or end is None else (start, end),
     )
     return checked_velocity(stated)
 
@@ -106,10 +110,14 @@ def _no_site(measurements: LandingMeasurements) -> SiteEstimate:
 
 VELOCITY_FORM: OfflineForm[VelocityEstimate] = OfflineForm(
     required=("velocity_east_m_s", "velocity_north_m_s"),
-    optional=("covariance_east_m2_s2", "covariance_east_north_m2_s2", "covariance_north_m2_s2"),
+    optional=(
+        ("covariance_east_m2_s2", "covariance_east_north_m2_s2", "covariance_north_m2_s2"),
+        ("start_s", "end_s"),
+    ),
     outcomes=VelocityOutcome,
     answer=_velocity,
     nothing=_no_velocity,
+    note="A velocity is the mean between the last two pictures, or between the time tags `start_s` and `end_s`.",
 )
 SITE_FORM: OfflineForm[SiteEstimate] = OfflineForm(
     required=("site_east_m", "site_north_m", "site_up_m"),
@@ -241,7 +249,7 @@ def _line(header: Sequence[str], cells: Sequence[str], form: OfflineForm[Any]) -
     if not stated["case"].isdecimal():
         raise ValueError(f"case is '{stated['case']}'; allowed: a whole number from 0")
     numbers = {name: _number(name, text) for name, text in stated.items() if name in form.columns[2:] and text}
-    check_together((form.required, form.optional), numbers)
+    check_together((form.required, *form.optional), numbers)
     return int(stated["case"]), form.answer(_outcome(stated.get("outcome", ""), numbers, form), numbers)
 
 

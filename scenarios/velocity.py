@@ -1,17 +1,84 @@
-"""What every scenario with a velocity estimator stores of its answer: errors, their consistency, and products."""
+"""How scenarios ask velocity estimators, and what they store of an answer: errors, their consistency, and products."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float64, UInt16
 
 from algorithms.dimes import DimesDetails, dimes_products
-from algorithms.interface import VelocityEstimate
+from algorithms.faults import AlgorithmError, Fault
+from algorithms.interface import VelocityEstimate, VelocityEstimator
+from algorithms.streams import StreamedEstimator, spanned
 from scenarios.interface import Scalar
+from scenarios.offline import Answered, Recorder
+from scenarios.trial import Attempt, attempted
+from sim.measurements import DescentMeasurements
 
 Horizontal = Float64[np.ndarray, "2"]
+#: Begin and end, as time tags, of what a velocity is the mean of; equal for that of an instant.
+Span = tuple[float, float]
+#: Places of three pictures among all, from 0.
+Triple = tuple[int, int, int]
+
+_THREE: Triple = (0, 1, 2)
+
+
+def asked(
+    make: Callable[[], VelocityEstimator], measurements: DescentMeasurements, triple: Triple | None = _THREE
+) -> Attempt[VelocityEstimate]:
+    """What came of asking an estimator about a descent; a velocity states its span.
+
+    A stream is given all pictures, as is what writes them down for others; an estimator of three pictures these three,
+    and where there are none it fails.
+    """
+    given = measurements
+
+    def answer() -> object:
+        nonlocal given
+        estimator = make()
+        if not isinstance(estimator, StreamedEstimator | Recorder | Answered):
+            given = _three_of(measurements, triple)
+        return estimator.estimate(given)
+
+    return attempted(answer, lambda answer: spanned(answer, given.tags_s))
+
+
+def _three_of(measurements: DescentMeasurements, triple: Triple | None) -> DescentMeasurements:
+    if triple is None:
+        raise ValueError(f"it takes three pictures, and {len(measurements.images)} are taken")
+    return measurements if len(measurements.images) == len(triple) else measurements.chosen(triple)
+
+
+def checked_last_interval(answer: object, measurements: DescentMeasurements) -> VelocityEstimate:
+    """The answer, if it is valid and of the last interval, where truth is known of that alone; else AlgorithmError."""
+    estimate = spanned(answer, measurements.tags_s)
+    if estimate.span_s not in (None, measurements.last_interval_s):
+        raise AlgorithmError(
+            Fault.BAD_ANSWER,
+            f"span_s is {estimate.span_s}; allowed here: between the last two pictures, {measurements.last_interval_s}",
+        )
+    return estimate
+
+
+def stream_row(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, Scalar]:
+    """What a stream knew after each of its pictures: errors, NaN where it reported nothing; nothing of others.
+
+    `answered_after` is the number of pictures after which it first reported a velocity, 0 where it did after none.
+    """
+    if estimate is None or not estimate.after_pictures:
+        return {}
+    errors = [_error_m_s(one, truth) for one in estimate.after_pictures]
+    first = next((number for number, error in enumerate(errors, start=1) if not np.isnan(error)), 0)
+    row: dict[str, Scalar] = {"stream_pictures": len(errors), "answered_after": first}
+    return row | {f"velocity_error_after_{number}_m_s": error for number, error in enumerate(errors, start=1)}
+
+
+def _error_m_s(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> float:
+    if estimate is None or estimate.velocity_m_s is None or estimate.span_s is None:
+        return float("nan")
+    return float(np.hypot(*(estimate.velocity_m_s - truth(estimate.span_s))))
 
 
 def velocity_row(name: str, estimated: Horizontal | None, true: Horizontal) -> dict[str, Scalar]:
@@ -51,9 +118,21 @@ def velocity_products(
 ) -> dict[str, object]:
     """Arrays from which a case's figures are drawn."""
     kept: dict[str, object] = {f"image_{number}": counts for number, counts in enumerate(pictures, start=1)}
+    if estimate is not None and estimate.after_pictures:
+        kept.update(_stream_products(estimate))
     if estimate is not None and isinstance(estimate.details, DimesDetails):
         kept.update(dimes_products(estimate.details))
     kept["velocity_true_m_s"] = true
     if estimate is not None and estimate.velocity_m_s is not None:
         kept["velocity_estimated_m_s"] = estimate.velocity_m_s
     return kept
+
+
+def _stream_products(estimate: VelocityEstimate) -> dict[str, object]:
+    """What a stream answered after each picture: velocities and spans, NaN where it reported nothing."""
+    reported = [one if one is not None and one.velocity_m_s is not None else None for one in estimate.after_pictures]
+    nothing = (np.nan, np.nan)
+    return {
+        "after_velocities_m_s": np.array([nothing if one is None else one.velocity_m_s for one in reported]),
+        "after_spans_s": np.array([nothing if one is None else one.span_s for one in reported]),
+    }

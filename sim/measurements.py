@@ -6,6 +6,7 @@ Nothing here holds truth. Cameras are as calibrated, times are as tagged, attitu
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, UInt16
@@ -91,26 +92,103 @@ class AltitudeMeasurement:
 
 
 @dataclass(frozen=True)
+class DescentFrame:
+    """What the lander's computer gets with one descent picture, and with nothing that comes after it.
+
+    The inertial unit's increments come as its navigation has added them up: attitude and velocity at the picture, mean
+    velocity since the one before. Both velocities carry the same unknown error of the navigation's initial velocity.
+
+    Attributes
+    ----------
+    image, attitude, altitude
+        The picture, with its camera in the body frame, and what was measured with it.
+    sun_direction
+        Unit vector to the sun, world axes.
+    inertial_velocity_m_s
+        Velocity of the camera at the picture's tag, world axes (east, north, up), m/s, shape (3,); None where it was
+        not recorded.
+    interval_velocity_m_s
+        Mean velocity of the camera since the picture before, likewise; None with the first picture.
+    """
+
+    image: DetectorImage
+    attitude: AttitudeMeasurement
+    altitude: AltitudeMeasurement
+    sun_direction: Float[np.ndarray, "3"]
+    inertial_velocity_m_s: Float[np.ndarray, "3"] | None = None
+    interval_velocity_m_s: Float[np.ndarray, "3"] | None = None
+
+
+@dataclass(frozen=True)
 class DescentMeasurements:
-    """What the lander's computer holds when the third descent picture has arrived.
+    """What the lander's computer holds when the last descent picture has arrived: the third, for DIMES.
 
     Attributes
     ----------
     images, attitudes, altitudes
-        Three of each, in the order of exposure.
+        As many of each, in the order of exposure.
     interval_velocities_m_s
-        Mean velocity of the camera over the two intervals between pictures as the inertial navigation has it, world
-        axes (east, north, up), m/s, shape (2, 3). Both carry the same unknown error of the navigation's initial
-        velocity; only their difference is accurate (the paper's "biased IMU horizontal velocities").
+        Mean velocity of the camera over the intervals between pictures as the inertial navigation has it, world
+        axes (east, north, up), m/s, one fewer than pictures, shape (n - 1, 3). All carry the same unknown error of the
+        navigation's initial velocity; only their differences are accurate (the paper's "biased IMU horizontal
+        velocities").
     sun_direction
         Unit vector to the sun, world axes.
+    inertial_velocities_m_s
+        Velocity at the pictures' tags, with the same error, shape (n, 3); None where it was not recorded.
     """
 
-    images: tuple[DetectorImage, DetectorImage, DetectorImage]
-    attitudes: tuple[AttitudeMeasurement, AttitudeMeasurement, AttitudeMeasurement]
-    altitudes: tuple[AltitudeMeasurement, AltitudeMeasurement, AltitudeMeasurement]
-    interval_velocities_m_s: Float[np.ndarray, "2 3"]
+    images: tuple[DetectorImage, ...]
+    attitudes: tuple[AttitudeMeasurement, ...]
+    altitudes: tuple[AltitudeMeasurement, ...]
+    interval_velocities_m_s: Float[np.ndarray, "intervals 3"]
     sun_direction: Float[np.ndarray, "3"]
+    inertial_velocities_m_s: Float[np.ndarray, "pictures 3"] | None = None
+
+    @property
+    def tags_s(self) -> tuple[float, ...]:
+        """The pictures' time tags."""
+        return tuple(image.time_s for image in self.images)
+
+    @property
+    def last_interval_s(self) -> tuple[float, float]:
+        """Time tags of the last two pictures."""
+        return self.images[-2].time_s, self.images[-1].time_s
+
+    def frames(self) -> tuple[DescentFrame, ...]:
+        """The same picture by picture, as it came."""
+        at = self.inertial_velocities_m_s
+        return tuple(
+            DescentFrame(
+                image=image,
+                attitude=self.attitudes[number],
+                altitude=self.altitudes[number],
+                sun_direction=self.sun_direction,
+                inertial_velocity_m_s=None if at is None else at[number],
+                interval_velocity_m_s=self.interval_velocities_m_s[number - 1] if number else None,
+            )
+            for number, image in enumerate(self.images)
+        )
+
+    def chosen(self, places: tuple[int, ...]) -> DescentMeasurements:
+        """Some of the pictures, by their places from 0 in ascending order, with the mean velocities between them."""
+        at = self.inertial_velocities_m_s
+        intervals = [self._mean_velocity(first, second) for first, second in pairwise(places)]
+        return DescentMeasurements(
+            images=tuple(self.images[place] for place in places),
+            attitudes=tuple(self.attitudes[place] for place in places),
+            altitudes=tuple(self.altitudes[place] for place in places),
+            interval_velocities_m_s=np.array(intervals, dtype=np.float64).reshape(-1, 3),
+            sun_direction=self.sun_direction,
+            inertial_velocities_m_s=None if at is None else at[list(places)],
+        )
+
+    def _mean_velocity(self, first: int, second: int) -> Float[np.ndarray, "3"]:
+        """Mean inertial velocity between two pictures."""
+        between = self.interval_velocities_m_s[first:second]
+        if len(between) == 1:
+            return np.asarray(between[0])
+        return np.asarray(np.average(between, axis=0, weights=np.diff(self.tags_s[first : second + 1])))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from sim.measurements import DescentMeasurements, DetectorCalibration, DetectorI
 
 #: Heights outside of which nothing is tried: lower than the airbags are large, higher than the atmosphere.
 HEIGHTS_M = (1.0, 1e6)
+_PICTURES = 3
 
 
 @dataclass(frozen=True)
@@ -97,14 +98,14 @@ def view(image: DetectorImage, world_from_body: Rotation, altitude_m: float, bin
     )
 
 
-def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, "3"]:
+def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, "pictures"]:
     """Measured altitudes carried from their own time tags to those of the pictures, metres.
 
-    The vertical velocity is the inertial one: that of the first interval for the first picture, of the second for the
-    third, and the mean of both for the second.
+    The vertical velocity is the inertial one: that of the first interval for the first picture, of the last for the
+    last, and the mean of both neighbours for those between.
     """
     vertical = measurements.interval_velocities_m_s[:, 2]
-    rates = np.array([vertical[0], vertical.mean(), vertical[1]])
+    rates = np.concatenate([vertical[:1], 0.5 * (vertical[:-1] + vertical[1:]), vertical[-1:]])
     lags = np.array([i.time_s - a.time_s for i, a in zip(measurements.images, measurements.altitudes, strict=True)])
     return np.asarray(np.array([a.altitude_m for a in measurements.altitudes], dtype=np.float64) + rates * lags)
 
@@ -114,7 +115,14 @@ def usable_views(measurements: DescentMeasurements, binned_size: tuple[int, int]
 
     None where altitudes or times are not finite, the pictures do not follow each other, or a height is out of
     `HEIGHTS_M`.
+
+    Raises
+    ------
+    ValueError
+        Where there are not three of them.
     """
+    if len(measurements.images) != _PICTURES:
+        raise ValueError(f"{len(measurements.images)} pictures are given; this estimator takes {_PICTURES}")
     altitudes = altitudes_at_images(measurements)
     times = np.array([image.time_s for image in measurements.images])
     if not (np.all(np.isfinite(altitudes)) and np.all(np.isfinite(times)) and np.all(np.diff(times) > 0.0)):

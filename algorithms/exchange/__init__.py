@@ -1,8 +1,12 @@
 """Algorithms that are programs of their own: cases as files, answers as JSON (docs/own-algorithms.md)."""
 
 from algorithms.exchange.command import PREFIXES, command_of
-from algorithms.exchange.executable import ExecutableSiteEstimator, ExecutableVelocityEstimator
-from algorithms.exchange.files import EXCHANGE, Pictures, read_case, write_case
+from algorithms.exchange.executable import (
+    ExecutableSiteEstimator,
+    ExecutableVelocityEstimator,
+    ExecutableVelocityStream,
+)
+from algorithms.exchange.files import EXCHANGE, Pictures, read_case, read_frame, write_case, write_frame
 from algorithms.exchange.process import Command, ExecutableLimits
 from algorithms.exchange.replies import ProgramDetails
 from algorithms.exchange.stops import read_mast, read_pose, read_stop, read_target
@@ -16,13 +20,16 @@ __all__ = [
     "ExecutableSiteEstimator",
     "ExecutableTargetTracker",
     "ExecutableVelocityEstimator",
+    "ExecutableVelocityStream",
     "Pictures",
     "ProgramDetails",
     "command_of",
     "read_case",
+    "read_frame",
     "read_mast",
     "read_pose",
     "read_stop",
     "read_target",
     "write_case",
+    "write_frame",
 ]

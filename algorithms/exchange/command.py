@@ -8,8 +8,13 @@ from collections.abc import Mapping
 
 from algorithms.exchange.process import Command
 
-#: How a program is named: one process a case, or one process for many.
-PREFIXES: Mapping[str, bool] = {"exec:": False, "serve:": True}
+#: How a program is named: whether one process answers many cases, and whether it gets pictures one by one.
+PREFIXES: Mapping[str, tuple[bool, bool]] = {
+    "exec:": (False, False),
+    "serve:": (True, False),
+    "exec-stream:": (False, True),
+    "serve-stream:": (True, True),
+}
 
 
 def command_of(text: str) -> Command | None:
@@ -32,4 +37,4 @@ def command_of(text: str) -> Command | None:
     if shutil.which(words[0]) is None:
         where = "is not there, or may not be run" if "/" in words[0] else "is not on the PATH; write ./ before your own"
         raise ValueError(f"no program for '{text}': {words[0]} {where}")
-    return Command(tuple(words), PREFIXES[prefix])
+    return Command(tuple(words), *PREFIXES[prefix])

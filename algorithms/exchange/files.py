@@ -1,5 +1,7 @@
 """One case as files: pictures as 16-bit PGM or PNG, cameras as `.cahvor`, all else in `case.json`.
 
+One picture of a descent, as a stream gets it, is such a folder too, with `frame.json`.
+
 What is written is read back as it was: counts and the flat field bit for bit, numbers too (JSON carries the shortest
 text that gives the same float64), attitudes to within rounding of a quaternion's norm.
 """
@@ -14,7 +16,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Float, Float64, UInt16
 from scipy.spatial.transform import Rotation
 
 from sim.camera import read_cahvor, write_cahvor
@@ -22,6 +24,7 @@ from sim.frames import rigid
 from sim.measurements import (
     AltitudeMeasurement,
     AttitudeMeasurement,
+    DescentFrame,
     DescentMeasurements,
     DetectorCalibration,
     DetectorImage,
@@ -32,7 +35,7 @@ from sim.measurements import (
 #: Version of the exchange: of `case.json`, of the answer, and of the lines of a persistent process.
 EXCHANGE = 1
 
-CASE_FILE = "case.json"
+CASE_FILE, FRAME_FILE = "case.json", "frame.json"
 
 #: Form in which pictures are written.
 Pictures = Literal["pgm", "png"]
@@ -44,8 +47,38 @@ def write_case(
     """Writes what instruments delivered into a folder that is there. Raises OSError where that fails."""
     told = _descent(measurements) if isinstance(measurements, DescentMeasurements) else _landing(measurements)
     images = _write_images(folder, measurements.images, pictures)
-    outline = {"exchange": EXCHANGE, **told, "images": images}
-    (folder / CASE_FILE).write_text(json.dumps(outline, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    _write_json(folder / CASE_FILE, {**told, "images": images})
+
+
+def write_frame(folder: Path, frame: DescentFrame) -> None:
+    """Writes what came with one picture of a descent into a folder that is there. Raises OSError where that fails."""
+    (image,) = _write_images(folder, [frame.image], "pgm")
+    told = {
+        "image": image,
+        "attitude": _told_attitude(frame.attitude),
+        "altitude": _told_altitude(frame.altitude),
+        "sun_direction": frame.sun_direction.tolist(),
+        "inertial_velocity_m_s": _told_vector(frame.inertial_velocity_m_s),
+        "interval_velocity_m_s": _told_vector(frame.interval_velocity_m_s),
+    }
+    _write_json(folder / FRAME_FILE, told)
+
+
+def read_frame(folder: Path) -> DescentFrame:
+    """Reads what `write_frame` wrote. Raises ValueError where the folder holds no frame, or one of another version."""
+    path = folder / FRAME_FILE
+    try:
+        told = _read_json(path)
+        return DescentFrame(
+            image=_read_image(folder, told["image"]),
+            attitude=_read_attitude(told["attitude"]),
+            altitude=_read_altitude(told["altitude"]),
+            sun_direction=_vector(told["sun_direction"]),
+            inertial_velocity_m_s=_optional_vector(told["inertial_velocity_m_s"]),
+            interval_velocity_m_s=_optional_vector(told["interval_velocity_m_s"]),
+        )
+    except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
+        raise ValueError(f"{path} is no picture of a descent: {error}") from error
 
 
 def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
@@ -58,40 +91,76 @@ def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
     """
     path = folder / CASE_FILE
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        if told["exchange"] != EXCHANGE:
-            raise ValueError(f"it has version {told['exchange']} of the exchange; this program reads {EXCHANGE}")
+        told = _read_json(path)
         images = [_read_image(folder, one) for one in told["images"]]
         return _read_descent(told, images) if told["task"] == "velocity" else _read_landing(told, images)
     except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
         raise ValueError(f"{path} is no case: {error}") from error
 
 
+def _write_json(path: Path, told: Mapping[str, Any]) -> None:
+    outline = {"exchange": EXCHANGE, **told}
+    path.write_text(json.dumps(outline, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _read_json(path: Path) -> Mapping[str, Any]:
+    told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    if told["exchange"] != EXCHANGE:
+        raise ValueError(f"it has version {told['exchange']} of the exchange; this program reads {EXCHANGE}")
+    return told
+
+
 def _descent(measurements: DescentMeasurements) -> dict[str, Any]:
+    at = measurements.inertial_velocities_m_s
     return {
         "task": "velocity",
-        "attitudes": [
-            {"world_from_body_xyzw": one.world_from_body.as_quat().tolist(), "time_s": one.time_s}
-            for one in measurements.attitudes
-        ],
-        "altitudes": [{"altitude_m": one.altitude_m, "time_s": one.time_s} for one in measurements.altitudes],
+        "attitudes": [_told_attitude(one) for one in measurements.attitudes],
+        "altitudes": [_told_altitude(one) for one in measurements.altitudes],
         "interval_velocities_m_s": measurements.interval_velocities_m_s.tolist(),
+        "inertial_velocities_m_s": _told_vector(at),
         "sun_direction": measurements.sun_direction.tolist(),
     }
 
 
 def _read_descent(told: Mapping[str, Any], images: Sequence[DetectorImage]) -> DescentMeasurements:
-    attitudes = [
-        AttitudeMeasurement(Rotation.from_quat(one["world_from_body_xyzw"]), one["time_s"]) for one in told["attitudes"]
-    ]
-    altitudes = [AltitudeMeasurement(one["altitude_m"], one["time_s"]) for one in told["altitudes"]]
     return DescentMeasurements(
-        images=(images[0], images[1], images[2]),
-        attitudes=(attitudes[0], attitudes[1], attitudes[2]),
-        altitudes=(altitudes[0], altitudes[1], altitudes[2]),
-        interval_velocities_m_s=np.array(told["interval_velocities_m_s"], dtype=np.float64),
-        sun_direction=np.array(told["sun_direction"], dtype=np.float64),
+        images=tuple(images),
+        attitudes=tuple(_read_attitude(one) for one in told["attitudes"]),
+        altitudes=tuple(_read_altitude(one) for one in told["altitudes"]),
+        interval_velocities_m_s=_vector(told["interval_velocities_m_s"]).reshape(-1, 3),
+        sun_direction=_vector(told["sun_direction"]),
+        inertial_velocities_m_s=_optional_vector(told.get("inertial_velocities_m_s")),
     )
+
+
+def _told_attitude(measured: AttitudeMeasurement) -> dict[str, Any]:
+    return {"world_from_body_xyzw": measured.world_from_body.as_quat().tolist(), "time_s": measured.time_s}
+
+
+def _read_attitude(told: Mapping[str, Any]) -> AttitudeMeasurement:
+    return AttitudeMeasurement(Rotation.from_quat(told["world_from_body_xyzw"]), told["time_s"])
+
+
+def _told_altitude(measured: AltitudeMeasurement) -> dict[str, Any]:
+    known = math.isfinite(measured.altitude_m)
+    return {"altitude_m": measured.altitude_m if known else None, "time_s": measured.time_s}
+
+
+def _read_altitude(told: Mapping[str, Any]) -> AltitudeMeasurement:
+    altitude_m = told["altitude_m"]
+    return AltitudeMeasurement(math.nan if altitude_m is None else altitude_m, told["time_s"])
+
+
+def _told_vector(value: Float[np.ndarray, "..."] | None) -> list[Any] | None:
+    return None if value is None else value.tolist()
+
+
+def _vector(told: Any) -> Float64[np.ndarray, "..."]:
+    return np.array(told, dtype=np.float64)
+
+
+def _optional_vector(told: Any) -> Float64[np.ndarray, "..."] | None:
+    return None if told is None else _vector(told)
 
 
 def _landing(measurements: LandingMeasurements) -> dict[str, Any]:

@@ -46,10 +46,21 @@ class ExecutableLimits(BaseModel):
 
 @dataclass(frozen=True)
 class Command:
-    """A program under test: its words, and whether one process answers many cases."""
+    """A program under test.
+
+    Attributes
+    ----------
+    words
+        The program and its arguments.
+    persistent
+        Whether one process answers many cases.
+    stream
+        Whether it is given a descent's pictures one by one.
+    """
 
     words: tuple[str, ...]
     persistent: bool
+    stream: bool = False
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import tempfile
-import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,9 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from algorithms.answers import checked_aim, checked_update
-from algorithms.exchange import serving
-from algorithms.exchange.files import EXCHANGE
-from algorithms.exchange.process import Child, Command, ExecutableLimits, Said
+from algorithms.exchange.process import Command, ExecutableLimits
 from algorithms.exchange.replies import (
     ProgramDetails,
     bad_answer,
@@ -25,10 +19,9 @@ from algorithms.exchange.replies import (
     member,
     named,
     numbers,
-    table_of,
 )
+from algorithms.exchange.session import Session
 from algorithms.exchange.stops import told_pose, told_target, write_mast, write_stop
-from algorithms.faults import AlgorithmError
 from algorithms.interface import MastAim, PixelBox, TargetLoss, TargetUpdate, TrackingState
 from sim.measurements import MastCalibration, RoverMeasurements, TargetDesignation
 
@@ -42,7 +35,9 @@ class ExecutableTargetTracker:
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
         self._state = TrackingState.NO_TARGET
-        self._session = _Session(command, limits)
+        self._session = Session(command, limits)
+        self._mast: MastCalibration | None = None
+        self._masts = 0
 
     @property
     def state(self) -> TrackingState:
@@ -55,14 +50,14 @@ class ExecutableTargetTracker:
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
         """Where the program wants the mast to look."""
-        told = {"world_from_rover": told_pose(world_from_rover), "mast": self._session.told_mast(mast)}
+        told = {"world_from_rover": told_pose(world_from_rover), "mast": self._told_mast(mast)}
         answer, details = self._session.ask("aim", told)
         return in_its_words(details.stderr, lambda: checked_aim(_aim(answer), mast))
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """The program's answer to a stop's pictures."""
-        told = {"mast": self._session.told_mast(measurements.mast)}
-        answer, details = self._session.ask("update", told, measurements)
+        told = {"mast": self._told_mast(measurements.mast)}
+        answer, details = self._session.ask("update", told, {"stop": lambda folder: write_stop(folder, measurements)})
         update = in_its_words(details.stderr, lambda: checked_update(_update(answer, details)))
         self._state = update.state
         return update
@@ -75,54 +70,16 @@ class ExecutableTargetTracker:
         answer, details = self._session.ask(do, told)
         self._state = in_its_words(details.stderr, lambda: _state(answer))
 
-
-class _Session:
-    """A program that is asked line by line, started when it is first asked, and the folder that it reads from."""
-
-    def __init__(self, command: Command, limits: ExecutableLimits) -> None:
-        self._command, self._limits = command, limits
-        self._child: Child | None = None
-        self._leave: weakref.finalize[Any, Any] | None = None
-        self._folder = Path(tempfile.mkdtemp(prefix="marsyard-track-"))
-        weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
-        self._mast: MastCalibration | None = None
-        self._masts = 0
-
-    def told_mast(self, mast: MastCalibration) -> str:
+    def _told_mast(self, mast: MastCalibration) -> str:
         """The folder in which the mast stands, written when it is another than before."""
         if mast is not self._mast:
             self._mast, self._masts = mast, self._masts + 1
-            folder = self._mast_folder()
-            folder.mkdir()
-            write_mast(folder, mast)
+            self._mast_folder().mkdir()
+            write_mast(self._mast_folder(), mast)
         return str(self._mast_folder())
 
     def _mast_folder(self) -> Path:
-        return self._folder / f"mast_{self._masts}"
-
-    def ask(
-        self, do: str, told: Mapping[str, Any], stop: RoverMeasurements | None = None
-    ) -> tuple[Mapping[str, Any], ProgramDetails]:
-        """The program's answer to one line, read but not checked; a stop's pictures lie there until it has answered."""
-        with tempfile.TemporaryDirectory(prefix="stop-", dir=self._folder) as folder:
-            line = {"exchange": EXCHANGE, "do": do, **told}
-            if stop is not None:
-                write_stop(Path(folder), stop)
-                line["stop"] = folder
-            said = self._said(json.dumps(line, allow_nan=False))
-        return table_of(said), ProgramDetails(said.stderr, said.time_s)
-
-    def _said(self, line: str) -> Said:
-        if self._child is None:
-            self._child = serving.taken(self._command, self._limits)
-            self._leave = weakref.finalize(self, serving.given_back, self._command, self._limits, self._child)
-        try:
-            return self._child.line(line)
-        except AlgorithmError:
-            # it is ended already, and is not to be asked by others
-            if self._leave is not None:
-                self._leave.detach()
-            raise
+        return self._session.folder / f"mast_{self._masts}"
 
 
 def _state(answer: Mapping[str, Any]) -> TrackingState:

@@ -110,6 +110,7 @@ def _write_manifest(campaign: Campaign, directory: Path) -> None:
             "",
             "`case` is the folder's number. Units are those that the names end with. A case without an answer has an",
             f"outcome and no numbers; outcomes: {', '.join(form.outcomes.__members__) if form else ''}.",
+            *([form.note] if form and form.note else []),
             "",
         ]
     )

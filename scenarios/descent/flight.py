@@ -112,17 +112,50 @@ def check_clearance(flight: FlightFile, motion: Trajectory, times_s: Sequence[fl
         )
 
 
-def picture_states(p: DescentScenarioParameters, motion: Trajectory) -> list[State]:
-    """Truth at the three exposures."""
-    return [motion.state(time) for time in faulty_times(p.faults, p.picture_times_s)]
+def picture_states(p: DescentScenarioParameters, flown: Flown) -> list[State]:
+    """Truth at the exposures.
+
+    Raises
+    ------
+    ValueError
+        If a picture would be taken after the thrusters' firing.
+    """
+    times = faulty_times(p.faults, p.picture_times_s)
+    late = [number for number, time in enumerate(times, start=1) if time > flown.firing_s]
+    if late:
+        raise ValueError(
+            f"picture {late[0]} of {p.pictures} would be taken at {times[late[0] - 1]:.2f} s, after the thrusters' "
+            f"firing at {flown.firing_s:.2f} s; allowed: fewer pictures, or a smaller descent.interval_s"
+        )
+    return [flown.motion.state(time) for time in times]
 
 
-def mean_velocities(states: Sequence[State]) -> Float64[np.ndarray, "2 3"]:
+def mean_velocities(states: Sequence[State]) -> Float64[np.ndarray, "intervals 3"]:
     """True mean velocities of the camera between the pictures, world axes, m/s."""
     positions = np.stack([state.position_m for state in states])
     times = np.array([state.time_s for state in states])
-    velocities: Float64[np.ndarray, "2 3"] = np.diff(positions, axis=0) / np.diff(times)[:, None]
+    velocities: Float64[np.ndarray, "intervals 3"] = np.diff(positions, axis=0) / np.diff(times)[:, None]
     return velocities
+
+
+def true_velocity(
+    motion: Trajectory, states: Sequence[State], tags_s: Sequence[float], span_s: tuple[float, float]
+) -> Float64[np.ndarray, "2"]:
+    """True horizontal velocity of the camera over a span of time tags: its mean, or that of the instant, m/s.
+
+    Tags are taken to be at the true times of the pictures that carry them, and in proportion between two of them: a
+    span from picture to picture is one from exposure to exposure, whatever errors their tags have.
+    """
+    first, second = (_at_tag(motion, states, tags_s, tag) for tag in span_s)
+    if second.time_s == first.time_s:
+        return np.asarray(first.velocity_m_s[:2])
+    return np.asarray((second.position_m - first.position_m)[:2] / (second.time_s - first.time_s))
+
+
+def _at_tag(motion: Trajectory, states: Sequence[State], tags_s: Sequence[float], tag_s: float) -> State:
+    if tag_s in tags_s:
+        return states[list(tags_s).index(tag_s)]
+    return motion.state(float(np.interp(tag_s, tags_s, [state.time_s for state in states])))
 
 
 def off_nadir_deg(state: State) -> float:

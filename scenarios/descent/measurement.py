@@ -96,16 +96,17 @@ def measure(
     attitudes = faulty_attitudes(p.faults, attitudes, streams.generator("attitude fault"))
     altitudes = faulty_altitudes(p.faults, _altitudes(motion, times, instruments.altimeter, streams))
     return DescentMeasurements(
-        images=(images[0], images[1], images[2]),
-        attitudes=(attitudes[0], attitudes[1], attitudes[2]),
-        altitudes=(altitudes[0], altitudes[1], altitudes[2]),
+        images=tuple(images),
+        attitudes=tuple(attitudes),
+        altitudes=tuple(altitudes),
         interval_velocities_m_s=instruments.navigation.mean_velocities(tags),
         sun_direction=world.sun.direction,
+        inertial_velocities_m_s=instruments.navigation.velocity(tags),
     )
 
 
 def _altitudes(
-    motion: Trajectory, times_s: Float64[np.ndarray, "3"], altimeter: RadarAltimeter, streams: Streams
+    motion: Trajectory, times_s: Float64[np.ndarray, "n"], altimeter: RadarAltimeter, streams: Streams
 ) -> list[AltitudeMeasurement]:
     """The radar's last readings before the pictures, with their own tags."""
     at = altimeter.sampling.latest(times_s)

@@ -28,7 +28,7 @@ from sim.sensor import (
 )
 from sim.terrain import Site, TerrainParameters, site, sites
 
-#: Pictures of a descent.
+#: Pictures of a descent as flown, which estimators without a stream take.
 PICTURES = 3
 
 
@@ -163,6 +163,16 @@ class DescentScenarioParameters(ChosenAlgorithms):
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
     sun: SunParameters = SunParameters()
     descent: SwingParameters = SwingParameters()
+    pictures: Annotated[
+        int, Field(ge=2, le=100, description="pictures that are taken, descent.interval_s apart; all go to a stream")
+    ] = PICTURES
+    triple: Annotated[
+        tuple[int, int, int] | None,
+        Field(
+            description="numbers, from 1, of the three that estimators of three pictures get; not stated: those as far "
+            "apart as they can be evenly, the last among them"
+        ),
+    ] = None
     flight: Annotated[FlightFile | None, Field(description="a recorded flight, in place of the descent's dynamics")] = (
         None
     )
@@ -228,6 +238,20 @@ class DescentScenarioParameters(ChosenAlgorithms):
         return self
 
     @model_validator(mode="after")
+    def _three_are_among_the_pictures(self) -> DescentScenarioParameters:
+        if self.triple is not None and not 1 <= self.triple[0] < self.triple[1] < self.triple[2] <= self.pictures:
+            raise ValueError(f"triple is {list(self.triple)}; allowed: three in ascending order, 1 to {self.pictures}")
+        of_three = [spec for spec in self.algorithms if VELOCITY.takes_stream(spec) is False]
+        if of_three and self.pictures < PICTURES:
+            raise ValueError(
+                f"pictures is {self.pictures}, but '{of_three[0]}' takes {PICTURES}; allowed: {PICTURES} to 100"
+            )
+        struck = max(self.faults.repeated_picture, self.faults.black_picture)
+        if struck > self.pictures:
+            raise ValueError(f"a fault strikes picture {struck}, but pictures is {self.pictures}")
+        return self
+
+    @model_validator(mode="after")
     def _flight_is_over_the_ground(self) -> DescentScenarioParameters:
         if self.flight is not None:
             self.flight.check(faulty_times(self.faults, self.picture_times_s))
@@ -236,7 +260,18 @@ class DescentScenarioParameters(ChosenAlgorithms):
     @property
     def picture_times_s(self) -> list[float]:
         """When pictures should be taken, s after the first."""
-        return [number * self.descent.interval_s for number in range(PICTURES)]
+        return [number * self.descent.interval_s for number in range(self.pictures)]
+
+    @property
+    def triple_places(self) -> tuple[int, int, int] | None:
+        """Places, from 0, of the three pictures that estimators of three get; None where fewer are taken."""
+        if self.triple is not None:
+            first, second, third = (number - 1 for number in self.triple)
+            return first, second, third
+        if self.pictures < PICTURES:
+            return None
+        last, apart = self.pictures - 1, (self.pictures - 1) // 2
+        return last - 2 * apart, last - apart, last
 
     @property
     def preset(self) -> Site | None:

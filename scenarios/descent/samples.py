@@ -21,9 +21,9 @@ from sim.streams import Streams
 
 
 def descent_samples(p: DescentScenarioParameters, streams: Streams) -> Iterator[Sample]:
-    """The three pictures of a case as the detector made them, with the truth of their pixels."""
+    """The pictures of a case as the detector made them, with the truth of their pixels."""
     world = World.of(p)
-    states = picture_states(p, flown_descent(p, world.surface, streams).motion)
+    states = picture_states(p, flown_descent(p, world.surface, streams))
     optics = camera_optics(p.camera)
     detector = Detector.drawn(
         optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector response")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 from pydantic import BaseModel
 
-from algorithms.answers import checked_velocity
 from scenarios.descent.exposure import expose
 from scenarios.descent.faults import faulty_detector
-from scenarios.descent.flight import flown_descent, mean_velocities, picture_states
+from scenarios.descent.flight import flown_descent, picture_states, true_velocity
 from scenarios.descent.landing import touchdown
 from scenarios.descent.measurement import Instruments, measure
 from scenarios.descent.optics import camera_optics
@@ -22,22 +22,23 @@ from scenarios.descent.score import (
     instrument_conditions,
     instrument_errors,
     landing_row,
-    products,
+    room_row,
+    shown,
 )
 from scenarios.descent.world import World
 from scenarios.estimators import VELOCITY
 from scenarios.interface import CaseResult
 from scenarios.provenance import rendered
 from scenarios.samples import Sample
-from scenarios.trial import Judged, attempted, case_result
-from scenarios.velocity import consistency_row, velocity_row
+from scenarios.trial import Judged, case_result
+from scenarios.velocity import Horizontal, Span, asked, consistency_row, stream_row, velocity_products, velocity_row
 from sim.sensor import Detector
 from sim.streams import Streams
 from sim.terrain import TerrainBank
 
 
 class DescentScenario:
-    """Three pictures of a parachute descent, measured and given to a velocity estimator."""
+    """Pictures of a parachute descent, three or as many as asked for, measured and given to a velocity estimator."""
 
     name = "descent"
     parameters_type = DescentScenarioParameters
@@ -54,7 +55,7 @@ class DescentScenario:
         TerrainBank(p.terrain, p.place.bank_seed).terrain(shared_input)
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """The three pictures of a case with the truth of their pixels."""
+        """The pictures of a case with the truth of their pixels."""
         return descent_samples(_checked(parameters), streams)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
@@ -62,7 +63,7 @@ class DescentScenario:
         p = _checked(parameters)
         world = World.of(p)
         flown = flown_descent(p, world.surface, streams)
-        states = picture_states(p, flown.motion)
+        states = picture_states(p, flown)
         at_firing = flown.motion.state(flown.firing_s)
         optics = camera_optics(p.camera)
         settings = faulty_detector(p.faults, p.detector)
@@ -71,11 +72,13 @@ class DescentScenario:
         instruments = Instruments.drawn(p, world, flown, streams)
         measurements = measure(p, world, flown.motion, pictures, detector, instruments, streams)
         camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
-        places = room(states, world.surface, camera, detector.calibration, world.sun.direction, p.dimes)
+        triple = p.triple_places
+        places = None
+        if triple is not None:
+            three = [states[place] for place in triple]
+            places = room(three, world.surface, camera, detector.calibration, world.sun.direction, p.dimes)
         conditions_row = {
-            "room": min(places) > 0,
-            "room_first_pair": places[0],
-            "room_second_pair": places[1],
+            **room_row(places),
             **conditions(p, world, states, at_firing),
             **instrument_conditions(instruments),
             **instrument_errors(world, states, measurements),
@@ -83,14 +86,17 @@ class DescentScenario:
             **rendered(p.render.backend, pictures),
         }
 
+        def truth(span_s: Span) -> Horizontal:
+            return true_velocity(flown.motion, states, measurements.tags_s, span_s)
+
         def judge(algorithm: str) -> Judged:
-            attempt = attempted(
-                lambda: VELOCITY.make(algorithm, p.dimes, p.executable, streams.case).estimate(measurements),
-                checked_velocity,
-            )
+            make = partial(VELOCITY.make, algorithm, p.dimes, p.executable, streams.case)
+            attempt = asked(make, measurements, triple)
             estimate = attempt.answer
             velocity = None if estimate is None else estimate.velocity_m_s
-            carried = carried_to_firing(velocity, measurements, instruments, at_firing.time_s)
+            span = None if estimate is None else estimate.span_s
+            true = truth(span or measurements.last_interval_s)
+            carried = carried_to_firing(estimate, instruments, at_firing.time_s)
             landed = touchdown(
                 p.landing,
                 at_firing.velocity_m_s[:2],
@@ -102,13 +108,14 @@ class DescentScenario:
                 outcome=attempt.outcome(lambda answer: answer.outcome.name),
                 answered=velocity is not None,
                 row={
-                    **velocity_row("velocity", velocity, mean_velocities(states)[1, :2]),
-                    **consistency_row(estimate, mean_velocities(states)[1, :2]),
+                    **velocity_row("velocity", velocity, true),
+                    **consistency_row(estimate, true),
                     **velocity_row("firing_velocity", carried, at_firing.velocity_m_s[:2]),
                     **landing_row(landed),
+                    **stream_row(estimate, truth),
                     **attempt.row,
                 },
-                products=products(pictures, estimate, states),
+                products=velocity_products(shown(pictures, estimate, triple), estimate, true),
                 failure=attempt.failure,
             )
 

@@ -7,16 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from algorithms.dimes import propagated
+from algorithms.dimes import DimesDetails, propagated
 from algorithms.dimes.binning import altitudes_at_images
 from algorithms.interface import VelocityEstimate
 from scenarios.descent.flight import mean_velocities, off_nadir_deg
 from scenarios.descent.landing import Touchdown
 from scenarios.descent.measurement import Instruments
-from scenarios.descent.parameters import PICTURES, DescentScenarioParameters
+from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.descent.world import World
 from scenarios.interface import Scalar
-from scenarios.velocity import velocity_products
 from sim.dynamics import State
 from sim.measurements import DescentMeasurements
 from sim.sensor import height_above_ground
@@ -26,13 +25,16 @@ Horizontal = Float64[np.ndarray, "2"]
 
 
 def carried_to_firing(
-    velocity: Horizontal | None, measurements: DescentMeasurements, instruments: Instruments, firing_s: float
+    estimate: VelocityEstimate | None, instruments: Instruments, firing_s: float
 ) -> Horizontal | None:
     """The reported velocity, carried on to the thrusters' firing by the inertial unit; None where none was reported."""
-    if velocity is None:
+    if estimate is None or estimate.velocity_m_s is None or estimate.span_s is None:
         return None
-    now = instruments.navigation.velocity(np.array([firing_s]))[0]
-    return propagated(velocity, measurements.interval_velocities_m_s[1, :2], now[:2])
+    navigation, span = instruments.navigation, np.array(estimate.span_s)
+    of_instant = estimate.span_s[0] == estimate.span_s[1]
+    then = (navigation.velocity(span) if of_instant else navigation.mean_velocities(span))[0]
+    now = navigation.velocity(np.array([firing_s]))[0]
+    return propagated(estimate.velocity_m_s, then[:2], now[:2])
 
 
 def conditions(
@@ -61,7 +63,7 @@ def conditions(
         row[f"off_nadir_{number}_deg"] = off_nadir_deg(state)
         row[f"attitude_rate_{number}_deg_s"] = float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
     row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in states)
-    row["attitude_rate_max_deg_s"] = max(float(row[f"attitude_rate_{k}_deg_s"]) for k in range(1, PICTURES + 1))
+    row["attitude_rate_max_deg_s"] = max(float(row[f"attitude_rate_{k}_deg_s"]) for k in range(1, len(states) + 1))
     return row
 
 
@@ -77,11 +79,12 @@ def instrument_conditions(instruments: Instruments) -> dict[str, Scalar]:
 
 
 def instrument_errors(world: World, states: Sequence[State], measurements: DescentMeasurements) -> dict[str, Scalar]:
-    """Errors of what was measured, divided into what the three pictures share and what each has of its own.
+    """Errors of what was measured, divided into what the pictures share and what each has of its own.
 
     The shared part of an attitude error is the mean of the three rotation vectors (world axes), the own part the RMS
     length of what is left; altitude errors, as shares of the altitude, likewise. Altitudes are those at the pictures,
-    over the ground straight below: relief that the radar sees nearer is part of their error.
+    over the ground straight below: relief that the radar sees nearer is part of their error. The change of velocity is
+    that from the last interval but one to the last.
     """
     turned = np.stack(
         [
@@ -92,8 +95,8 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
     shares = altitudes_at_images(measurements) / heights - 1.0
     tags = np.array([image.time_s for image in measurements.images]) - np.array([state.time_s for state in states])
-    true_change, change = (
-        np.diff(velocities[:, :2], axis=0)[0]
+    true_changes, changes = (
+        np.diff(velocities[:, :2], axis=0)
         for velocities in (mean_velocities(states), measurements.interval_velocities_m_s)
     )
     row: dict[str, Scalar] = {
@@ -103,8 +106,9 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
         ),
         "altitude_error_common": float(shares.mean()),
         "altitude_error_own": float(np.sqrt(np.mean((shares - shares.mean()) ** 2))),
-        "velocity_change_error_m_s": float(np.hypot(*(change - true_change))),
     }
+    if len(changes):
+        row["velocity_change_error_m_s"] = float(np.hypot(*(changes[-1] - true_changes[-1])))
     for number, (rotation, share, tag) in enumerate(zip(turned, shares, tags, strict=True), start=1):
         row[f"attitude_error_{number}_deg"] = float(np.degrees(np.linalg.norm(rotation)))
         row[f"altitude_error_{number}_m"] = float(share * heights[number - 1])
@@ -121,6 +125,14 @@ def landing_row(landed: Touchdown) -> dict[str, Scalar]:
     }
 
 
-def products(pictures: Pictures, estimate: VelocityEstimate | None, states: Sequence[State]) -> dict[str, object]:
-    """Arrays from which the case's figures are drawn."""
-    return velocity_products(pictures, estimate, mean_velocities(states)[1, :2])
+def room_row(places: tuple[int, int] | None) -> dict[str, Scalar]:
+    """In how many places DIMES has room in its pairs of pictures; nothing where it has no three pictures."""
+    if places is None:
+        return {}
+    return {"room": min(places) > 0, "room_first_pair": places[0], "room_second_pair": places[1]}
+
+
+def shown(pictures: Pictures, estimate: VelocityEstimate | None, triple: tuple[int, int, int] | None) -> Pictures:
+    """The pictures that a case's figures show: of DIMES the three that it was given."""
+    ours = estimate is not None and isinstance(estimate.details, DimesDetails)
+    return [pictures[place] for place in triple] if ours and triple is not None else pictures

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from pydantic import BaseModel
 
-from algorithms.answers import checked_velocity
 from algorithms.dimes import DimesOptions
 from scenarios.estimators import VELOCITY
 from scenarios.fieldtest.parameters import FieldTestParameters
@@ -20,7 +19,7 @@ from scenarios.fieldtest.triples import Category, Triple
 from scenarios.interface import CaseResult, Scalar
 from scenarios.provenance import rendered
 from scenarios.trial import Judged, attempted, case_result
-from scenarios.velocity import consistency_row, velocity_products, velocity_row
+from scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
 from sim.dynamics import State
 from sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from sim.sensor import Detector
@@ -72,7 +71,9 @@ class FieldTestScenario:
 
         def judge(algorithm: str) -> Judged:
             estimator = partial(VELOCITY.make, algorithm, DimesOptions(), p.executable, streams.case)
-            attempt = attempted(lambda: estimator().estimate(measurements), checked_velocity)
+            attempt = attempted(
+                lambda: estimator().estimate(measurements), lambda answer: checked_last_interval(answer, measurements)
+            )
             estimate = attempt.answer
             velocity = None if estimate is None else estimate.velocity_m_s
             return Judged(
@@ -154,9 +155,9 @@ def measure(
         AltitudeMeasurement(float(case.run.pictures.altitude_m[k]), tag) for k, tag in zip(numbers, tags, strict=True)
     ]
     return DescentMeasurements(
-        images=(images[0], images[1], images[2]),
-        attitudes=(attitudes[0], attitudes[1], attitudes[2]),
-        altitudes=(altitudes[0], altitudes[1], altitudes[2]),
+        images=tuple(images),
+        attitudes=tuple(attitudes),
+        altitudes=tuple(altitudes),
         interval_velocities_m_s=truth_velocities(p, case),
         sun_direction=case.run.sun(case.states[1].time_s),
     )

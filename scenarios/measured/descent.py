@@ -7,7 +7,6 @@ from jaxtyping import Float64
 from pydantic import BaseModel
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.answers import checked_velocity
 from algorithms.dimes import DimesDetails
 from algorithms.interface import VelocityEstimate
 from scenarios.estimators import VELOCITY
@@ -17,7 +16,7 @@ from scenarios.measured.consistency import agreement_products, agreement_row, ag
 from scenarios.measured.parameters import MeasuredVelocityParameters
 from scenarios.measured.store import StoredCase, descent_measurements, images_of
 from scenarios.trial import Judged, case_result
-from scenarios.velocity import consistency_row, velocity_products, velocity_row
+from scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
 from sim.frames import rigid
 from sim.measurements import DescentMeasurements
 from sim.streams import Streams
@@ -37,7 +36,9 @@ class MeasuredVelocityScenario(MeasuredScenario):
         images = images_of(p.cases, p.case)
         measurements = descent_measurements(p.case, images)
         matches = matched(images)
-        attempts = tried(p, p.dimes, measurements, checked_velocity, streams.case)
+        attempts = tried(
+            p, p.dimes, measurements, lambda answer: checked_last_interval(answer, measurements), streams.case
+        )
 
         def judge(algorithm: str) -> Judged:
             attempt = attempts[algorithm]

@@ -250,9 +250,9 @@ def descent_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) ->
         for one in case.pictures
     ]
     return DescentMeasurements(
-        images=(images[0], images[1], images[2]),
-        attitudes=(attitudes[0], attitudes[1], attitudes[2]),
-        altitudes=(altitudes[0], altitudes[1], altitudes[2]),
+        images=images,
+        attitudes=tuple(attitudes),
+        altitudes=tuple(altitudes),
         interval_velocities_m_s=np.array(case.interval_velocities_m_s, dtype=np.float64),
         sun_direction=np.array(case.sun_direction, dtype=np.float64),
     )
