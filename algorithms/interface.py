@@ -73,7 +73,7 @@ class VelocityEstimator(Protocol):
 class VelocityStream(Protocol):
     """Estimates horizontal velocity from any number of descent pictures, given one by one as they are taken.
 
-    `algorithms.streams.StreamedEstimator` makes it a `VelocityEstimator`. It has no `estimate` of its own.
+    `algorithms.streams.StreamedEstimator` makes it a `VelocityEstimator`.
     """
 
     def start(self) -> None:

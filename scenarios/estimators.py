@@ -129,8 +129,10 @@ class Task(Generic[Algorithm, Options]):
         return self._is_stream(found) if isinstance(found, type) else None
 
     def _is_stream(self, thing: object) -> bool:
-        """Whether a class or an object is one that takes pictures one by one."""
-        return self.streamed is not None and hasattr(thing, "picture") and not hasattr(thing, "estimate")
+        """Whether a class or an object is one that takes pictures one by one, be it with a method lacking."""
+        whole = all(hasattr(thing, method) for method in STREAM_METHODS)
+        begun = hasattr(thing, "picture") and not any(hasattr(thing, method) for method in self.methods)
+        return self.streamed is not None and (whole or begun)
 
     def _form(self, spec: str) -> OfflineForm[Any]:
         if self.offline is None:

@@ -28,7 +28,10 @@ Measurements = TypeVar("Measurements", DescentMeasurements, LandingMeasurements)
 
 #: Mean velocity of the descent, of its wind and fall, east, north, up, m/s.
 DESCENT_VELOCITY_M_S = np.array([12.0, -7.0, -75.0])
-_INTERVAL_S = 3.75
+#: Time between pictures, at most, and from the first to the last, at most, s.
+_INTERVAL_S, _LASTS_S = 3.75, 7.5
+#: Attitudes that the pictures are taken in, in turn: about z, y and x, degrees.
+_TURNS_DEG = ((40, 4, -3), (44, 2, 3), (41, -3, 5))
 _FIRST_M = np.array([0.0, 0.0, 1900.0])
 
 #: Where the landing's two pictures are taken, metres.
@@ -46,20 +49,21 @@ BLANKS: dict[str, Blank] = {
 
 
 @cache
-def descent() -> DescentMeasurements:
-    """Three descent pictures of level, textured ground; instruments without errors."""
-    places = _FIRST_M + _INTERVAL_S * np.arange(3)[:, None] * DESCENT_VELOCITY_M_S
-    turns = [Rotation.from_euler("ZYX", angles, degrees=True) for angles in ((40, 4, -3), (44, 2, 3), (41, -3, 5))]
-    times = [100.0 + _INTERVAL_S * number for number in range(3)]
-    images = _pictures(preset("mer-descent-flown"), places, turns, times, 2.0)
-    attitudes = [AttitudeMeasurement(turn, time) for turn, time in zip(turns, times, strict=True)]
-    altitudes = [AltitudeMeasurement(float(place[2]), time) for place, time in zip(places, times, strict=True)]
+def descent(pictures: int = 3) -> DescentMeasurements:
+    """Descent pictures of level, textured ground; instruments without errors but in the inertial velocity."""
+    apart_s = min(_INTERVAL_S, _LASTS_S / (pictures - 1))
+    places = _FIRST_M + apart_s * np.arange(pictures)[:, None] * DESCENT_VELOCITY_M_S
+    turned = [_TURNS_DEG[number % len(_TURNS_DEG)] for number in range(pictures)]
+    turns = [Rotation.from_euler("ZYX", angles, degrees=True) for angles in turned]
+    times = [100.0 + apart_s * number for number in range(pictures)]
+    inertial = DESCENT_VELOCITY_M_S + np.array([9.0, -4.0, 0.0])
     return DescentMeasurements(
-        images=(images[0], images[1], images[2]),
-        attitudes=(attitudes[0], attitudes[1], attitudes[2]),
-        altitudes=(altitudes[0], altitudes[1], altitudes[2]),
-        interval_velocities_m_s=np.stack([DESCENT_VELOCITY_M_S, DESCENT_VELOCITY_M_S]) + np.array([9.0, -4.0, 0.0]),
+        images=tuple(_pictures(preset("mer-descent-flown"), places, turns, times, 2.0)),
+        attitudes=tuple(AttitudeMeasurement(turn, time) for turn, time in zip(turns, times, strict=True)),
+        altitudes=tuple(AltitudeMeasurement(float(place[2]), time) for place, time in zip(places, times, strict=True)),
+        interval_velocities_m_s=np.tile(inertial, (pictures - 1, 1)),
         sun_direction=direction(np.radians(250.0), np.radians(35.0)),
+        inertial_velocities_m_s=np.tile(inertial, (pictures, 1)),
     )
 
 

@@ -11,13 +11,13 @@ from algorithms.dimes import DimesOptions
 from algorithms.exchange import PREFIXES, ExecutableLimits
 from algorithms.hda import HdaOptions
 from algorithms.vtt import VttOptions
-from scenarios.conformance import estimators, inputs, surfaces, trackers
+from scenarios.conformance import estimators, inputs, streams, surfaces, trackers
 from scenarios.conformance.findings import Check, Finding
 from scenarios.dotted import found_at
 from scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
 
 _INPUTS: Mapping[str, Sequence[Callable[[], object]]] = {
-    "velocity": [inputs.descent],
+    "velocity": [inputs.descent, streams.STREAM.measurements],
     "landing": [inputs.landing],
     "tracking": [trackers.mast, surfaces.texture],
 }
@@ -53,6 +53,8 @@ class Subject:
 
         if task is TRACKING:
             return trackers.TrackerSuite(make, self.spec, program, self.limit_s).checks()
+        if task.takes_stream(self.spec):
+            return streams.StreamSuite(make, self.spec, program, self.limit_s).checks()
         protocol = estimators.VELOCITY if task is VELOCITY else estimators.LANDING
         return estimators.EstimatorSuite(protocol, make, self.spec, program, self.limit_s).checks()
 
