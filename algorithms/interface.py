@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -70,6 +70,7 @@ class VelocityEstimator(Protocol):
         ...
 
 
+@runtime_checkable
 class VelocityStream(Protocol):
     """Estimates horizontal velocity from any number of descent pictures, given one by one as they are taken.
 
