@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 #: Lines of sight with which a rock's outline is found, across and up.
 _OUTLINE = 96
 #: A point is hidden where something lies this far before it, metres: more than rounding, less than any relief.
 _CLOSER_M = 1e-3
+#: Rays along a side of the patch whose normal is wanted.
+_ACROSS_PATCH = 5
 
 
 def distances(
@@ -20,12 +22,32 @@ def distances(
     directions: Float64[np.ndarray, "rays 3"],
 ) -> Float64[np.ndarray, "rays"]:
     """Distance along rays from one place to the nearest triangle, infinite where none is met (Moeller & Trumbore)."""
+    nearest, _ = _met(triangles, origin, directions)
+    return nearest
+
+
+def first_met(
+    triangles: Float64[np.ndarray, "triangles 3 3"],
+    origin: Float64[np.ndarray, "3"],
+    directions: Float64[np.ndarray, "rays 3"],
+) -> Int64[np.ndarray, "rays"]:
+    """Number of the triangle that each ray meets first, -1 where none is met."""
+    _, numbers = _met(triangles, origin, directions)
+    return numbers
+
+
+def _met(
+    triangles: Float64[np.ndarray, "triangles 3 3"],
+    origin: Float64[np.ndarray, "3"],
+    directions: Float64[np.ndarray, "rays 3"],
+) -> tuple[Float64[np.ndarray, "rays"], Int64[np.ndarray, "rays"]]:
     corner = triangles[:, 0]
     first, second = triangles[:, 1] - corner, triangles[:, 2] - corner
     beside = origin - corner
     turned = np.cross(beside, first)
     along = np.sum(second * turned, axis=1)
     nearest = np.full(len(directions), np.inf)
+    numbers = np.full(len(directions), -1, dtype=np.int64)
     for number, direction in enumerate(directions):
         across = np.cross(direction, second)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -35,8 +57,56 @@ def distances(
             t = scale * along
         met = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
         if met.any():
-            nearest[number] = t[met].min()
-    return nearest
+            numbers[number] = np.argmin(np.where(met, t, np.inf))
+            nearest[number] = t[numbers[number]]
+    return nearest, numbers
+
+
+def about_line(
+    triangles: Float64[np.ndarray, "triangles 3 3"],
+    eye: Float64[np.ndarray, "3"],
+    point: Float64[np.ndarray, "3"],
+    reach_rad: float,
+) -> Float64[np.ndarray, "near 3 3"]:
+    """The triangles that lines of sight from a place can meet within an angle of the line to a point, and some more."""
+    ahead = (point - eye) / np.linalg.norm(point - eye)
+    middles = triangles.mean(axis=1) - eye
+    along = middles @ ahead
+    aside = np.linalg.norm(middles - along[:, None] * ahead, axis=1)
+    size = np.linalg.norm(triangles[:, 1:] - triangles[:, :1], axis=2).max(axis=1)
+    near: Float64[np.ndarray, "near 3 3"] = triangles[aside <= np.tan(reach_rad) * np.maximum(along, 0.0) + size]
+    return near
+
+
+def facing(
+    triangles: Float64[np.ndarray, "triangles 3 3"],
+    eye: Float64[np.ndarray, "3"],
+    point: Float64[np.ndarray, "3"],
+    reach_rad: float,
+) -> Float64[np.ndarray, "3"]:
+    """Unit normal, towards a place, of the surface that is seen from it about a point: mean of a square of rays.
+
+    Parameters
+    ----------
+    reach_rad
+        Half of the square's side, as an angle. Rays that pass the rock do not count.
+    """
+    ahead = (point - eye) / np.linalg.norm(point - eye)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    steps = np.tan(reach_rad) * np.linspace(-1.0, 1.0, _ACROSS_PATCH)
+    offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    rays = ahead + offsets @ np.stack([right, np.cross(right, ahead)])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    near = about_line(triangles, eye, point, np.sqrt(2.0) * reach_rad)
+    met = first_met(near, eye, rays)
+    corners = near[met[met >= 0]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals *= -np.sign(normals @ ahead)[:, None]
+    mean = normals.sum(axis=0)
+    normal: Float64[np.ndarray, "3"] = mean / np.linalg.norm(mean)
+    return normal
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from scenarios.provenance import rendered_as
 from scenarios.rover.parameters import RoverScenarioParameters
 from scenarios.rover.run import Run
 from scenarios.rover.stops import RunOutcome, Stop
+from scenarios.rover.target import sightings
 
 _FULL_TURN_DEG = 360.0
 
@@ -185,6 +186,8 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     )
     sun = [world.sun.direction(0.0 if one is None else one.time_s) for one in (first, last)]
     rock = chosen.rock
+    eyes = [run.rig.eyes(one.world_from_head) for one in stops]
+    seen = sightings(world, chosen.point_world, eyes, run.rig.pixel_rad, p.vtt) if eyes else None
     return {
         "site": p.world.site,
         "terrain": p.world.terrain,
@@ -201,6 +204,9 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "point_on_edge": chosen.on_edge,
         "point_lit": chosen.lit,
         "selectable": chosen.lit and not chosen.on_edge,
+        "point_in_view": seen is not None and seen.in_view,
+        "obliquity_start_deg": float("nan") if seen is None else seen.obliquity_start_deg,
+        "obliquity_max_deg": float("nan") if seen is None else seen.obliquity_max_deg,
         "incline": p.world.incline.name,
         "slope_deg": p.world.incline.slope_deg,
         "range_start_m": float("nan") if first is None else first.range_m,

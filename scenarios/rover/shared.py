@@ -11,7 +11,7 @@ A drive is a function of the parameters, the campaign's seed and the run's numbe
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Annotated, cast
 
@@ -33,7 +33,7 @@ from scenarios.rover.route import Belief, commands, finished
 from scenarios.rover.run import Run
 from scenarios.rover.score import conditions, products, provenance, score, stored_updates, tracking
 from scenarios.rover.stops import RunOutcome, Stop
-from scenarios.rover.target import in_view, point_on, rock_of, told_by_pixel
+from scenarios.rover.target import Sightings, point_on, rock_of, sightings, told_by_pixel
 from scenarios.rover.vehicle import Vehicle
 from scenarios.rover.world import RunWorld, terrain_parameters
 from scenarios.trial import Judged, answer_time_s, attempted, case_result
@@ -298,7 +298,7 @@ def _outcome(run: Run) -> RunOutcome:
 
 
 @lru_cache(maxsize=128)
-def stays_in_view(
+def seen_along(
     p: RoverScenarioParameters,
     margin_px: float,
     seed: int,
@@ -306,13 +306,13 @@ def stays_in_view(
     run: int,
     chosen: PointParameters,
     options: VttOptions,
-) -> bool:
-    """Whether both cameras see a target all along a drive; kept, as the cases of a target ask the same."""
+) -> Sightings:
+    """How a target shows itself all along a drive; kept, as the cases of a target ask the same."""
     drive = shared_drive(p, margin_px, seed, campaign, run)
-    eyes = [eye for one in drive.views for eye in drive.rig.eyes(one.world_from_head)]
-    seen = _picked_from(p, drive.world, eyes[0])
-    point = point_on(drive.world, eyes[:2], chosen.across, chosen.up, drive.rig.pixel_rad, options, seen)[0]
-    return in_view(drive.world, point, eyes, drive.rig.pixel_rad, options)
+    eyes = [drive.rig.eyes(one.world_from_head) for one in drive.views]
+    seen = _picked_from(p, drive.world, eyes[0][0])
+    point = point_on(drive.world, eyes[0], chosen.across, chosen.up, drive.rig.pixel_rad, options, seen)[0]
+    return sightings(drive.world, point, eyes, drive.rig.pixel_rad, options)
 
 
 class SharedDriveScenario:
@@ -357,8 +357,8 @@ class SharedDriveScenario:
             }
             return Judged(run.outcome.name, completed, row, products(case, run))
 
-        seen = stays_in_view(*shared, p.targets[p.target], p.drive.vtt)
-        return case_result(p.drive.algorithms, judge, {**_known(p), "in_view": seen})
+        seen = seen_along(*shared, p.targets[p.target], p.drive.vtt)
+        return case_result(p.drive.algorithms, judge, {**_known(p), **asdict(seen)})
 
 
 def _known(p: SharedDriveParameters) -> dict[str, Scalar]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from scenarios.rover.points import Sight, distances, hidden, shaded
+from scenarios.rover.points import Sight, about_line, distances, facing, hidden, shaded
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +44,27 @@ def test_the_far_side_is_hidden_and_the_lee_in_shadow(sphere: np.ndarray) -> Non
     assert hidden(sphere, points, eye).tolist() == [False, True]
     west = np.array([-np.cos(0.5), 0.0, np.sin(0.5)])
     assert shaded(sphere, points, west).tolist() == [False, True]
+
+
+def test_the_surface_faces_where_the_sphere_does(sphere: np.ndarray) -> None:
+    eye, middle = np.array([0.0, 0.0, 0.5]), np.array([5.0, 0.0, 0.5])
+    sight = Sight.of(sphere, eye, 0.0)
+    for across in (-0.9, -0.5, 0.0, 0.7):
+        point = sight.point(across, 0.5)
+        normal = facing(sphere, eye, point, 0.01)
+        assert np.linalg.norm(normal) == pytest.approx(1.0)
+        # a triangle of the sphere is 3.5 deg wide
+        assert normal @ (point - middle) / np.linalg.norm(point - middle) > np.cos(np.radians(3.5))
+
+
+def test_what_lies_about_a_line_is_all_that_its_rays_can_meet(sphere: np.ndarray) -> None:
+    eye, reach = np.array([0.0, 0.0, 0.5]), 0.03
+    rng = np.random.default_rng(2)
+    for point in Sight.of(sphere, eye, 0.0).point(0.4, 0.7), np.array([5.0, 0.4, 0.8]):
+        near = about_line(sphere, eye, point, reach)
+        assert 0 < len(near) < 0.2 * len(sphere)
+        ahead = (point - eye) / np.linalg.norm(point - eye)
+        rays = ahead + np.tan(reach) * rng.uniform(-0.7, 0.7, (200, 3))
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = rays[rays @ ahead > np.cos(reach)]
+        np.testing.assert_array_equal(distances(near, eye, rays), distances(sphere, eye, rays))
