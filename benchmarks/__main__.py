@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks import descent, engine, estimators, hda, pictures, reporting, vtt
+from benchmarks import beside, descent, engine, estimators, hda, pictures, reporting, vtt
 from benchmarks.page import PAGE, write_page
 from benchmarks.timing import Figure
 from sim.processor import processor_features
@@ -34,7 +34,7 @@ def main() -> None:
         *descent.case(7),
         *estimators.side_by_side(8),
         *pictures.wall_seconds_of_a_frame(9),
-        *pictures.beside_pyrender(5),
+        *beside.figures(5),
         *pictures.rover_pictures(3),
         *descent.new_terrains(2),
         *vtt.figures(9),

@@ -1,4 +1,4 @@
-"""Pictures near the ground, beside pyrender's own, and a worker's memory."""
+"""Pictures near the ground, and a worker's memory."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from scenarios.views import Eye, SiteGround, nadir_pose, site_scene
 from sim.camera import Cahv, Cahvor
 from sim.frames import direction, rigid
 from sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture, process_renderer
-from sim.render.backend import compile_shaders_once, default_backend
-from sim.render.mesh import graded_offsets, ground_mesh
-from sim.render.rays import VIEW_SIDE_PX
+from sim.render.backend import default_backend
 from sim.sensor import Detector, DetectorParameters
 from sim.streams import Streams
 from sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
@@ -48,49 +46,6 @@ def descent_pose(surface: Surface) -> RigidTransform:
     """Where the lander of the descent scene is a second after its first picture."""
     flown = flown_descent(DescentScenarioParameters(), surface, Streams(1, "bench", 0))
     return flown.motion.state(1.0).world_from_body
-
-
-def beside_pyrender(repeats: int) -> list[Figure]:
-    """A sensor-realistic descent frame against pyrender's own shaded frame of the same ground, in turn.
-
-    Ours shows the terrain's samples, 1.5 m apart, whatever the mesh that starts the search; pyrender shows what its
-    mesh holds. It gets a mesh with lines 3 m apart in the middle, twice as coarse as the terrain still, and casts
-    shadows, as ours does.
-    """
-    ours = descent_exposure()
-    scene, surface = descent_scene()
-    focal_px = float(camera_optics(CameraParameters()).rays.focal_px[0])
-    theirs = _pyrender_shaded(scene, descent_pose(surface).as_matrix() @ _camera_to_gl(), focal_px)
-    paired = [(core_seconds(ours, 1)[0], core_seconds(theirs, 1)[0]) for _ in range(repeats)]
-    return [
-        Figure("descent frame with shadows and detector", [mine for mine, _ in paired], bar=0.3),
-        Figure("pyrender's shaded frame of a mesh as fine, with shadows", [other for _, other in paired]),
-        Figure("how many times slower that is", [other / mine for mine, other in paired], least=3.0),
-    ]
-
-
-def _camera_to_gl() -> np.ndarray:
-    """The descent camera looks along the body's -z with columns to +x: OpenGL's own camera."""
-    return np.eye(4)
-
-
-def _pyrender_shaded(scene: Scene, pose: np.ndarray, focal_px: float) -> Callable[[], None]:
-    import pyrender
-
-    offsets = graded_offsets(scene.mesh_reach_m, 3.0, 1025)
-    mesh = ground_mesh(scene.surface, scene.centre_m[0] + offsets, scene.centre_m[1] + offsets)
-    theirs = pyrender.Scene(ambient_light=(0.1, 0.1, 0.1))
-    theirs.add(pyrender.Mesh.from_trimesh(mesh, smooth=True))
-    light = np.eye(4)
-    light[:3, :3] = Rotation.align_vectors(SUN.direction[None], np.array([[0.0, 0.0, 1.0]]))[0].as_matrix()
-    theirs.add(pyrender.DirectionalLight(intensity=3.0), pose=light)
-    middle = VIEW_SIDE_PX / 2.0
-    camera = pyrender.IntrinsicsCamera(focal_px, focal_px, middle, middle, znear=100.0, zfar=40000.0)
-    theirs.add(camera, pose=pose)
-    renderer = pyrender.OffscreenRenderer(VIEW_SIDE_PX, VIEW_SIDE_PX)
-    compile_shaders_once(renderer._renderer)
-    flags = pyrender.RenderFlags.SHADOWS_DIRECTIONAL
-    return lambda: renderer.render(theirs, flags=flags)
 
 
 def rover_pictures(repeats: int) -> list[Figure]:
