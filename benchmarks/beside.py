@@ -54,7 +54,7 @@ def figures(repeats: int) -> list[Figure]:
         command = [sys.executable, "-m", "benchmarks.beside"]
         found.append(Figure("PyVista's (VTK's) frame of that mesh, with shadows", _elsewhere(command, given, repeats)))
     if BLENDER in os.environ:
-        command = [os.environ[BLENDER], str(Path(__file__).with_name("cycles.py"))]
+        command = [os.environ[BLENDER], str(Path(__file__).with_name("blender_frame.py"))]
         found.append(Figure("Blender Cycles' frame of that mesh, 16 samples a pixel", _elsewhere(command, given, 2)))
     return found
 

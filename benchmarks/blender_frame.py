@@ -1,6 +1,7 @@
-"""Draws a file's ground by Blender's Cycles: ``PYTHON cycles.py GROUND.npz REPEATS``; see `benchmarks.beside`.
+"""Draws a file's ground by Blender's Cycles: ``PYTHON blender_frame.py GROUND.npz REPEATS``; see `benchmarks.beside`.
 
-Needs nothing of Marsyard's, as Blender's ``bpy`` lives in an environment of its own. One thread; the last line printed
+Needs nothing of Marsyard's, as Blender's ``bpy`` lives in an environment of its own; called ``cycles.py`` it would hide
+Blender's own module of that name. One thread; the last line printed
 is the core-seconds of each frame but the first, which builds the mesh's tree.
 """
 
