@@ -1,18 +1,5 @@
 """Radiometric corrections: the frame-transfer ramp and the fall-off (section II.A).
 
-The frame-transfer ramp
------------------------
-Without a shutter a charge packet gathers light under every row that it passes. A packet that ends as physical row r
-passes under rows r+1 .. N-1 while the detector is cleared before the exposure (`clear_row_s` under each) and under rows
-r-1 .. 0 on its way out (`transfer_row_s` under each). n physical rows are summed into a delivered row; let them be
-equally bright, x_R counts per second each. Averaged over the n packets, a delivered row R of M is (divided by n)
-
-    y_R = (t + (n-1)/2 (a + b)) x_R + n a P_R + n b (T - P_R - x_R)
-
-with t the exposure time, a and b the transfer and clear times per row, P_R the sum of x over the rows before R, and T
-the sum over all rows: within the delivered row the packets pass (n-1)/2 of its own rows on average in each direction.
-Given T this is a linear recursion in P; T itself follows because P_M = T is linear in T.
-
 Dark current is left in, as the paper does. It is a ramp along the columns: for the MER camera over the 31 rows of a
 template 0.05 counts at -34 deg C (flight) and 2.5 counts at 0 deg C (field test), less than a pixel's noise of 6, and
 without effect on velocities even over terrain of 2 % contrast. At +23 deg C it is 36 counts: over such terrain few
@@ -22,59 +9,13 @@ tracks stay valid and no velocity is reported, over terrain of 15 % contrast err
 from __future__ import annotations
 
 import numpy as np
-import scipy  # its signal is slow to import, and so left until it is called
 from jaxtyping import Float
 
 from algorithms.dimes.binning import View
-from sim.measurements import DetectorCalibration
+from algorithms.image.frame_transfer import without_frame_transfer
 
 #: Responses below this are treated as this: what is nearly blind cannot be corrected.
 LEAST_RESPONSE = 0.02
-
-
-def _row_sums(
-    signal: Float[np.ndarray, "rows columns"], own: float, before: float
-) -> Float[np.ndarray, "rows_and_one columns"]:
-    """P_0 = 0, P_(R+1) = P_R + x_R with x_R = (y_R - before P_R) / own, shape (rows + 1, columns)."""
-    sums = scipy.signal.lfilter([1.0 / own], [1.0, before / own - 1.0], signal, axis=0)
-    return np.concatenate([np.zeros((1, signal.shape[1])), sums])
-
-
-def without_frame_transfer(
-    signal: Float[np.ndarray, "rows columns"], calibration: DetectorCalibration, rows_summed: int
-) -> Float[np.ndarray, "rows columns"]:
-    """The signal of the exposure alone, in the units of `signal`, from whole columns of a delivered picture.
-
-    Inverts the transfer exactly for a scene that does not move during it and is constant within each delivered row.
-
-    Parameters
-    ----------
-    signal
-        Counts above the offset, all rows, any columns: they do not mix.
-    calibration
-        Exposure and row times.
-    rows_summed
-        Physical rows in a row of `signal`.
-
-    Raises
-    ------
-    ValueError
-        If the exposure is too short against the row times for the transfer to be inverted.
-    """
-    n, a, b = rows_summed, calibration.transfer_row_s, calibration.clear_row_s
-    own = calibration.exposure_s + 0.5 * (n - 1) * (a + b) - n * b
-    before = n * (a - b)
-    if own <= 0.5 * abs(before):
-        raise ValueError(
-            f"an exposure of {calibration.exposure_s} s is too short to invert a frame transfer of "
-            f"{a} s and {b} s per row with {n} rows summed"
-        )
-    values = np.asarray(signal, dtype=np.float64)
-    for_no_total = _row_sums(values, own, before)
-    per_total = _row_sums(np.full((len(values), 1), n * b), own, before)
-    total = for_no_total[-1] / (1.0 + per_total[-1])
-    rates = np.diff(for_no_total - per_total * total, axis=0)
-    return np.asarray(calibration.exposure_s * rates)
 
 
 def corrected_patch(view: View, rows: slice, columns: slice) -> Float[np.ndarray, "_ _"]:

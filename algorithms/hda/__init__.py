@@ -6,12 +6,13 @@ from algorithms.hda.estimator import HdaEstimator
 from algorithms.hda.hazards import HazardMaps, Safety, hazard_maps, safe_site
 from algorithms.hda.motion import Motion
 from algorithms.hda.options import HdaOptions, SurfaceFrame, TrackSeed
-from algorithms.hda.structure import Matches
+from algorithms.hda.structure import Fate, Matches
 from algorithms.hda.tracking import Tracks
 
 __all__ = [
     "STAGES",
     "ElevationMap",
+    "Fate",
     "Ground",
     "HazardMaps",
     "HdaDetails",

@@ -11,14 +11,14 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from algorithms.hda.estimator import find_site, matched_structure
 from algorithms.hda.motion import Motion, assessed
 from algorithms.hda.options import HdaOptions
 from algorithms.hda.sighting import Sighting, sighting
-from algorithms.hda.structure import Matches, depth_bounds, epipolar_segments, pixel_lattice, triangulated
+from algorithms.hda.structure import Fate, Matches, depth_bounds, epipolar_segments, pixel_lattice, triangulated
 from algorithms.hda.tracking import Tracks
 from algorithms.hda.view import View, pixels_of, points_at, undistorted
 from algorithms.interface import SiteEstimate
@@ -219,10 +219,11 @@ def semi_global_structure(seen: Sighting, motion: Motion, options: HdaOptions) -
     if pair is not None:
         found = disparities(seen.views, pair, motion.second_from_first, bounds)
         depths = _depths(pair, found, places)
-    accepted: Bool[np.ndarray, "n"] = (depths > bounds[0]) & (depths < bounds[1])
+    accepted = (depths > bounds[0]) & (depths < bounds[1])
+    fates = np.where(accepted, Fate.ACCEPTED, Fate.OUT_OF_BOUNDS).astype(np.uint8)
     points = points_at(places, depths)
     matched, _ = pixels_of(second.camera, motion.second_from_first.apply(points))
-    return Matches(pixels, starts, ends, matched, np.full(len(pixels), np.nan), depths, accepted, points[accepted])
+    return Matches(pixels, starts, ends, matched, np.full(len(pixels), np.nan), depths, fates, points[accepted])
 
 
 def _depths(

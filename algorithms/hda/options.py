@@ -72,6 +72,10 @@ class HdaOptions:
         Half width of the windows compared along epipolar segments.
     min_match_correlation
         Least correlation (Eq. 3) of a structure match.
+    max_return_px
+        Beyond the paper: each structure match is looked for again, from the second picture in the first, and dropped if
+        it comes out farther than this, pixels, from where it started. None: no such check, as the paper has it. Both
+        searches go by whole pixels beside a line, each up to 0.7 px off.
     min_points
         Least number of points for an elevation map.
     surface_frame
@@ -122,6 +126,7 @@ class HdaOptions:
     grid_px: int = 8
     search_half_px: int = 5
     min_match_correlation: float = 0.7
+    max_return_px: float | None = None
     min_points: int = 100
     surface_frame: SurfaceFrame = SurfaceFrame.INCLINOMETER
     lander_diameter_m: float = 2.0
@@ -143,7 +148,7 @@ class HdaOptions:
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
         for name in _POSITIVE:
-            if not getattr(self, name) > 0.0:
+            if getattr(self, name) is not None and not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
         if not self.max_slope_rad < np.pi / 2:
             raise ValueError(f"max_slope_rad is {self.max_slope_rad}; it must be below pi/2")
@@ -170,6 +175,7 @@ _LEAST = {
 }
 _POSITIVE = (
     "robust_px",
+    "max_return_px",
     "narrowest_hazard",
     "max_residual_px",
     "lander_diameter_m",

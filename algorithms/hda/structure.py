@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial.transform import RigidTransform
 
 from algorithms.hda.kernels import matching
 from algorithms.hda.options import HdaOptions
 from algorithms.hda.view import View, pixels_of, points_at, undistorted
+
+
+class Fate(IntEnum):
+    """What became of a structure match; the first reason to drop it counts."""
+
+    ACCEPTED = 0
+    UNLIKE = 1
+    OUT_OF_BOUNDS = 2
+    NOT_RETURNED = 3
 
 
 @dataclass(frozen=True)
@@ -29,8 +39,9 @@ class Matches:
         Eq. 3 there.
     depths
         By triangulation, metres, in the first camera's frame.
-    accepted
-        Whether correlation and depth are believed.
+    fates
+        Values of `Fate`: whether each match is believed, and why not: too low a correlation, a depth out of bounds, or
+        another pixel found on the way back.
     points
         Points of the accepted ones in the first camera's frame, metres.
     """
@@ -41,8 +52,13 @@ class Matches:
     second: Float[np.ndarray, "n 2"]
     correlations: Float[np.ndarray, "n"]
     depths: Float[np.ndarray, "n"]
-    accepted: Bool[np.ndarray, "n"]
+    fates: UInt8[np.ndarray, "n"]
     points: Float[np.ndarray, "m 3"]
+
+    @property
+    def accepted(self) -> Bool[np.ndarray, "n"]:
+        """Whether each match is believed."""
+        return np.asarray(self.fates == Fate.ACCEPTED)
 
 
 def depth_bounds(depth_range_m: tuple[float, float], margin: float) -> tuple[float, float]:
@@ -108,7 +124,8 @@ def match_pixels(
 
     The least sum of absolute differences (Eq. 9) on the segment, then the top of the biquadratic through the
     correlations about it. (The paper says "the maximum SAD value"; the best match is the least.) Pixels whose segment
-    leaves the second picture are dropped, matches with too low a correlation or a depth out of bounds not accepted.
+    leaves the second picture are dropped; matches with too low a correlation or a depth out of bounds are not accepted,
+    nor, with `max_return_px`, those that do not find their way back.
     """
     first, second = views
     border = options.search_half_px + 1
@@ -121,9 +138,54 @@ def match_pixels(
         first.counts, second.counts, whole[:, ::-1], (found - whole)[:, ::-1], options.search_half_px
     )
     depths = triangulated(places, undistorted(second.camera, matched), second_from_first)
-    accepted = (correlations >= options.min_match_correlation) & (depths > bounds_m[0]) & (depths < bounds_m[1])
-    points = points_at(places[accepted], depths[accepted])
-    return Matches(pixels, starts, ends, matched, correlations, depths, accepted, points)
+    fates = np.full(len(pixels), Fate.ACCEPTED, dtype=np.uint8)
+    fates[~((depths > bounds_m[0]) & (depths < bounds_m[1]))] = Fate.OUT_OF_BOUNDS
+    fates[~(correlations >= options.min_match_correlation)] = Fate.UNLIKE
+    if options.max_return_px is not None:
+        left = np.flatnonzero(fates == Fate.ACCEPTED)
+        way = return_distance(
+            views, second_from_first, whole[left], found[left], places[left], bounds_m, options.search_half_px
+        )
+        fates[left[way > options.max_return_px]] = Fate.NOT_RETURNED
+    accepted = fates == Fate.ACCEPTED
+    return Matches(
+        pixels, starts, ends, matched, correlations, depths, fates, points_at(places[accepted], depths[accepted])
+    )
+
+
+def return_distance(
+    views: tuple[View, View],
+    second_from_first: RigidTransform,
+    pixels: Int[np.ndarray, "n 2"],
+    found: Int[np.ndarray, "n 2"],
+    places: Float[np.ndarray, "n 2"],
+    bounds_m: tuple[float, float],
+    half_px: int,
+) -> Float[np.ndarray, "n"]:
+    """How far from each pixel of the first picture the one lies that its match in the second finds there.
+
+    Pixels are whole, `places` their undistorted coordinates. What the match sees is looked for at the depths in the
+    second camera's frame that the bounds are there, as far as the first picture goes: the search has as many rivals as
+    on the way there, and a patch that only resembles another finds the other.
+    """
+    first, second = views
+    ends = [second_from_first.apply(points_at(places, np.full(len(places), depth)))[:, 2] for depth in bounds_m]
+    back = undistorted(second.camera, found.astype(np.float64))
+    reached = [pixels_of(first.camera, second_from_first.inv().apply(points_at(back, depths)))[0] for depths in ends]
+    near, far = (within(first.camera.size, pixels.astype(np.float64), end, half_px + 1.0) for end in reached)
+    returned = matching.search_segments(second.counts, first.counts, found, near, far, half_px)
+    return np.asarray(np.hypot(*(returned - pixels).T))
+
+
+def within(
+    size: tuple[int, int], inside: Float[np.ndarray, "n 2"], ends: Float[np.ndarray, "n 2"], border_px: float
+) -> Float[np.ndarray, "n 2"]:
+    """Ends of lines from places inside of a picture of (columns, rows), cut where they come too near to its border."""
+    away = np.nan_to_num(ends - inside)
+    limits = np.where(away > 0.0, np.array(size) - 1.0 - border_px, border_px)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(away == 0.0, 1.0, (limits - inside) / away)
+    return np.asarray(inside + np.clip(share.min(axis=1), 0.0, 1.0)[:, None] * away)
 
 
 def dense_structure(

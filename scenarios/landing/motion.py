@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.hda import HdaDetails
+from algorithms.hda import Fate, HdaDetails
 from scenarios.interface import Scalar
 
 NAN = float("nan")
+#: Why matches are dropped.
+DROPPED = (Fate.UNLIKE, Fate.OUT_OF_BOUNDS, Fate.NOT_RETURNED)
 
 
 def motion_errors(found: RigidTransform, true: RigidTransform) -> dict[str, Scalar]:
@@ -34,7 +36,9 @@ def solved_row(details: HdaDetails) -> dict[str, Scalar]:
             "motion_residual_px": float(np.median(details.motion.residuals_px)),
         }
     if details.matches is not None:
-        row |= {"points": len(details.matches.points), "matched_share": float(details.matches.accepted.mean())}
+        matches = details.matches
+        row |= {"points": len(matches.points), "matched_share": float(matches.accepted.mean())}
+        row |= {f"matches_{fate.name.lower()}": int(np.sum(matches.fates == fate)) for fate in DROPPED}
     if details.ground is not None:
         rows, columns = details.ground.elevation.elevation_m.shape
         row |= {"map_rows": rows, "map_columns": columns, "cell_m": details.ground.elevation.cell_m}

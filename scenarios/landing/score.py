@@ -86,6 +86,7 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
         "features", "tracks", "features_in_view", "tracks_right", "tracked_share", "tracks_wrong_share", "inliers",
         "parallax_px", "rotation_error_deg", "direction_error_deg", "length_error_m", "baseline_error_share",
         "motion_residual_px", "points", "matched_share", "map_rows", "map_columns", "cell_m",
+        "matches_unlike", "matches_out_of_bounds", "matches_not_returned",
     )  # fmt: skip
     row: dict[str, Scalar] = dict.fromkeys(names, NAN)
     row["tracked_well"] = False

@@ -15,6 +15,7 @@ from scenarios.views import Eye, SiteGround, site_scene
 from sim.camera import CameraModel
 from sim.frames import direction
 from sim.render import Objects, Scene, Sun
+from sim.sensor import OwnCamera, preset
 from sim.terrain import TerrainBank, TerrainParameters, site
 from sim.terrain.sites import SiteTexture
 
@@ -35,8 +36,7 @@ class World:
     meshes
         Own bodies on the ground.
     brightness
-        Sunlight at the ground over that at 1 AU above the air. The exposure is set by the picture, so that a detector
-        whose responsivity is stated for another distance from the sun is only exposed for longer.
+        Sunlight at the ground over that for which the camera's responsivity is stated.
     """
 
     ground: SiteGround
@@ -56,7 +56,8 @@ class World:
         air = p.preset.environment
         elevation = float(np.radians(faulty_sun_deg(p.faults, p.sun.elevation_deg)))
         sun = Sun(direction(np.radians(p.sun.azimuth_deg), elevation), air.sun_radius_rad)
-        return cls(ground, sun, p.meshes, air.direct_share(elevation) * air.solar_irradiance)
+        brightness = air.direct_share(elevation) * air.solar_irradiance / camera_sunlight(p.camera)
+        return cls(ground, sun, p.meshes, brightness)
 
     def scene(self, eye: Eye, caster_diameter_m: float) -> Scene:
         """One scene for both pictures, as fine as the lower one sees."""
@@ -72,6 +73,11 @@ def site_ground(site_name: str, terrain: TerrainParameters, bank_seed: int, numb
     """A terrain of a site's bank with its rocks, kept by the process."""
     bank = TerrainBank(terrain, bank_seed)
     return SiteGround(site(site_name), terrain, bank.terrain(number), bank.rocks(number))
+
+
+def camera_sunlight(camera: str | OwnCamera) -> float:
+    """Sunlight, over that at 1 AU, for which a camera's responsivity is stated; 1 for an own camera."""
+    return 1.0 if isinstance(camera, OwnCamera) else preset(camera).sunlight
 
 
 @lru_cache(maxsize=4)

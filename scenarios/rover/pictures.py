@@ -20,13 +20,12 @@ from sim.sensor import Detector, auto_expose, natural_fall_off, preset
 
 #: The full frame is judged for its exposure in a picture so many times smaller.
 _BINNED = 16
-#: Sunlight, over that at 1 AU, for which a preset's responsivity is stated: MER's cameras at Mars.
-_SUNLIGHT = {"mer": 1.0 / 1.5**2, "research": 1.0}
 
 
+@lru_cache(maxsize=8)
 def sunlight_of_preset(name: str) -> float:
-    """Sunlight over that at 1 AU for which a camera's responsivity is stated."""
-    return _SUNLIGHT[name.partition("-")[0]]
+    """Sunlight over that at 1 AU for which a camera's responsivity is stated; kept, as it is asked for each picture."""
+    return preset(name).sunlight
 
 
 @lru_cache(maxsize=8)

@@ -95,11 +95,19 @@ class Preset:
     ----------
     design, light, detector
         Geometry, light path and detector.
+    sun_au
+        Distance from the sun for which the detector's responsivity is stated.
     """
 
     design: CameraDesign
     light: LightPath
     detector: DetectorParameters
+    sun_au: float
+
+    @property
+    def sunlight(self) -> float:
+        """Sunlight, over that at 1 AU, for which the detector's responsivity is stated."""
+        return 1.0 / self.sun_au**2
 
     def cameras(self) -> tuple[CameraModel, ...]:
         """The camera, or the left and the right one of a pair."""
@@ -113,7 +121,7 @@ def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float
         "dark_e_s": DARK_E_S,
         "optics": OpticsParameters(diffraction_px=light.diffraction_px()),
     }
-    return Preset(design, light, DetectorParameters.model_validate(settings | changes))
+    return Preset(design, light, DetectorParameters.model_validate(settings | changes), sun_au)
 
 
 _DESCENT = CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, down=True)
@@ -174,7 +182,7 @@ def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
         dark_e_s=DARK_E_S * (design.pixel_pitch_um / 12.0) ** 2,
         optics=OpticsParameters(diffraction_px=light.diffraction_px()),
     )
-    return Preset(design, light, detector)
+    return Preset(design, light, detector, sun_au=1.0)
 
 
 def _research_navcam() -> Preset:

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from synthetic_descent import CAMERA, ROWS_SUMMED, calibration, delivered, fall_off, scene, terrain
 
 from algorithms.dimes.binning import View, bin_factors, bin_mean, view
-from algorithms.dimes.radiometry import corrected_patch, without_frame_transfer
+from algorithms.dimes.radiometry import corrected_patch
+from algorithms.image.frame_transfer import without_frame_transfer
 from sim.measurements import DetectorImage
 
 LEVEL = 1600.0

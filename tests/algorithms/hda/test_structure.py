@@ -9,7 +9,7 @@ import pytest
 from relief_scene import Pass, bumps, measured, plane, pose
 from scipy.spatial.transform import Rotation
 
-from algorithms.hda import HdaEstimator, HdaOptions
+from algorithms.hda import Fate, HdaEstimator, HdaOptions
 from algorithms.hda.kernels import matching
 from algorithms.hda.sighting import Sighting, sighting
 from algorithms.hda.structure import (
@@ -18,7 +18,9 @@ from algorithms.hda.structure import (
     epipolar_segments,
     match_pixels,
     pixel_lattice,
+    return_distance,
     triangulated,
+    within,
 )
 from algorithms.hda.view import undistorted
 from sim.frames import rigid
@@ -155,3 +157,51 @@ def test_all_lengths_follow_the_altimeter(factor: float, scene: Pass) -> None:
     # Issue 6, bar 1: 1 % of the baseline, the scale by the altimeter exact.
     expected = factor * scene.second_from_first.translation
     assert np.linalg.norm(motion.second_from_first.translation - expected) < 0.01 * np.linalg.norm(expected)
+
+
+def test_matches_that_do_not_find_their_way_back_are_dropped_and_counted(scene: Pass, seen: Sighting) -> None:
+    # Half of the second picture shows something else, and no correlation is too low: what is found there is chance.
+    counts = seen.views[1].counts.copy()
+    counts[:, 160:] = np.random.default_rng(2).integers(500, 2500, (240, 160))
+    views = (seen.views[0], replace(seen.views[1], counts=counts))
+    plain, checked = (
+        dense_structure(
+            views,
+            scene.second_from_first,
+            (9.0, 11.0),
+            replace(OPTIONS, min_match_correlation=-1.0, max_return_px=tolerance),
+        )
+        for tolerance in (None, 1.5)
+    )
+    true = scene.camera(1).project(scene.ground(0, plain.first))[0]
+    wrong = np.linalg.norm(plain.second - true, axis=1) > 1.5
+    assert np.sum(plain.accepted & wrong) > 100
+    # Segments are some 25 px long: of matches by chance an eighth comes back by chance.
+    assert np.sum(checked.accepted & wrong) < 0.3 * np.sum(plain.accepted & wrong)
+    assert np.sum(checked.accepted & ~wrong) > 0.95 * np.sum(plain.accepted & ~wrong)
+    # All else stays as it was, and each match has one fate.
+    np.testing.assert_array_equal(checked.second, plain.second)
+    dropped = checked.fates == Fate.NOT_RETURNED
+    np.testing.assert_array_equal(checked.accepted | dropped, plain.accepted)
+    np.testing.assert_array_equal(np.where(dropped, Fate.ACCEPTED, checked.fates), plain.fates)
+    assert len(checked.points) == checked.accepted.sum()
+
+
+def test_right_matches_find_their_way_back(scene: Pass, seen: Sighting) -> None:
+    pixels = pixel_lattice((320, 240), 16, 6)
+    places = undistorted(seen.views[0].camera, pixels)
+    _, _, room = epipolar_segments(seen.views[1], scene.second_from_first, places, (7.0, 13.0), 6)
+    pixels, places = pixels[room].astype(np.int64), places[room]
+    true = np.rint(scene.camera(1).project(scene.ground(0, pixels.astype(np.float64)))[0]).astype(np.int64)
+    off = return_distance(seen.views, scene.second_from_first, pixels, true, places, (7.0, 13.0), 5)
+    # Both searches go by whole pixels: 0.7 px each, and what relief within a window adds.
+    assert np.mean(off <= 1.5) > 0.98
+
+
+def test_ends_of_segments_are_cut_at_the_border() -> None:
+    inside = np.array([[50.0, 50.0], [50.0, 50.0], [10.0, 10.0], [50.0, 50.0]])
+    ends = np.array([[60.0, 40.0], [110.0, 80.0], [0.0, 20.0], [np.nan, 10.0]])
+    cut = within((100, 80), inside, ends, 10.0)
+    np.testing.assert_allclose(
+        cut, [[60.0, 40.0], [50.0 + 39.0 * 19.0 / 30.0 * 60.0 / 39.0, 69.0], [10.0, 10.0], [50.0, 10.0]]
+    )

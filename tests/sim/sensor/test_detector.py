@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from algorithms.dimes.radiometry import without_frame_transfer
+from algorithms.image.frame_transfer import without_frame_transfer
 from sim.sensor import Detector, DetectorParameters, ImageMotion
 from sim.sensor.defects import BurstParameters, DefectParameters
 from sim.sensor.detector import dark_seconds

@@ -1,0 +1,46 @@
+"""Pictures as the algorithm sees them: what the camera adds to the ground is taken off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from relief_scene import camera
+
+from algorithms.hda.view import flat_fielded
+from sim.measurements import DetectorImage
+from sim.sensor import Detector, DetectorParameters, natural_fall_off
+from sim.sensor.optics import OpticsParameters
+
+
+def delivered(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, DetectorImage]:
+    """A scene, brighter towards one side, and its picture without noise to speak of at 4 ms."""
+    optics = camera(320)
+    rows, columns = optics.size[1], optics.size[0]
+    rng = np.random.default_rng(3)
+    scene = (0.2 + 0.1 * np.arange(columns) / columns + 0.02 * rng.standard_normal((rows, columns))).astype(np.float32)
+    parameters = DetectorParameters(
+        rows_summed=1,
+        transfer_row_s=transfer_row_s,
+        clear_row_s=clear_row_s,
+        full_well_e=1e9,
+        responsivity_e_s=4e9,
+        gain_e_dn=4000.0,
+        read_noise_e=0.0,
+        calibration_error=0.0,
+        optics=OpticsParameters(diffraction_px=0.0, diffusion_px=0.0, pixel_aperture=False),
+    )
+    detector = Detector.drawn(natural_fall_off(optics), parameters, rng)
+    return scene, DetectorImage(detector.expose(scene, rng), 0.0, optics, detector.calibration)
+
+
+@pytest.mark.parametrize("times", [(0.0, 0.0), (5e-6, 0.0), (5e-6, 1e-6)])
+def test_counts_are_those_of_the_pixels_own_ground(times: tuple[float, float]) -> None:
+    scene, image = delivered(*times)
+    counts = flat_fielded(image).astype(np.float64)
+    # Exposure times counts per second; each count is rounded twice, and the response divides by 0.65 at least.
+    expected = 0.004 * 4e9 / 4000.0 * scene
+    assert np.abs(counts - expected).max() < 0.01 * expected.mean()
+    smeared = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
+    ramp = np.abs(smeared - expected).max() / expected.mean()
+    # 240 rows of 5 us over 4 ms, behind a lens that is brighter in the middle.
+    assert (ramp > 0.2) == (times[0] > 0.0)
