@@ -18,6 +18,7 @@ from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.samples import quantile_bounds
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
+from reports.verdicts import terrain_groups
 from reports.vtt.rows import flag_share, interval_text, is_closed_loop, known, selectable, share_text
 from reports.wording import NOTHING, number, stated
 
@@ -127,7 +128,7 @@ def _of_camera(runs: pd.DataFrame, camera: str) -> CameraRuns:
         false_tracks=flag_share(runs, "true_track", wanted=False),
         median_m=_quantile(error, 0.5),
         quantile_m=_quantile(error, QUANTILE),
-        quantile_bound_m=quantile_bounds(error, QUANTILE, CONFIDENCE)[1],
+        quantile_bound_m=quantile_bounds(error, QUANTILE, CONFIDENCE, terrain_groups(completed))[1],
         range_rms_m=_rms(known(completed, "range_error_m")),
         cross_rms_m=_rms(known(completed, "cross_error_m")),
         drift_median_px=_quantile(drift, 0.5),

@@ -37,8 +37,11 @@ def holds(frame: pd.DataFrame, *names: str) -> Bool[np.ndarray, " n"]:
 
 
 def selectable(frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows whose target operators would have selected: lit, off the rock's edge, in both pictures to the end."""
-    return frame[holds(frame, "selectable", "in_view")]
+    """The rows whose target operators would have selected: lit, off the rock's edge, in both pictures to the end.
+
+    Where a campaign says how obliquely its targets may be seen (`face_deg`), those on that face.
+    """
+    return frame[holds(frame, "selectable", "in_view", "on_face")]
 
 
 def share_text(share: Share) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Any
 
@@ -16,7 +17,7 @@ from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.svg import MARKERS, SERIES, in_page_style, new_axes
-from reports.vtt.rows import flag_share, interval_text, is_tracking, legs, selectable, share_text
+from reports.vtt.rows import flag_share, holds, interval_text, is_tracking, legs, selectable, share_text
 from reports.wording import NOTHING, number, stated
 
 #: What tells the lines of a figure apart, where it varies.
@@ -108,15 +109,43 @@ def steps_section(subject: Subject) -> Section | None:
         Block(text=motion.text, plates=[plate(step_figure(found, motion), "steps", caption)]),
         Block(grid=_grid(found, motion), note=_NOTE),
     ]
+    oblique = _obliquity_grid(subject.frame, motion)
+    if oblique is not None:
+        blocks.append(Block(grid=oblique, note=_OBLIQUE))
     return Section("steps", "Steps", motion.title, blocks, {"cells": [asdict(one) for one in found]})
 
 
 _NOTE = (
-    "Selectable: lit, off the rock's edge, and in both pictures to the end. Tracked: found in the last picture within "
-    "the stated pixels of the designated point's true projection. Falsely tracked: reported beyond them at some stop. "
+    "Selectable: lit, off the rock's edge, in both pictures to the end and, where the campaign says so, on the face "
+    "that all stops see. Tracked: found in the last picture within the stated pixels of the designated point's true "
+    "projection. Falsely tracked: reported beyond them at some stop. "
     f"Intervals: two-sided, Clopper and Pearson, at {stated(CONFIDENCE)} confidence, as for independent targets; "
     "those of a rock share its pictures and are not."
 )
+
+
+#: Edges of classes of the most oblique sight, deg.
+_CLASSES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
+
+_OBLIQUE = (
+    "Lit targets in view to the end, tracked of all, by how obliquely their surface was seen at most. The template is "
+    "scaled and rolled, but not narrowed as an oblique patch is that turns."
+)
+
+
+def _obliquity_grid(frame: pd.DataFrame, motion: Motion) -> Grid | None:
+    """Targets tracked by class of the most oblique sight and step; None where sights are not told or do not turn."""
+    if motion.per_cent or "obliquity_max_deg" not in frame:
+        return None
+    seen = frame[holds(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
+    steps = sorted(seen["step"].unique())
+    rows = []
+    for low, high in pairwise(_CLASSES_DEG):
+        chosen = seen[seen["obliquity_max_deg"].between(low, high, inclusive="left")]
+        if len(chosen):
+            shares = [flag_share(chosen[chosen["step"].eq(step)], "tracked") for step in steps]
+            rows.append([f"{low:g} to {high:g}", *(f"{one.hits:,} of {one.n:,}" for one in shares)])
+    return Grid(["Most oblique sight (deg)", *(f"{step:g} deg" for step in steps)], rows) if rows else None
 
 
 def cells(subject: Subject) -> list[StepCell]:

@@ -146,6 +146,9 @@ class LegParameters(_Parameters):
     goal_m: Annotated[
         Positive, Field(description="horizontal distance of the rover's origin from the target in the end, m")
     ] = 2.0
+    ends_with_steps: Annotated[
+        bool, Field(description="whether it has come to its end when its steps are done, short of goal_m or not")
+    ] = False
     offset_right_m: Annotated[
         float, Field(description="how far to the right of the target's direction the goal lies, m")
     ] = 0.0

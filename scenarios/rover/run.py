@@ -214,6 +214,8 @@ class _Loop:
 
 def _reached(leg: LegParameters, belief: Belief) -> bool:
     """Whether the last leg has come to its goal, if it has one; those before end with their steps too."""
+    if leg.ends_with_steps:
+        return True
     if leg.motion == "approach":
         return belief.distance_m <= leg.goal_m + GOAL_TOLERANCE_M
     if leg.motion == "back-off":

@@ -86,6 +86,9 @@ class SharedDriveParameters(_Parameters):
     skip: Annotated[int, Field(ge=0, le=100, description="stops left out between two updates")] = 0
     margin_px: Annotated[float, Field(gt=0.0, description="what of the frame is taken around the rock")] = 110.0
     bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps that are told apart")] = ()
+    face_deg: Annotated[
+        float | None, Field(gt=0.0, le=90.0, description="most oblique sight at any stop of a target `on_face`")
+    ] = None
 
     @model_validator(mode="after")
     def _are_there(self) -> SharedDriveParameters:
@@ -358,7 +361,8 @@ class SharedDriveScenario:
             return Judged(run.outcome.name, completed, row, products(case, run))
 
         seen = seen_along(*shared, p.targets[p.target], p.drive.vtt)
-        return case_result(p.drive.algorithms, judge, {**_known(p), **asdict(seen)})
+        on_face = seen.in_view and (p.face_deg is None or seen.obliquity_max_deg <= p.face_deg)
+        return case_result(p.drive.algorithms, judge, {**_known(p), **asdict(seen), "on_face": on_face})
 
 
 def _known(p: SharedDriveParameters) -> dict[str, Scalar]:

@@ -80,6 +80,21 @@ def test_steps_around_and_in_place_are_degrees() -> None:
     assert steps_section(subject(rows(3))) is None
 
 
+def test_oblique_targets_are_told_apart_and_those_off_the_face_are_no_part_of_the_paper_s_share() -> None:
+    """Face-on targets are tracked, oblique ones lost: the share beside the paper's is of those on the face alone."""
+    face_on = rows(6, skip=0, step=5.0, obliquity_max_deg=40.0, in_view=True, on_face=True)
+    oblique = rows(4, skip=0, step=5.0, obliquity_max_deg=72.0, in_view=True, on_face=False, tracked=False)
+    hidden = rows(3, skip=0, step=5.0, obliquity_max_deg=80.0, in_view=False, on_face=False, tracked=False)
+    run = subject(pd.concat([face_on, oblique, hidden], ignore_index=True), legs=[{"motion": "circle"}])
+    (cell,) = cells(run)
+    assert (cell.good.hits, cell.good.n, cell.all_targets.n) == (6, 6, 13)
+    section = steps_section(run)
+    assert section is not None
+    grid = section.blocks[-1].grid
+    assert grid is not None
+    assert [list(row) for row in grid.rows] == [["0 to 45", "6 of 6"], ["70 to 90", "0 of 4"]]
+
+
 def _with_updates(numbers: int, cases: int = 3) -> pd.DataFrame:
     frame = rows(cases)
     for n in range(1, numbers + 1):

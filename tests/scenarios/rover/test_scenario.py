@@ -167,6 +167,19 @@ def test_trackers_share_the_pictures_of_a_drive() -> None:
     assert all(result.row["pure_ncc.updates"] == result.row["updates"] for result in results)
     assert all(result.row["Wordless.outcome"] == "BAD_ANSWER" for result in results)
     assert [result.failure for result in results] == [None, None]
+    # all steps see the same arc; a target is on the face where no stop sees it more obliquely than is said
+    row = results[0].row
+    assert [result.row["obliquity_max_deg"] for result in results] == [row["obliquity_max_deg"]] * 2
+    assert isinstance(row["obliquity_max_deg"], float)
+    within, beyond = (
+        scenario.run(SharedDriveParameters.model_validate({**stated, "face_deg": limit}), streams(0)).row
+        for limit in (row["obliquity_max_deg"] + 0.1, row["obliquity_max_deg"] - 0.1)
+    )
+    assert [(one["in_view"], one["on_face"]) for one in (row, within, beyond)] == [
+        (True, True),
+        (True, True),
+        (True, False),
+    ]
     drive = shared_drive(fine.of_run(), fine.margin_px, 1, "rover tests", 0)
     other = tracked(SharedDriveParameters.model_validate({**stated, "target": 1}), drive)
     assert other.stops[0].point_px[0] > drive.views[0].pictures.left.corner[0]
