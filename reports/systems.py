@@ -12,6 +12,7 @@ import pandas as pd
 
 from reports.columns import numbers, primary_metric
 from reports.dimes.shown import DIMES
+from reports.dimes.stream import STREAM
 from reports.hda.shown import HDA
 from reports.measured.shown import MEASURED
 from reports.shown import CaseView, System
@@ -20,7 +21,7 @@ from reports.vtt.shown import VTT
 from reports.wording import NOTHING
 
 #: Those whose products are looked for in a case, in this order.
-SYSTEMS: tuple[System, ...] = (MEASURED, DIMES, VTT, HDA)
+SYSTEMS: tuple[System, ...] = (MEASURED, STREAM, DIMES, VTT, HDA)
 #: Kept cases of each kind (the worst, those without an answer, others drawn at random) whose pictures go into the page;
 #: each takes about half a megabyte.
 _MOST_OF_A_KIND = 2

@@ -118,8 +118,6 @@ def velocity_products(
 ) -> dict[str, object]:
     """Arrays from which a case's figures are drawn."""
     kept: dict[str, object] = {f"image_{number}": counts for number, counts in enumerate(pictures, start=1)}
-    if estimate is not None and estimate.after_pictures:
-        kept.update(_stream_products(estimate))
     if estimate is not None and isinstance(estimate.details, DimesDetails):
         kept.update(dimes_products(estimate.details))
     kept["velocity_true_m_s"] = true
@@ -128,11 +126,20 @@ def velocity_products(
     return kept
 
 
-def _stream_products(estimate: VelocityEstimate) -> dict[str, object]:
-    """What a stream answered after each picture: velocities and spans, NaN where it reported nothing."""
-    reported = [one if one is not None and one.velocity_m_s is not None else None for one in estimate.after_pictures]
+def stream_products(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, object]:
+    """What a stream answered after each picture, with the truth of it, NaN where it reported nothing; else nothing."""
+    if estimate is None or not estimate.after_pictures:
+        return {}
     nothing = (np.nan, np.nan)
+    told = [
+        (nothing, nothing, nothing)
+        if one is None or one.velocity_m_s is None or one.span_s is None
+        else (one.span_s, one.velocity_m_s, truth(one.span_s))
+        for one in estimate.after_pictures
+    ]
+    spans, velocities, true = zip(*told, strict=True)
     return {
-        "after_velocities_m_s": np.array([nothing if one is None else one.velocity_m_s for one in reported]),
-        "after_spans_s": np.array([nothing if one is None else one.span_s for one in reported]),
+        "after_spans_s": np.array(spans),
+        "after_velocities_m_s": np.array(velocities),
+        "after_true_m_s": np.array(true),
     }

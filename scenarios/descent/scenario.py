@@ -31,7 +31,16 @@ from scenarios.interface import CaseResult
 from scenarios.provenance import rendered
 from scenarios.samples import Sample
 from scenarios.trial import Judged, case_result
-from scenarios.velocity import Horizontal, Span, asked, consistency_row, stream_row, velocity_products, velocity_row
+from scenarios.velocity import (
+    Horizontal,
+    Span,
+    asked,
+    consistency_row,
+    stream_products,
+    stream_row,
+    velocity_products,
+    velocity_row,
+)
 from sim.sensor import Detector
 from sim.streams import Streams
 from sim.terrain import TerrainBank
@@ -115,7 +124,10 @@ class DescentScenario:
                     **stream_row(estimate, truth),
                     **attempt.row,
                 },
-                products=velocity_products(shown(pictures, estimate, triple), estimate, true),
+                products={
+                    **velocity_products(shown(pictures, estimate, triple), estimate, true),
+                    **stream_products(estimate, truth),
+                },
                 failure=attempt.failure,
             )
 
