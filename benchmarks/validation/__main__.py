@@ -19,6 +19,7 @@ from benchmarks.validation import (
     motion_checks,
     sampling_checks,
     statistics_checks,
+    tracking_checks,
 )
 from benchmarks.validation.records import Measure
 
@@ -27,6 +28,7 @@ CHECKS = (
     *motion_checks.CHECKS,
     *light_checks.CHECKS,
     *dimes_checks.CHECKS,
+    *tracking_checks.CHECKS,
     *landing_checks.CHECKS,
     *sampling_checks.CHECKS,
     *campaign_checks.CHECKS,
