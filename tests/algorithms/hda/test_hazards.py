@@ -234,3 +234,5 @@ def test_options_out_of_range_are_named() -> None:
         HdaOptions(lander_diameter_m=0.0)
     with pytest.raises(ValueError, match="max_slope_rad"):
         HdaOptions(max_slope_rad=2.0)
+    with pytest.raises(ValueError, match="max_return_px is 0"):
+        HdaOptions(max_return_px=0.0)

@@ -93,6 +93,17 @@ def test_a_picture_of_each(name: str) -> None:
     assert level == pytest.approx(0.6, abs=0.05) if "descent" not in name else 0.05 < level < 0.1
 
 
+@pytest.mark.parametrize("name", PRESETS)
+def test_responsivity_is_that_of_the_sunlight_that_is_stated_with_it(name: str) -> None:
+    camera = preset(name)
+    of_earth = camera.light.responsivity_e_s(1.0)
+    assert camera.detector.responsivity_e_s == pytest.approx(camera.sunlight * of_earth, rel=1e-12)
+    # MER's cameras are at Mars, but for the descent camera that was flown over deserts
+    assert camera.sunlight == pytest.approx(
+        0.444 if name in ("mer-descent-flown", "mer-navcam", "mer-hazcam") else 1.0, abs=1e-3
+    )
+
+
 def test_unknown_name() -> None:
     with pytest.raises(ValueError, match=r"no camera preset 'mer-pancam'; allowed: mer-descent-flown, "):
         preset("mer-pancam")
