@@ -29,6 +29,7 @@ format: setup ## Rewrite the sources in the project's format, mending what can b
 
 bench: setup ## Measure speed and memory
 	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks.growth
 
 validate: setup ## Compare with the papers' published results
 	@[ -e benchmarks/validation.py ] || [ -e benchmarks/validation/__main__.py ] || { echo "validate: there is no comparison with published results yet" >&2; exit 1; }

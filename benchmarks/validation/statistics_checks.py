@@ -95,21 +95,58 @@ def run_clustered(quick: bool) -> Iterator[Measure]:
                 yield Measure(claim, min(lower, upper), "", _least(CONFIDENCE, trials), how, "at least")
 
 
+def run_shared(quick: bool) -> Iterator[Measure]:
+    """Coverage of the intervals of errors that share terrains: mean, standard deviation, quantile."""
+    trials = 100 if quick else 600
+    rng = np.random.default_rng(6)
+    truths = {"mean": 0.0, "standard deviation": 1.0, "95 % quantile": float(stats.norm.ppf(0.95))}
+    for correlation in (0.05, 0.3, 0.9):
+        for terrains in (12, 60, 250):
+            found = [_covered(*_errors(rng, correlation, terrains), truths) for _ in range(trials)]
+            for what, nominal in (("mean", 0.95), ("standard deviation", 0.95), ("95 % quantile", CONFIDENCE)):
+                covered = float(np.min(np.mean([one[what] for one in found], axis=0)))
+                interval = "bounds" if what.endswith("quantile") else "interval"
+                claim = f"{100 * nominal:.0f} % {interval} of the {what}, "
+                claim += f"correlation {correlation}, {terrains} terrains"
+                how = f"{trials} campaigns, 1 to 14 normal errors a terrain"
+                yield Measure(claim, covered, "", _least(nominal, trials), how, "at least")
+
+
+def _errors(rng: np.random.Generator, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
+    """Standard normal errors, alike on a terrain, and the terrain of each."""
+    terrain = np.repeat(np.arange(terrains), rng.integers(1, 15, terrains))
+    shared, own = rng.normal(size=terrains)[terrain], rng.normal(size=terrain.size)
+    return math.sqrt(correlation) * shared + math.sqrt(1.0 - correlation) * own, terrain
+
+
+def _covered(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
+    """Whether each interval holds the truth; of the quantile the lower and the upper bound apart."""
+    lower, upper = quantile_bounds(errors, 0.95, CONFIDENCE, terrain)
+    covered: dict[str, tuple[bool, ...]] = {
+        "95 % quantile": (lower <= truths["95 % quantile"], upper >= truths["95 % quantile"])
+    }
+    for what, interval in (("mean", mean_interval), ("standard deviation", spread_interval)):
+        low, high = interval(errors, 0.95, terrain)
+        covered[what] = (low <= truths[what] <= high,)
+    return covered
+
+
 def run_sequential(quick: bool) -> Iterator[Measure]:
     """Error rates of campaigns that stop themselves, at the rate asked, where every verdict is wrong one way."""
     trials = 300 if quick else 2000
     rng = np.random.default_rng(3)
     for asked, most in ((0.9, 512), (0.99, 1000)):
         for correlation in (None, 0.2):
-            passed = sum(_passes(rng, asked, most, correlation) for _ in range(trials)) / trials
+            wrong = np.mean([_decided(rng, asked, most, correlation) for _ in range(trials)], axis=0)
             kind = "independent cases" if correlation is None else f"cases on terrains, correlation {correlation}"
             how = f"{trials} campaigns of at most {most} cases at a true rate of {asked}; Monte Carlo error allowed"
             bar = 1.0 - _least(CONFIDENCE, trials)
-            yield Measure(f"false PASS of {asked} at 90 %, {kind}", passed, "", bar, how)
+            for word, share in zip(("PASS", "FAIL"), wrong.tolist(), strict=True):
+                yield Measure(f"false {word} of {asked} at 90 %, {kind}", share, "", bar, how)
 
 
-def _passes(rng: np.random.Generator, asked: float, most: int, correlation: float | None) -> bool:
-    """Whether any look at a campaign finds its requirement met."""
+def _decided(rng: np.random.Generator, asked: float, most: int, correlation: float | None) -> tuple[bool, bool]:
+    """Whether the first look at a campaign that decides its requirement finds it met, and whether not met."""
     if correlation is None:
         success, terrain = rng.random(most) < asked, np.arange(most)
     else:
@@ -119,12 +156,14 @@ def _passes(rng: np.random.Generator, asked: float, most: int, correlation: floa
     for look in looks_of(most):
         confidence, first = confidence_at(CONFIDENCE, look.share), success[: look.cases]
         if correlation is None:
-            lower = proportion_lower(int(first.sum()), look.cases, confidence)
+            seen = int(first.sum()), look.cases, confidence
+            lower, upper = proportion_lower(*seen), proportion_upper(*seen)
         else:
-            lower = clustered_evidence(first, terrain[: look.cases], confidence).lower
-        if lower >= asked:
-            return True
-    return False
+            shown = clustered_evidence(first, terrain[: look.cases], confidence)
+            lower, upper = shown.lower, shown.upper
+        if lower >= asked or upper < asked:
+            return lower >= asked, upper < asked
+    return False, False
 
 
 def run_nights(quick: bool) -> Iterator[Measure]:
@@ -148,6 +187,7 @@ def run_nights(quick: bool) -> Iterator[Measure]:
 CHECKS = (
     Check("intervals", "Statistics", run_intervals),
     Check("clustered", "Statistics", run_clustered),
+    Check("shared", "Statistics", run_shared),
     Check("sequential", "Statistics", run_sequential),
     Check("nights", "Statistics", run_nights),
 )

@@ -1,0 +1,200 @@
+"""How costs grow: ``python -m benchmarks.growth`` measures, keeps the points, and draws docs/images/growth.svg.
+
+Frame over pixels and over triangles, case over the terrain's size, campaign over cases and workers (light ones, as
+many as a cluster's would be here, and by Dask), report over cases. Core-seconds, but for workers: what they are for
+is wall-clock time.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.engine import BusyParameters, BusyScenario, Stopwatch
+from benchmarks.pictures import descent_pose, descent_scene
+from benchmarks.reporting import made_up, marsyard
+from benchmarks.timing import core_seconds
+from campaigns.definition.campaign import Campaign
+from campaigns.definition.configuration import CampaignConfiguration, Retain
+from campaigns.definition.loading import load_campaign
+from campaigns.execution.crew import Crew
+from campaigns.running.engine import run_campaign
+from scenarios.descent import CameraParameters, camera_optics
+from scenarios.interface import CaseResult
+from sim.render import PixelRays, process_renderer
+from sim.render.backend import default_backend
+from sim.streams import Streams
+
+KEPT = Path(__file__).parent / "results" / "growth.json"
+FIGURE = Path(__file__).parents[1] / "docs" / "images" / "growth.svg"
+#: What a light worker is busy with, seconds a case.
+LIGHT_S = 0.02
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One cost over one size.
+
+    Attributes
+    ----------
+    name, size, cost
+        Of the curve, and of its axes with their units.
+    points
+        (size, cost) each.
+    """
+
+    name: str
+    size: str
+    cost: str
+    points: Sequence[tuple[float, float]]
+
+    @property
+    def power(self) -> float:
+        """Exponent of the power law between the largest size and the one before: what the growth comes to."""
+        (before, cheap), (last, dear) = self.points[-2:]
+        return float(np.log(dear / cheap) / np.log(last / before))
+
+
+class LightScenario(BusyScenario):
+    """Waits without computing, so that more workers than cores tell what the engine costs and not the cores."""
+
+    name = "light"
+
+    def run(self, parameters: BusyParameters, streams: Streams) -> CaseResult:
+        time.sleep(parameters.busy_s)
+        return CaseResult("VALID", True, {"number": streams.case})
+
+
+def curves() -> list[Curve]:
+    """All that is measured."""
+    return [
+        Curve("frame over pixels", "pixels", "core-s", _frames_of_sizes((128, 256, 512, 1024))),
+        Curve("frame over triangles", "triangles of the mesh", "core-s", _frames_of_meshes((65, 129, 257, 513, 1025))),
+        Curve("case over terrain", "posts of the terrain", "core-s", _cases_over_terrains((512, 1024, 2048, 4096))),
+        Curve("campaign over cases", "empty cases", "wall s", _campaigns((1_000, 10_000, 100_000))),
+        Curve("campaign over workers", "light workers", "wall s", _crews((1, 2, 4, 8))),
+        Curve("campaign over Dask's workers", "light workers", "wall s", _clusters((1, 2, 4))),
+        Curve("report over cases", "cases", "core-s", _reports((100, 1_000, 10_000, 100_000, 1_000_000))),
+    ]
+
+
+def _frames_of_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
+    scene, surface = descent_scene()
+    camera, pose = camera_optics(CameraParameters()).camera, descent_pose(surface)
+    renderer = process_renderer(default_backend())
+    found = []
+    for side in sides:
+        corner = (camera.size[0] - side) // 2
+        rays = PixelRays.of(camera.cropped(corner, corner, (side, side)))
+        found.append((float(side**2), _least(lambda rays=rays: renderer.render(scene, rays, pose))))
+    return found
+
+
+def _frames_of_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
+    scene, surface = descent_scene()
+    rays, pose = camera_optics(CameraParameters()).rays, descent_pose(surface)
+    renderer = process_renderer(default_backend())
+    found = []
+    for count in lines:
+        # as far as the frame's own mesh reaches, with lines further apart where they are fewer
+        finest = scene.mesh_finest_m * (scene.mesh_lines - 1) / (count - 1)
+        of_count = replace(scene, mesh_lines=count, mesh_finest_m=finest)
+        cost = _least(lambda of_count=of_count: renderer.render(of_count, rays, pose))
+        found.append((2.0 * (count - 1) ** 2, cost))
+    return found
+
+
+def _cases_over_terrains(samples: Sequence[int]) -> list[tuple[float, float]]:
+    found = []
+    for count in samples:
+        campaign = load_campaign("dimes-smoke", [f"terrain.samples={count}", "retain.showcase=none"])
+        # one case again and again: cases differ by more than terrains do
+        parameters = campaign.with_values({**campaign.draws(0), "place.terrain": 0})
+        run = partial(campaign.scenario.run, parameters, campaign.streams(0))
+        found.append((float(count**2), _least(run)))
+    return found
+
+
+def _campaigns(cases: Sequence[int]) -> list[tuple[float, float]]:
+    return [(float(count), _campaign_s(count, 0.0, Crew(1))) for count in cases]
+
+
+def _crews(jobs: Sequence[int]) -> list[tuple[float, float]]:
+    return [(float(count), _campaign_s(400, LIGHT_S, Crew(count))) for count in jobs]
+
+
+def _clusters(workers: Sequence[int]) -> list[tuple[float, float]]:
+    return [(float(count), _campaign_s(400, LIGHT_S, Crew(cluster=f"local:{count}"))) for count in workers]
+
+
+def _campaign_s(cases: int, waiting_s: float, crew: Crew) -> float:
+    """Wall-clock time from the first case done to the last."""
+    scenario = "benchmarks.growth:LightScenario" if waiting_s else "benchmarks.engine:BusyScenario"
+    configuration = CampaignConfiguration(
+        name="growth",
+        scenario=scenario,
+        cases=cases,
+        parameters={"busy_s": waiting_s},
+        retain=Retain(showcase="none"),
+    )
+    watch = Stopwatch((1, cases))
+    with TemporaryDirectory() as folder:
+        of_kind = LightScenario() if waiting_s else BusyScenario()
+        run_campaign(Campaign(configuration, of_kind), Path(folder, "run"), crew, watch)
+    return watch.at[cases][0] - watch.at[1][0]
+
+
+def _reports(cases: Sequence[int]) -> list[tuple[float, float]]:
+    with TemporaryDirectory() as folder:
+        runs = [(count, made_up(Path(folder, f"of-{count}"), count)) for count in cases]
+        return [(float(count), marsyard("report", str(run)).core_s) for count, run in runs]
+
+
+def _least(run: Callable[[], object]) -> float:
+    """The least of three: growth is what is asked, and what else runs on the machine only adds."""
+    return min(core_seconds(run, 3))
+
+
+def drawn(found: Sequence[Curve]) -> Figure:
+    """A panel each, both axes logarithmic."""
+    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
+    panels = figure.subplots(2, 4).ravel()
+    for axes, curve in zip(panels, found, strict=False):
+        sizes, costs = zip(*curve.points, strict=True)
+        axes.loglog(sizes, costs, "o-", color="#33598f")
+        axes.set_title(f"{curve.name}\n(size$^{{{curve.power:.2f}}}$ at the end)", fontsize=8)
+        axes.set_xlabel(curve.size, fontsize=8)
+        axes.set_ylabel(curve.cost, fontsize=8)
+        axes.tick_params(labelsize=7, which="both")
+        axes.grid(visible=True, color="0.9")
+    for axes in panels[len(found) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def main() -> None:
+    """Measures, keeps and draws."""
+    cv2.setNumThreads(1)
+    mpl.rcParams["svg.hashsalt"] = "marsyard"
+    found = curves()
+    for curve in found:
+        points = ", ".join(f"{size:g}: {cost:.3g}" for size, cost in curve.points)
+        print(f"{curve.name:<32}{points} {curve.cost}; size^{curve.power:.2f} at the end")
+    KEPT.parent.mkdir(exist_ok=True)
+    KEPT.write_text(json.dumps([asdict(curve) for curve in found], indent=1) + "\n")
+    drawn(found).savefig(FIGURE, metadata={"Date": None})
+    print(f"kept in {KEPT}, drawn as {FIGURE}")
+
+
+if __name__ == "__main__":
+    main()
