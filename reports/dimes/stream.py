@@ -60,7 +60,8 @@ def draw_stream_case(products: Mapping[str, Any]) -> Figure:
     table = _table(products)
     lines = -(-len(table) // _MOST_IN_ROW)
     figure = Figure(figsize=(12.0, 3.4 + 1.6 * lines), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.6 * lines, 3.4))
+    parts = figure.add_gridspec(2, 1, height_ratios=(1.6 * lines, 3.4))
+    upper, lower = (figure.add_subfigure(part) for part in (parts[0], parts[1]))
     in_row = min(len(table), _MOST_IN_ROW)
     for place, axes in enumerate(upper.subplots(lines, in_row, squeeze=False).ravel()):
         axes.set_axis_off()

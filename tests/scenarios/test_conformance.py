@@ -31,7 +31,14 @@ def findings(spec: str, *only: str) -> dict[str, Finding]:
 
 
 @pytest.mark.parametrize(
-    "spec", [*VELOCITY.shipped, *TRACKING.shipped, *LANDING.shipped, "velocity_estimator:MedianShift"]
+    "spec",
+    [
+        *VELOCITY.shipped,
+        *TRACKING.shipped,
+        *LANDING.shipped,
+        "velocity_estimator:MedianShift",
+        "velocity_stream:ChainedShifts",
+    ],
 )
 def test_what_ships_conforms(spec: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
@@ -92,6 +99,73 @@ def test_bad_estimators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: 
     found = findings(bad(tmp_path, monkeypatch, estimator(lines)), check)[check]
     assert problem in found.problem
     assert found.next_step
+
+
+STREAM = """
+class Bad:
+    def start(self):
+        self.kept = []
+    def picture(self, frame):
+        self.kept.append(frame)
+        {picture}
+    def finish(self):
+        {finish}
+"""
+MOVING = "return VelocityEstimate(Outcome.VALID, np.ones(2)) if len(self.kept) > 1 else NOTHING"
+
+
+@pytest.mark.parametrize(
+    ("check", "picture", "finish", "problem"),
+    [
+        ("answer", "return 3.0", "return NOTHING", "BAD_ANSWER: the answer is a float"),
+        ("answer", "return None", "return None", "BAD_ANSWER: the answer is a NoneType"),
+        ("answer", "return VelocityEstimate(Outcome.VALID, np.ones(2))", "return NOTHING", "there is no last interval"),
+        (
+            "answer",
+            "return VelocityEstimate(Outcome.VALID, np.ones(2), span_s=(99.0, 101.0))",
+            "return NOTHING",
+            "within the pictures' tags, 100.0 to 100.0 s",
+        ),
+        ("answer", "return None", "return VelocityEstimate(Outcome.VALID, np.ones(2), span_s=(105.0, 101.0))", "first"),
+        ("saturated", "return None", MOVING, "it answers VALID to pictures that are saturated"),
+        ("inputs", "frame.image.counts[:] = 0", "return NOTHING", "are not what they were before"),
+        (
+            "inputs",
+            "frame.interval_velocity_m_s is None or frame.interval_velocity_m_s.fill(0)",
+            MOVING,
+            "are not what",
+        ),
+        ("few", "return None", "return NOTHING if len(self.kept) == 1 else 1 / 0", "ZeroDivisionError"),
+        (
+            "few",
+            "return None",
+            "t = self.kept[-1].image.time_s if self.kept else 0.0\n"
+            "        return VelocityEstimate(Outcome.VALID, np.ones(2), span_s=(t, t))",
+            "it answers VALID to no picture",
+        ),
+        ("number", "return None", "first, second, third = self.kept[:3]\n        return NOTHING", "not enough values"),
+        ("truth", "gc.get_objects()", "return NOTHING", "goes through all objects"),
+    ],
+)
+def test_bad_streams(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, picture: str, finish: str, problem: str
+) -> None:
+    body = STREAM.format(picture=picture, finish=finish)
+    assert problem in findings(bad(tmp_path, monkeypatch, body), check)[check].problem
+
+
+def test_a_stream_that_keeps_a_descent_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    body = """
+    class Bad:
+        seen = 0.0
+        def start(self): pass
+        def picture(self, frame): self.seen += frame.image.counts.mean()
+        def finish(self): return VelocityEstimate(Outcome.VALID, np.full(2, self.seen), span_s=(100.0, 100.0))
+    """
+    found = findings(bad(tmp_path, monkeypatch, body), "deterministic", "start", "time")
+    assert found["deterministic"].problem == "its answer depends on the case that it was asked before"
+    assert found["start"].problem == "started again after two pictures, it answers differently"
+    assert found["time"].passed
 
 
 def test_state_of_the_estimator_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,6 +235,8 @@ def test_a_plane_is_seen_where_it_lies() -> None:
 
 def test_inputs_are_what_instruments_deliver() -> None:
     descent, landing = inputs.descent(), inputs.landing()
+    many = inputs.descent(5)
+    assert (len(many.images), many.images[4].time_s, len(many.interval_velocities_m_s)) == (5, 107.5, 4)
     assert descent.images[0].counts.shape == (256, 1024)
     assert 200 < descent.images[0].counts.mean() < 4000
     # the laser's ray ends on the ground
