@@ -13,7 +13,7 @@ from scenarios.interface import CaseResult
 from sim.measurements import DescentFrame, DescentMeasurements
 from tests.scenarios.descent.settings import DESCENT, PERFECT, parameters, run
 
-STREAM = "tests.scenarios.descent.test_streams:Inertial"
+STREAM = "tests.scenarios.descent.test_many_pictures:Inertial"
 #: The three pictures of a descent as flown, among nine.
 NINE = {"pictures": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
 
@@ -59,12 +59,12 @@ def test_the_truth_is_of_what_the_answer_is_of(nine: CaseResult) -> None:
     """The inertial unit makes no errors here, so that its velocities are true of every span."""
     row = nine.row
     assert (nine.outcome, row["stream_pictures"], row["answered_after"]) == ("VALID", 9, 2)
-    assert np.isnan(row["velocity_error_after_1_m_s"])  # type: ignore[arg-type]
+    assert np.isnan(row["velocity_error_after_1_m_s"])
     after = [row[f"velocity_error_after_{number}_m_s"] for number in range(2, 10)]
     # 400 Hz samples of a swinging descent, added up by the trapezoidal rule
-    assert max(after) < 1e-3  # type: ignore[type-var]
-    assert row["velocity_error_m_s"] < 1e-3  # type: ignore[operator]
-    assert row["firing_velocity_error_m_s"] < 2e-2  # type: ignore[operator]
+    assert max(after) < 1e-3
+    assert row["velocity_error_m_s"] < 1e-3
+    assert row["firing_velocity_error_m_s"] < 2e-2
     # of an instant, not of the interval before it: the swinging camera changes its velocity
     means = nine.products["after_true_m_s"][-1]
     assert np.hypot(*(means - nine.products["velocity_true_m_s"])) > 0.05
@@ -81,7 +81,7 @@ def test_an_estimator_of_three_gets_those_of_a_descent_of_three(nine: CaseResult
         three["room_first_pair"],
         three["room_second_pair"],
     )
-    assert nine.row["dimes.velocity_error_m_s"] < 1.0  # type: ignore[operator]
+    assert nine.row["dimes.velocity_error_m_s"] < 1.0
     assert "dimes.stream_pictures" not in nine.row
 
 
@@ -93,7 +93,7 @@ def test_pictures_that_dimes_was_given_are_kept_for_its_figures() -> None:
 
 def test_a_span_between_pictures() -> None:
     """A quarter of the way: between the pictures' true times in proportion, by the descent's own motion."""
-    spec = "tests.scenarios.descent.test_streams:Halfway"
+    spec = "tests.scenarios.descent.test_many_pictures:Halfway"
     two, nine = (
         run(algorithm=spec, pictures=pictures, descent=DESCENT | {"interval_s": 4.0 / (pictures - 1)}, **PERFECT)
         for pictures in (2, 9)
