@@ -12,6 +12,7 @@ from sim.streams import Streams
 
 if TYPE_CHECKING:
     from scenarios.estimators import Task
+    from scenarios.parts.named import Kind
 
 #: A value that can stand in a column of the results.
 Scalar = float | int | str | bool
@@ -102,4 +103,14 @@ class TakesAlgorithms(Protocol):
     @property
     def algorithm_table(self) -> tuple[str, ...]:
         """The table in the parameters that holds the three; empty where they stand at its top."""
+        ...
+
+
+@runtime_checkable
+class TakesParts(Protocol):
+    """A scenario whose cases can be made of a user's own parts (`scenarios.parts`)."""
+
+    @property
+    def part_keys(self) -> Mapping[str, Kind]:
+        """The parameters that name parts, by their dotted paths, each a name or a list of names; their kinds."""
         ...

@@ -224,10 +224,16 @@ def key_text(key: Iterable[str | int]) -> str:
 
 
 def _written(model: type[BaseModel], location: Sequence[str | int]) -> Key:
-    """The key as written: without the name of the kind that pydantic adds behind a dispersion's path."""
+    """The key as written: without the names of the kind that pydantic adds where one of several models is chosen."""
     if model is CampaignConfiguration and len(location) > 2 and location[0] == "dispersions":
         return (*location[:2], *location[3:])
-    return tuple(location)
+    here: Any = model
+    written: list[str | int] = []
+    for part in location:
+        if not any(kind.__name__ == part for kind in _models(here)):
+            written.append(part)
+        here = _inner(here, part)
+    return tuple(written)
 
 
 def _message(detail: Mapping[str, Any], model: type[BaseModel]) -> str:
@@ -251,8 +257,7 @@ def fields_at(model: type[BaseModel], location: Sequence[str | int]) -> list[str
     here: Any = model
     for part in location:
         here = _inner(here, part)
-    models = [kind for kind in _alternatives(here) if isinstance(kind, type) and issubclass(kind, BaseModel)]
-    return sorted({name for kind in models for name in kind.model_fields})
+    return sorted({name for kind in _models(here) for name in kind.model_fields})
 
 
 def description_at(model: type[BaseModel], path: str) -> str:
@@ -274,13 +279,18 @@ def _inner(kind: Any, part: str | int) -> Any:
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             if part in choice.model_fields:
                 found.append(choice.model_fields[str(part)].annotation)
-            elif part in FRIENDLY and choice is FRIENDLY[str(part)]:
+            elif choice.__name__ == part or (part in FRIENDLY and choice is FRIENDLY[str(part)]):
                 found.append(choice)
         elif get_origin(choice) in (list, tuple, set, frozenset) and isinstance(part, int):
             found.append(get_args(choice)[0])
         elif get_origin(choice) in (dict, Mapping) and isinstance(part, str):
             found.append(get_args(choice)[1])
     return Union[tuple(found)] if found else None  # noqa: UP007
+
+
+def _models(kind: Any) -> list[type[BaseModel]]:
+    """The models among the members of a union."""
+    return [one for one in _alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)]
 
 
 def _alternatives(kind: Any) -> list[Any]:

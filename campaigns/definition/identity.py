@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from algorithms.exchange import command_of
+from campaigns.definition.campaign import value_at
 from campaigns.definition.configuration import CampaignConfiguration
 from scenarios.dotted import relative_to
 from scenarios.estimators import sources_of
-from scenarios.interface import TakesAlgorithms
+from scenarios.interface import TakesAlgorithms, TakesParts
 from scenarios.offline import answers_file
 from scenarios.registry import UnknownScenarioError, scenario
 
@@ -40,8 +41,8 @@ class Identity:
     configuration
         Hash of what the configuration states about cases.
     code
-        Hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of the user's own scenario and
-        algorithms.
+        Hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of the user's own scenario, algorithms
+        and parts.
     versions
         Of Python, Marsyard and the packages that it requires.
     """
@@ -69,7 +70,7 @@ class Identity:
 
 def identity_of(configuration: CampaignConfiguration) -> Identity:
     """The identity of a campaign if it were run now."""
-    code = code_hash((configuration.scenario, *chosen_algorithms(configuration)))
+    code = code_hash((configuration.scenario, *chosen_algorithms(configuration), *chosen_parts(configuration)))
     return Identity(configuration_hash(configuration), code, package_versions())
 
 
@@ -91,6 +92,38 @@ def chosen_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
     return tuple(str(spec) for spec in dict.fromkeys(stated) if spec)
 
 
+def chosen_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
+    """Where the user's own parts are that a configuration names, as ``module:name``, dispersed ones among them."""
+    try:
+        found = scenario(configuration.scenario)
+    except UnknownScenarioError:
+        return ()
+    if not isinstance(found, TakesParts):
+        return ()
+    trees = [configuration.parameters]
+    for path, dispersion in configuration.dispersions.items():
+        values = dispersion.extremes() if any(f"{key}.".startswith(f"{path}.") for key in found.part_keys) else ()
+        trees += [_nested(path, value) for value in values]
+    paths = [kind.path(spec) for tree in trees for key, kind in found.part_keys.items() for spec in _named(tree, key)]
+    return tuple(dict.fromkeys(paths))
+
+
+def _nested(path: str, value: Any) -> dict[str, Any]:
+    """A tree that holds one value."""
+    for part in reversed(path.split(".")):
+        value = {part: value}
+    return dict(value)
+
+
+def _named(tree: Any, path: str) -> list[str]:
+    """The name, or the names, at a path of a tree; none where it has none."""
+    try:
+        found = value_at(tree, path)
+    except ValueError:
+        return []
+    return [found] if isinstance(found, str) else [str(one) for one in found or ()]
+
+
 def configuration_hash(configuration: CampaignConfiguration) -> str:
     """A hash of what a configuration states about cases."""
     stated = configuration.model_dump(mode="json")
@@ -100,7 +133,7 @@ def configuration_hash(configuration: CampaignConfiguration) -> str:
 
 @cache
 def code_hash(named: tuple[str, ...]) -> str:
-    """A hash of the sources that rows depend on, each file's name and contents; `named` are scenario and algorithms."""
+    """A hash of the sources that rows depend on, names and contents; `named` are scenario, algorithms and parts."""
     digest = hashlib.sha256()
     foreign = [source for one in named for source in _foreign_sources(one)]
     for name, path in (*_own_sources(), *foreign):

@@ -1,4 +1,4 @@
-"""The true motion of a descent: flown by the dynamics, or recorded."""
+"""The true motion of a descent: flown by the dynamics, by a user's own, or recorded."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from jaxtyping import Float64
 
 from scenarios.descent.faults import faulty_times
 from scenarios.descent.parameters import DescentScenarioParameters
-from scenarios.descent.recorded import FlightFile
+from scenarios.descent.recorded import AFTER_S, FlightFile, check_looks_down
 from scenarios.interface import Scalar
+from scenarios.parts.motions import DescentPlace, OwnMotion
 from sim.dynamics import State, SwingDescent, Trajectory
 from sim.dynamics.recorded_files import TrajectoryFileError
 from sim.streams import Streams
@@ -23,7 +24,7 @@ MARS_GRAVITY_M_S2 = 3.72
 LEAD_S = 5.0
 #: How long before the first picture and after the last instant of interest the inertial unit is read, s.
 MARGIN_S = 0.1
-#: Instants at which a recorded flight is searched for the height of the thrusters' firing.
+#: Instants at which a flight by poses is searched for the height of the thrusters' firing.
 _SEARCHED = 2000
 
 
@@ -38,7 +39,7 @@ class Flown:
     lead_s
         How long before the first picture it is known.
     firing_s
-        When the thrusters fire: at `thruster_firing_m` above the ground; where a recorded flight ends before, at its
+        When the thrusters fire: at `thruster_firing_m` above the ground; where a flight by poses ends before, at its
         end.
     row
         What it was flown by, as columns of the results.
@@ -60,11 +61,13 @@ def flown_descent(p: DescentScenarioParameters, surface: Surface, streams: Strea
 
     Raises
     ------
-    TrajectoryFileError
-        If a recorded flight is below the ground at a picture.
+    ValueError
+        If a recorded flight or an own motion is below the ground at a picture, or an own motion gives no flight.
     """
     ground = float(surface.height(p.place.east_m, p.place.north_m))
     below = np.array([p.place.east_m, p.place.north_m, ground])
+    if isinstance(p.flight, OwnMotion):
+        return _own(p, p.flight, below, surface, streams)
     if p.flight is not None:
         return _recorded(p, p.flight, below, surface)
     descent = SwingDescent.flown(
@@ -83,13 +86,35 @@ def _recorded(
     p: DescentScenarioParameters, flight: FlightFile, below: Float64[np.ndarray, "3"], surface: Surface
 ) -> Flown:
     motion = flight.motion(below, gravity_m_s2(p))
-    check_clearance(flight, motion, faulty_times(p.faults, p.picture_times_s), surface)
+    check_clearance(flight.file, motion, faulty_times(p.faults, p.picture_times_s), surface)
     row: dict[str, Scalar] = {"flight_file": flight.file, "flight_first_picture_s": flight.start_s}
     return Flown(motion, flight.lead_s, _firing_s(p, motion, surface), row)
 
 
+def _own(
+    p: DescentScenarioParameters,
+    flight: OwnMotion,
+    below: Float64[np.ndarray, "3"],
+    surface: Surface,
+    streams: Streams,
+) -> Flown:
+    times = faulty_times(p.faults, p.picture_times_s)
+    place = DescentPlace(
+        ground_height=lambda east, north: float(surface.height(below[0] + east, below[1] + north) - below[2]),
+        gravity_m_s2=gravity_m_s2(p),
+        pictures_s=tuple(times),
+        from_s=-flight.lead_s,
+        until_s=max(times) + AFTER_S,
+        firing_height_m=p.descent.thruster_firing_m,
+    )
+    motion, row = flight.flown(place, below, streams.generator("own motion"))
+    check_looks_down(flight.motion, motion, times)
+    check_clearance(flight.motion, motion, times, surface)
+    return Flown(motion, flight.lead_s, _firing_s(p, motion, surface), row)
+
+
 def _firing_s(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
-    """When a recorded flight first comes down to the thrusters' firing, over the ground below its first picture."""
+    """When a flight by poses first comes down to the thrusters' firing, over the ground below its first picture."""
     times = np.linspace(max(p.picture_times_s), motion.span_s[1] - MARGIN_S, _SEARCHED)
     first = motion.state(0.0).position_m
     heights = motion.motion(times).positions_m[:, 2] - float(surface.height(first[0], first[1]))
@@ -100,14 +125,14 @@ def _firing_s(p: DescentScenarioParameters, motion: Trajectory, surface: Surface
     return float(np.interp(-p.descent.thruster_firing_m, -heights[around], times[around]))
 
 
-def check_clearance(flight: FlightFile, motion: Trajectory, times_s: Sequence[float], surface: Surface) -> None:
-    """Raises TrajectoryFileError where a recorded flight is below the ground at a picture."""
+def check_clearance(name: str, motion: Trajectory, times_s: Sequence[float], surface: Surface) -> None:
+    """Raises TrajectoryFileError where a flight of this name is below the ground at a picture."""
     positions = motion.motion(np.array(times_s)).positions_m
     heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
     buried = np.flatnonzero(heights <= 0.0)
     if buried.size:
         raise TrajectoryFileError(
-            f"{flight.file}: at picture {buried[0] + 1} the camera is {-heights[buried[0]]:.1f} m below the ground; "
+            f"{name}: at picture {buried[0] + 1} the camera is {-heights[buried[0]]:.1f} m below the ground; "
             "allowed: above it"
         )
 

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, UInt16
+from scipy.spatial.transform import Rotation
 
 from scenarios.descent.faults import faulty_altitudes, faulty_attitudes
 from scenarios.descent.flight import MARGIN_S, Flown, gravity_m_s2
 from scenarios.descent.optics import calibrated_camera
 from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.descent.world import World
+from scenarios.interface import Scalar
+from scenarios.parts.instruments import (
+    InstrumentReadings,
+    InstrumentTruth,
+    OwnAltimeter,
+    OwnAttitudeSource,
+    attitudes_of,
+)
 from sim.dynamics import Trajectory
 from sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
-from sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter
+from sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter, Readings
+from sim.sensor.radar import first_return
 from sim.streams import Streams
 
 
@@ -32,16 +42,22 @@ class Instruments:
     navigation
         Attitude and velocity as propagated on board, from shortly before the first picture to the thrusters' firing.
     altimeter
-        The radar.
+        The radar; or what a user's own read.
     clock
         Of the pictures' time tags.
+    attitude_source
+        What a user's own instrument read at the pictures' time tags; None where attitudes are navigation's.
+    row
+        What the user's own were, as columns of the results.
     """
 
     approach: Approach
     imu: Imu
     navigation: InertialSolution
-    altimeter: RadarAltimeter
+    altimeter: RadarAltimeter | InstrumentReadings
     clock: Clock
+    attitude_source: InstrumentReadings | None
+    row: Mapping[str, Scalar]
 
     @classmethod
     def drawn(cls, p: DescentScenarioParameters, world: World, flown: Flown, streams: Streams) -> Instruments:
@@ -50,13 +66,49 @@ class Instruments:
         approach = Approach(p.approach, start)
         unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
         imu = approach.calibrated(unit, streams.generator("inertial unit's calibration"))
+        clock = Clock.drawn(p.clock, streams.generator("image clock"))
+        own = _own_readings(p, world, flown.motion, _tags(p, clock, streams), streams)
         return cls(
             approach=approach,
             imu=imu,
             navigation=_navigated(p, approach, imu, flown, streams),
-            altimeter=RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
-            clock=Clock.drawn(p.clock, streams.generator("image clock")),
+            altimeter=own["altimeter"][0]
+            if isinstance(p.altimeter, OwnAltimeter)
+            else RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
+            clock=clock,
+            attitude_source=own["attitude_source"][0] if "attitude_source" in own else None,
+            row={name: value for _, row in own.values() for name, value in row.items()},
         )
+
+
+def _tags(p: DescentScenarioParameters, clock: Clock, streams: Streams) -> Float64[np.ndarray, "n"]:
+    """The pictures' time tags."""
+    return clock.tags(np.array(p.picture_times_s), streams.generator("image time tags"))
+
+
+def _own_readings(
+    p: DescentScenarioParameters,
+    world: World,
+    motion: Trajectory,
+    tags_s: Float64[np.ndarray, "n"],
+    streams: Streams,
+) -> dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]]:
+    """What a user's own instruments read, with their columns, by the table that names them."""
+    surface = world.surface
+    read: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
+    asked = {"altimeter": np.array(p.picture_times_s), "attitude_source": tags_s}
+    for table, times in asked.items():
+        own = getattr(p, table)
+        if isinstance(own, OwnAltimeter | OwnAttitudeSource):
+            truth = InstrumentTruth(
+                times_s=times,
+                motion=motion,
+                ground_height=lambda x, y: float(surface.height(x, y)),
+                nearest_ground=lambda apex, axis, half, far: first_return(surface, apex, axis, half, far),
+            )
+            readings = own.read(truth, streams.generator(f"own {table}"))
+            read[table] = readings, own.columns(table, readings.columns)
+    return read
 
 
 def _navigated(
@@ -82,7 +134,7 @@ def measure(
 ) -> DescentMeasurements:
     """Pictures and readings: attitudes at the pictures' tags, altitudes of the radar's last readings before them."""
     times = np.array(p.picture_times_s)
-    tags = instruments.clock.tags(times, streams.generator("image time tags"))
+    tags = _tags(p, instruments.clock, streams)
     model = calibrated_camera(p.camera, streams.generator("camera calibration"))
     camera = model.binned(columns=1, rows=p.detector.rows_summed)
     images = [
@@ -91,7 +143,7 @@ def measure(
     ]
     attitudes = [
         AttitudeMeasurement(attitude, float(tag))
-        for attitude, tag in zip(instruments.navigation.attitude(tags), tags, strict=True)
+        for attitude, tag in zip(_attitudes(instruments, tags), tags, strict=True)
     ]
     attitudes = faulty_attitudes(p.faults, attitudes, streams.generator("attitude fault"))
     altitudes = faulty_altitudes(p.faults, _altitudes(motion, times, instruments.altimeter, streams))
@@ -105,12 +157,25 @@ def measure(
     )
 
 
+def _attitudes(instruments: Instruments, tags_s: Float64[np.ndarray, "n"]) -> Rotation:
+    """Attitudes at the pictures' time tags: navigation's, or a user's own."""
+    own = instruments.attitude_source
+    return instruments.navigation.attitude(tags_s) if own is None else attitudes_of(own)
+
+
 def _altitudes(
-    motion: Trajectory, times_s: Float64[np.ndarray, "n"], altimeter: RadarAltimeter, streams: Streams
+    motion: Trajectory,
+    times_s: Float64[np.ndarray, "n"],
+    altimeter: RadarAltimeter | InstrumentReadings,
+    streams: Streams,
 ) -> list[AltitudeMeasurement]:
-    """The radar's last readings before the pictures, with their own tags."""
-    at = altimeter.sampling.latest(times_s)
-    readings = altimeter.measure(motion, at, streams.generator("altimeter noise"))
+    """The radar's last readings before the pictures, or those of a user's own altimeter, with their own tags."""
+    readings: Readings | InstrumentReadings
+    if isinstance(altimeter, RadarAltimeter):
+        at = altimeter.sampling.latest(times_s)
+        readings = altimeter.measure(motion, at, streams.generator("altimeter noise"))
+    else:
+        readings = altimeter
     return [
         AltitudeMeasurement(float(value), float(tag))
         for value, tag in zip(readings.values, readings.times_s, strict=True)

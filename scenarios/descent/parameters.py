@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, Tag, field_validator, model_validator
 
 from algorithms.dimes import DimesOptions
 from scenarios.chosen import ChosenAlgorithms
@@ -13,6 +13,10 @@ from scenarios.descent.faults import Faults, faulty_times
 from scenarios.descent.recorded import FlightFile
 from scenarios.estimators import VELOCITY
 from scenarios.meshes import MeshParameters
+from scenarios.parts.instruments import OwnAltimeter, OwnAttitudeSource
+from scenarios.parts.motions import OwnMotion
+from scenarios.parts.named import usual_or
+from scenarios.parts.scores import OwnScores, ScoredDescent
 from scenarios.terrain_files import check_terrain
 from sim.dynamics import SwingParameters
 from sim.render.backend import Backend, default_backend
@@ -142,7 +146,16 @@ class RenderParameters(BaseModel):
     )
 
 
-class DescentScenarioParameters(ChosenAlgorithms):
+Flight = Annotated[
+    Annotated[FlightFile, Tag("FlightFile")] | Annotated[OwnMotion, Tag("OwnMotion")], usual_or(FlightFile, OwnMotion)
+]
+Altimeter = Annotated[
+    Annotated[RadarParameters, Tag("RadarParameters")] | Annotated[OwnAltimeter, Tag("OwnAltimeter")],
+    usual_or(RadarParameters, OwnAltimeter),
+]
+
+
+class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
     """Everything that a descent campaign may set or disperse.
 
     With a `site`, the keys that the table `terrain` sets are changes of the site's own terrain, and light, gravity,
@@ -153,6 +166,7 @@ class DescentScenarioParameters(ChosenAlgorithms):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     task = VELOCITY
+    scored = ScoredDescent
 
     site: Annotated[str | None, Field(description="preset of terrain, light and gravity; none: a plain terrain")] = None
     terrain_site: Annotated[
@@ -173,9 +187,9 @@ class DescentScenarioParameters(ChosenAlgorithms):
             "apart as they can be evenly, the last among them"
         ),
     ] = None
-    flight: Annotated[FlightFile | None, Field(description="a recorded flight, in place of the descent's dynamics")] = (
-        None
-    )
+    flight: Annotated[
+        Flight | None, Field(description="a recorded flight or an own motion, in place of the descent's dynamics")
+    ] = None
     lander: LanderParameters = LanderParameters()
     camera: CameraParameters = CameraParameters()
     faults: Faults = Faults()
@@ -186,7 +200,10 @@ class DescentScenarioParameters(ChosenAlgorithms):
     detector: DetectorChoice = DetectorParameters()
     imu: ImuParameters = ImuParameters()
     approach: ApproachParameters = ApproachParameters()
-    altimeter: RadarParameters = RadarParameters()
+    altimeter: Altimeter = RadarParameters()
+    attitude_source: Annotated[
+        OwnAttitudeSource | None, Field(description="an own instrument in place of navigation's attitudes at pictures")
+    ] = None
     clock: Annotated[ClockParameters, Field(description="of the pictures' time tags")] = ClockParameters(
         offset_sd_s=0.001, jitter_sd_s=0.0005
     )
@@ -253,7 +270,7 @@ class DescentScenarioParameters(ChosenAlgorithms):
 
     @model_validator(mode="after")
     def _flight_is_over_the_ground(self) -> DescentScenarioParameters:
-        if self.flight is not None:
+        if isinstance(self.flight, FlightFile):
             self.flight.check(faulty_times(self.faults, self.picture_times_s))
         return self
 

@@ -69,15 +69,8 @@ class FlightFile(OwnFile, RecordedAxes):
                 f"{self.start_s + max(pictures_s):.3f} s, lead_s {self.lead_s:g} s before and {AFTER_S:g} s after them "
                 "are needed"
             )
-        at = motion.motion(np.array(pictures_s))
-        for number, (position, attitude) in enumerate(zip(at.positions_m, at.attitudes, strict=True), start=1):
-            axis = attitude.apply(np.array([0.0, 0.0, -1.0]))
-            if axis[2] >= 0.0:
-                elevation = np.degrees(np.arcsin(np.clip(axis[2], -1.0, 1.0)))
-                raise TrajectoryFileError(
-                    f"{self.file}: at picture {number} the camera looks up, {elevation:.1f} deg above the horizon; "
-                    "allowed: down (flight.axes, attitude_of and mounting say whose axes the file means)"
-                )
+        check_looks_down(self.file, motion, pictures_s)
+        for number, position in enumerate(motion.motion(np.array(pictures_s)).positions_m, start=1):
             if self.origin == "place" and position[2] <= 0.0:
                 raise TrajectoryFileError(
                     f"{self.file}: at picture {number} the camera is {-position[2]:.1f} m below the ground at the "
@@ -102,3 +95,15 @@ class FlightFile(OwnFile, RecordedAxes):
         if self.origin == "place":
             positions = positions + ground_m
         return RecordedMotion(poses.times_s - self.start_s, positions, self.bodies(recorded), gravity_m_s2)
+
+
+def check_looks_down(name: str, motion: RecordedMotion, pictures_s: Sequence[float]) -> None:
+    """Raises TrajectoryFileError where the camera of a flight of this name looks up at a picture."""
+    for number, attitude in enumerate(motion.motion(np.array(pictures_s)).attitudes, start=1):
+        axis = attitude.apply(np.array([0.0, 0.0, -1.0]))
+        if axis[2] >= 0.0:
+            elevation = np.degrees(np.arcsin(np.clip(axis[2], -1.0, 1.0)))
+            raise TrajectoryFileError(
+                f"{name}: at picture {number} the camera looks up, {elevation:.1f} deg above the horizon; "
+                "allowed: down (flight.axes, attitude_of and mounting say whose axes are meant)"
+            )

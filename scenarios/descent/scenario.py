@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 
 from pydantic import BaseModel
@@ -28,6 +28,8 @@ from scenarios.descent.score import (
 from scenarios.descent.world import World
 from scenarios.estimators import VELOCITY
 from scenarios.interface import CaseResult
+from scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
+from scenarios.parts.scores import ScoredDescent, scored
 from scenarios.provenance import rendered
 from scenarios.samples import Sample
 from scenarios.trial import Judged, case_result
@@ -53,6 +55,12 @@ class DescentScenario:
     parameters_type = DescentScenarioParameters
     task = VELOCITY
     algorithm_table = ()
+    part_keys: Mapping[str, Kind] = {
+        "flight.motion": DYNAMICS,
+        "altimeter.instrument": INSTRUMENT,
+        "attitude_source.instrument": INSTRUMENT,
+        "scores": SCORE,
+    }
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains."""
@@ -113,17 +121,28 @@ class DescentScenario:
                 at_firing.time_s - states[-1].time_s,
                 streams.generator("landing"),
             )
+            row = {
+                **velocity_row("velocity", velocity, true),
+                **consistency_row(estimate, true),
+                **velocity_row("firing_velocity", carried, at_firing.velocity_m_s[:2]),
+                **landing_row(landed),
+                **stream_row(estimate, truth),
+                **attempt.row,
+            }
+            if estimate is not None:
+                case = ScoredDescent(
+                    states=tuple(states),
+                    motion=flown.motion,
+                    at_firing=at_firing,
+                    touchdown_m_s=landed.with_answer,
+                    measurements=measurements,
+                    answer=estimate,
+                )
+                row |= scored(p.scores, case, {*row, *conditions_row})
             return Judged(
                 outcome=attempt.outcome(lambda answer: answer.outcome.name),
                 answered=velocity is not None,
-                row={
-                    **velocity_row("velocity", velocity, true),
-                    **consistency_row(estimate, true),
-                    **velocity_row("firing_velocity", carried, at_firing.velocity_m_s[:2]),
-                    **landing_row(landed),
-                    **stream_row(estimate, truth),
-                    **attempt.row,
-                },
+                row=row,
                 products={
                     **velocity_products(shown(pictures, estimate, triple), estimate, true),
                     **stream_products(estimate, truth),

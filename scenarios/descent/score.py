@@ -75,6 +75,7 @@ def instrument_conditions(instruments: Instruments) -> dict[str, Scalar]:
     return {
         "approach_heading_deg": float(np.degrees(np.arctan2(flight[0], flight[1])) % 360.0),
         "imu_warm_up_change_k": float(change_k),
+        **instruments.row,
     }
 
 

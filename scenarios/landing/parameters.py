@@ -17,6 +17,7 @@ from scenarios.landing.helicopter import HelicopterParameters
 from scenarios.landing.pair_choice import PairParameters
 from scenarios.landing.relief import Limits
 from scenarios.meshes import MeshParameters
+from scenarios.parts.scores import OwnScores, ScoredLanding
 from scenarios.terrain_files import check_terrain
 from sim.camera import CameraModel
 from sim.sensor import (
@@ -96,13 +97,14 @@ class LanderParameters(_Parameters):
         return Limits(self.diameter_m, float(np.radians(self.max_slope_deg)), self.max_roughness_m)
 
 
-class LandingScenarioParameters(ChosenAlgorithms):
+class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
     """Everything that a campaign of landings may set or disperse.
 
     The keys that the table `terrain` sets are changes of the site's own terrain at the stated scale.
     """
 
     task = LANDING
+    scored = ScoredLanding
 
     site: Annotated[str, Field(description="preset of terrain, light, texture and rocks")] = "heli-hazardous"
     scale: Annotated[Literal["ground", "descent"], Field(description="which of the site's terrains")] = "ground"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from pydantic import BaseModel
 
@@ -19,6 +19,8 @@ from scenarios.landing.samples import landing_samples
 from scenarios.landing.score import conditions, map_row, motion_row, products, site_row, times_row
 from scenarios.landing.truth import GroundTruth
 from scenarios.landing.world import KEPT_GROUNDS, World, camera_optics
+from scenarios.parts.named import SCORE, Kind
+from scenarios.parts.scores import ScoredLanding, scored
 from scenarios.provenance import rendered
 from scenarios.samples import Sample
 from scenarios.trial import Judged, attempted, case_result
@@ -33,6 +35,7 @@ class LandingScenario:
     parameters_type = LandingScenarioParameters
     task = LANDING
     algorithm_table = ()
+    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains; none of a bank so large that hardly two flights have the same one.
@@ -59,6 +62,7 @@ class LandingScenario:
         pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
         measurements = measure(p, flight, pair, streams)
         truth = GroundTruth.of(world, flight, pair, p.lander.limits)
+        known = {**conditions(p, world, flight, pair, measurements, truth), **rendered(p.render.backend, pair.counts)}
         # what is left to land on where an algorithm fails to answer
         nothing = SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
 
@@ -67,22 +71,25 @@ class LandingScenario:
                 lambda: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(measurements), checked_site
             )
             estimate = nothing if attempt.answer is None else attempt.answer
+            row = {
+                **site_row(estimate, flight, truth),
+                **landing_row(p, estimate, flight, truth, streams),
+                **motion_row(estimate.details, flight, pair),
+                **map_row(p, estimate, flight, truth),
+                **times_row(estimate.details),
+                **attempt.row,
+            }
+            if attempt.answer is not None:
+                case = ScoredLanding(flight.states, truth, measurements, attempt.answer)
+                row |= scored(p.scores, case, {*row, *known})
             return Judged(
                 outcome=attempt.outcome(lambda answer: answer.outcome.name),
                 answered=attempt.answer is not None and estimate.outcome.converged,
-                row={
-                    **site_row(estimate, flight, truth),
-                    **landing_row(p, estimate, flight, truth, streams),
-                    **motion_row(estimate.details, flight, pair),
-                    **map_row(p, estimate, flight, truth),
-                    **times_row(estimate.details),
-                    **attempt.row,
-                },
+                row=row,
                 products=products(p, estimate, flight, pair, truth),
                 failure=attempt.failure,
             )
 
-        known = {**conditions(p, world, flight, pair, measurements, truth), **rendered(p.render.backend, pair.counts)}
         return case_result(p.algorithms, judge, known)
 
 

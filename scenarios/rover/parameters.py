@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from algorithms.vtt import VttOptions
 from scenarios.chosen import ChosenAlgorithms
 from scenarios.estimators import TRACKING
+from scenarios.parts.scores import OwnScores, ScoredRun
 from sim.dynamics import SlipParameters
 from sim.render import CloudParameters
 from sim.render.backend import Backend, default_backend
@@ -234,10 +235,11 @@ class ScoreParameters(_Parameters):
     ] = 0
 
 
-class RoverScenarioParameters(ChosenAlgorithms):
+class RoverScenarioParameters(ChosenAlgorithms, OwnScores):
     """Everything that a campaign of the rover scenario may set or disperse."""
 
     task = TRACKING
+    scored = ScoredRun
 
     world: WorldParameters = WorldParameters()
     target: TargetParameters = TargetParameters()

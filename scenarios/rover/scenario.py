@@ -10,9 +10,11 @@ from pydantic import BaseModel
 
 from scenarios.estimators import TRACKING
 from scenarios.interface import CaseResult, Scalar
+from scenarios.parts.named import SCORE, Kind
+from scenarios.parts.scores import scored
 from scenarios.rover.parameters import RoverScenarioParameters
 from scenarios.rover.run import Run, run_case
-from scenarios.rover.score import conditions, products, provenance, score, stored_updates, tracking
+from scenarios.rover.score import conditions, products, provenance, score, scored_run, stored_updates, tracking
 from scenarios.rover.stops import RunOutcome
 from scenarios.rover.world import terrain_parameters
 from scenarios.trial import Judged, attempted, case_result
@@ -27,6 +29,7 @@ class RoverScenario:
     parameters_type = RoverScenarioParameters
     task = TRACKING
     algorithm_table = ()
+    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains."""
@@ -47,10 +50,11 @@ class RoverScenario:
             if attempt.answer is None:
                 return Judged(attempt.outcome(lambda made: made[0].outcome.name), False, {}, failure=attempt.failure)
             run, row = attempt.answer
-            if algorithm != p.algorithm:
-                return _judged(run, row)
-            row |= {**stored_updates(run, p.score.stored_updates), **conditions(p, run), **provenance(p, run)}
-            return _judged(run, row, products(p, run))
+            judged = algorithm == p.algorithm
+            if judged:
+                row |= {**stored_updates(run, p.score.stored_updates), **conditions(p, run), **provenance(p, run)}
+            row |= scored(p.scores, scored_run(run), row)
+            return _judged(run, row, products(p, run) if judged else None)
 
         return case_result(p.algorithms, judge, {})
 

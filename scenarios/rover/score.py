@@ -11,11 +11,13 @@ from jaxtyping import Float64
 from algorithms.vtt.accuracy import stereo_range_error_m
 from algorithms.vtt.stereo import disparity_px_m
 from scenarios.interface import Scalar
+from scenarios.parts.scores import ScoredRun
 from scenarios.provenance import rendered_as
 from scenarios.rover.parameters import RoverScenarioParameters
 from scenarios.rover.run import Run
 from scenarios.rover.stops import RunOutcome, Stop
 from scenarios.rover.target import sightings
+from sim.measurements import RoverMeasurements
 
 _FULL_TURN_DEG = 360.0
 
@@ -299,3 +301,19 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
         "rocks_m": run.world.placed_m,
     }
     return kept
+
+
+def scored_run(run: Run) -> ScoredRun:
+    """The run as a user's own scores are handed it."""
+    known = run.rig.calibrated
+    return ScoredRun(
+        outcome=run.outcome.name,
+        target_world=run.target.point_world.copy(),
+        world_from_rover=tuple(stop.stance.world_from_rover for stop in run.stops),
+        point_px=np.array([stop.point_px for stop in run.stops]).reshape(-1, 2),
+        measurements=tuple(
+            RoverMeasurements(stop.pictures.left, stop.pictures.right, known, *stop.angles_rad, stop.estimated)
+            for stop in run.stops
+        ),
+        answers=tuple(stop.update for stop in run.stops),
+    )

@@ -11,6 +11,7 @@ A drive is a function of the parameters, the campaign's seed and the run's numbe
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Annotated, cast
@@ -26,12 +27,14 @@ from algorithms.vtt import VttOptions
 from algorithms.vtt.pointing import box_around, mast_angles
 from scenarios.estimators import TRACKING
 from scenarios.interface import CaseResult, Scalar
+from scenarios.parts.named import SCORE, Kind
+from scenarios.parts.scores import scored
 from scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from scenarios.rover.pictures import Detectors, Photographer, StereoPictures, sunlight_of_preset
 from scenarios.rover.rig import Rig
 from scenarios.rover.route import Belief, commands, finished
 from scenarios.rover.run import Run
-from scenarios.rover.score import conditions, products, provenance, score, stored_updates, tracking
+from scenarios.rover.score import conditions, products, provenance, score, scored_run, stored_updates, tracking
 from scenarios.rover.stops import RunOutcome, Stop
 from scenarios.rover.target import Sightings, point_on, rock_of, sightings, told_by_pixel
 from scenarios.rover.vehicle import Vehicle
@@ -325,6 +328,7 @@ class SharedDriveScenario:
     parameters_type = SharedDriveParameters
     task = TRACKING
     algorithm_table = ("drive",)
+    part_keys: Mapping[str, Kind] = {"drive.scores": SCORE}
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains that runs use."""
@@ -343,6 +347,10 @@ class SharedDriveScenario:
         drive = shared_drive(*shared)
         case = of_run.model_copy(update={"algorithm": p.drive.algorithm, "vtt": p.drive.vtt, "score": p.drive.score})
 
+        seen = seen_along(*shared, p.targets[p.target], p.drive.vtt)
+        on_face = seen.in_view and (p.face_deg is None or seen.obliquity_max_deg <= p.face_deg)
+        known = {**_known(p), **asdict(seen), "on_face": on_face}
+
         def judge(algorithm: str) -> Judged:
             attempt = attempted(lambda: tracked(p, drive, algorithm), lambda made: cast(Run, made))
             run = attempt.answer
@@ -350,19 +358,18 @@ class SharedDriveScenario:
                 outcome = attempt.outcome(lambda made: made.outcome.name)
                 return Judged(outcome, False, attempt.row, failure=attempt.failure)
             row = {**score(case, run), **tracking(run)}
+            judged = algorithm == p.drive.algorithm
+            if judged:
+                row |= {
+                    **conditions(case, run),
+                    **stored_updates(run, p.drive.score.stored_updates),
+                    **provenance(case, run),
+                }
+            row |= scored(p.drive.scores, scored_run(run), {*row, *known})
             completed = run.outcome is RunOutcome.COMPLETED
-            if algorithm != p.drive.algorithm:
-                return Judged(run.outcome.name, completed, row)
-            row |= {
-                **conditions(case, run),
-                **stored_updates(run, p.drive.score.stored_updates),
-                **provenance(case, run),
-            }
-            return Judged(run.outcome.name, completed, row, products(case, run))
+            return Judged(run.outcome.name, completed, row, products(case, run) if judged else {})
 
-        seen = seen_along(*shared, p.targets[p.target], p.drive.vtt)
-        on_face = seen.in_view and (p.face_deg is None or seen.obliquity_max_deg <= p.face_deg)
-        return case_result(p.drive.algorithms, judge, {**_known(p), **asdict(seen), "on_face": on_face})
+        return case_result(p.drive.algorithms, judge, known)
 
 
 def _known(p: SharedDriveParameters) -> dict[str, Scalar]:

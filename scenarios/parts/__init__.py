@@ -1,0 +1,19 @@
+"""Parts of a case that a user brings: the motion of a descent, an instrument, a score.
+
+Read `named` first: how a part is named, found and made from its options. `motions`, `instruments` and `scores` hold
+what each kind is handed and what it gives.
+"""
+
+from scenarios.parts.instruments import InstrumentReadings, InstrumentTruth
+from scenarios.parts.motions import DescentPlace, Poses
+from scenarios.parts.scores import ScoredDescent, ScoredLanding, ScoredRun
+
+__all__ = [
+    "DescentPlace",
+    "InstrumentReadings",
+    "InstrumentTruth",
+    "Poses",
+    "ScoredDescent",
+    "ScoredLanding",
+    "ScoredRun",
+]
