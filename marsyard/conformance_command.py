@@ -1,4 +1,4 @@
-"""`marsyard conformance`: an algorithm put to its protocol's suite."""
+"""`marsyard conformance`: an algorithm, or a motion, instrument or score of one's own, put to its protocol's suite."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ def conformance(
         typer.Option(
             "--task",
             metavar="TASK",
-            help="velocity, tracking or landing; by default what its methods tell, and velocity of a program.",
+            help="velocity, tracking, landing; dynamics, instrument, score. By default what its members tell, and "
+            "velocity of a program.",
         ),
     ] = None,
     time_limit: Annotated[
@@ -32,13 +33,16 @@ def conformance(
     ] = 60.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Put an algorithm to its protocol's suite: right types, no change of inputs, an outcome for any picture, ..."""
+    """Put an algorithm, or your own motion, instrument or score, to its suite: right types, no change of inputs, ..."""
     from campaigns.running.conformance import examine, subject_of
+    from scenarios.parts.named import KINDS
 
     subject = subject_of(algorithm, task, time_limit)
     findings = []
     if not as_json:
-        typer.echo(f"{algorithm} as an algorithm for {subject.task}")
+        typer.echo(
+            f"{algorithm} as {'a part of the kind' if subject.task in KINDS else 'an algorithm for'} {subject.task}"
+        )
     for finding in examine(subject):
         findings.append(finding)
         if not as_json:

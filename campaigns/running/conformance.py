@@ -1,4 +1,4 @@
-"""Puts an algorithm to its protocol's suite, each check in a worker process: what ends the worker ends one check."""
+"""Puts an algorithm or a part to its suite, each check in a worker process: what ends the worker ends one check."""
 
 from __future__ import annotations
 
@@ -10,26 +10,25 @@ from campaigns.execution.work import Work, WorkLimits
 from campaigns.execution.worker_process import LOADING_S, Done, settle, start_clock
 from campaigns.execution.workers import LocalWorkers
 from campaigns.outcomes import CaseEndedError
-from scenarios.conformance import Finding, Subject, check_names, run_check, task_of
-from scenarios.estimators import TASKS
+from scenarios.conformance import EXAMINED, Finding, Subject, check_names, check_subject, run_check, task_of
 
 #: Output that a check may write, and memory that it may have.
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 
 def subject_of(spec: str, task: str | None, limit_s: float) -> Subject:
-    """The algorithm of a name, for the task that is stated or that it tells by itself.
+    """The algorithm or part of a name, for the task or of the kind that is stated or that it tells by itself.
 
     Raises
     ------
     CampaignError
-        Where there is no such algorithm, or no such task.
+        Where there is nothing of this name, or no such task.
     """
-    if task is not None and task not in TASKS:
-        raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(TASKS)}")
+    if task is not None and task not in EXAMINED:
+        raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(EXAMINED)}")
     try:
         chosen = task_of(spec) if task is None else task
-        TASKS[chosen].check(spec)
+        check_subject(spec, chosen)
     except ValueError as error:
         raise CampaignError(str(error)) from error
     return Subject(spec, chosen, limit_s)

@@ -35,6 +35,7 @@ class Glider:
             raise ValueError(f"glide_ratio is {self.glide_ratio}; allowed: 0 to 5")
 
     def fly(self, place: DescentPlace, rng: np.random.Generator) -> Poses:
+        """One glide over the place."""
         heading, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
         down = self.speed_m_s / np.hypot(1.0, self.glide_ratio)
         lowest_s = (self.height_m - 0.5 * place.firing_height_m) / down
@@ -64,6 +65,7 @@ class PulsedLidar:
             raise ValueError(f"beam_deg is {self.beam_deg}; allowed: 0.01 to 20")
 
     def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
+        """The altitudes of one descent."""
         scale = 1.0 + self.scale_error * rng.standard_normal()
         times = truth.times_s - self.late_s
         ranges = np.array([truth.first_return_m(time, 0.5 * self.beam_deg, 10000.0) for time in times])
@@ -82,6 +84,7 @@ class StarTracker:
     noise_deg: float = 0.05  # 1 sigma per axis
 
     def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
+        """The attitudes of one descent."""
         errors = Rotation.from_rotvec(np.radians(self.noise_deg) * rng.standard_normal((truth.times_s.size, 3)))
         read = errors * truth.motion.motion(truth.times_s).attitudes
         return InstrumentReadings(truth.times_s, read.as_quat())

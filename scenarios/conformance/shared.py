@@ -1,4 +1,4 @@
-"""Checks that estimators and trackers share."""
+"""Checks that estimators, trackers and parts share."""
 
 from __future__ import annotations
 
@@ -23,8 +23,13 @@ Prepared = Callable[[], Callable[[], object]]
 
 def process_checks(spec: str, prepared: Prepared) -> Iterator[Check]:
     """What an algorithm that runs in our process must leave alone there: its surroundings, and the truth."""
-    yield Check("process", "leaves its process as it is", _ADVICE_PROCESS, partial(_leaves_its_process, prepared))
+    yield process_check(prepared)
     yield Check("truth", "reaches for no truth", _ADVICE_TRUTH, partial(_reaches_for_no_truth, spec, prepared))
+
+
+def process_check(prepared: Prepared) -> Check:
+    """That what runs in our process leaves it as it is."""
+    return Check("process", "leaves its process as it is", _ADVICE_PROCESS, partial(_leaves_its_process, prepared))
 
 
 def _leaves_its_process(prepared: Prepared) -> str:

@@ -11,10 +11,11 @@ from algorithms.dimes import DimesOptions
 from algorithms.exchange import PREFIXES, ExecutableLimits
 from algorithms.hda import HdaOptions
 from algorithms.vtt import VttOptions
-from scenarios.conformance import estimators, inputs, streams, surfaces, trackers
+from scenarios.conformance import estimators, inputs, parts, streams, surfaces, trackers
 from scenarios.conformance.findings import Check, Finding
 from scenarios.dotted import found_at
 from scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
+from scenarios.parts.named import KINDS
 
 _INPUTS: Mapping[str, Sequence[Callable[[], object]]] = {
     "velocity": [inputs.descent, streams.STREAM.measurements],
@@ -26,14 +27,14 @@ _OPTIONS = {"velocity": DimesOptions, "tracking": VttOptions, "landing": HdaOpti
 
 @dataclass(frozen=True)
 class Subject:
-    """An algorithm to be examined.
+    """An algorithm, or a part of a user's own, to be examined.
 
     Attributes
     ----------
     spec
-        How it is named; see `scenarios.estimators`.
+        How it is named; see `scenarios.estimators`, `scenarios.parts`.
     task
-        The name of its task.
+        The name of its task, or of its kind.
     limit_s
         Longest time that an answer may take.
     """
@@ -44,6 +45,8 @@ class Subject:
 
     def checks(self) -> Iterator[Check]:
         """The task's suite for it."""
+        if self.task in KINDS:
+            return parts.PartSuite(KINDS[self.task], self.spec, self.limit_s).checks()
         task: Task[Any, Any] = TASKS[self.task]
         limits = ExecutableLimits(time_s=self.limit_s)
         program = self.spec.startswith(tuple(PREFIXES))
@@ -60,10 +63,25 @@ class Subject:
 
     def prepare(self) -> None:
         """Loads and compiles what the suite itself needs, and the algorithm's code."""
+        check_subject(self.spec, self.task)
+        if self.task in KINDS:
+            parts.PartSuite(KINDS[self.task], self.spec, self.limit_s).cases()
+            return
         task: Task[Any, Any] = TASKS[self.task]
-        task.check(self.spec)
-        for one in _INPUTS[self.task]:
+        for one in _INPUTS[task.name]:
             one()
+
+
+#: What can be examined, by the words of the command line.
+EXAMINED = (*TASKS, *KINDS)
+
+
+def check_subject(spec: str, task: str) -> None:
+    """Raises ValueError where there is nothing of this name for a task, or of a kind; it says what is allowed."""
+    if task in KINDS:
+        parts.check_part(KINDS[task], spec)
+    else:
+        TASKS[task].check(spec)
 
 
 def check_names(subject: Subject) -> list[tuple[str, str]]:
@@ -77,7 +95,7 @@ def run_check(subject: Subject, number: int) -> Finding:
 
 
 def task_of(spec: str) -> str:
-    """The task that an algorithm is for, as far as its name, its methods or their annotations tell; else velocity.
+    """What a name is for, or of: as far as it, its methods or their annotations tell; else velocity.
 
     Raises
     ------
@@ -89,6 +107,9 @@ def task_of(spec: str) -> str:
         return shipped
     if spec.startswith(tuple(PREFIXES)):
         return VELOCITY.name
+    kind = None if spec in installed() else parts.kind_of(spec)
+    if kind is not None:
+        return kind
     path = installed()[spec].value if spec in installed() else spec
     if ":" not in path:
         VELOCITY.check(spec)
