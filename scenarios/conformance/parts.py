@@ -279,7 +279,7 @@ def scored_cases() -> tuple[ScoredDescent | ScoredLanding | ScoredRun, ...]:
         ScoredDescent(states, motion(), motion().state(20.0), np.array([3.0, -1.0]), inputs.descent(), answer)
         for answer in velocities
     )
-    landings = (ScoredLanding(states[:2], _ground(), inputs.landing(), answer) for answer in sites)
+    landings = (ScoredLanding((states[0], states[1]), _ground(), inputs.landing(), answer) for answer in sites)
     return (*descents, *landings, _run(TrackingState.NORMAL), _run(TrackingState.FAILURE))
 
 
