@@ -1,0 +1,170 @@
+"""Descents flown, measured and scored by a user's own parts: what they give is what the case is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scenarios.descent.flight import flown_descent
+from scenarios.descent.world import World
+from scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
+from scenarios.parts.scores import scored
+from sim.streams import Streams
+from tests.scenarios.descent.settings import FLAT, PERFECT, parameters, run
+
+HERE = f"{__name__}:"
+
+
+@dataclass(frozen=True)
+class Falling:
+    """Falls at an even rate while it turns about the vertical; `wrong` spoils one thing."""
+
+    random: ClassVar[bool] = True
+
+    height_m: float = 2000.0
+    east_m_s: float = 11.0
+    wrong: str = ""
+
+    def fly(self, place: DescentPlace, rng: np.random.Generator) -> Poses:
+        north = float(rng.normal(0.0, 5.0))
+        times = np.arange(place.from_s, 26.0, 0.1)
+        if self.wrong == "short":
+            times = np.arange(place.from_s, 3.0, 0.1)
+        positions = np.column_stack([self.east_m_s * times, north * times, self.height_m - 75.0 * times])
+        quaternions = Rotation.from_rotvec(np.outer(0.1 * times, [0.0, 0.0, 1.0])).as_quat()
+        if self.wrong == "length":
+            quaternions *= 1.1
+        if self.wrong == "up":
+            quaternions = (Rotation.from_euler("x", np.pi) * Rotation.from_quat(quaternions)).as_quat()
+        if self.wrong == "order":
+            times = times[::-1]
+        if self.wrong == "nan":
+            positions[7, 1] = np.nan
+        columns = {"height_m": 1.0} if self.wrong == "column" else {"north_m_s": north}
+        return Poses(times, positions, quaternions, columns)
+
+
+@dataclass(frozen=True)
+class Exact:
+    """Altitudes or attitudes off the truth by what is stated."""
+
+    quantity: ClassVar[str] = "altitude"
+    random: ClassVar[bool] = False
+
+    off_m: float = 0.0
+
+    def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
+        heights = np.array([truth.altitude_m(time) for time in truth.times_s])
+        return InstrumentReadings(truth.times_s, heights + self.off_m, {"applied_m": self.off_m})
+
+
+@dataclass(frozen=True)
+class Turned:
+    """Attitudes turned about the vertical."""
+
+    quantity: ClassVar[str] = "attitude"
+    random: ClassVar[bool] = False
+
+    turn_deg: float = 0.3
+
+    def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
+        turn = Rotation.from_euler("z", self.turn_deg, degrees=True)
+        return InstrumentReadings(truth.times_s, (turn * truth.motion.motion(truth.times_s).attitudes).as_quat())
+
+
+def handed(case: ScoredDescent) -> dict[str, float | bool]:
+    """What the case is made of, told so that it can be held against the row."""
+    estimated = case.answer.velocity_m_s
+    true = (case.states[2].position_m - case.states[1].position_m)[:2] / (case.states[2].time_s - case.states[1].time_s)
+    return {
+        "altitude_m": case.measurements.altitudes[1].altitude_m,
+        "error_m_s": float("nan") if estimated is None else float(np.hypot(*(estimated - true))),
+        "touchdown_m_s": float(np.hypot(*case.touchdown_m_s)),
+        "firing_s": case.at_firing.time_s,
+        "at_firing": bool(np.allclose(case.motion.state(case.at_firing.time_s).position_m, case.at_firing.position_m)),
+    }
+
+
+def clashing(case: ScoredDescent) -> dict[str, float]:
+    return {"m_s": 1.0}
+
+
+velocity_error = clashing
+
+OWN = {
+    "flight": {"motion": f"{HERE}Falling", "attitude_of": "body"},
+    "altimeter": {"instrument": f"{HERE}Exact", "options": {"off_m": 6.0}},
+    "attitude_source": {"instrument": f"{HERE}Turned"},
+    "scores": [f"{HERE}handed"],
+}
+
+
+def test_a_case_is_flown_measured_and_scored_by_what_the_parts_give() -> None:
+    made = {name: part for name, part in PERFECT.items() if name != "altimeter"}
+    result = run(terrain=FLAT, **made, **OWN)
+    row = result.row
+    assert result.outcome == "VALID"
+    # the motion: the true velocity is what was flown, and the state when the thrusters fire is 100 m above level ground
+    assert row["velocity_true_x_m_s"] == pytest.approx(11.0, abs=1e-6)
+    assert row["velocity_true_y_m_s"] == pytest.approx(row["flight_north_m_s"], abs=1e-6)
+    assert row["altitude_1_m"] == pytest.approx(2000.0, abs=1e-3)
+    assert row["handed_firing_s"] == pytest.approx(1900.0 / 75.0, abs=1e-4)
+    # the instruments: their errors are read back from what was delivered
+    for number in (1, 2, 3):
+        assert row[f"altitude_error_{number}_m"] == pytest.approx(6.0, abs=1e-6)
+        assert row[f"attitude_error_{number}_deg"] == pytest.approx(0.3, abs=1e-6)
+    assert (row["altimeter_off_m"], row["altimeter_applied_m"], row["altimeter_instrument"]) == (
+        6.0,
+        6.0,
+        f"{HERE}Exact",
+    )
+    assert row["attitude_source_turn_deg"] == 0.3
+    # the score is handed what the algorithm was, its answer, and the truth
+    assert row["handed_altitude_m"] == pytest.approx(float(row["altitude_2_m"]) + 6.0, abs=1e-6)
+    assert row["handed_error_m_s"] == pytest.approx(row["velocity_error_m_s"], abs=1e-9)
+    assert row["handed_touchdown_m_s"] == row["touchdown_speed_with_m_s"]
+    assert row["handed_at_firing"] is True
+
+
+def test_the_motion_of_a_case_is_its_own() -> None:
+    p = parameters(terrain=FLAT, **OWN)
+    surface = World.of(p).surface
+    first, again, other = (flown_descent(p, surface, Streams(1, "test", case)).row for case in (0, 0, 1))
+    assert first == again
+    assert first["flight_north_m_s"] != other["flight_north_m_s"]
+    assert not any(name.startswith("descent_") for name in first)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("short", "flies -5 to 2.9 s; allowed: from -5 s or before to 8 s or after"),
+        ("length", r"gives a quaternion of length 1\.1 \(pose 1\); allowed: 1"),
+        ("up", "at picture 1 the camera looks up"),
+        ("order", "flies 25.9 to -5 s"),
+        ("nan", "gives positions_m that are not finite"),
+        ("column", "tells the column height_m twice, or it is one of its options"),
+    ],
+)
+def test_a_motion_that_is_none_is_told(wrong: str, said: str) -> None:
+    flight = {**OWN["flight"], "options": {"wrong": wrong}}  # type: ignore[dict-item]
+    p = parameters(terrain=FLAT, flight=flight)
+    with pytest.raises(ValueError, match=said):
+        flown_descent(p, World.of(p).surface, Streams(1, "test", 0))
+
+
+def test_a_motion_below_the_ground_is_told() -> None:
+    flight = {**OWN["flight"], "options": {"height_m": 500.0}}  # type: ignore[dict-item]
+    p = parameters(terrain=FLAT, flight=flight)
+    with pytest.raises(ValueError, match=r"at picture 3 the camera is 62\.5 m below the ground"):
+        flown_descent(p, World.of(p).surface, Streams(1, "test", 0))
+
+
+def test_a_score_takes_no_column_that_is_there() -> None:
+    spec = f"{HERE}velocity_error"
+    with pytest.raises(ValueError, match="gives the column velocity_error_m_s, which the row has already"):
+        scored([spec], None, {"velocity_error_m_s"})  # type: ignore[arg-type]

@@ -1,0 +1,167 @@
+"""Parts are found by a path or an entry point, made from their options, and refused in one message."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from campaigns.definition.configuration import CampaignConfiguration, problems_of
+from campaigns.definition.identity import _foreign_sources, chosen_parts
+from scenarios.descent import DescentScenarioParameters
+from scenarios.parts import named
+from scenarios.parts.motions import OwnMotion
+from scenarios.parts.named import DYNAMICS, SCORE, checked_columns
+from scenarios.parts.scores import SCORED, ScoredDescent, ScoredLanding, score_of, taken_by
+
+EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
+
+
+@pytest.fixture(autouse=True)
+def _examples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+
+
+def problem(**parts: Any) -> tuple[str, str]:
+    """Where the parameters of a descent are wrong, and what is said of it."""
+    with pytest.raises(ValidationError) as caught:
+        DescentScenarioParameters.model_validate(parts)
+    ((key, message),) = problems_of(caught.value, DescentScenarioParameters)
+    return ".".join(map(str, key)), message
+
+
+@pytest.mark.parametrize(
+    ("parts", "key", "said"),
+    [
+        ({"flight": {"motion": "nowhere:X"}}, "flight", "no motion at 'nowhere:X': No module named 'nowhere'"),
+        ({"flight": {"motion": "own_parts:Glidr"}}, "flight", "has no attribute 'Glidr'"),
+        ({"flight": {"motion": "glidr"}}, "flight", "unknown motion 'glidr'; allowed: your own as module:name"),
+        ({"flight": {"motion": "own_parts:sideways"}}, "flight", "is no motion: it is a function, not a class"),
+        ({"flight": {"motion": "own_parts:StarTracker"}}, "flight", "is no motion: it has no fly"),
+        (
+            {"flight": {"motion": "own_parts:Glider", "options": {"glide": 1.0}}},
+            "flight",
+            "unexpected keyword argument 'glide'; it has: height_m, speed_m_s, glide_ratio, rocking_deg",
+        ),
+        (
+            {"flight": {"motion": "own_parts:Glider", "options": {"glide_ratio": 9.0}}},
+            "flight",
+            "refuses its options: glide_ratio is 9.0; allowed: 0 to 5",
+        ),
+        ({"flight": {"motion": "own_parts:Glider", "turn_deg": 1.0}}, "flight.turn_deg", "unknown key"),
+        (
+            {"altimeter": {"instrument": "own_parts:StarTracker"}},
+            "altimeter",
+            "'own_parts:StarTracker' measures 'attitude'; allowed here: 'altitude'",
+        ),
+        (
+            {"attitude_source": {"instrument": "own_parts:StarTracker", "options": {"noise_deg": float("nan")}}},
+            "attitude_source",
+            "not JSON compliant",
+        ),
+        ({"altimeter": {"beam": 2.0}}, "altimeter.beam", "did you mean 'beam_deg'?"),
+        ({"scores": ["own_parts:Glider"]}, "scores", "is no score: it is a class, not a function"),
+        ({"scores": ["own_parts:MASS_KG"]}, "scores", "is no score: it is a float, not a function"),
+        ({"scores": ["own_parts:sideways"] * 2}, "scores", "the score 'own_parts:sideways' is named twice"),
+    ],
+)
+def test_what_is_wrong_is_told_where_it_stands(parts: dict[str, Any], key: str, said: str) -> None:
+    where, message = problem(**parts)
+    assert where == key
+    assert said in message
+
+
+def test_a_module_that_raises_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "raises_at_import.py").write_text("raise RuntimeError('no licence')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert "RuntimeError: no licence" in problem(flight={"motion": "raises_at_import:Any"})[1]
+
+
+def test_options_are_filled_in_and_can_be_dispersed() -> None:
+    p = DescentScenarioParameters.model_validate(
+        {"flight": {"motion": "own_parts:Glider", "options": {"glide_ratio": 0.25}}}
+    )
+    assert isinstance(p.flight, OwnMotion)
+    assert p.flight.options == {"height_m": 1800.0, "speed_m_s": 60.0, "glide_ratio": 0.25, "rocking_deg": 8.0}
+    assert p.flight.made().glide_ratio == 0.25
+    assert DescentScenarioParameters.model_validate(p.model_dump(mode="json")) == p
+
+
+def test_an_entry_point_names_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        named, "installed", lambda group: {"glider": "own_parts:Glider"} if group in DYNAMICS.group else {}
+    )
+    assert type(DYNAMICS.made("glider", {})).__name__ == "Glider"
+    with pytest.raises(ValueError, match=r"unknown motion 'glidr' \(did you mean 'glider'\?\)"):
+        DYNAMICS.found("glidr")
+    with pytest.raises(ValueError, match="unknown score 'glider'"):
+        SCORE.found("glider")
+
+
+def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "scores_here.py").write_text(
+        "from scenarios.parts import ScoredDescent, ScoredLanding\n"
+        "def any_case(case): return {}\n"
+        "def two(case: ScoredDescent | ScoredLanding): return {}\n"
+        "def landing(case: 'ScoredLanding'): return {}\n"
+        "def none_at_all(): return {}\n"
+        "class Kept:\n    def __call__(self, case: ScoredLanding): return {}\n"
+        "kept = Kept()\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    taken = {name: taken_by(score_of(f"scores_here:{name}")) for name in ("any_case", "two", "landing", "kept")}
+    assert taken["any_case"] == SCORED
+    assert taken["two"] == (ScoredDescent, ScoredLanding)
+    assert taken["landing"] == taken["kept"] == (ScoredLanding,)
+    with pytest.raises(ValueError, match="scores ScoredLanding; allowed here: ScoredDescent"):
+        score_of("scores_here:landing", ScoredDescent)
+    with pytest.raises(ValueError, match="does not take one argument"):
+        score_of("scores_here:none_at_all")
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ([1.0], "gives its columns as a list; allowed: a mapping"),
+        ({"a b": 1.0}, "names a column 'a b'"),
+        ({"ä": 1.0}, "names a column 'ä'"),
+        ({"a": "text"}, "gives a as a str; allowed: a number, true or false"),
+        ({"a": None}, "gives a as a NoneType"),
+    ],
+)
+def test_columns_that_cannot_be(told: object, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        checked_columns("x:y", told, texts=False)
+
+
+def test_the_identity_covers_the_modules_of_parts() -> None:
+    """Those that are stated, and those that a dispersion chooses, alone or with their table."""
+    configuration = CampaignConfiguration.model_validate(
+        {
+            "name": "parts",
+            "scenario": "descent",
+            "cases": 1,
+            "parameters": {"scores": ["mine.scores:energy"], "flight": {"motion": "own_parts:Glider"}, "altimeter": {}},
+            "dispersions": {
+                "flight.motion": {
+                    "distribution": "choice",
+                    "values": ["own_parts:Glider", "other:Falling"],
+                    "source": "-",
+                },
+                "altimeter": {
+                    "distribution": "choice",
+                    "values": [{"beam_deg": 3.0}, {"instrument": "own_parts:PulsedLidar"}],
+                    "source": "-",
+                },
+            },
+        }
+    )
+    assert chosen_parts(configuration) == (
+        "own_parts:Glider",
+        "mine.scores:energy",
+        "other:Falling",
+        "own_parts:PulsedLidar",
+    )
+    assert list(_foreign_sources("own_parts:Glider")) == [("own_parts.py", EXAMPLES / "own_parts.py")]
