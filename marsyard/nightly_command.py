@@ -53,6 +53,8 @@ def nightly(
         raise StoreError(f"{out} cannot be written: {error.strerror or error}") from error
     with folder_lock(out), History(out / HISTORY_FILE) as history:
         night = history.begin(git_commit())
+        # what a night that is killed leaves behind
+        _write_page(history, night, out, ())
         try:
             with stopped_by_signals(), campaign_progress(console(stderr=True)) as watch:
                 for one in stated.campaigns:
@@ -110,8 +112,16 @@ def _changes(history: History, night: int) -> list[Change]:
 
 def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
     """Writes the page, renews the dashboard, and prints the page."""
-    from reports.campaign import write_whole
     from reports.dashboard.site import write_site
+
+    text = _write_page(history, night, out, found)
+    write_site(out / SITE, [out / RUNS])
+    typer.echo(text)
+
+
+def _write_page(history: History, night: int, out: Path, found: Sequence[Change]) -> str:
+    """Writes what is known of the night so far, and returns it."""
+    from reports.campaign import write_whole
     from reports.night_page import night_text
     from reports.regressions import comparisons_of
 
@@ -121,8 +131,7 @@ def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> N
     compared = sum(bool(one.before) for one in comparisons_of(history, night))
     text = night_text(now, earlier, history.campaigns(night), found, compared)
     write_whole(out / PAGE_FILE, text)
-    write_site(out / SITE, [out / RUNS])
-    typer.echo(text)
+    return text
 
 
 def _status(campaigns: Sequence[NightCampaign], found: Sequence[Change]) -> int:

@@ -35,10 +35,20 @@ def report(
     requirements: RequirementsOption = None,
     pdf: Annotated[bool, typer.Option("--pdf", help="Print the page into report.pdf as well; takes Chromium.")] = False,
     csv: Annotated[bool, typer.Option("--csv", help="Write all rows into cases.csv as well.")] = False,
+    gallery: Annotated[
+        bool,
+        typer.Option("--gallery", help="First run the worst cases, some without an answer and some at random again."),
+    ] = False,
 ) -> None:
-    """Judge a campaign, also one that was interrupted or killed, and write its report, from the stored rows alone."""
-    from marsyard.outcome import conclude
+    """Judge a campaign, also one that was interrupted or killed, and write its report, from the stored rows.
 
+    Nothing is run again but for --gallery.
+    """
+    from marsyard.outcome import conclude
+    from marsyard.report_pictures import keep_notable_cases
+
+    if gallery:
+        keep_notable_cases(directory, typer.echo)
     asked = None if requirements is None else _asked(directory, requirements)
     status = conclude(directory, console(), asked)
     if csv:

@@ -48,6 +48,16 @@ class Share:
     shared_lower: float | None = None
     shared_upper: float | None = None
 
+    @property
+    def sound_lower(self) -> float:
+        """The lower end of the interval that holds however the cases are spread over terrains."""
+        return self.lower if self.shared_lower is None else self.shared_lower
+
+    @property
+    def sound_upper(self) -> float:
+        """The upper end of it."""
+        return self.upper if self.shared_upper is None else self.shared_upper
+
 
 def share_of(hit: Bool[np.ndarray, " n"], frame: pd.DataFrame) -> Share:
     """The share of the cases of `frame` that `hit` marks, shape (n,)."""

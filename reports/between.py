@@ -1,8 +1,7 @@
 """Two stored campaigns side by side: what each shows of the same figures, and whether they differ.
 
-Where both ran the same draws (name, seed, dispersions) cases are compared in pairs: rates by McNemar's exact test,
-errors by Wilcoxon's signed ranks. Otherwise terrain by terrain (`reports.statistics.changes`). The p are corrected for
-their number by Holm's method.
+Where both ran the same draws (name, seed, dispersions) cases are compared in pairs (`reports.statistics.paired`).
+Otherwise terrain by terrain (`reports.statistics.changes`). The p are corrected for their number by Holm's method.
 """
 
 from __future__ import annotations
@@ -16,10 +15,11 @@ import pandas as pd
 from jaxtyping import Float
 
 from reports.columns import label, numbers, primary_metric
-from reports.comparison import mcnemar, paired_errors
+from reports.comparison import CONFIDENCE
 from reports.sampled import sampled
 from reports.sections import Grid
 from reports.statistics.changes import Sample, difference_p, holm
+from reports.statistics.paired import compared_errors, compared_successes
 from reports.stored import StoredRun
 from reports.verdicts import is_flag, members, succeeded, terrain_groups
 from reports.wording import NOTHING, number, percent
@@ -153,9 +153,11 @@ def _paired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Fi
     both = np.isfinite(a) & np.isfinite(b)
     if not both.any():
         return math.nan
+    groups = terrain_groups(first)
+    shared = None if groups is None else groups[here][both]
     if mine.larger_is_better:
-        return mcnemar(a[both] > 0.5, b[both] > 0.5)[2]
-    return paired_errors(b[both] - a[both], None)[3]
+        return compared_successes(a[both] > 0.5, b[both] > 0.5, shared)[2]
+    return compared_errors(b[both] - a[both], shared, CONFIDENCE)[3]
 
 
 def _finite(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

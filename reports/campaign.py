@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from reports.faults import faults_section
 from reports.hda.every import HDA_SECTIONS
 from reports.judged import Judged, judged
 from reports.measured.agreement import agreement_section
+from reports.overall import Overall
 from reports.sampled import sampled
 from reports.scatter import scatter_section
 from reports.section import Section, SectionMaker, Subject
@@ -37,7 +39,8 @@ from reports.stored import StoredRun
 from reports.systems import shown_cases
 from reports.tables import error_summaries, outcome_counts
 from reports.traceability import evidence_of, junit_xml, verification_csv
-from reports.verdicts import Overall, Verdict
+from reports.twin import SCHEMA
+from reports.verdicts import Verdict
 from reports.vtt.beside import beside_section
 from reports.vtt.goal import goal_section
 from reports.vtt.kinds import regression_section, terrains_section
@@ -45,9 +48,6 @@ from reports.vtt.steps import steps_section
 from reports.vtt.table_1 import table_1_section
 from reports.vtt.updates import updates_section
 from reports.wording import number
-
-#: Version of the layout of `report.json`.
-SCHEMA = 2
 
 #: Sections that a page has where the rows hold their columns, in the page's order.
 FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
@@ -148,6 +148,7 @@ def page_context(
         "configuration": sections.configuration_text(run),
         "rerun": sections.rerun_command(run),
         "replay": sections.replay_command(run, "CASE"),
+        "gallery": shlex.join(["marsyard", "report", str(run.directory), "--gallery"]),
     }
     pictured = [str(case.case) for case in context["shown"]]
     context["explorer"] = _explorer(subject, pictured)
@@ -209,6 +210,8 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
                 **asdict(verdict),
                 "note": verdict.note,
                 "plain_status": verdict.plain_status,
+                "confident_status": verdict.confident_status,
+                "consumer_risk": verdict.consumer_risk,
                 "margin": verdict.margin,
             }
             for verdict in found.verdicts

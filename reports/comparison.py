@@ -1,30 +1,29 @@
 """Several algorithms on the same cases: what each did, and what the pairs say of the differences.
 
 Cases are paired: both algorithms had the same pictures, or the same draws. Whether one succeeds more often is told by
-the cases in which just one of them does (McNemar 1947, here with the exact binomial distribution); whose errors are
-smaller, by the differences of the cases that both answered (Wilcoxon's signed ranks, and a bootstrap of the mean, of
-whole terrains where cases share them). Further algorithms stand in the rows as `scenarios.trial` puts them.
+the cases in which just one of them does (`reports.statistics.paired`); whose errors are smaller, by the differences of
+the cases that both answered. Where cases share terrains, whole terrains are compared. Further algorithms stand in the
+rows as `scenarios.trial` puts them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float
-from scipy import stats
 
 from reports.columns import numbers, split_unit
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
+from reports.statistics.changes import holm
+from reports.statistics.paired import compared_errors, compared_successes
 from reports.verdicts import ENGINE_FAILURES, is_flag, succeeded, terrain_groups
 from reports.wording import NOTHING, number, percent, stated
 
 CONFIDENCE = 0.9
-_RESAMPLES, _SEED = 2000, 20250101
 
 
 @dataclass(frozen=True)
@@ -63,13 +62,15 @@ class Difference:
     only_first, only_other
         Cases in which just the judged one, or just the other, is within the bound; None where there is no bound.
     success_p
-        Two-sided probability of so uneven a split if both succeed equally often (exact McNemar); NaN without a bound.
+        Two-sided probability of so uneven a split if both succeed equally often; NaN without a bound.
     pairs
         Cases that both answered.
     mean, lower, upper
-        Mean of the other's magnitude less the judged one's, with its bootstrap interval; negative: the other is better.
+        Mean of the other's magnitude less the judged one's, with its interval; negative: the other is better.
     error_p
         Two-sided probability of such differences if their distribution is symmetric about zero (Wilcoxon).
+
+    Both probabilities are corrected for the number of algorithms (Holm).
     """
 
     name: str
@@ -118,41 +119,13 @@ def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float |
 def difference(first: pd.DataFrame, other: pd.DataFrame, name: str, metric: str, bound: float | None) -> Difference:
     """One algorithm against another, from rows of the same cases in the same order."""
     mine, its = (np.abs(numbers(frame, metric)) for frame in (first, other))
-    both = np.isfinite(mine) & np.isfinite(its)
+    both, groups = np.isfinite(mine) & np.isfinite(its), terrain_groups(first)
     split: tuple[int | None, int | None, float] = (None, None, math.nan)
     if bound is not None:
-        split = mcnemar(mine <= bound, its <= bound)
-    mean, lower, upper, p = paired_errors((its - mine)[both], terrain_groups(first[both]))
+        split = compared_successes(mine <= bound, its <= bound, groups)
+    shared = None if groups is None else groups[both]
+    mean, lower, upper, p = compared_errors((its - mine)[both], shared, CONFIDENCE)
     return Difference(name, *split, int(both.sum()), mean, lower, upper, p)
-
-
-def mcnemar(first: Bool[np.ndarray, " n"], other: Bool[np.ndarray, " n"]) -> tuple[int, int, float]:
-    """Cases in which just the first and just the other succeeds, and the exact two-sided probability of the split."""
-    only_first, only_other = int((first & ~other).sum()), int((other & ~first).sum())
-    total = only_first + only_other
-    p = 1.0 if total == 0 else float(stats.binomtest(only_first, total, 0.5).pvalue)
-    return only_first, only_other, p
-
-
-def paired_errors(differences: Float[np.ndarray, " n"], groups: np.ndarray | None) -> tuple[float, float, float, float]:
-    """Mean of paired differences, its percentile bootstrap interval at `CONFIDENCE`, and Wilcoxon's two-sided p.
-
-    Whole groups (cases on one terrain), shape (n,), are drawn together. NaN for no pairs; the interval is NaN for one.
-    """
-    if differences.size == 0:
-        return math.nan, math.nan, math.nan, math.nan
-    mean = float(differences.mean())
-    p = 1.0 if not differences.any() else float(stats.wilcoxon(differences).pvalue)
-    members = np.arange(differences.size) if groups is None else np.unique(groups, return_inverse=True)[1]
-    count = int(members.max()) + 1
-    if count < 2:
-        return mean, math.nan, math.nan, p
-    sums = np.bincount(members, weights=differences)
-    sizes = np.bincount(members)
-    drawn = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1.0 / count), size=_RESAMPLES)
-    means = (drawn @ sums) / (drawn @ sizes)
-    lower, upper = np.quantile(means, (0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)))
-    return mean, float(lower), float(upper), p
 
 
 def comparison(
@@ -171,7 +144,11 @@ def comparison(
     if metric is None:
         return contenders, []
     found = [difference(frame, own, name, metric, bound) for name, own in others.items() if metric in own]
-    return contenders, found
+    of_success, of_errors = (holm([getattr(one, key) for one in found]) for key in ("success_p", "error_p"))
+    return contenders, [
+        replace(one, success_p=success, error_p=error)
+        for one, success, error in zip(found, of_success, of_errors, strict=True)
+    ]
 
 
 def comparison_section(subject: Subject) -> Section | None:
@@ -184,8 +161,8 @@ def comparison_section(subject: Subject) -> Section | None:
     note = (
         f"Against {judged}, on the same cases. Only one within the bound: cases that tell the two apart; p of an exact "
         "McNemar test. Difference: the other's error less that of the judged one where both answered, its mean with a "
-        f"{stated(CONFIDENCE)} bootstrap interval over whole terrains; p of Wilcoxon's signed ranks. The p are "
-        "two-sided, take cases as independent, and are not corrected for the number of algorithms."
+        f"{stated(CONFIDENCE)} BCa bootstrap interval; p of Wilcoxon's signed ranks. The p are two-sided, corrected "
+        "for the number of algorithms (Holm). Where cases share terrains, intervals and p are of whole terrains."
     )
     blocks = [Block(grid=grids[0])]
     if differences:

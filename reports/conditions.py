@@ -87,9 +87,10 @@ def conditions_section(subject: Subject) -> Section | None:
         blocks.append(Block(heading="By terrain", grid=_spread_grid(known), note=_SPREAD_NOTE))
     note = (
         "Bins hold as many cases each. Answered: with its two-sided Clopper-Pearson interval at "
-        f"{stated(CONFIDENCE)} confidence, as for independent cases. Mean and standard deviation of the errors of the "
-        f"answers. Bound: what the {stated(QUANTILE)} quantile of the magnitude does not exceed, at "
-        f"{stated(CONFIDENCE)} confidence (order statistics); it takes 230 answers."
+        f"{stated(CONFIDENCE)} confidence, which allows for shared terrains. Mean and standard deviation of the errors "
+        f"of the answers. Bound: what the {stated(QUANTILE)} quantile of the magnitude does not exceed, at "
+        f"{stated(CONFIDENCE)} confidence (order statistics); it takes 230 answers, or as many terrains where they are "
+        "shared."
     )
     data: dict[str, Any] = {column: [asdict(one) for one in bins] for column, bins in tables.items()}
     data["between_terrains"] = [asdict(one) for one in known]
@@ -205,8 +206,9 @@ def _bins(values: Float[np.ndarray, " n"]) -> list[tuple[str, Bool[np.ndarray, "
 def _bin(chosen: pd.DataFrame, metric: str, name: str) -> Bin:
     answered = members(chosen, "valid")
     valid = chosen[answered]
-    magnitude = np.abs(numbers(valid, metric))
-    magnitude = magnitude[np.isfinite(magnitude)]
+    magnitude, groups = np.abs(numbers(valid, metric)), terrain_groups(valid)
+    finite = np.isfinite(magnitude)
+    magnitude, shared = magnitude[finite], None if groups is None else groups[finite]
     parts = [numbers(valid, part) for part in _parts(chosen, metric)]
     parts = [part[np.isfinite(part)] for part in parts]
     return Bin(
@@ -214,7 +216,7 @@ def _bin(chosen: pd.DataFrame, metric: str, name: str) -> Bin:
         answered=share_of(answered, chosen),
         means=[float(part.mean()) if part.size else float("nan") for part in parts],
         sds=[float(part.std(ddof=1)) if part.size > 1 else float("nan") for part in parts],
-        quantile_bound=quantile_bounds(magnitude, QUANTILE, CONFIDENCE)[1],
+        quantile_bound=quantile_bounds(magnitude, QUANTILE, CONFIDENCE, shared)[1],
         largest=float(magnitude.max()) if magnitude.size else float("nan"),
     )
 
@@ -231,7 +233,7 @@ def _grid(frame: pd.DataFrame, metric: str, bins: Sequence[Bin]) -> Grid:
         of_parts = [number(value) for pair in zip(one.means, one.sds, strict=True) for value in pair]
         share = one.answered
         ends = [number(one.quantile_bound) if np.isfinite(one.quantile_bound) else "n too small", number(one.largest)]
-        interval = f"{percent(share.lower)} to {percent(share.upper)}"
+        interval = f"{percent(share.sound_lower)} to {percent(share.sound_upper)}"
         rows.append([one.name, f"{share.n:,}", percent(share.share), interval, *of_parts, *ends])
     return Grid(head, rows)
 

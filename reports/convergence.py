@@ -15,9 +15,9 @@ from reports.columns import magnitude_label, numbers
 from reports.plates import plate
 from reports.sampled import sampled
 from reports.section import Block, Section, Subject
-from reports.statistics.samples import quantile_bounds
+from reports.statistics.samples import mean_interval, quantile_bounds
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.verdicts import judge_campaign
+from reports.verdicts import judge_campaign, terrain_groups
 
 #: Up to this ratio of the most cases to the fewest an axis has ticks within its decades too.
 _FEW_DECADES = 50
@@ -37,7 +37,7 @@ class Point:
 
 
 def convergence_section(subject: Subject) -> Section | None:
-    """Success rates and the 95 % quantile of the errors against the number of cases; None for fewer than sixteen."""
+    """Success rates, mean and 95 % quantile of the errors against the number of cases; None for fewer than sixteen."""
     frame = subject.whole
     if len(frame) < 2 * FEWEST:
         return None
@@ -47,17 +47,16 @@ def convergence_section(subject: Subject) -> Section | None:
         for k, (name, asked, points) in enumerate(curves)
     ]
     data = {name: [asdict(point) for point in points] for name, _, points in curves}
-    if subject.metric is not None:
-        points = quantile_curve(frame, subject.metric)
-        if points:
-            figure = curve_figure(points, f"95 % of {magnitude_label(subject.metric)}", subject.bound)
-            plates.append(plate(figure, "convergeq", "95 % quantile of the errors and its bounds."))
-            data[f"{subject.metric}: 95 % quantile"] = [asdict(point) for point in points]
+    for key, (name, axis, points) in error_curves(frame, subject.metric).items():
+        bound = subject.bound if key == "quantile" else None
+        plates.append(plate(curve_figure(points, axis, bound), f"converge-{key}", f"{name} and its bounds."))
+        data[f"{subject.metric}: {name}"] = [asdict(point) for point in points]
     if not plates:
         return None
     note = (
         "Of the first so many cases, in the order of their numbers, which is no order at all. Band: one-sided bounds "
-        "at the confidence asked; of a quantile at 90 %, by order statistics. Dashed: what is asked."
+        "at the confidence asked; of mean and quantile at 90 %, open upwards where cases are too few for a bound. "
+        "Dashed: what is asked."
     )
     return Section("convergence", "Convergence", "Convergence", [Block(plates=plates, note=note)], data)
 
@@ -85,17 +84,28 @@ def requirement_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]
     return curves
 
 
-def quantile_curve(frame: pd.DataFrame, metric: str) -> list[Point]:
-    """The 95 % quantile of the magnitudes of the first cases."""
-    magnitude = np.abs(numbers(frame, metric))
-    points = []
+def error_curves(frame: pd.DataFrame, metric: str | None) -> dict[str, tuple[str, str, list[Point]]]:
+    """Name, axis and points of the mean and of the 95 % quantile of the magnitudes of the first cases; none where the
+    cases are too few.
+    """
+    if metric is None:
+        return {}
+    magnitude, groups = np.abs(numbers(frame, metric)), terrain_groups(frame)
+    means, quantiles = [], []
     for size in sizes(len(frame)):
-        first = magnitude[:size]
-        known = first[np.isfinite(first)]
-        if known.size >= FEWEST:
-            bounds = quantile_bounds(known, QUANTILE, CONFIDENCE)
-            points.append(Point(size, float(np.quantile(known, QUANTILE)), *bounds))
-    return points if len(points) > 1 else []
+        finite = np.isfinite(magnitude[:size])
+        if finite.sum() >= FEWEST:
+            known, shared = magnitude[:size][finite], None if groups is None else groups[:size][finite]
+            means.append(Point(size, float(known.mean()), *mean_interval(known, CONFIDENCE, shared)))
+            bounds = quantile_bounds(known, QUANTILE, CONFIDENCE, shared)
+            quantiles.append(Point(size, float(np.quantile(known, QUANTILE)), *bounds))
+    if len(quantiles) < 2:
+        return {}
+    name = magnitude_label(metric)
+    return {
+        "mean": ("mean of the errors", f"mean of {name}", means),
+        "quantile": ("95 % quantile of the errors", f"95 % of {name}", quantiles),
+    }
 
 
 @in_page_style
@@ -106,12 +116,15 @@ def curve_figure(points: Sequence[Point], name: str, asked: float | None) -> Fig
     estimates = np.array([point.estimate for point in points])
     lower = np.array([point.lower for point in points])
     upper = np.array([point.upper for point in points])
-    if np.isfinite(estimates).any():
-        ends = np.concatenate([estimates, lower[np.isfinite(lower)], upper[np.isfinite(upper)]])
-        top, bottom = float(ends.max()), float(ends.min())
+    known = np.concatenate([estimates, lower, upper, [math.nan if asked is None else asked]])
+    known = known[np.isfinite(known)]
+    if known.size:
+        margin = 0.06 * float(np.ptp(known)) or 0.06
+        bottom, top = float(known.min()) - margin, float(known.max()) + margin
+        axes.set_ylim(bottom, top)
         axes.fill_between(
-            cases, np.nan_to_num(lower, nan=0.0, neginf=bottom), np.where(np.isfinite(upper), upper, top),
-            where=np.isfinite(lower) | np.isfinite(upper), color=SERIES[0], alpha=0.25, linewidth=0.0,
+            cases, np.where(np.isfinite(lower), lower, bottom), np.where(np.isfinite(upper), upper, top),
+            where=~np.isnan(lower), color=SERIES[0], alpha=0.25, linewidth=0.0,
         )  # fmt: skip
     axes.plot(cases, estimates, color=SERIES[0], marker="o", markersize=3.5)
     if asked is not None and math.isfinite(asked):

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from reports.overall import Overall, exit_code, overall
 from reports.sampled import Sampled, sampled
 from reports.stored import StoredRun, read_run
-from reports.verdicts import Overall, Verdict, exit_code, judge_campaign, overall
+from reports.verdicts import Verdict, judge_campaign
 
 
 @dataclass(frozen=True)

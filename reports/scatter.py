@@ -11,6 +11,7 @@ from reports.figures import ELLIPSE
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.plane import circular_error, error_ellipse
+from reports.verdicts import terrain_groups
 from reports.wording import interval, number, percent, stated
 
 #: Shares of the errors within the radii, and the confidence of the radii's bounds.
@@ -29,7 +30,8 @@ def scatter_section(subject: Subject) -> Section | None:
     ellipse = error_ellipse(errors, ELLIPSE)
     if ellipse is None:
         return None
-    circles = [circular_error(errors, share, CONFIDENCE) for share in SHARES]
+    groups = terrain_groups(subject.whole)
+    circles = [circular_error(errors, share, CONFIDENCE, groups) for share in SHARES]
     unit = split_unit(metric)[1]
     x, y = (number(value) for value in ellipse.centre)
     text = (
@@ -41,8 +43,8 @@ def scatter_section(subject: Subject) -> Section | None:
     grid = Grid(["Share of errors", f"Radius ({unit})", f"Bounds, {stated(CONFIDENCE)} each"], rows)
     note = (
         "Radius about the truth that holds the share; that of 50 % is the circular error probable. Bounds by order "
-        "statistics, as for independent cases. The ellipse holds the next error with its probability, however few "
-        "cases there are."
+        "statistics: of whole terrains, or of the effective number of cases, where cases share terrains. The ellipse "
+        "holds the next error with its probability, however few cases there are."
     )
     data = {"ellipse": asdict(ellipse), "circles": [asdict(one) for one in circles]}
     return Section("scatter", "Scatter", "Scatter of the errors", [Block(text=text, grid=grid, note=note)], data)

@@ -13,10 +13,11 @@ import numpy as np
 import pandas as pd
 
 from reports.columns import axis_columns, driver_columns, label, numbers
+from reports.overall import Overall
 from reports.sampled import sampled
 from reports.stored import StoredRun, table
 from reports.tables import error_summaries, outcome_counts, statistics_rows
-from reports.verdicts import Overall, Verdict, members
+from reports.verdicts import Verdict, members
 from reports.wording import NOTHING, asked_text, count, number, percent
 
 #: Rows of the tables of single cases; the rows that are left out are counted.
@@ -42,6 +43,7 @@ class VerdictRow:
     asked: str
     evidence: Sequence[str]
     bounds: str
+    risk: str
     further: str
     strip: Strip | None
 
@@ -84,7 +86,8 @@ def verdict_row(verdict: Verdict) -> VerdictRow:
         bounds = NOTHING if math.isnan(verdict.estimate) else f"{percent(verdict.estimate)} seen"
     further = NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}"
     evidence = [count(verdict.n, "case"), f"{verdict.failures:,} failed"]
-    return VerdictRow(verdict, asked, evidence, bounds, further, _strip(verdict))
+    risk = "" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}"
+    return VerdictRow(verdict, asked, evidence, bounds, risk, further, _strip(verdict))
 
 
 def _strip(verdict: Verdict) -> Strip | None:

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from reports.columns import axis_columns, label, numbers
 from reports.statistics.samples import ErrorSummary, summarize
-from reports.verdicts import ENGINE_FAILURES, Status, Verdict, is_flag, members
+from reports.verdicts import ENGINE_FAILURES, Status, Verdict, is_flag, members, terrain_groups
 from reports.wording import NOTHING, asked_text, interval, number, percent, stated
 
 _STYLES = {Status.PASS: "bold green", Status.FAIL: "bold red", Status.INSUFFICIENT: "bold yellow"}
@@ -76,7 +76,8 @@ def outcome_table(frame: pd.DataFrame) -> Table:
 def error_summaries(frame: pd.DataFrame, metric: str) -> list[tuple[str, ErrorSummary]]:
     """Summaries of a metric and of its signed parts, over all cases that have one."""
     parts = [metric, *axis_columns(metric, [str(column) for column in frame.columns])]
-    return [(label(part), summarize(numbers(frame, part))) for part in parts]
+    groups = terrain_groups(frame)
+    return [(label(part), summarize(numbers(frame, part), groups=groups)) for part in parts]
 
 
 def error_table(frame: pd.DataFrame, metric: str) -> Table:

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree as Xml
 
-from reports.verdicts import Overall, Status, Verdict
+from reports.overall import Overall
+from reports.verdicts import Status, Verdict
 
 #: Columns of the matrix; one row for each requirement and campaign.
 COLUMNS = (
@@ -25,12 +26,15 @@ COLUMNS = (
     "population",
     "probability",
     "confidence",
+    "decided_by",
     "cases",
     "failures",
     "terrains",
     "rate",
     "lower_bound",
     "upper_bound",
+    "design_effect",
+    "consumer_risk",
     "further_cases",
     "note",
 )
@@ -53,12 +57,15 @@ def evidence_of(campaign: str, verdicts: Iterable[Verdict]) -> list[dict[str, An
             "population": one.population,
             "probability": one.probability,
             "confidence": one.confidence,
+            "decided_by": one.decide_by,
             "cases": one.n,
             "failures": one.failures,
             "terrains": one.terrains,
             "rate": one.estimate,
             "lower_bound": one.lower,
             "upper_bound": one.upper,
+            "design_effect": math.nan if one.clustered is None else one.clustered.design_effect,
+            "consumer_risk": one.consumer_risk,
             "further_cases": one.further_cases,
             "note": one.note,
         }

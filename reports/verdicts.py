@@ -26,7 +26,7 @@ from campaigns.outcomes import UNFINISHED
 from reports.columns import numbers
 from reports.sampled import INDEPENDENT, Sampled
 from reports.statistics.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
-from reports.statistics.proportions import further_cases_needed, proportion_lower, proportion_upper
+from reports.statistics.proportions import consumer_risk, further_cases_needed, proportion_lower, proportion_upper
 from reports.statistics.sequential import confidence_at
 from reports.wording import count, percent, stated
 
@@ -109,6 +109,21 @@ class Verdict:
         return status_of(self.plain_lower, self.plain_upper, self.probability)
 
     @property
+    def confident_status(self) -> Status:
+        """The status by the bounds, also where the estimate decides; INSUFFICIENT where there are none."""
+        return status_of(self.lower, self.upper, self.probability)
+
+    @property
+    def consumer_risk(self) -> float:
+        """The chance of evidence as good from a rate only just the one asked; NaN where there are no bounds."""
+        if math.isnan(self.lower):
+            return math.nan
+        shared = self.clustered
+        if shared is None:
+            return consumer_risk(self.n - self.failures, self.n, self.probability)
+        return consumer_risk(shared.effective_successes, shared.effective_n, self.probability)
+
+    @property
     def margin(self) -> float:
         """By how much the bound that decides is on the right side: of the rate asked; NaN where there are no bounds."""
         decisive = self.estimate if self.decide_by == ESTIMATE else self.lower
@@ -119,13 +134,21 @@ class Verdict:
         """What a reader must know before trusting the verdict; empty where there is nothing to say."""
         if self.reason:
             return self.reason
-        return " ".join(part for part in (self._sharing(), self._look()) if part)
+        return " ".join(part for part in (self._basis(), self._sharing(), self._look()) if part)
+
+    def _basis(self) -> str:
+        if self.decide_by != ESTIMATE or self.n == 0:
+            return ""
+        return f"Decided by the rate seen; at {stated(self.confidence)} confidence it would be {self.confident_status}."
 
     def _sharing(self) -> str:
         shared = self.clustered
         if shared is None:
             return ""
-        effect = "" if math.isnan(shared.design_effect) else f", design effect {shared.design_effect:.3g}"
+        effect = f", design effect {shared.design_effect:.3g}"
+        if math.isnan(shared.design_effect):
+            worst = self.n / shared.effective_n
+            effect = f", the design effect taken for {worst:.3g}: too few failures, or terrains, to estimate it"
         said = (
             f"{count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} and so are not independent; "
             f"the bounds allow for that ({shared.method}, effective n {shared.effective_n:.4g}{effect})."
@@ -145,23 +168,6 @@ class Verdict:
         )
 
 
-@dataclass(frozen=True)
-class Overall:
-    """A campaign's verdict in one word and one sentence.
-
-    `status` is None where no requirement was asked.
-    """
-
-    status: Status | None
-    crashed: int
-    sentence: str
-
-    @property
-    def word(self) -> str:
-        """The headline."""
-        return "NO REQUIREMENT" if self.status is None else str(self.status)
-
-
 def judge_campaign(
     frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], how: Sampled = INDEPENDENT
 ) -> list[Verdict]:
@@ -178,43 +184,6 @@ def judge_campaign(
         requirements that ask for a confidence stay INSUFFICIENT; those decided by the estimate are decided by the rate.
     """
     return [_judge(how.drawn(frame), requirement, how) for requirement in requirements]
-
-
-def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = INDEPENDENT) -> Overall:
-    """The campaign's verdict: FAIL if any requirement failed, else INSUFFICIENT if any is open, else PASS."""
-    crashed = crashed_cases(frame)
-    statuses = [verdict.status for verdict in verdicts]
-    tail = f" {count(crashed, 'case')} crashed." if crashed else ""
-    if not statuses:
-        return Overall(None, crashed, "The campaign asks for no requirement." + tail)
-    worst = next((status for status in (Status.FAIL, Status.INSUFFICIENT) if status in statuses), Status.PASS)
-    if not how.independent:
-        return Overall(worst, crashed, _by_rates(verdicts) + how.no_probability + tail)
-    sentence = {
-        Status.PASS: f"{count(len(statuses), 'requirement')} met.",
-        Status.FAIL: f"{statuses.count(Status.FAIL)} of {count(len(statuses), 'requirement')} not met.",
-        Status.INSUFFICIENT: (
-            f"{statuses.count(Status.INSUFFICIENT)} of {count(len(statuses), 'requirement')} "
-            f"cannot be decided by {count(len(frame), 'case')}.{_further(verdicts)}"
-        ),
-    }[worst]
-    return Overall(worst, crashed, sentence + tail)
-
-
-def _by_rates(verdicts: Sequence[Verdict]) -> str:
-    """How many requirements the rates of a designed campaign's own cases meet; empty where none is decided by them."""
-    statuses = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
-    if not statuses:
-        return ""
-    return f"{statuses.count(Status.PASS)} of {count(len(statuses), 'requirement')} met by the rate of these cases. "
-
-
-def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
-    """The exit code of a campaign: 1 a requirement failed or a case crashed, 3 not enough cases to say, 0 otherwise."""
-    statuses = {verdict.status for verdict in verdicts}
-    if crashed or Status.FAIL in statuses:
-        return 1
-    return 3 if Status.INSUFFICIENT in statuses else 0
 
 
 def crashed_cases(frame: pd.DataFrame) -> int:
@@ -418,14 +387,3 @@ def _number(value: object) -> float:
 
 def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + "."
-
-
-def _further(verdicts: Sequence[Verdict]) -> str:
-    """How many cases would decide what is open, where that can be said."""
-    needed = [verdict for verdict in verdicts if verdict.further_cases is not None]
-    if not needed:
-        return ""
-    most = max(needed, key=lambda verdict: verdict.further_cases or 0)
-    counted = most.clustered is not None and most.clustered.method is ClusterMethod.TERRAIN_COUNT
-    where = ", each on a terrain of its own," if counted else ""
-    return f" {count(most.further_cases or 0, 'further case')}{where} would do if no more fail."

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from campaigns.errors import CampaignError
-from reports.campaign import SCHEMA, TWIN_FILE, write_report
+from reports.campaign import TWIN_FILE, write_report
 from reports.stored import RECORD_FILE, TABLE_FILE, table
+from reports.twin import SCHEMA
 
 #: How deep below a folder campaigns are looked for.
 _DEPTH = 3

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from campaigns.definition.requirements import StatedRequirement
 from reports.dashboard.entries import Entry, Shown
+from reports.verdicts import ESTIMATE
 from reports.wording import NOTHING, percent
 
 #: Campaigns that a sparkline shows, the latest ones, and its size in pixels.
@@ -95,6 +96,20 @@ def sparkline(shown: Sequence[Shown]) -> Sparkline | None:
     places = [(round(4.0 + step * k, 2), height(rate)) for k, rate in enumerate(rates)]
     text = f"{len(known)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
     return Sparkline(" ".join(f"{x},{y}" for x, y in places), places[-1], height(known[-1].probability), text)
+
+
+def coverage(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
+    """Latest verdicts and how many requirements have each, those that no campaign shows last."""
+    words = [row.latest.shown.status for row in rows if row.latest is not None]
+    known = [word for word in dict.fromkeys(("FAIL", "INSUFFICIENT", "PASS", *words)) if word in words]
+    found = [(word, words.count(word)) for word in known]
+    missing = sum(row.latest is None for row in rows)
+    return [*found, ("NO CAMPAIGN", missing)] if missing else found
+
+
+def basis_text(shown: Shown) -> str:
+    """What a verdict rests on where that is no confidence; empty otherwise."""
+    return "by the rate seen" if shown.decide_by == ESTIMATE else ""
 
 
 def margin_text(shown: Shown) -> str:

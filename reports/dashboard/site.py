@@ -7,6 +7,7 @@ campaigns takes no longer than what is new.
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,7 @@ from typing import Any
 from campaigns.definition.requirements import StatedRequirement, shipped_requirements
 from reports.campaign import PAGE_FILE, VERIFICATION_FILE, page_environment, write_whole
 from reports.dashboard.entries import Entry, find_campaigns, read_entries
-from reports.dashboard.rows import RequirementRow, margin_text, requirement_rows
+from reports.dashboard.rows import RequirementRow, basis_text, coverage, margin_text, requirement_rows
 from reports.explorer import embedded, script_hash
 from reports.sections import replay_command
 from reports.stored import read_run
@@ -64,6 +65,8 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
         problems=problems,
         filters=_filters(entries),
         margin=margin_text,
+        basis=basis_text,
+        coverage=coverage(rows),
         percent=percent,
         data=embedded(_data(rows)),
         script=script,
@@ -84,7 +87,8 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
     if report.is_file():
         _place(report, folder / PAGE_FILE)
     cases = _write_cases(folder, entry)
-    text = _rendered("dashboard_campaign.html.j2", entry=entry, cases=cases, margin=margin_text, percent=percent)
+    shown = {"margin": margin_text, "basis": basis_text, "percent": percent}
+    text = _rendered("dashboard_campaign.html.j2", entry=entry, cases=cases, **shown)
     write_whole(page, text)
 
 
@@ -93,7 +97,9 @@ def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
     if not entry.kept:
         return []
     run, told = read_run(entry.directory), []
-    for case in entry.kept[:_MOST_CASES]:
+    # the worst first: two clicks from a requirement lead to its pictures
+    kept = sorted(entry.kept, key=lambda case: _place_among_worst(entry, case))
+    for case in kept[:_MOST_CASES]:
         shown = shown_case(run, case)
         if shown is None:
             continue
@@ -102,8 +108,15 @@ def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
         command = replay_command(run, str(case))
         text = _rendered("dashboard_case.html.j2", entry=entry, shown=shown, values=values, command=command)
         write_whole(folder / f"case-{case}.html", text)
-        told.append({"case": str(case), "outcome": shown.outcome, "file": f"case-{case}.html"})
+        place = _place_among_worst(entry, case)
+        rank = "" if place == len(entry.worst) else ("the largest error" if place == 0 else "among the largest errors")
+        told.append({"case": str(case), "outcome": shown.outcome, "file": f"case-{case}.html", "rank": rank})
     return told
+
+
+def _place_among_worst(entry: Entry, case: int) -> int:
+    """Where a case stands among those of the largest errors; behind all of them where it is none."""
+    return entry.worst.index(str(case)) if str(case) in entry.worst else len(entry.worst)
 
 
 def _place(source: Path, target: Path) -> None:
@@ -134,6 +147,10 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
                 "margin": margin_text(cell.shown),
                 "date": cell.entry.started[:10],
                 "evidence": f"{cell.shown.failures:,} of {cell.shown.n:,} failed",
+                "rate": cell.shown.estimate if math.isfinite(cell.shown.estimate) else None,
+                "asked": cell.shown.probability if math.isfinite(cell.shown.probability) else None,
+                "rate_text": percent(cell.shown.estimate),
+                "basis": basis_text(cell.shown),
             }
             for cell in row.all_cells
         ]
@@ -159,6 +176,7 @@ def _matrix(rows: Sequence[RequirementRow]) -> str:
                     "verdict": cell.shown.status,
                     "probability": shown["probability"],
                     "confidence": shown["confidence"],
+                    "decided_by": shown["decide_by"],
                     "cases": shown["n"],
                     "failures": shown["failures"],
                     "rate": shown["estimate"],

@@ -11,9 +11,9 @@ from reports.columns import numbers
 from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.statistics.samples import quantile_bounds
+from reports.statistics.samples import Groups, quantile_bounds
 from reports.svg import SERIES, in_page_style, new_axes
-from reports.verdicts import is_flag, members
+from reports.verdicts import is_flag, members, terrain_groups
 from reports.wording import number, percent, stated
 
 WITH, WITHOUT = "touchdown_speed_with_m_s", "touchdown_speed_without_m_s"
@@ -43,7 +43,12 @@ def landing_section(subject: Subject) -> Section | None:
         punctual = members(landed, IN_TIME)
         shares["computed before the thrusters fired, of all landings"] = share_of(punctual, landed)
     rows = [
-        [name, f"{one.hits:,} of {one.n:,}", percent(one.share), f"{percent(one.lower)} to {percent(one.upper)}"]
+        [
+            name,
+            f"{one.hits:,} of {one.n:,}",
+            percent(one.share),
+            f"{percent(one.sound_lower)} to {percent(one.sound_upper)}",
+        ]
         for name, one in shares.items()
     ]
     caption = "Share of landings with a horizontal speed at touchdown of more than so much."
@@ -52,13 +57,13 @@ def landing_section(subject: Subject) -> Section | None:
     confidence = stated(CONFIDENCE)
     gain, loss = number(float(-change.min())), number(float(change.max()))
     note = (
-        f"The same descents, with the answer used and not used. Intervals: two-sided, Clopper and "
-        f"Pearson, at {confidence} confidence. Largest gain and loss: {gain} and {loss} m/s."
+        f"The same descents, with the answer used and not used. Intervals: two-sided, Clopper and Pearson, at "
+        f"{confidence} confidence, which allow for shared terrains. Largest gain and loss: {gain} and {loss} m/s."
     )
     blocks = [
         Block(plates=[drawn]),
         Block(heading="Good and harm", grid=Grid(["", "Landings", "Share", f"{confidence} interval"], rows), note=note),
-        Block(heading="Horizontal speed at touchdown", grid=_speeds_grid(with_it, without)),
+        Block(heading="Horizontal speed at touchdown", grid=_speeds_grid(with_it, without, terrain_groups(landed))),
     ]
     data = {
         "landings": int(known.sum()),
@@ -89,14 +94,14 @@ def speed_figure(with_it: Float[np.ndarray, " n"], without: Float[np.ndarray, " 
     return figure
 
 
-def _speeds_grid(with_it: Float[np.ndarray, " n"], without: Float[np.ndarray, " n"]) -> Grid:
+def _speeds_grid(with_it: Float[np.ndarray, " n"], without: Float[np.ndarray, " n"], groups: Groups) -> Grid:
     """Mean, quantiles with bounds, and shares above round speeds."""
     columns = (with_it, without)
     rows = [["mean (m/s)", *(number(float(values.mean())) for values in columns)]]
     for probability in (0.5, 0.95, 0.99):
         texts = []
         for values in columns:
-            bound = quantile_bounds(values, probability, CONFIDENCE)[1]
+            bound = quantile_bounds(values, probability, CONFIDENCE, groups)[1]
             known = f" (≤ {number(bound)})" if np.isfinite(bound) else ""
             texts.append(f"{number(float(np.quantile(values, probability)))}{known}")
         rows.append([f"{stated(probability)} quantile (its bound)", *texts])

@@ -16,8 +16,10 @@ from reports.hda.rows import flag, interval_text, is_landing, share_text
 from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
+from reports.statistics.proportions import Interval
 from reports.statistics.samples import mean_interval
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
+from reports.verdicts import terrain_groups
 from reports.wording import NOTHING, number, stated
 
 #: Table II: run, position error, deviations of northing and easting (m), run time (s). Run 2 is missing there.
@@ -44,7 +46,7 @@ def touchdown_section(subject: Subject) -> Section | None:
         return None
     caption = "Share of landings nearer to the site than so much; vertical: the paper's three runs, by averaged GPS."
     figure = plate(touchdown_figure(errors), "touchdown", caption)
-    means = {name: mean_interval(values, CONFIDENCE) for name, values in errors.items() if values.size}
+    means = {name: _interval(landed, name) for name, values in errors.items() if values.size}
     note = (
         "By averaged GPS: distance of the receiver's averaged solutions after landing from the site's coordinates, as "
         "the paper measured it. By truth: of the true touchdown from where these coordinates led, the navigation's "
@@ -95,7 +97,7 @@ def _grid(landed: pd.DataFrame, errors: Mapping[str, np.ndarray]) -> Grid:
     taken = _known(landed, "estimation_time_s")
     for name, values in errors.items():
         if values.size:
-            bounds = mean_interval(values, CONFIDENCE)
+            bounds = _interval(landed, name)
             told = f"mean {number(float(values.mean()))} ({number(bounds[0])} to {number(bounds[1])})"
             spread = " to ".join(number(float(one)) for one in np.quantile(values, (0.05, 0.95)))
             run_time = f"{1e3 * float(np.median(taken)):.0f} ms here" if taken.size else NOTHING
@@ -124,6 +126,13 @@ def touchdown_figure(errors: Mapping[str, Float[np.ndarray, " n"]]) -> Figure:
 def _known(frame: pd.DataFrame, name: str) -> Float[np.ndarray, " n"]:
     values = numbers(frame, name)
     return np.asarray(values[np.isfinite(values)])
+
+
+def _interval(frame: pd.DataFrame, name: str) -> Interval:
+    """The interval of a column's mean, which allows for shared terrains."""
+    values, groups = numbers(frame, name), terrain_groups(frame)
+    finite = np.isfinite(values)
+    return mean_interval(values[finite], CONFIDENCE, None if groups is None else groups[finite])
 
 
 def _mean(values: Float[np.ndarray, " n"]) -> str:

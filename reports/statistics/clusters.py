@@ -46,6 +46,8 @@ class ClusteredEvidence:
         Variance of the success rate over that of as many independent cases; NaN where it cannot be estimated.
     effective_n
         The number of independent cases that the evidence is worth: terrains where whole terrains are counted.
+    effective_successes
+        Of these, those that succeeded: the lower bound is that of so many.
     lower, upper
         One-sided bounds of the success rate of a case, each at the requirement's confidence.
     """
@@ -55,6 +57,7 @@ class ClusteredEvidence:
     method: ClusterMethod
     design_effect: float
     effective_n: float
+    effective_successes: float
     lower: float
     upper: float
 
@@ -89,6 +92,7 @@ def clustered_evidence(
         ClusterMethod.TERRAIN_COUNT,
         float("nan"),
         float(terrains),
+        float(terrains - failed),
         proportion_lower(terrains - failed, terrains, confidence),
         proportion_upper(succeeded, terrains, confidence),
     )
@@ -123,6 +127,7 @@ def _korn_graubard(
         ClusterMethod.KORN_GRAUBARD,
         design_effect,
         effective_n,
+        float(effective_successes),
         proportion_lower(effective_successes, effective_n, confidence),
         proportion_upper(effective_successes, effective_n, confidence),
     )

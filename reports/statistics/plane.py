@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from reports.statistics.samples import Quantile, quantile_bounds
+from reports.statistics.samples import Groups, Quantile, quantile_bounds
 
 #: Fewest points of an ellipse: its factor needs two degrees of freedom beyond the plane's.
 FEWEST_OF_ELLIPSE = 5
@@ -83,12 +83,18 @@ def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> Error
     )
 
 
-def circular_error(errors: Float[np.ndarray, "n 2"], probability: float, confidence: float) -> Quantile:
+def circular_error(
+    errors: Float[np.ndarray, "n 2"], probability: float, confidence: float, groups: Groups = None
+) -> Quantile:
     """The radius about the truth that holds a share of the errors (0.5: the circular error probable), with bounds.
 
     The bounds are order statistics, one-sided each at the confidence: nothing is assumed of the distribution.
     """
-    known = errors[np.isfinite(errors).all(axis=1)]
-    radii = np.hypot(known[:, 0], known[:, 1])
+    finite = np.isfinite(errors).all(axis=1)
+    radii = np.hypot(*errors[finite].T)
     estimate = float(np.quantile(radii, probability)) if radii.size else math.nan
-    return Quantile(probability, estimate, *quantile_bounds(radii, probability, confidence))
+    return Quantile(
+        probability,
+        estimate,
+        *quantile_bounds(radii, probability, confidence, None if groups is None else groups[finite]),
+    )

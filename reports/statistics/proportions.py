@@ -99,3 +99,15 @@ def minimum_sample_size(reliability: float, confidence: float, failures: int = 0
 def further_cases_needed(n: int, failures: int, reliability: float, confidence: float) -> int:
     """How many more cases show the reliability at the confidence if none of them fails; 0 when it is shown."""
     return max(0, minimum_sample_size(reliability, confidence, failures) - n)
+
+
+def consumer_risk(successes: float | int, n: float | int, rate: float) -> float:
+    """The chance of evidence at least as good from a true rate that is only just the one asked.
+
+    Notes
+    -----
+    The risk of the one who accepts it (Hanson & Beard, NASA/TP-2010-216447): it is at most 1 - confidence exactly where
+    the one-sided lower Clopper-Pearson bound at that confidence reaches the rate. With no successes it is 1.
+    """
+    _check_counts(successes, n)
+    return 1.0 if successes <= 0 else float(stats.beta.cdf(rate, successes, n - successes + 1.0))

@@ -2,37 +2,36 @@
 
 Quantiles are bounded by order statistics, free of any assumption about the distribution (Wilks, "Determination of
 sample sizes for setting tolerance limits", Ann. Math. Statist. 12, 1941; as Hanson & Beard use them for a stated
-consumer risk, NASA/TP-2010-216447). Means and spreads are bounded by the BCa bootstrap (Efron, "Better bootstrap
-confidence intervals", J. Amer. Statist. Assoc. 82, 1987) as SciPy has it, with two corrections for small samples, in
-which BCa alone covers too little: its level is that of Student's t instead of the normal distribution (Hesterberg,
-"What teachers should know about the bootstrap", Amer. Statist. 69, 2015), and a spread's interval reaches at least as
-far as Bonett's ("Approximate confidence interval for standard deviation of nonnormal distributions", Comput. Statist.
-Data Anal. 50, 2006). `python -m benchmarks.validation --only intervals` measures their coverage.
+consumer risk, NASA/TP-2010-216447). Means and spreads are bounded by the BCa bootstrap (`.bootstrap`); a spread's
+interval reaches at least as far as Bonett's ("Approximate confidence interval for standard deviation of nonnormal
+distributions", Comput. Statist. Data Anal. 50, 2006), since BCa alone covers too little in small samples.
+Where values share terrains (`groups`) all of these are by terrains: `reports.statistics.shared`. `python -m
+benchmarks.validation --only intervals --only shared` measures their coverage.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import stats
 
+from reports.statistics.bootstrap import LARGEST_SAMPLE, bca
 from reports.statistics.proportions import Interval, check_confidence
+from reports.statistics.shared import is_shared, shared_mean, shared_quantile, shared_spread
 
-#: Above this many values the bootstrap's interval equals the large-sample one in what is printed.
-_BOOTSTRAP_LARGEST_SAMPLE = 2000
-_BOOTSTRAP_RESAMPLES = 2000
-#: The bootstrap of a report draws from a fixed seed: the same rows give the same page.
-_BOOTSTRAP_SEED = 19340401
+#: Which values are from one terrain: its number for each; None where all are independent.
+Groups = Int[np.ndarray, " n"] | None
 #: Fewest values that say anything of their spread.
 _FEWEST_OF_SPREAD = 8
 
 
-def quantile_bounds(sample: Float[np.ndarray, " n"], quantile: float, confidence: float) -> Interval:
+def quantile_bounds(
+    sample: Float[np.ndarray, " n"], quantile: float, confidence: float, groups: Groups = None
+) -> Interval:
     """One-sided lower and upper order-statistic bounds of a quantile, each at the confidence.
 
     Returns
@@ -47,6 +46,8 @@ def quantile_bounds(sample: Float[np.ndarray, " n"], quantile: float, confidence
     P(Bin(n, q) <= r - 1): the upper bound is the smallest such value with that probability at the confidence.
     """
     check_confidence(confidence)
+    if groups is not None and is_shared(groups):
+        return shared_quantile(np.asarray(sample, dtype=np.float64), groups, quantile, confidence)
     ordered = np.sort(np.asarray(sample, dtype=np.float64))
     n = ordered.size
     if n == 0:
@@ -63,10 +64,10 @@ def _upper_order_bound(ordered: Float[np.ndarray, " n"], quantile: float, confid
     return float(ordered[rank]) if rank < n else math.inf
 
 
-def mean_interval(sample: Float[np.ndarray, " n"], confidence: float) -> Interval:
+def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
     """Two-sided interval of the mean: BCa bootstrap, or the central limit theorem's in large samples.
 
-    NaN for fewer than two values; the value itself where all are equal.
+    NaN for fewer than two values, or five terrains; the value itself where all are equal.
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
@@ -75,16 +76,18 @@ def mean_interval(sample: Float[np.ndarray, " n"], confidence: float) -> Interva
     mean, spread = float(values.mean()), float(values.std(ddof=1))
     if np.ptp(values) == 0.0:
         return mean, mean
-    if values.size > _BOOTSTRAP_LARGEST_SAMPLE:
+    if groups is not None and is_shared(groups):
+        return shared_mean(values, groups, confidence)
+    if values.size > LARGEST_SAMPLE:
         half = float(stats.norm.ppf(0.5 * (1.0 + confidence))) * spread / math.sqrt(values.size)
         return mean - half, mean + half
-    return _bootstrap(values, np.mean, confidence)
+    return bca((values,), np.mean, confidence)
 
 
-def spread_interval(sample: Float[np.ndarray, " n"], confidence: float) -> Interval:
+def spread_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
     """Two-sided interval of the standard deviation: BCa bootstrap and Bonett's, whichever reaches further.
 
-    NaN for fewer than eight values; 0 where all are equal. In large samples Bonett's alone.
+    NaN for fewer than eight values, or five terrains; 0 where all are equal. In large samples Bonett's alone.
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
@@ -92,10 +95,12 @@ def spread_interval(sample: Float[np.ndarray, " n"], confidence: float) -> Inter
         return math.nan, math.nan
     if np.ptp(values) == 0.0:
         return 0.0, 0.0
+    if groups is not None and is_shared(groups):
+        return shared_spread(values, groups, confidence)
     lower, upper = _bonett(values, confidence)
-    if values.size > _BOOTSTRAP_LARGEST_SAMPLE:
+    if values.size > LARGEST_SAMPLE:
         return lower, upper
-    resampled = _bootstrap(values, _deviation, confidence)
+    resampled = bca((values,), _deviation, confidence)
     return float(np.fmin(lower, resampled[0])), float(np.fmax(upper, resampled[1]))
 
 
@@ -114,30 +119,6 @@ def _bonett(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
     error = correction * math.sqrt(max((kurtosis - (n - 3.0) / n) / (n - 1.0), 0.0))
     middle = math.log(correction * squares / (n - 1.0))
     return math.exp(0.5 * (middle - quantile * error)), math.exp(0.5 * (middle + quantile * error))
-
-
-def _bootstrap(values: Float[np.ndarray, " n"], statistic: Any, confidence: float) -> Interval:
-    with warnings.catch_warnings():
-        # A degenerate bootstrap distribution (two values, say) is answered by NaN bounds, which the caller prints.
-        warnings.simplefilter("ignore")
-        result = stats.bootstrap(
-            (values,),
-            statistic,
-            confidence_level=_widened(confidence, values.size),
-            n_resamples=_BOOTSTRAP_RESAMPLES,
-            batch=200,
-            vectorized=True,
-            method="BCa",
-            rng=np.random.default_rng(_BOOTSTRAP_SEED),
-        )
-    return float(result.confidence_interval.low), float(result.confidence_interval.high)
-
-
-def _widened(confidence: float, n: int) -> float:
-    """The level at which the normal quantile is Student's, times sqrt(n / (n - 1)): Hesterberg 2015, section 5."""
-    quantile = float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1)) * math.sqrt(n / (n - 1.0))
-    # below 1, which the bootstrap does not take
-    return min(2.0 * float(stats.norm.cdf(quantile)) - 1.0, 1.0 - 1e-6)
 
 
 @dataclass(frozen=True)
@@ -194,17 +175,18 @@ def summarize(
     sample: Float[np.ndarray, " n"],
     quantiles: tuple[float, ...] = (0.5, 0.95, 0.99),
     confidence: float = 0.95,
+    groups: Groups = None,
 ) -> ErrorSummary:
     """Summarises a sample of errors; values that are not finite are counted as missing and left out.
 
     For radial errors the quantiles 0.5 and 0.95 are the circular error probable and the 95 % radius about the truth.
     """
     values = np.asarray(sample, dtype=np.float64)
-    finite = values[np.isfinite(values)]
+    finite, shared = values[np.isfinite(values)], None if groups is None else groups[np.isfinite(values)]
     n, missing = finite.size, values.size - finite.size
     median = float(np.median(finite)) if n else math.nan
-    mean_lower, mean_upper = mean_interval(finite, confidence)
-    sd_lower, sd_upper = spread_interval(finite, confidence)
+    mean_lower, mean_upper = mean_interval(finite, confidence, shared)
+    sd_lower, sd_upper = spread_interval(finite, confidence, shared)
     return ErrorSummary(
         n=n,
         missing=missing,
@@ -218,13 +200,13 @@ def summarize(
         median=median,
         robust_sd=1.4826 * float(np.median(np.abs(finite - median))) if n else math.nan,
         largest=float(np.abs(finite).max()) if n else math.nan,
-        quantiles=tuple(_quantile(finite, probability, confidence) for probability in quantiles),
+        quantiles=tuple(_quantile(finite, probability, confidence, shared) for probability in quantiles),
         confidence=confidence,
     )
 
 
-def _quantile(finite: Float[np.ndarray, " n"], probability: float, confidence: float) -> Quantile:
+def _quantile(finite: Float[np.ndarray, " n"], probability: float, confidence: float, groups: Groups) -> Quantile:
     # A quantile beyond all but the last value is an extrapolation, not an estimate.
     told = finite.size * min(probability, 1.0 - probability) >= 1.0 - 1e-9
     estimate = float(np.quantile(finite, probability)) if told else math.nan
-    return Quantile(probability, estimate, *quantile_bounds(finite, probability, confidence))
+    return Quantile(probability, estimate, *quantile_bounds(finite, probability, confidence, groups))

@@ -10,6 +10,31 @@
     ["system", "site", "algorithm", "commit"].every((key) => !asked[key] || row.dataset[key] === asked[key]) &&
     (!asked.from || row.dataset.date >= asked.from) && (!asked.until || row.dataset.date <= asked.until) &&
     (!asked.text || row.dataset.text.toLowerCase().includes(asked.text.toLowerCase()));
+  const SVG = "http://www.w3.org/2000/svg", LATEST = 24, W = 120, H = 26;
+  const add = (parent, name, attributes) => {
+    const node = document.createElementNS(SVG, name);
+    for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+    parent.append(node);
+  };
+  // as `reports.dashboard.rows.sparkline` draws it of all campaigns
+  const spark = (found) => {
+    const known = found.filter((one) => one.name === found[0].name && one.rate !== null && one.asked !== null);
+    const shown = known.slice(0, LATEST).reverse();
+    if (shown.length < 2) return [];
+    let low = Math.min(...shown.flatMap((one) => [one.rate, one.asked]));
+    low -= 0.15 * (1 - low) + 1e-9;
+    const height = (rate) => 3 + (H - 6) * (1 - rate) / (1 - low), last = shown[shown.length - 1];
+    const places = shown.map((one, k) => [4 + (W - 8) / (shown.length - 1) * k, height(one.rate)]);
+    const drawn = document.createElementNS(SVG, "svg");
+    drawn.setAttribute("class", "spark");
+    drawn.setAttribute("viewBox", `0 0 ${W} ${H}`);
+    drawn.setAttribute("role", "img");
+    drawn.setAttribute("aria-label", `${shown.length} campaigns, rates ${shown[0].rate_text} to ${last.rate_text}`);
+    add(drawn, "line", {x1: 0, x2: W, y1: height(last.asked), y2: height(last.asked)});
+    add(drawn, "polyline", {points: places.map((at) => at.join()).join(" ")});
+    add(drawn, "circle", {cx: places[places.length - 1][0], cy: places[places.length - 1][1], r: 2.6});
+    return [drawn];
+  };
   const show = (row, found) => {
     const verdict = row.querySelector(".verdict");
     if (!verdict) return;
@@ -17,7 +42,12 @@
     const latest = found[0];
     verdict.className = `verdict status-${latest ? latest.status.toLowerCase() : "no-campaign"}`;
     const badge = latest && badges.get(latest.status);
-    if (badge) verdict.replaceChildren(badge.cloneNode(true));
+    if (badge) {
+      const basis = document.createElement("span");
+      basis.className = "asked";
+      basis.textContent = latest.basis;
+      verdict.replaceChildren(badge.cloneNode(true), basis);
+    }
     else verdict.textContent = "no campaign fits";
     evidence.textContent = latest ? latest.evidence : "\u2013";
     if (latest) {
@@ -30,6 +60,7 @@
       about.append(link, ", ", date);
       evidence.append(about);
     }
+    row.querySelector(".trend").replaceChildren(...(latest ? spark(found) : []));
     margin.textContent = latest ? latest.margin : "\u2013";
     shown.textContent = found.length.toLocaleString("en");
   };

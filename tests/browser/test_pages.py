@@ -139,6 +139,19 @@ def test_campaigns_are_filtered(campaigns: Path, open_page: Open) -> None:
     assert seen.complaints == []
 
 
+def test_trends_are_those_of_the_campaigns_that_are_left(campaigns: Path, open_page: Open) -> None:
+    page, seen = open_page(_index(campaigns))
+    trend = page.locator('tr[data-requirement="DIMES-VEL"] .trend svg')
+    of_all = trend.get_attribute("aria-label")
+    page.locator("input[name=until]").fill("2026-01-01")
+    assert trend.count() == 0
+    page.locator("input[name=until]").fill("")
+    # drawn anew, it is what the page came with
+    assert (trend.count(), trend.get_attribute("aria-label")) == (1, of_all)
+    assert page.locator(".coverage").inner_text().count("NO CAMPAIGN") == 1
+    assert seen.complaints == []
+
+
 def test_a_filter_stands_on_the_way_back(campaigns: Path, open_page: Open) -> None:
     page, seen = open_page(_index(campaigns))
     page.locator("select[name=site]").select_option("meridiani")

@@ -13,7 +13,7 @@ from fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
 
 from campaigns.definition.loading import load_campaign
 from campaigns.errors import ConfigurationError
-from marsyard import cli
+from marsyard import cli, nightly_command
 from marsyard.nightly_plan import PLAN_FILE, definition_of, night_seed, read_plan
 
 pytestmark = [
@@ -71,6 +71,31 @@ def test_a_campaign_that_cannot_be_run_costs_the_night_no_other(nightly: Nightly
     assert "NOT RUN" in text
     assert "nonesuch" in text
     assert "| fake |" in text
+
+
+def test_a_killed_night_is_visible_and_compared_with_nothing(
+    nightly: Nightly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        """What no handler catches, as SIGKILL."""
+
+    def kill(*_: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as now:
+        now.setattr(nightly_command, "_run_one", kill)
+        with pytest.raises(Killed):
+            nightly()
+    assert (tmp_path / "out" / "nightly.md").read_text().startswith("# Night 1: RUNNING")
+    _, page = nightly()
+    assert page.startswith("# Night 2:")
+    assert "Night 1, begun" in page
+    assert "was interrupted" in page
+    assert "No figure has a history" in page
+    with monkeypatch.context() as now:
+        now.setattr(nightly_command, "_run_one", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        status, page = nightly()
+    assert (status, page.splitlines()[0]) == (130, "# Night 3: INTERRUPTED")
 
 
 def test_nights_draw_cases_of_their_own(tmp_path: Path) -> None:

@@ -20,12 +20,15 @@ from fake_campaign import REQUIREMENT, Silence, write_campaign
 from campaigns.definition.loading import load_campaign
 from campaigns.errors import CampaignError
 from campaigns.execution.crew import Crew
+from campaigns.running.engine import run_campaign
 from campaigns.store import record
 from marsyard import cli
 from marsyard.dashboard_command import server
 from marsyard.deciding import run_until_decided
 from reports.deciding import next_look
+from reports.notable import notable_cases
 from reports.sampled import Sampled
+from reports.stored import read_run
 from reports.verdicts import judge_campaign
 
 pytestmark = [
@@ -172,6 +175,24 @@ def test_a_campaign_stops_itself_and_says_so(tmp_path: Path) -> None:
     # All cases fail, but on one terrain, and that refutes a rate of half at none of the looks: it runs to its end.
     assert (stored.total_cases, stored.most_cases) == (128, 128)
     assert watch.notes[-1] == "stopped after 128 of at most 128 cases"
+
+
+def test_the_gallery_runs_its_cases_again(tmp_path: Path, marsyard: Command) -> None:
+    dispersions = '[dispersions]\naltitude_m = {distribution = "normal", mean = 2000, sd = 100}\n'
+    path, directory = write_campaign(tmp_path, dispersions=dispersions), tmp_path / "run"
+    run_campaign(load_campaign(str(path), cases=12), directory, Crew(jobs=1), Silence())
+    wanted = set(notable_cases(read_run(directory)))
+    assert len(wanted) >= 4
+    _, out, err = marsyard("report", directory, "--gallery")
+    kept = {int(folder.name) for folder in (directory / "cases").iterdir()}
+    assert (wanted - kept, err) == (set(), "")
+    assert out.count("ran again for its pictures") == len(wanted - {json.loads(_record(directory))["showcase"]})
+    # once they are kept nothing is run again
+    assert "ran again" not in marsyard("report", directory, "--gallery")[1]
+
+
+def _record(directory: Path) -> str:
+    return (directory / "campaign.json").read_text()
 
 
 def test_what_cannot_be_decided_is_refused(tmp_path: Path) -> None:

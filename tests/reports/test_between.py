@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
+import pytest
 
 from reports.between import Contrast, contrast_grid, contrasts
 from reports.stored import read_run
@@ -18,7 +19,7 @@ def _contrasts(first: Path, second: Path) -> tuple[bool, dict[str, Contrast]]:
 
 
 def test_the_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun) -> None:
-    frame = make_rows(200)
+    frame = make_rows(200, terrains=40)
     worse = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
     paired, found = _contrasts(make_run(frame), make_run(worse, name="other"))
     assert paired
@@ -26,6 +27,11 @@ def test_the_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun
     assert found["velocity error (m/s)"].p_value < 1e-9
     assert found["answered"].p_value == 1.0
     assert found["came to an end"].second.level == 1.0
+    # Four terrains say nothing of others, however many cases they bear: four signs alike, twice, of four figures.
+    few = make_rows(200)
+    worse = few.assign(velocity_error_m_s=few["velocity_error_m_s"] * 1.02)
+    _, found = _contrasts(make_run(few, name="few"), make_run(worse, name="few-other"))
+    assert found["velocity error (m/s)"].p_value == pytest.approx(4 * 2 / 2**4)
 
 
 def test_draws_of_their_own_are_compared_as_two_samples(make_rows: Rows, make_run: MakeRun) -> None:

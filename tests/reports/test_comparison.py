@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from reports.comparison import comparison, mcnemar, own_frame, paired_errors
+from reports.comparison import comparison, own_frame
 from reports.consistency import consistencies, consistency
 
 
@@ -16,15 +16,6 @@ def rows(mine: list[float], its: list[float]) -> pd.DataFrame:
         frame[f"{prefix}outcome"] = np.where(known, "VALID", "CRASHED")
         frame[f"{prefix}answered"] = known
     return pd.DataFrame({**frame, "other.velocity_error_m_s": its, "altitude_m": 1.0})
-
-
-def test_mcnemar_is_exact() -> None:
-    first = np.array([True] * 9 + [False] * 1 + [True] * 5)
-    other = np.array([False] * 9 + [True] * 1 + [True] * 5)
-    only_first, only_other, p = mcnemar(first, other)
-    assert (only_first, only_other) == (9, 1)
-    assert p == pytest.approx(2 * (1 + 10) / 2**10)  # two tails of ten fair coins
-    assert mcnemar(first, first)[2] == 1.0
 
 
 def test_algorithms_side_by_side() -> None:
@@ -38,6 +29,15 @@ def test_algorithms_side_by_side() -> None:
     assert difference.mean == pytest.approx((1 + 1 - 5) / 3)
 
 
+def test_probabilities_are_corrected_for_the_number_of_algorithms() -> None:
+    frame = rows([1.0] * 12, [2.0] * 12)
+    again = frame.filter(like="other.").rename(columns=lambda name: name.replace("other.", "third."))
+    (alone,) = comparison(frame, "velocity_error_m_s", 1.5)[1]
+    both = comparison(pd.concat([frame, again], axis=1), "velocity_error_m_s", 1.5)[1]
+    assert [one.success_p for one in both] == pytest.approx([2.0 * alone.success_p] * 2)
+    assert [one.error_p for one in both] == pytest.approx([2.0 * alone.error_p] * 2)
+
+
 def test_one_algorithm_alone_is_no_comparison() -> None:
     frame = rows([1, 2], [1, 2])[["case", "algorithm", "outcome", "answered", "velocity_error_m_s"]]
     assert comparison(frame, "velocity_error_m_s", 5.0) == ([], [])
@@ -48,25 +48,6 @@ def test_a_frame_as_if_the_other_had_been_judged() -> None:
     assert own["velocity_error_m_s"].tolist() == [3, 4]
     assert own["altitude_m"].tolist() == [1.0, 1.0]
     assert not any("." in str(name) for name in own.columns)
-
-
-def test_the_interval_of_a_paired_mean_covers_it() -> None:
-    rng = np.random.default_rng(5)
-    hits = sum(
-        lower <= 0.3 <= upper
-        for _, lower, upper, _ in (paired_errors(rng.normal(0.3, 1.0, 60), None) for _ in range(200))
-    )
-    # 90 % of 200, with 4 standard deviations of sqrt(200 * 0.9 * 0.1) and what a bootstrap of 60 falls short of
-    assert 158 <= hits <= 197
-
-
-def test_cases_on_one_terrain_are_drawn_together() -> None:
-    rng = np.random.default_rng(6)
-    terrains = np.repeat(np.arange(20), 10)
-    differences = np.repeat(rng.normal(size=20), 10)
-    _, lower, upper, _ = paired_errors(differences, terrains)
-    _, lone_lower, lone_upper, _ = paired_errors(differences, None)
-    assert (upper - lower) / (lone_upper - lone_lower) == pytest.approx(np.sqrt(10.0), rel=0.15)
 
 
 def test_right_covariances_are_consistent_19_times_in_20() -> None:

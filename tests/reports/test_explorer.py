@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from reports.explorer import MOST_POINTS, embedded, explorer_data, points_of
+from reports.notable import notable_cases
 from reports.stored import read_run
 from reports.systems import gallery_cases
 
@@ -44,6 +45,18 @@ def test_embedded_data_cannot_end_its_element() -> None:
     text = str(embedded(hostile))
     assert not set("<>&\u2028") & set(text)
     assert json.loads(text) == hostile
+
+
+def test_notable_cases_are_the_worst_the_silent_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+    frame = make_rows(60, crashed=2)
+    found = notable_cases(read_run(make_run(frame)))
+    sizes = frame["velocity_error_m_s"]
+    assert found[:2] == sizes.nlargest(2).index.tolist()
+    silent = frame.index[sizes.isna() & ~frame["outcome"].eq("CRASHED")].tolist()
+    assert found[2:4] == silent[:2]
+    assert len(found) == len(set(found)) == 6
+    assert not set(found) & set(frame.index[frame["outcome"].eq("CRASHED")])
+    assert notable_cases(read_run(make_run(frame.head(0), name="none"))) == []
 
 
 def test_the_gallery_holds_the_worst_the_silent_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:

@@ -15,9 +15,10 @@ import pytest
 from rich.console import Console
 
 from reports.campaign import write_report
+from reports.overall import exit_code, overall
 from reports.sampled import INDEPENDENT, Sampled, sampled
 from reports.tables import verdict_table
-from reports.verdicts import Status, exit_code, judge_campaign, overall
+from reports.verdicts import Status, judge_campaign
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from reports.overall import exit_code, overall
 from reports.sampled import Sampled
 from reports.statistics.proportions import proportion_lower, proportion_upper
-from reports.verdicts import Status, Verdict, exit_code, judge_campaign, overall
+from reports.verdicts import Status, Verdict, judge_campaign
 
 Rows = Callable[..., pd.DataFrame]
 
@@ -161,6 +162,22 @@ def test_the_estimate_decides_among_shared_terrains_too(velocity: dict[str, Any]
     verdict = _judge(_rows(400, 0).assign(terrain=np.arange(400) % 8), velocity, decide_by="estimate")
     assert (verdict.status, verdict.plain_status) == (Status.PASS, None)
     assert "8 terrains" in verdict.note
+
+
+def test_what_the_estimate_decides_says_what_confidence_would(velocity: dict[str, Any]) -> None:
+    found = _judge(_rows(24, 0), velocity, decide_by="estimate")
+    assert (found.status, found.confident_status) == (Status.PASS, Status.INSUFFICIENT)
+    assert "at 90 % confidence it would be INSUFFICIENT" in found.note
+    assert "1 of them by the rate seen alone" in overall([found], _rows(24, 0)).sentence
+
+
+def test_consumers_risk_is_what_the_confidence_leaves_at_the_least_cases_that_pass(velocity: dict[str, Any]) -> None:
+    # 0.99 ** 230 = 0.0991: the least n of the design's table for 99 % at 90 %.
+    assert _judge(_rows(230, 0), velocity).consumer_risk == pytest.approx(0.99**230)
+    # ten cases on each of 230 terrains are worth no more
+    found = _judge(_rows(2300, 0).assign(terrain=np.arange(2300) // 10), velocity)
+    assert found.consumer_risk == pytest.approx(0.99**230)
+    assert "the design effect taken for 10" in found.note
 
 
 def test_valid_cannot_be_told_without_its_column(velocity: dict[str, Any]) -> None:

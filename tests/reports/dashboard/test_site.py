@@ -38,6 +38,10 @@ def test_every_requirement_has_a_row_and_every_campaign(make_rows: Rows, make_ru
     assert len(re.findall(r'<tr id="dimes-synthetic-', text)) == 3
     assert '<svg class="spark"' in text
     assert "3 stored campaigns" in text
+    counted = re.search(r'<ul class="coverage".*?</ul>', text, re.DOTALL)
+    assert counted is not None
+    told = " ".join(re.sub(r"<[^>]+>", " ", counted[0]).split())
+    assert told == f"INSUFFICIENT 1 NO CAMPAIGN {len(shipped_requirements()) - 1}"
     matrix = list(csv.DictReader(io.StringIO((tmp_path / "site" / "verification.csv").read_text())))
     verdicts = {row["requirement"]: row["verdict"] for row in matrix}
     assert (verdicts["DIMES-VEL"], verdicts["HDA-TIME"]) == ("INSUFFICIENT", "NO CAMPAIGN")

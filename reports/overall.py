@@ -1,0 +1,84 @@
+"""A campaign's verdict in one word and one sentence, and the exit status that goes with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import pandas as pd
+
+from reports.sampled import INDEPENDENT, Sampled
+from reports.statistics.clusters import ClusterMethod
+from reports.verdicts import ESTIMATE, Status, Verdict, crashed_cases
+from reports.wording import count
+
+
+@dataclass(frozen=True)
+class Overall:
+    """A campaign's verdict in one word and one sentence.
+
+    `status` is None where no requirement was asked.
+    """
+
+    status: Status | None
+    crashed: int
+    sentence: str
+
+    @property
+    def word(self) -> str:
+        """The headline."""
+        return "NO REQUIREMENT" if self.status is None else str(self.status)
+
+
+def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = INDEPENDENT) -> Overall:
+    """The campaign's verdict: FAIL if any requirement failed, else INSUFFICIENT if any is open, else PASS."""
+    crashed = crashed_cases(frame)
+    statuses = [verdict.status for verdict in verdicts]
+    tail = f" {count(crashed, 'case')} crashed." if crashed else ""
+    if not statuses:
+        return Overall(None, crashed, "The campaign asks for no requirement." + tail)
+    worst = next((status for status in (Status.FAIL, Status.INSUFFICIENT) if status in statuses), Status.PASS)
+    if not how.independent:
+        return Overall(worst, crashed, _by_rates(verdicts) + how.no_probability + tail)
+    sentence = {
+        Status.PASS: f"{count(len(statuses), 'requirement')} met.{_estimated(verdicts)}",
+        Status.FAIL: f"{statuses.count(Status.FAIL)} of {count(len(statuses), 'requirement')} not met.",
+        Status.INSUFFICIENT: (
+            f"{statuses.count(Status.INSUFFICIENT)} of {count(len(statuses), 'requirement')} "
+            f"cannot be decided by {count(len(frame), 'case')}.{_further(verdicts)}"
+        ),
+    }[worst]
+    return Overall(worst, crashed, sentence + tail)
+
+
+def _estimated(verdicts: Sequence[Verdict]) -> str:
+    """How many requirements are met by the rate seen alone; empty for none."""
+    alone = sum(one.decide_by == ESTIMATE and one.confident_status is not Status.PASS for one in verdicts)
+    return f" {alone} of them by the rate seen alone, not at the confidence." if alone else ""
+
+
+def _by_rates(verdicts: Sequence[Verdict]) -> str:
+    """How many requirements the rates of a designed campaign's own cases meet; empty where none is decided by them."""
+    statuses = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
+    if not statuses:
+        return ""
+    return f"{statuses.count(Status.PASS)} of {count(len(statuses), 'requirement')} met by the rate of these cases. "
+
+
+def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
+    """The exit code of a campaign: 1 a requirement failed or a case crashed, 3 not enough cases to say, 0 otherwise."""
+    statuses = {verdict.status for verdict in verdicts}
+    if crashed or Status.FAIL in statuses:
+        return 1
+    return 3 if Status.INSUFFICIENT in statuses else 0
+
+
+def _further(verdicts: Sequence[Verdict]) -> str:
+    """How many cases would decide what is open, where that can be said."""
+    needed = [verdict for verdict in verdicts if verdict.further_cases is not None]
+    if not needed:
+        return ""
+    most = max(needed, key=lambda verdict: verdict.further_cases or 0)
+    counted = most.clustered is not None and most.clustered.method is ClusterMethod.TERRAIN_COUNT
+    where = ", each on a terrain of its own," if counted else ""
+    return f" {count(most.further_cases or 0, 'further case')}{where} would do if no more fail."

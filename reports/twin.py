@@ -1,0 +1,133 @@
+"""The layout of `report.json`, the page's machine-readable twin: what other programs may rely on.
+
+`report.schema.json` is this layout as JSON Schema, kept beside this module and held to it by the tests. What is taken
+away or changes its meaning raises `SCHEMA`; what is added does not.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+#: Version of the layout.
+SCHEMA = 3
+
+Word = Literal["PASS", "FAIL", "INSUFFICIENT"]
+
+
+class _Part(BaseModel):
+    """Plain data; null stands for NaN and infinities."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TwinClusters(_Part):
+    """What cases that share terrains show of a success rate."""
+
+    terrains: int
+    failed_terrains: int
+    method: str
+    design_effect: float | None = Field(description="null where too few failures, or terrains, tell it")
+    effective_n: float = Field(description="independent cases that the evidence is worth")
+    effective_successes: float
+    lower: float
+    upper: float
+
+
+class TwinVerdict(_Part):
+    """One requirement judged."""
+
+    requirement_id: str
+    statement: str
+    source: str
+    kind: str
+    metric: str
+    scale: float | None
+    bound: float | None
+    probability: float | None
+    confidence: float | None
+    population: str
+    decide_by: str = Field(description="`confidence`, or `estimate`: by the rate seen")
+    status: Word
+    confident_status: Word = Field(description="by the bounds, also where the estimate decides")
+    plain_status: Word | None = Field(description="as for independent cases; null where no terrain is shared")
+    n: int
+    failures: int
+    estimate: float | None
+    lower: float | None = Field(description="one-sided, at `bounds_confidence`")
+    upper: float | None
+    bounds_confidence: float | None
+    plain_lower: float | None
+    plain_upper: float | None
+    consumer_risk: float | None = Field(description="chance of evidence as good from a rate only just the one asked")
+    margin: float | None = Field(description="what decides less the rate asked")
+    further_cases: int | None = Field(description="that would pass it if none fails")
+    terrains: int | None
+    clustered: TwinClusters | None
+    reason: str
+    note: str
+
+
+class TwinQuantile(_Part):
+    """A quantile with one-sided bounds."""
+
+    probability: float
+    estimate: float | None
+    lower: float | None
+    upper: float | None
+
+
+class TwinStatistics(_Part):
+    """What errors say."""
+
+    n: int
+    missing: int
+    mean: float | None
+    mean_lower: float | None
+    mean_upper: float | None
+    sd: float | None
+    sd_lower: float | None
+    sd_upper: float | None
+    rms: float | None
+    median: float | None
+    robust_sd: float | None
+    largest: float | None
+    quantiles: list[TwinQuantile]
+    confidence: float
+
+
+class TwinSampling(_Part):
+    """How cases were drawn."""
+
+    design: str
+    grids: list[str]
+    nominal: bool
+    most_cases: int | None
+    independent: bool
+    text: str
+
+
+class Twin(_Part):
+    """A campaign's report in numbers."""
+
+    report_schema: Literal[3] = Field(alias="schema")
+    campaign: str
+    state: Any = Field(description="as the campaign's record has it, as are seed, git_commit and the times")
+    seed: Any
+    git_commit: Any
+    started_utc: Any
+    finished_utc: Any
+    cases: int
+    crashed: int
+    sampling: TwinSampling
+    verdict: Word | Literal["NO REQUIREMENT"]
+    sentence: str
+    exit_code: Literal[0, 1, 3]
+    verdicts: list[TwinVerdict]
+    outcomes: dict[str, int]
+    metric: str | None
+    statistics: dict[str, TwinStatistics]
+    worst_cases: list[str]
+    sections: dict[str, Any] = Field(description="of each further section of the page, by its anchor")
+    showcases: list[int] = Field(description="cases whose products are kept")
