@@ -21,6 +21,9 @@ from scenarios.trial import Judged, attempted, case_result
 from sim.streams import Streams
 from sim.terrain import TerrainBank
 
+#: Terrains of a bank that are built before its runs; a larger bank's are built by the runs that need them.
+PREPARED_TERRAINS = 64
+
 
 class RoverScenario:
     """A rover drives to, around or away from what it sees, and tracks it at every stop."""
@@ -32,8 +35,9 @@ class RoverScenario:
     part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Numbers of the bank's terrains."""
-        return tuple(range(_checked(parameters).world.bank))
+        """Numbers of the bank's terrains; none of a bank so large that hardly two runs have the same one."""
+        bank = _checked(parameters).world.bank
+        return tuple(range(bank)) if bank <= PREPARED_TERRAINS else ()
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Builds one terrain of the bank."""

@@ -187,3 +187,9 @@ def test_trackers_share_the_pictures_of_a_drive() -> None:
     # The camera keeps its distance from the targets' middle and goes around it.
     ranges = [stop.range_m for stop in other.stops]
     assert np.ptp(ranges) < 0.15
+
+
+@pytest.mark.parametrize(("bank", "built"), [(8, 8), (100_000, 0)])
+def test_only_small_banks_are_built_ahead(bank: int, built: int) -> None:
+    p = parameters(world={**SHORT["world"], "bank": bank})
+    assert RoverScenario().shared_inputs(p) == tuple(range(built))
