@@ -63,6 +63,10 @@ class ClusterWorkers:
         self._distributed = distributed
         self._cluster: Any = _local_cluster(address) if address.startswith(_LOCAL) else None
         try:
+            if self._cluster is None:
+                # Dask never closes a client that fails over its address. Garbage collection does, and where that comes
+                # upon it in the thread of the next client, both wait for each other for 10 s and fail.
+                distributed.comm.get_address_host_port(address)
             self._client = distributed.Client(self._cluster or address, timeout=_REACH_S, set_as_default=False)
         except (OSError, ValueError, ImportError) as error:
             raise CampaignError(f"--cluster {address}: no scheduler answers: {error}") from error
