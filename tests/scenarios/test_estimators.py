@@ -10,6 +10,7 @@ from algorithms.baselines import HomographyEstimator
 from algorithms.dimes import DimesOptions
 from algorithms.exchange import ExecutableLimits, ExecutableTargetTracker, ExecutableVelocityEstimator
 from algorithms.interface import VelocityEstimate, VelocityOutcome
+from algorithms.streams import StreamedEstimator
 from algorithms.vtt import VttOptions
 from scenarios import estimators
 from scenarios.descent.parameters import DescentScenarioParameters
@@ -100,3 +101,29 @@ def test_an_error_in_units_of_its_covariance() -> None:
     assert (row["velocity_normalised_x"], row["velocity_normalised_y"]) == (1.0, 1.0)
     assert row["velocity_correlation"] == pytest.approx(0.5)
     assert consistency_row(VelocityEstimate(VelocityOutcome.VALID, np.zeros(2)), np.zeros(2)) == {}
+
+
+STREAM = "class Mine:\n    def start(self): ...\n    def picture(self, frame): ...\n"
+
+
+def test_streams_are_told_from_estimators_of_three(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    finish = "    def finish(self): ...\n"
+    (tmp_path / "streams_here.py").write_text(f"{STREAM}{finish}\ndef made():\n    return Mine()\n")
+    (tmp_path / "streams_half.py").write_text(STREAM)
+    monkeypatch.chdir(tmp_path)
+    point = EntryPoint("theirs", "streams_here:Mine", estimators.GROUP)
+    monkeypatch.setattr(estimators, "installed", lambda: {"theirs": point})
+    for spec in ("streams_here:Mine", "streams_here:made", "theirs", "exec-stream:cat", "serve-stream:cat -u"):
+        VELOCITY.check(spec)
+        assert isinstance(VELOCITY.make(spec, DimesOptions(), LIMITS), StreamedEstimator)
+    kinds = {spec: VELOCITY.takes_stream(spec) for spec in ("theirs", "serve-stream:cat", "exec:cat", "dimes")}
+    assert kinds == {"theirs": True, "serve-stream:cat": True, "exec:cat": False, "dimes": False}
+    # only what a function returns tells
+    assert VELOCITY.takes_stream("streams_here:made") is None
+    with pytest.raises(ValueError, match="is no velocity estimator: it has no finish"):
+        VELOCITY.check("streams_half:Mine")
+    with pytest.raises(ValueError, match="a target tracker takes no stream of pictures; allowed: exec:, serve:"):
+        TRACKING.check("exec-stream:cat")
+    with pytest.raises(ValueError, match="is no estimator of landing sites: it has no estimate"):
+        LANDING.check("streams_here:Mine")
+    assert labels(["exec-stream:./mine --fast", "serve-stream:./mine"]) == ("mine", "mine_2")

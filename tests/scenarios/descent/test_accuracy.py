@@ -38,7 +38,7 @@ def _tracked(case: int, **parts: Any) -> tuple[list[Track], list[State], Descent
     p = parameters(**PERFECT, descent=motion, detector=NOISELESS, **parts)
     world, streams = World.of(p), Streams(5, "accuracy", case)
     flown = flown_descent(p, world.surface, streams)
-    states = picture_states(p, flown.motion)
+    states = picture_states(p, flown)
     optics = camera_optics(p.camera)
     detector = Detector.drawn(optics.fall_off, p.detector, streams.generator("detector response"))
     pictures = expose(p, world, states, optics, detector, streams)

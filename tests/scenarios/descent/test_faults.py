@@ -128,7 +128,7 @@ def test_readings_are_wrong_by_what_is_asked_for() -> None:
 def _pictures(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]:
     p = parameters(faults=faults, detector=NOISELESS, **parts)
     world, streams = World.of(p), Streams(1, "faults", 0)
-    states = picture_states(p, flown_descent(p, world.surface, streams).motion)
+    states = picture_states(p, flown_descent(p, world.surface, streams))
     optics = camera_optics(p.camera)
     detector = Detector.drawn(optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector"))
     return expose(p, world, states, optics, detector, streams)
