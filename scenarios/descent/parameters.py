@@ -258,11 +258,12 @@ class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
     def _three_are_among_the_pictures(self) -> DescentScenarioParameters:
         if self.triple is not None and not 1 <= self.triple[0] < self.triple[1] < self.triple[2] <= self.pictures:
             raise ValueError(f"triple is {list(self.triple)}; allowed: three in ascending order, 1 to {self.pictures}")
-        of_three = [spec for spec in self.algorithms if VELOCITY.takes_stream(spec) is False]
-        if of_three and self.pictures < PICTURES:
-            raise ValueError(
-                f"pictures is {self.pictures}, but '{of_three[0]}' takes {PICTURES}; allowed: {PICTURES} to 100"
-            )
+        if self.pictures < PICTURES:
+            of_three = [spec for spec in self.algorithms if VELOCITY.takes_stream(spec) is False]
+            if of_three:
+                raise ValueError(
+                    f"pictures is {self.pictures}, but '{of_three[0]}' takes {PICTURES}; allowed: {PICTURES} to 100"
+                )
         struck = max(self.faults.repeated_picture, self.faults.black_picture)
         if struck > self.pictures:
             raise ValueError(f"a fault strikes picture {struck}, but pictures is {self.pictures}")
