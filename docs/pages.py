@@ -101,19 +101,23 @@ def real_pictures_page() -> str:
 def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
     """Keys and fields of a model and of the models in it, in order."""
     for name, field in model.model_fields.items():
-        inner = _model_of(field.annotation)
-        if inner is None:
+        inner = _models_of(field.annotation)
+        if not inner:
             yield prefix + name, field
-        else:
-            yield from _fields(inner, f"{prefix}{name}.")
+        told: set[str] = set()
+        for one in inner:
+            found = {key: below for key, below in _fields(one, f"{prefix}{name}.") if key not in told}
+            told.update(found)
+            yield from found.items()
 
 
-def _model_of(annotation: Any) -> type[BaseModel] | None:
-    """The model that a field holds, where it holds one."""
+def _models_of(annotation: Any) -> list[type[BaseModel]]:
+    """The models that a field holds, where it holds one or one of several."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    held = [one for one in get_args(annotation) if isinstance(one, type) and issubclass(one, BaseModel)]
-    return held[0] if _is_union(annotation) and held else None
+        return [annotation]
+    if get_origin(annotation) is Annotated:
+        return _models_of(get_args(annotation)[0])
+    return [model for one in get_args(annotation) for model in _models_of(one)] if _is_union(annotation) else []
 
 
 def _is_union(annotation: Any) -> bool:
@@ -143,6 +147,8 @@ def _type_name(annotation: Any) -> str:
     if get_origin(annotation) in (tuple, list):
         inner = sorted({_type_name(one) for one in get_args(annotation) if one is not Ellipsis})
         return f"list of {', '.join(inner)}"
+    if get_origin(annotation) is dict:
+        return "table"
     names = {float: "number", int: "whole number", str: "text", bool: "true or false"}
     return names.get(annotation, f"`{getattr(annotation, '__name__', annotation)}`")
 

@@ -13,7 +13,7 @@ import pytest
 
 TUTORIALS = sorted((Path(__file__).parents[2] / "docs" / "tutorials").glob("*.md"))
 FENCED = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-SAVED_AS = re.compile(r"Save it as `([\w.]+)`")
+SAVED_AS = re.compile(r"Save it as `([\w.]+)`:\s*\Z")
 #: What a tutorial says is there in the end.
 PROMISED = {
     "first-campaign": (
@@ -23,7 +23,10 @@ PROMISED = {
         "first/cases.sqlite",
         "first/campaign.json",
         "first/cases/3/dimes.png",
-    )
+    ),
+    "own-dynamics": ("powered/report.html",),
+    "own-instrument": ("lidar/report.html",),
+    "own-score": ("airbags/report.html",),
 }
 EXITS = re.compile(r"# exits with (\d)(?: or (\d))?")
 
@@ -31,12 +34,15 @@ EXITS = re.compile(r"# exits with (\d)(?: or (\d))?")
 @pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
 def test_tutorial(tutorial: Path, tmp_path: Path) -> None:
     text = tutorial.read_text(encoding="utf-8")
-    names = iter(SAVED_AS.findall(text))
     commands = 0
-    for language, body in FENCED.findall(text):
-        if language == "toml":
-            (tmp_path / next(names)).write_text(body, encoding="utf-8")
-        elif language == "python":
+    for block in FENCED.finditer(text):
+        language, body = block.groups()
+        saved = SAVED_AS.search(text, 0, block.start())
+        if saved is not None:
+            (tmp_path / saved[1]).write_text(body, encoding="utf-8")
+            continue
+        assert language != "toml", "a campaign that is saved nowhere"
+        if language == "python":
             _run([sys.executable, "-c", body], {0}, tmp_path)
         elif language == "console":
             for line in body.splitlines():

@@ -1,0 +1,169 @@
+"""The suite passes the examples, and names what bad parts do."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenarios.conformance import Finding, Subject, check_names, run_check, task_of
+from scenarios.conformance import parts as suite
+
+EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
+HEAD = """
+import os
+import numpy as np
+from scenarios.parts import InstrumentReadings, Poses, ScoredDescent, ScoredLanding, ScoredRun
+KEPT = []
+def poses(place, east=0.0):
+    times = np.arange(place.from_s, 20.0, 0.1)
+    upright = np.tile([0.0, 0.0, 0.0, 1.0], (times.size, 1))
+    return times, np.column_stack([east * times, 0.0 * times, 2000.0 - 50.0 * times]), upright
+"""
+
+
+def findings(spec: str, *only: str) -> dict[str, Finding]:
+    subject = Subject(spec, task_of(spec), 60.0)
+    names = [name for name, _ in check_names(subject)]
+    return {name: run_check(subject, names.index(name)) for name in (only or names)}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("Glider", "dynamics"), ("PulsedLidar", "instrument"), ("StarTracker", "instrument"), ("sideways", "score")],
+)
+def test_the_examples_conform(name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    assert task_of(f"own_parts:{name}") == kind
+    found = findings(f"own_parts:{name}")
+    assert {check: one.problem for check, one in found.items() if not one.passed} == {}
+    assert ("random" in found) == (kind != "score")
+
+
+def bad(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
+    """A module whose name is its own, as modules are kept."""
+    name = f"bad_part_{abs(hash(body))}"
+    (folder / f"{name}.py").write_text(HEAD + textwrap.dedent(body))
+    monkeypatch.syspath_prepend(str(folder))
+    return name
+
+
+@pytest.mark.parametrize(
+    ("check", "random", "lines", "problem"),
+    [
+        ("answer", False, "return poses(place)", "flies a tuple; allowed: scenarios.parts.Poses"),
+        ("answer", False, "t, x, q = poses(place)\nreturn Poses(t, x[:, :2], q)", "positions_m of shape"),
+        ("answer", False, "t, x, q = poses(place)\nreturn Poses(t[::40], x[::40], q[::40] * 0.9)", "length 0.9"),
+        ("answer", False, "t, x, q = poses(place)\nt[5] = t[4]\nreturn Poses(t, x, q)", "time does not increase after"),
+        (
+            "answer",
+            False,
+            "t, x, q = poses(place)\nq[1::2] = [1.0, 0.0, 0.0, 0.0]\nreturn Poses(t, x, q)",
+            "turns by 180",
+        ),
+        ("answer", False, "return 1 / 0", "it raised ZeroDivisionError"),
+        ("random", True, "return Poses(*poses(place))", "its random is true, but two streams give the same"),
+        ("random", False, "return Poses(*poses(place, rng.normal()))", "its random is false, but two streams give"),
+        (
+            "deterministic",
+            True,
+            "return Poses(*poses(place, np.random.normal()))",
+            "asked twice, it gives something else",
+        ),
+        (
+            "deterministic",
+            False,
+            "self.asked = getattr(self, 'asked', 0) + 1\nreturn Poses(*poses(place, self.asked))",
+            "depends on the cases that it was asked before",
+        ),
+        (
+            "columns",
+            True,
+            "return Poses(*poses(place), {'gust' if rng.random() > 0.4 else 'calm': 1.0})",
+            "its columns change",
+        ),
+        ("columns", False, "return Poses(*poses(place), {'a b': 1.0})", "names a column 'a b'"),
+        (
+            "process",
+            False,
+            "os.environ['X_OF_A_PART'] = '1'\nreturn Poses(*poses(place))",
+            "changed environment variables",
+        ),
+    ],
+)
+def test_what_a_motion_must_not_do(
+    check: str, random: bool, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("X_OF_A_PART", "0")
+    body = f"class Bad:\n    random = {random}\n    def fly(self, place, rng):\n" + textwrap.indent(lines, " " * 8)
+    name = bad(tmp_path, monkeypatch, body)
+    (found,) = findings(f"{name}:Bad", check).values()
+    assert problem in found.problem
+    assert found.next_step
+
+
+@pytest.mark.parametrize(
+    ("check", "quantity", "lines", "problem"),
+    [
+        ("answer", "altitude", "return InstrumentReadings(truth.times_s[:2], np.ones(2))", "times_s of shape (2,)"),
+        ("answer", "attitude", "return InstrumentReadings(truth.times_s, np.ones((truth.times_s.size, 4)))", "length"),
+        ("answer", "altitude", "return InstrumentReadings(truth.times_s, np.full(truth.times_s.size, np.inf))", "infinite altitude"),
+        ("answer", "altitude", "return truth.times_s", "reads a ndarray; allowed: scenarios.parts.InstrumentReadings"),
+        (
+            "inputs",
+            "altitude",
+            "truth.times_s[0] -= 1.0\nreturn InstrumentReadings(truth.times_s, 1.0 * truth.times_s)",
+            "the InstrumentTruth that it was handed is not what it was before",
+        ),
+    ],
+)
+def test_what_an_instrument_must_not_do(
+    check: str, quantity: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    head = f"class Bad:\n    random = False\n    quantity = '{quantity}'\n    def read(self, truth, rng):\n"
+    name = bad(tmp_path, monkeypatch, head + textwrap.indent(lines, " " * 8))
+    (found,) = findings(f"{name}:Bad", check).values()
+    assert problem in found.problem
+
+
+@pytest.mark.parametrize(
+    ("check", "annotation", "lines", "problem"),
+    [
+        ("answer", "ScoredDescent", "return {'east': case.answer.velocity_m_s[0]}", "it raised TypeError"),
+        ("answer", "ScoredLanding", "return {'site': 'here'}", "gives site as a str; allowed: a number, true or false"),
+        ("columns", "ScoredRun", "return {a.state.name: 1.0 for a in case.answers}", "its columns change"),
+        ("inputs", "ScoredDescent", "case.touchdown_m_s[:] = 0.0\nreturn {}", "the ScoredDescent that it was handed"),
+        (
+            "deterministic",
+            "ScoredRun",
+            "KEPT.append(1)\nreturn {'asked': len(KEPT)}",
+            "asked twice, it gives something",
+        ),
+    ],
+)
+def test_what_a_score_must_not_do(
+    check: str, annotation: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = f"def bad(case: {annotation}):\n" + textwrap.indent(lines, " " * 4)
+    name = bad(tmp_path, monkeypatch, body)
+    (found,) = findings(f"{name}:bad", check).values()
+    assert problem in found.problem
+
+
+def test_the_suites_nearest_ground_is_the_planes() -> None:
+    """Against rays cast at the plane from a fan over the cone."""
+    apex = np.array([30.0, -20.0, 500.0])
+    tilt = 0.4
+    axis = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
+    across, along = np.array([0.0, 1.0, 0.0]), np.array([np.cos(tilt), 0.0, np.sin(tilt)])
+    half = np.radians(20.0)
+    away, turn = np.meshgrid(np.linspace(0.0, half, 200), np.linspace(0.0, 2.0 * np.pi, 361))
+    rays = (
+        np.cos(away)[..., None] * axis
+        + (np.sin(away) * np.cos(turn))[..., None] * along
+        + (np.sin(away) * np.sin(turn))[..., None] * across
+    )
+    ranges = (apex[2] - 0.05 * apex[0]) / (0.05 * rays[..., 0] - rays[..., 2])
+    assert suite.truths()[0].nearest_ground(apex, axis, half, 1e4) == pytest.approx(float(ranges.min()), rel=1e-4)
