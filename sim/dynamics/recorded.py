@@ -22,6 +22,8 @@ from sim.dynamics.trajectory import Motion
 LEAST_INSTANTS = 4
 #: Most turn from one instant to the next: beyond, the way round is a guess.
 MOST_TURN_DEG = 90.0
+#: By how much a time may be outside of the span: sums of times that lead to its very end are off by rounding.
+ROUNDING_S = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ class RecordedMotion:
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Truth at many times. Raises ValueError outside of the span."""
         first, last = self.span_s
-        outside = times_s[(times_s < first) | (times_s > last)]
+        outside = times_s[(times_s < first - ROUNDING_S) | (times_s > last + ROUNDING_S)]
         if outside.size:
             raise ValueError(f"time {outside[0]:.6g} s is not recorded; allowed: {first:.6g} to {last:.6g} s")
         attitudes = self._attitude(times_s)

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenarios.descent.flight import flown_descent
+from scenarios.descent.measurement import Instruments
 from scenarios.descent.world import World
 from scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
 from scenarios.parts.scores import scored
@@ -27,11 +28,12 @@ class Falling:
 
     height_m: float = 2000.0
     east_m_s: float = 11.0
+    lasts_s: float = 26.0
     wrong: str = ""
 
     def fly(self, place: DescentPlace, rng: np.random.Generator) -> Poses:
         north = float(rng.normal(0.0, 5.0))
-        times = np.arange(place.from_s, 26.0, 0.1)
+        times = np.arange(place.from_s, self.lasts_s, 0.05)
         if self.wrong == "short":
             times = np.arange(place.from_s, 3.0, 0.1)
         positions = np.column_stack([self.east_m_s * times, north * times, self.height_m - 75.0 * times])
@@ -145,7 +147,7 @@ def test_the_motion_of_a_case_is_its_own() -> None:
         ("short", "flies -5 to 2.9 s; allowed: from -5 s or before to 8 s or after"),
         ("length", r"gives a quaternion of length 1\.1 \(pose 1\); allowed: 1"),
         ("up", "at picture 1 the camera looks up"),
-        ("order", "flies 25.9 to -5 s"),
+        ("order", "flies 25.95 to -5 s"),
         ("nan", "gives positions_m that are not finite"),
         ("column", "tells the column height_m twice, or it is one of its options"),
     ],
@@ -155,6 +157,17 @@ def test_a_motion_that_is_none_is_told(wrong: str, said: str) -> None:
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=said):
         flown_descent(p, World.of(p).surface, Streams(1, "test", 0))
+
+
+@pytest.mark.parametrize("lasts_s", [20.0, 20.05, 27.95, 28.0])
+def test_a_motion_that_ends_early_is_followed_to_its_end(lasts_s: float) -> None:
+    """To its last instant, whatever the sum of the times that lead there comes to."""
+    flight = {**OWN["flight"], "options": {"east_m_s": 0.0, "lasts_s": lasts_s, "height_m": 5000.0}}  # type: ignore[dict-item]
+    p = parameters(terrain=FLAT, flight=flight)
+    world, streams = World.of(p), Streams(1, "test", 0)
+    flown = flown_descent(p, world.surface, streams)
+    assert flown.firing_s == pytest.approx(flown.motion.span_s[1] - 0.1)
+    assert Instruments.drawn(p, world, flown, streams).navigation.velocity(np.array([flown.firing_s])).shape == (1, 3)
 
 
 def test_a_motion_below_the_ground_is_told() -> None:

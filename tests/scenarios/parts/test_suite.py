@@ -109,7 +109,12 @@ def test_what_a_motion_must_not_do(
     [
         ("answer", "altitude", "return InstrumentReadings(truth.times_s[:2], np.ones(2))", "times_s of shape (2,)"),
         ("answer", "attitude", "return InstrumentReadings(truth.times_s, np.ones((truth.times_s.size, 4)))", "length"),
-        ("answer", "altitude", "return InstrumentReadings(truth.times_s, np.full(truth.times_s.size, np.inf))", "infinite altitude"),
+        (
+            "answer",
+            "altitude",
+            "return InstrumentReadings(truth.times_s, np.full(truth.times_s.size, np.inf))",
+            "infinite altitude",
+        ),
         ("answer", "altitude", "return truth.times_s", "reads a ndarray; allowed: scenarios.parts.InstrumentReadings"),
         (
             "inputs",
