@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: Names of a browser that prints pages, in the order in which they are looked for.
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-_PRINTING_S = 120.0
+_PRINTING_S = 600.0
 
 RequirementsOption = Annotated[
     Path | None,
@@ -68,7 +68,7 @@ def compare(
     Exit status 0 in any event: a difference is no verdict.
     """
     from marsyard.showing import grid_table
-    from reports.between import contrast_grid, contrasts
+    from reports.between import contrast_grid, contrasts, same_grounds
     from reports.stored import read_run
 
     runs = [read_run(directory) for directory in (first, second)]
@@ -78,7 +78,8 @@ def compare(
     out.print(grid_table("Side by side", contrast_grid(["first", "second"], found)))
     for place, name in zip(("first", "second"), names, strict=True):
         out.print(f"{place}: {name}", markup=False, highlight=False, soft_wrap=True)
-    how = "the same draws, compared in pairs" if paired else "draws of their own, compared terrain by terrain"
+    grounds = "terrain by terrain" if same_grounds(*runs) else "terrains of their own against one another"
+    how = "the same draws, compared in pairs" if paired else f"draws of their own, compared {grounds}"
     out.print(f"Cases: {how}. p: two-sided, corrected for the number of figures (Holm).", soft_wrap=True)
 
 

@@ -1,7 +1,8 @@
 """Two stored campaigns side by side: what each shows of the same figures, and whether they differ.
 
 Where both ran the same draws (name, seed, dispersions) cases are compared in pairs (`reports.statistics.paired`).
-Otherwise terrain by terrain (`reports.statistics.changes`). The p are corrected for their number by Holm's method.
+Otherwise terrain by terrain, or by whole terrains where they have none in common (`reports.statistics.changes`). The p
+are corrected for their number by Holm's method.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from reports.sampled import sampled
 from reports.sections import Grid
 from reports.statistics.changes import Sample, difference_p, holm
 from reports.statistics.paired import compared_errors, compared_successes
-from reports.stored import StoredRun
+from reports.stored import StoredRun, table
 from reports.verdicts import is_flag, members, succeeded, terrain_groups
 from reports.wording import NOTHING, number, percent
 
@@ -109,7 +110,7 @@ def contrasts(first: StoredRun, second: StoredRun) -> tuple[bool, list[Contrast]
     paired = same_draws(first, second)
     theirs = {figure.name: figure for figure in of_each[1]}
     both = [(figure, theirs[figure.name]) for figure in of_each[0] if figure.name in theirs]
-    test = _paired_p if paired else _unpaired_p
+    test = _paired_p if paired else _unpaired_p if same_grounds(first, second) else _apart_p
     p_values = holm([test(frames[0], mine, frames[1], other) for mine, other in both])
     return paired, [Contrast(mine.name, mine, other, p) for (mine, other), p in zip(both, p_values, strict=True)]
 
@@ -117,6 +118,15 @@ def contrasts(first: StoredRun, second: StoredRun) -> tuple[bool, list[Contrast]
 def same_draws(first: StoredRun, second: StoredRun) -> bool:
     """Whether a case of one number is the same case in both."""
     return all(first.said(key) == second.said(key) for key in ("name", "scenario", "seed", "dispersions", "design"))
+
+
+def same_grounds(first: StoredRun, second: StoredRun) -> bool:
+    """Whether a terrain of one number is the same terrain in both: all parameters but the algorithm's are the same."""
+    worlds = [
+        {name: value for name, value in table(run.said("parameters")).items() if name != "algorithm"}
+        for run in (first, second)
+    ]
+    return worlds[0] == worlds[1] and first.said("scenario") == second.said("scenario")
 
 
 def contrast_grid(names: Sequence[str], found: Sequence[Contrast]) -> Grid:
@@ -145,6 +155,15 @@ def sample_of(frame: pd.DataFrame, figure: Figure) -> Sample:
 
 def _unpaired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure) -> float:
     return difference_p(sample_of(first, mine), sample_of(second, other))
+
+
+def _apart_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure) -> float:
+    """As `_unpaired_p`, of campaigns that have no terrain in common, whatever their numbers."""
+    here, there = sample_of(first, mine), sample_of(second, other)
+    if not here.terrains.size or not there.terrains.size:
+        return math.nan
+    apart = there.terrains + (1 + int(here.terrains.max()) - int(there.terrains.min()))
+    return difference_p(here, Sample(there.values, apart))
 
 
 def _paired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure) -> float:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from reports import gallery, sections
@@ -73,6 +74,9 @@ FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
     sensitivity_section,
     conditions_section,
 )
+
+#: Sites and algorithms that the twin names, at most.
+_MOST_KINDS = 24
 
 PAGE_FILE = "report.html"
 TWIN_FILE = "report.json"
@@ -201,6 +205,8 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
         "finished_utc": run.said("finished_utc"),
         "cases": len(run.whole),
         "crashed": whole.crashed,
+        "sites": _kinds(run.frame, "site"),
+        "algorithms": _kinds(run.frame, "algorithm"),
         "sampling": {**asdict(how), "independent": how.independent, "text": how.text},
         "verdict": whole.word,
         "sentence": whole.sentence,
@@ -225,6 +231,13 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
     }
     plain: dict[str, Any] = _plain(twin)
     return plain
+
+
+def _kinds(frame: pd.DataFrame, column: str) -> list[str]:
+    """The texts in a column, each once, as many as a reader can choose among; none where there is none."""
+    if column not in frame:
+        return []
+    return [str(value) for value in frame[column].dropna().unique()[:_MOST_KINDS]]
 
 
 def _error_sections(run: StoredRun, metric: str | None, bound: float | None, pictured: Sequence[str]) -> dict[str, Any]:

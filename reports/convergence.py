@@ -103,7 +103,7 @@ def error_curves(frame: pd.DataFrame, metric: str | None) -> dict[str, tuple[str
         return {}
     name = magnitude_label(metric)
     return {
-        "mean": ("mean of the errors", f"mean of {name}", means),
+        "mean": ("Mean of the errors", f"mean of {name}", means),
         "quantile": ("95 % quantile of the errors", f"95 % of {name}", quantiles),
     }
 

@@ -25,7 +25,7 @@ def notable_cases(run: StoredRun) -> list[int]:
     kinds = (
         cases[known][np.argsort(-sizes[known], kind="stable")][:OF_A_KIND],
         cases[~known][:OF_A_KIND],
-        np.random.default_rng(_SEED).permutation(cases),
+        cases[np.random.default_rng(_SEED).permutation(cases.size)],
     )
     chosen: dict[int, None] = {}
     for kind in kinds:

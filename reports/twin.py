@@ -120,6 +120,8 @@ class Twin(_Part):
     finished_utc: Any
     cases: int
     crashed: int
+    sites: list[str] = Field(description="as the rows name them, at most 24, as are the algorithms")
+    algorithms: list[str]
     sampling: TwinSampling
     verdict: Word | Literal["NO REQUIREMENT"]
     sentence: str

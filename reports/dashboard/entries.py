@@ -50,7 +50,7 @@ class Entry:
         Its folder's name in the site: letters, digits, dots and hyphens, told apart by a hash of where it was.
     directory
         Where it is stored.
-    name, system, site, algorithm, commit, started, state, cases, crashed, verdict, sentence
+    name, system, sites, algorithms, commit, started, state, cases, crashed, verdict, sentence
         As its record and its report have it; empty where they do not say.
     shown
         What it shows of each requirement.
@@ -62,8 +62,8 @@ class Entry:
     directory: Path
     name: str
     system: str
-    site: str
-    algorithm: str
+    sites: tuple[str, ...]
+    algorithms: tuple[str, ...]
     commit: str
     started: str
     state: str
@@ -75,6 +75,11 @@ class Entry:
     kept: tuple[int, ...]
     worst: tuple[str, ...]
     outcomes: Mapping[str, int]
+
+    @property
+    def finished(self) -> bool:
+        """Whether it came to its end: what is interrupted shows but a part."""
+        return self.state == "finished"
 
 
 def find_campaigns(directories: Sequence[Path]) -> list[Path]:
@@ -130,8 +135,8 @@ def _entry(path: Path, twin: Mapping[str, Any]) -> Entry:
         directory=path,
         name=name,
         system=next((one for one in _SYSTEMS if name.startswith(one)), "other"),
-        site=_first(parameters, "site"),
-        algorithm=_first(parameters, "algorithm"),
+        sites=_named(twin, "sites", parameters, "site"),
+        algorithms=_named(twin, "algorithms", parameters, "algorithm"),
         commit=str(twin.get("git_commit") or "")[:10],
         started=str(twin.get("started_utc") or ""),
         state=str(twin.get("state") or ""),
@@ -167,6 +172,13 @@ def slug_of(path: Path, name: str) -> str:
     """A folder's name that no other campaign has and that cannot lead out of the site."""
     plain = re.sub(r"[^A-Za-z0-9-]+", "-", name)[:60].strip("-") or "campaign"
     return f"{plain}-{hashlib.sha256(str(path.resolve()).encode('utf-8', 'replace')).hexdigest()[:10]}"
+
+
+def _named(twin: Mapping[str, Any], key: str, parameters: Mapping[str, Any], stated: str) -> tuple[str, ...]:
+    """What the rows name, or the parameters where the rows name none."""
+    found = tuple(str(one) for one in twin.get(key) or () if str(one))
+    one = _first(parameters, stated)
+    return found or ((one,) if one else ())
 
 
 def _first(parameters: Mapping[str, Any], key: str) -> str:

@@ -11,6 +11,8 @@ from reports.dashboard.entries import Entry, Shown
 from reports.verdicts import ESTIMATE
 from reports.wording import NOTHING, percent
 
+#: Further campaigns whose latest verdicts stand beside a requirement's.
+MOST_BESIDE = 7
 #: Campaigns that a sparkline shows, the latest ones, and its size in pixels.
 _TREND, _WIDTH, _HEIGHT = 24, 120.0, 26.0
 
@@ -37,7 +39,8 @@ class Cell:
 class RequirementRow:
     """A requirement: what it asks, the latest of each campaign, and the trend of the campaign judged last.
 
-    `all_cells` are the verdicts of all campaigns, the latest first; `cells` the latest of each campaign's name.
+    `all_cells` are the verdicts of all campaigns, the latest first, those that did not come to their end behind all
+    others; `cells` the latest of each campaign's name.
     """
 
     requirement: str
@@ -50,7 +53,7 @@ class RequirementRow:
 
     @property
     def latest(self) -> Cell | None:
-        """The verdict of the campaign that was run last."""
+        """The verdict of the campaign that was run last, and to its end where any was."""
         return self.cells[0] if self.cells else None
 
 
@@ -63,12 +66,13 @@ def requirement_rows(entries: Sequence[Entry], stated: Mapping[str, StatedRequir
     return [_row(name, found, stated.get(name)) for name, found in cells.items()]
 
 
-def _row(name: str, found: Sequence[Cell], stated: StatedRequirement | None) -> RequirementRow:
+def _row(name: str, listed: Sequence[Cell], stated: StatedRequirement | None) -> RequirementRow:
+    found = sorted(listed, key=lambda cell: not cell.entry.finished)
     latest: dict[str, Cell] = {}
     for cell in found:
         latest.setdefault(cell.entry.name, cell)
     cells = list(latest.values())
-    same = [cell for cell in found if cells and cell.entry.name == cells[0].entry.name]
+    same = [cell for cell in found if cell.entry.name == cells[0].entry.name and cell.entry.finished]
     return RequirementRow(
         requirement=name,
         statement=stated.statement if stated else (cells[0].shown.statement if cells else ""),
@@ -105,6 +109,11 @@ def coverage(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
     found = [(word, words.count(word)) for word in known]
     missing = sum(row.latest is None for row in rows)
     return [*found, ("NO CAMPAIGN", missing)] if missing else found
+
+
+def evidence_text(shown: Shown) -> str:
+    """The cases behind a verdict."""
+    return f"{shown.failures:,} of {shown.n:,} failed" if shown.n else "no case yet"
 
 
 def basis_text(shown: Shown) -> str:

@@ -18,7 +18,15 @@ from typing import Any
 from campaigns.definition.requirements import StatedRequirement, shipped_requirements
 from reports.campaign import PAGE_FILE, VERIFICATION_FILE, page_environment, write_whole
 from reports.dashboard.entries import Entry, find_campaigns, read_entries
-from reports.dashboard.rows import RequirementRow, basis_text, coverage, margin_text, requirement_rows
+from reports.dashboard.rows import (
+    MOST_BESIDE,
+    RequirementRow,
+    basis_text,
+    coverage,
+    evidence_text,
+    margin_text,
+    requirement_rows,
+)
 from reports.explorer import embedded, script_hash
 from reports.sections import replay_command
 from reports.stored import read_run
@@ -66,6 +74,8 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
         filters=_filters(entries),
         margin=margin_text,
         basis=basis_text,
+        evidence=evidence_text,
+        most=MOST_BESIDE,
         coverage=coverage(rows),
         percent=percent,
         data=embedded(_data(rows)),
@@ -87,7 +97,7 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
     if report.is_file():
         _place(report, folder / PAGE_FILE)
     cases = _write_cases(folder, entry)
-    shown = {"margin": margin_text, "basis": basis_text, "percent": percent}
+    shown = {"margin": margin_text, "basis": basis_text, "evidence": evidence_text, "percent": percent}
     text = _rendered("dashboard_campaign.html.j2", entry=entry, cases=cases, **shown)
     write_whole(page, text)
 
@@ -132,8 +142,13 @@ def _place(source: Path, target: Path) -> None:
 
 def _filters(entries: Sequence[Entry]) -> list[tuple[str, str, list[str]]]:
     """What can be filtered by: attribute, name, and the values there are."""
-    names = (("system", "System"), ("site", "Site"), ("algorithm", "Algorithm"), ("commit", "Commit"))
-    return [(key, name, sorted({getattr(entry, key) for entry in entries} - {""})) for key, name in names]
+    found: dict[str, set[str]] = {
+        "System": {entry.system for entry in entries},
+        "Site": {site for entry in entries for site in entry.sites},
+        "Algorithm": {algorithm for entry in entries for algorithm in entry.algorithms},
+        "Commit": {entry.commit for entry in entries},
+    }
+    return [(name.lower(), name, sorted(values - {""})) for name, values in found.items()]
 
 
 def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
@@ -146,7 +161,8 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
                 "status": cell.shown.status,
                 "margin": margin_text(cell.shown),
                 "date": cell.entry.started[:10],
-                "evidence": f"{cell.shown.failures:,} of {cell.shown.n:,} failed",
+                "evidence": evidence_text(cell.shown),
+                "finished": cell.entry.finished,
                 "rate": cell.shown.estimate if math.isfinite(cell.shown.estimate) else None,
                 "asked": cell.shown.probability if math.isfinite(cell.shown.probability) else None,
                 "rate_text": percent(cell.shown.estimate),

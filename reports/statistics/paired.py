@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
+from reports.statistics.clusters import terrain_index
 from reports.statistics.samples import Groups, mean_interval
 from reports.statistics.shared import is_shared
 
@@ -44,7 +45,7 @@ def compared_errors(
 
 
 def _sums(differences: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, " terrains"]:
-    return np.bincount(np.unique(groups, return_inverse=True)[1], weights=differences)
+    return np.bincount(terrain_index(groups), weights=differences)
 
 
 def _signed_ranks_p(differences: Float[np.ndarray, " n"]) -> float:

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from scipy import stats
 
 from reports.statistics.bootstrap import LARGEST_SAMPLE, bca
-from reports.statistics.clusters import ClusterMethod, clustered_evidence
+from reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
 from reports.statistics.proportions import Interval, proportion_lower
 
 #: Fewest terrains that say anything of the spread between them.
@@ -28,7 +28,7 @@ FEWEST_TERRAINS = 5
 
 def is_shared(groups: Int[np.ndarray, " n"] | None) -> bool:
     """Whether any two values are from one terrain."""
-    return groups is not None and np.unique(groups).size < groups.size
+    return groups is not None and groups.size > 0 and int(terrain_index(groups).max()) + 1 < groups.size
 
 
 def shared_mean(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
@@ -41,7 +41,7 @@ def shared_mean(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], 
     confidence
         Of the interval.
     """
-    _, index = np.unique(groups, return_inverse=True)
+    index = terrain_index(groups)
     sizes, sums = np.bincount(index).astype(np.float64), np.bincount(index, weights=values)
     terrains = sizes.size
     if terrains < FEWEST_TERRAINS:
@@ -56,7 +56,7 @@ def shared_mean(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], 
 
 def shared_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
     """Two-sided interval of the standard deviation of values on shared terrains; NaN for fewer than five terrains."""
-    _, index = np.unique(groups, return_inverse=True)
+    index = terrain_index(groups)
     sizes = np.bincount(index).astype(np.float64)
     terrains = sizes.size
     if terrains < FEWEST_TERRAINS:
@@ -96,7 +96,7 @@ def _upper_bound(
     shown = clustered_evidence(below, groups, confidence)
     if shown.method is ClusterMethod.TERRAIN_COUNT:
         # what holds for all values of so many terrains holds for at least as many values
-        _, index = np.unique(groups, return_inverse=True)
+        index = terrain_index(groups)
         ordered = np.full(int(index.max()) + 1, -math.inf)
         np.maximum.at(ordered, index, values)
         ordered, worth = np.sort(ordered), 1.0

@@ -7,10 +7,11 @@
   const badges = new Map();
   for (const node of document.querySelectorAll(".badge")) badges.set(node.textContent.trim(), node);
   const fits = (row, asked) =>
-    ["system", "site", "algorithm", "commit"].every((key) => !asked[key] || row.dataset[key] === asked[key]) &&
+    ["system", "site", "algorithm", "commit"].every(
+      (key) => !asked[key] || row.dataset[key].split("\n").includes(asked[key])) &&
     (!asked.from || row.dataset.date >= asked.from) && (!asked.until || row.dataset.date <= asked.until) &&
     (!asked.text || row.dataset.text.toLowerCase().includes(asked.text.toLowerCase()));
-  const SVG = "http://www.w3.org/2000/svg", LATEST = 24, W = 120, H = 26;
+  const SVG = "http://www.w3.org/2000/svg", LATEST = 24, BESIDE = 7, W = 120, H = 26;
   const add = (parent, name, attributes) => {
     const node = document.createElementNS(SVG, name);
     for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
@@ -18,7 +19,7 @@
   };
   // as `reports.dashboard.rows.sparkline` draws it of all campaigns
   const spark = (found) => {
-    const known = found.filter((one) => one.name === found[0].name && one.rate !== null && one.asked !== null);
+    const known = found.filter((one) => one.finished && one.name === found[0].name && one.rate !== null && one.asked !== null);
     const shown = known.slice(0, LATEST).reverse();
     if (shown.length < 2) return [];
     let low = Math.min(...shown.flatMap((one) => [one.rate, one.asked]));
@@ -49,17 +50,24 @@
       verdict.replaceChildren(badge.cloneNode(true), basis);
     }
     else verdict.textContent = "no campaign fits";
-    evidence.textContent = latest ? latest.evidence : "\u2013";
-    if (latest) {
-      const [about, link, date] = ["span", "a", "span"].map((name) => document.createElement(name));
+    const list = document.createElement("ul"), names = new Set();
+    for (const one of found) {
+      if (names.has(one.name) || names.size > BESIDE) continue;
+      names.add(one.name);
+      const [item, about, word, link, date] = ["li", "span", "b", "a", "span"].map((name) => document.createElement(name));
+      item.textContent = one.evidence;
       about.className = "asked";
-      link.href = `c/${latest.slug}/index.html`;
-      link.textContent = latest.name;
+      word.className = `status-${one.status.toLowerCase()}`;
+      word.textContent = one.status;
+      link.href = `c/${one.slug}/index.html`;
+      link.textContent = one.name;
       date.className = "date";
-      date.textContent = latest.date;
-      about.append(link, ", ", date);
-      evidence.append(about);
+      date.textContent = one.date;
+      about.append(...(names.size > 1 ? [word, " "] : []), link, ", ", date, one.finished ? "" : ", not finished");
+      item.append(about);
+      list.append(item);
     }
+    evidence.replaceChildren(...(latest ? [list] : ["\u2013"]));
     row.querySelector(".trend").replaceChildren(...(latest ? spark(found) : []));
     margin.textContent = latest ? latest.margin : "\u2013";
     shown.textContent = found.length.toLocaleString("en");

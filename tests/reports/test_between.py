@@ -3,11 +3,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
-from reports.between import Contrast, contrast_grid, contrasts
-from reports.stored import read_run
+from reports.between import Contrast, Figure, contrast_grid, contrasts, figures_of, sample_of
+from reports.statistics.changes import difference_p
+from reports.stored import StoredRun, read_run
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
@@ -45,6 +47,27 @@ def test_draws_of_their_own_are_compared_as_two_samples(make_rows: Rows, make_ru
     assert changed["velocity error (m/s)"].p_value < 1e-3
     grid = contrast_grid(["a", "b"], list(changed.values()))
     assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
+
+
+def test_terrains_of_other_sites_are_other_terrains(make_rows: Rows, make_run: MakeRun) -> None:
+    # Errors go with the terrain. Of two sites terrain 3 is not the same: nothing has changed but the draw of
+    # terrains, which number by number is taken for a change in 7 of 9 pairs of draws.
+    def run(name: str, seed: int) -> Path:
+        level = np.random.default_rng(seed).uniform(1.0, 3.0, 20)
+        frame = make_rows(400, terrains=20, answered=1.0, seed=seed)
+        frame["velocity_error_m_s"] = level[frame["terrain"]] + 0.1 * np.arange(400) / 400
+        configuration = {"parameters": {"site": name}}
+        return make_run(frame, name=name, seed=seed, configuration=configuration)
+
+    here, there = read_run(run("gusev", 1)), read_run(run("meridiani", 6))
+    assert min(one.p_value for one in contrasts(here, there)[1]) > 0.05
+    mine, its = (sample_of(*_errors(one)) for one in (here, there))
+    assert difference_p(mine, its) < 1e-3
+
+
+def _errors(run: StoredRun) -> tuple[pd.DataFrame, Figure]:
+    frame, found = figures_of(run)
+    return frame, next(one for one in found if one.name == "velocity error (m/s)")
 
 
 def test_campaigns_with_nothing_in_common(make_rows: Rows, make_run: MakeRun) -> None:

@@ -233,15 +233,3 @@ def test_same_files_same_page(make_rows: Rows, make_run: MakeRun) -> None:
     directory = make_run(make_rows(24)[[*BARE, "off_nadir_max_deg", "terrain"]])
     first = write_report(directory).read_bytes()
     assert write_report(directory).read_bytes() == first
-
-
-def test_twin_keeps_its_schema(make_rows: Rows, make_run: MakeRun) -> None:
-    _, _, twin = _read(make_run(make_rows(24)[BARE]))
-    assert set(twin) == {
-        "schema", "campaign", "state", "seed", "git_commit", "started_utc", "finished_utc", "cases", "crashed",
-        "verdict", "sentence", "exit_code", "verdicts", "outcomes", "metric", "statistics", "worst_cases", "sections",
-        "showcases", "sampling",
-    }  # fmt: skip
-    assert {"requirement_id", "status", "n", "failures", "lower", "upper", "further_cases", "note"} <= set(
-        twin["verdicts"][0]
-    )

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from campaigns.definition.requirements import shipped_requirements
-from reports.dashboard.entries import Shown, find_campaigns, slug_of
+from reports.dashboard.entries import Shown, find_campaigns, read_entries, slug_of
 from reports.dashboard.rows import margin_text, requirement_rows, sparkline
 from reports.dashboard.site import write_site
 from reports.explorer import script_hash
@@ -45,6 +45,23 @@ def test_every_requirement_has_a_row_and_every_campaign(make_rows: Rows, make_ru
     matrix = list(csv.DictReader(io.StringIO((tmp_path / "site" / "verification.csv").read_text())))
     verdicts = {row["requirement"]: row["verdict"] for row in matrix}
     assert (verdicts["DIMES-VEL"], verdicts["HDA-TIME"]) == ("INSUFFICIENT", "NO CAMPAIGN")
+
+
+def test_what_came_to_its_end_stands_before_what_did_not(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+    paths = []
+    for day, (name, state) in enumerate([("a", "finished"), ("b", "finished"), ("c", "interrupted")], start=1):
+        said = {"started_utc": f"2026-01-0{day}T00:00:00Z", "state": state}
+        frame = make_rows(24, seed=day)[BARE].assign(site=["east", "west"] * 12, algorithm="mine")
+        record = make_run(frame, **said) / "campaign.json"
+        paths.append(record.parent.rename(tmp_path / name))
+        text = (tmp_path / name / "campaign.json").read_text()
+        (tmp_path / name / "campaign.json").write_text(text.replace("dimes-synthetic", f"dimes-{name}"))
+    entries, problems = read_entries(paths)
+    assert problems == []
+    assert [entry.name for entry in entries] == ["dimes-c", "dimes-b", "dimes-a"]
+    assert (entries[0].sites, entries[0].algorithms) == (("east", "west"), ("mine",))
+    row = next(row for row in requirement_rows(entries, {}) if row.requirement == "DIMES-VEL")
+    assert [cell.entry.name for cell in row.cells] == ["dimes-b", "dimes-a", "dimes-c"]
 
 
 def test_links_lead_to_files_of_the_site(

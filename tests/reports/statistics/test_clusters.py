@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reports.statistics.clusters import ClusterMethod, clustered_evidence
+from reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
 from reports.statistics.proportions import proportion_lower, proportion_upper
 
 SIZE = 8
@@ -84,3 +84,9 @@ def test_effective_sample_size_never_exceeds_the_cases() -> None:
     assert evidence.effective_n == 1000.0
     assert evidence.lower == proportion_lower(900, 1000, 0.9)
     assert evidence.upper == proportion_upper(900, 1000, 0.9)
+
+
+def test_terrains_are_counted_without_gaps() -> None:
+    for terrain in ([7, 3, 7, 5], [-2, 10**15, -2], [4]):
+        numbered = np.array(terrain, dtype=np.int64)
+        np.testing.assert_array_equal(terrain_index(numbered), np.unique(numbered, return_inverse=True)[1])
