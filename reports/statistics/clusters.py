@@ -105,7 +105,7 @@ def terrain_index(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
         return np.unique(terrain, return_inverse=True)[1]
     # without sorting, which takes most of a report of a million cases
     shifted = terrain - first
-    return (np.cumsum(np.bincount(shifted) > 0) - 1)[shifted]
+    return np.asarray((np.cumsum(np.bincount(shifted) > 0) - 1)[shifted])
 
 
 def _design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
