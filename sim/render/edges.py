@@ -14,6 +14,7 @@ from jaxtyping import Float32, Float64, Int8, Int32, Int64
 
 from sim.render.kernels.edges import look_closely, mark_edges, split_rays
 from sim.render.objects import Objects
+from sim.render.pyramid import pyramid
 from sim.render.rays import PixelRays, RayBundle
 from sim.terrain import Surface
 
@@ -99,7 +100,7 @@ def look_within(
     """
     found = Sight.unseen(len(within.directions), objects)
     look_closely(
-        surface.levels,
+        pyramid(surface)[0],
         surface.spacing_m,
         bounds_m,
         objects.hierarchy,

@@ -29,6 +29,7 @@ from sim.render.kernels.sun import Shadow
 from sim.render.mesh import cells_in_hull, graded_offsets, ground_mesh, lines_in_view
 from sim.render.objects import Objects
 from sim.render.photometry import Photometry, Sun, Texture
+from sim.render.pyramid import pyramid
 from sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
 from sim.render.reach import EVERYWHERE, Cone, casters_towards, concerned, shade_reach
 from sim.terrain import Surface
@@ -252,7 +253,7 @@ class Renderer:
         light = scene.light(time_s)
         sight = Sight.unseen(rows * columns, scene.objects)
         look(
-            scene.surface.levels,
+            *pyramid(scene.surface),
             scene.surface.spacing_m,
             scene.bounds_m,
             depth,
@@ -357,7 +358,7 @@ def _shaded(
     body = np.empty(count, dtype=np.int32)
     normal = np.empty((count, 3), dtype=np.float32)
     shade(
-        scene.surface.levels,
+        *pyramid(scene.surface),
         scene.surface.spacing_m,
         sight.distance,
         sight.triangle,

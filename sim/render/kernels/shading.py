@@ -177,6 +177,7 @@ def _keep_normals(width: int, work: Array, normal: Array32) -> None:
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def shade(
     levels: tuple[Level, ...],
+    top_level: int,
     spacing: float,
     distance: Array,
     triangle_of_pixel: Ints,
@@ -210,8 +211,8 @@ def shade(
 
     Parameters
     ----------
-    levels, spacing
-        The surface's pyramid and the spacing of its level 0.
+    levels, top_level, spacing
+        The surface's pyramid (`sim.render.pyramid`), its coarsest level, and the spacing of its level 0.
     distance, triangle_of_pixel, weights, level_of_pixel
         What each ray meets, as `look` finds it.
     world_from_body, position
@@ -264,7 +265,6 @@ def shade(
     ground = np.empty(STRIP, dtype=np.int64)
     mixed = np.empty(STRIP, dtype=np.int64)
     other = np.empty(STRIP, dtype=np.int64)
-    top_level = len(levels) - 1
     count = directions.shape[0]
     for first in range(0, count, STRIP):
         width = min(STRIP, count - first)

@@ -231,6 +231,7 @@ def _meet_ground(
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def look(
     levels: tuple[Level, ...],
+    top_level: int,
     spacing: float,
     bounds: Bounds,
     depth: Array32,
@@ -253,8 +254,9 @@ def look(
 
     Parameters
     ----------
-    levels, spacing, bounds
-        The surface's pyramid, the spacing of its level 0, and where the mesh ends.
+    levels, top_level, spacing, bounds
+        The surface's pyramid (`sim.render.pyramid`), its coarsest level, the spacing of its level 0, and where the mesh
+        ends.
     depth, ids, focal, view_from_body
         Pinhole views from `position`: depth along the axis, number of the triangle plus one (0 for ground; empty where
         no triangles were drawn, for none are in view), focal lengths in samples, and rotations from body axes to the
@@ -277,7 +279,6 @@ def look(
     side = depth.shape[1]
     middle = side / 2.0 - 0.5
     inverse_spacing = 1.0 / spacing
-    top_level = len(levels) - 1
     things = ids.shape[1] > 0
     rotation = numbers(world_from_body)
     centre = (position[0], position[1], position[2])
