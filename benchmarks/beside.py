@@ -23,7 +23,6 @@ from scipy.spatial.transform import Rotation
 from benchmarks.pictures import SUN, descent_exposure, descent_pose, descent_scene
 from benchmarks.timing import Figure, core_seconds
 from scenarios.descent import CameraParameters, camera_optics
-from sim.render.backend import compile_shaders_once
 from sim.render.mesh import graded_offsets, ground_mesh
 from sim.render.rays import VIEW_SIDE_PX
 
@@ -84,9 +83,34 @@ def _pyrender_shaded(given: Mapping[str, Any]) -> Callable[[], None]:
     camera = pyrender.IntrinsicsCamera(given["focal_px"], given["focal_px"], middle, middle, znear=NEAR_M, zfar=FAR_M)
     theirs.add(camera, pose=given["pose"])
     renderer = pyrender.OffscreenRenderer(VIEW_SIDE_PX, VIEW_SIDE_PX)
-    compile_shaders_once(renderer._renderer)
+    _compile_shaders_once(renderer._renderer)
     flags = pyrender.RenderFlags.SHADOWS_DIRECTIONAL
     return lambda: renderer.render(theirs, flags=flags)
+
+
+def _compile_shaders_once(renderer: Any) -> None:
+    """Makes pyrender find the shaders that it has compiled.
+
+    pyrender looks them up by the current context. PyOpenGL tells OSMesa's context by a new pointer object each time, so
+    that every picture would compile its shaders anew and leave the old ones behind, some 0.3 MB. A renderer has one
+    context for life.
+    """
+    programs = renderer._program_cache
+    compile_program = programs.get_program
+    compiled: dict[Any, Any] = {}
+
+    def get_program(
+        vertex_shader: str,
+        fragment_shader: str,
+        geometry_shader: str | None = None,
+        defines: dict[str, Any] | None = None,
+    ) -> Any:
+        key = (vertex_shader, fragment_shader, geometry_shader, tuple(sorted((defines or {}).items())))
+        if key not in compiled:
+            compiled[key] = compile_program(vertex_shader, fragment_shader, geometry_shader, defines)
+        return compiled[key]
+
+    programs.get_program = get_program
 
 
 def _elsewhere(command: list[str], given: Mapping[str, Any], repeats: int) -> list[float]:

@@ -1,8 +1,9 @@
 """The OpenGL context: the only module that knows which library draws.
 
 OpenGL is asked for one thing: what each pixel of a pinhole view sees, as depth and number of the triangle. pyrender
-draws that off-screen, through OSMesa or EGL. The platform has to be chosen before pyrender or PyOpenGL is first
-imported in a process, and contexts belong to the process that made them: they survive neither fork nor threads.
+makes the context, off-screen, through OSMesa or EGL; its scenes and renderer are left out, as they take longer than a
+small picture does. The platform has to be chosen before pyrender or PyOpenGL is first imported in a process, and
+contexts belong to the process that made them: they survive neither fork nor threads.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt32
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     import trimesh
@@ -70,19 +72,33 @@ class PinholeView:
 
 #: OpenGL's camera looks along -z with y up.
 _VIEW_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
+_Numbers = NDArray[Any]
 
-
-def _colours(number: Int64[np.ndarray, "count"]) -> Float32[np.ndarray, "count 4"]:
-    """Colours that spell numbers in 24 bits, least significant first."""
-    spelled = np.stack([number & 255, (number >> 8) & 255, (number >> 16) & 255, np.full_like(number, 255)], axis=-1)
-    return spelled.astype(np.float32) / np.float32(255.0)
-
-
-def _numbers(colours: UInt8[np.ndarray, "rows columns 4"]) -> Int32[np.ndarray, "rows columns"]:
-    """The numbers that colours spell; opacity spells nothing."""
-    spelled = colours.view("<u4")[..., 0]
-    numbers: Int32[np.ndarray, "rows columns"] = np.bitwise_and(spelled, 0xFFFFFF).view(np.int32)
-    return numbers
+#: Every corner tells its triangle's number to all of the triangle.
+_CORNERS = """#version 330 core
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec4 number;
+uniform mat4 view;
+uniform mat4 projection;
+flat out vec4 spelled;
+void main()
+{
+    // mat4() keeps the compiler from projecting the viewed corner instead, which rounds otherwise
+    gl_Position = mat4(projection * view) * vec4(position, 1.0);
+    spelled = number;
+}
+"""
+_SAMPLES = """#version 330 core
+flat in vec4 spelled;
+out vec4 colour;
+void main()
+{
+    colour = spelled;
+}
+"""
+_POSITION, _NUMBER = 0, 1
+#: Numbers are spelled in the 24 bits of a colour, least significant first; the rest is opacity.
+_SPELLED, _OPAQUE = 0xFFFFFF, 0xFF000000
 
 
 class DepthRenderer:
@@ -104,19 +120,15 @@ class DepthRenderer:
     def __init__(self, side_px: int, backend: Backend) -> None:
         self.side_px = side_px
         self.backend = backend
-        pyrender = _import_pyrender(backend)
+        _import_pyrender(backend)
         try:
-            self._offscreen = pyrender.OffscreenRenderer(side_px, side_px)
+            self._platform = _context(side_px, backend)
+            self._drawing = _Drawing(side_px, in_buffer=self._platform.supports_framebuffers())
         except Exception as error:
             raise RenderingError(
                 f"no OpenGL context through {backend} ({error}); run 'marsyard doctor' to see what is missing"
             ) from error
-        _draw_single_sampled(self._offscreen._renderer)
-        compile_shaders_once(self._offscreen._renderer)
-        _read_quickly(self._offscreen._renderer)
-        self._pyrender = pyrender
-        self._scene: Any = None
-        self._flags = 0
+        self._loaded = False
 
     def load(
         self,
@@ -134,80 +146,197 @@ class DepthRenderer:
             Corners in world coordinates of triangles that stand on the ground, and the number by which each is told
             apart in the picture, counted from zero.
         """
-        self._clear()
-        pyrender = self._pyrender
-        self._flags = (
-            pyrender.RenderFlags.DEPTH_ONLY
-            if len(triangles) == 0
-            else pyrender.RenderFlags.FLAT | pyrender.RenderFlags.RGBA
+        self._platform.make_current()
+        spelled = (numbers + 1).astype(np.uint32) | np.uint32(_OPAQUE)
+        self._drawing.load(
+            ground.vertices.view(np.ndarray).astype(np.float32),
+            ground.faces.view(np.ndarray).astype(np.uint32),
+            triangles.astype(np.float32),
+            np.repeat(spelled, 3),
         )
-        black = pyrender.MetallicRoughnessMaterial(baseColorFactor=(0.0, 0.0, 0.0, 1.0))
-        primitives = [
-            pyrender.Primitive(
-                positions=ground.vertices.view(np.ndarray).astype(np.float32),
-                indices=ground.faces.view(np.ndarray).astype(np.uint32),
-                mode=pyrender.GLTF.TRIANGLES,
-                material=black,
-            )
-        ]
-        if len(triangles) > 0:
-            primitives.append(
-                pyrender.Primitive(
-                    positions=triangles.reshape(-1, 3).astype(np.float32),
-                    color_0=np.repeat(_colours(numbers + 1), 3, axis=0),
-                    mode=pyrender.GLTF.TRIANGLES,
-                )
-            )
-        self._scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0))
-        self._scene.add(pyrender.Mesh(primitives))
+        self._loaded = True
 
-    def draw(self, view: PinholeView) -> tuple[Float32[np.ndarray, "side side"], Int32[np.ndarray, "side side"]]:
+    def draw(self, view: PinholeView) -> tuple[Float32[np.ndarray, "side side"], Int32[np.ndarray, "_ _"]]:
         """Depth along the view's axis, metres, and the number of the triangle seen plus one, 0 for the ground.
 
         The depth is 0 where there is nothing. The numbers are an empty array where nothing but ground is loaded. Row 0
         is the top of the view.
         """
-        if self._scene is None:
+        if not self._loaded:
             raise RenderingError("no mesh has been loaded")
-        # pyrender counts pixels from the corner of the first, whose centre is at 0.5: the middle is at side / 2
-        middle = self.side_px / 2.0
-        camera = self._pyrender.IntrinsicsCamera(
-            view.focal_px, view.focal_px, middle, middle, znear=view.near_m, zfar=view.far_m
-        )
-        node = self._scene.add(camera, pose=view.world_from_view @ _VIEW_FROM_GL)
-        try:
-            drawn = self._offscreen.render(self._scene, flags=self._flags)
-        finally:
-            self._scene.remove_node(node)
-        if isinstance(drawn, tuple):
-            colours, depth = drawn
-            return depth, _numbers(colours)
-        return drawn, np.zeros((0, 0), dtype=np.int32)
-
-    def _clear(self) -> None:
-        """Releases what is loaded, on the card too, now rather than when pyrender next draws."""
-        if self._scene is None:
-            return
-        self._offscreen._platform.make_current()
-        for mesh in self._scene.meshes:
-            for primitive in mesh.primitives:
-                primitive.delete()
-        self._scene.clear()
-        self._scene = None
+        self._platform.make_current()
+        self._drawing.draw(np.linalg.inv(view.world_from_view @ _VIEW_FROM_GL), _projection(view, self.side_px))
+        depth = _metres(self._drawing.depth()[::-1], view.near_m, view.far_m)
+        if self._drawing.things == 0:
+            return depth, np.zeros((0, 0), dtype=np.int32)
+        return depth, np.bitwise_and(self._drawing.colours()[::-1], np.uint32(_SPELLED)).view(np.int32)
 
     def description(self) -> str:
         """Renderer and version strings of OpenGL."""
         from OpenGL.GL import GL_RENDERER, GL_VERSION, glGetString
 
-        self._offscreen._platform.make_current()
+        self._platform.make_current()
         return " / ".join(glGetString(name).decode() for name in (GL_RENDERER, GL_VERSION))
 
     def close(self) -> None:
-        """Releases the context."""
-        self._offscreen.delete()
+        """Releases the context, and all that it holds."""
+        self._platform.make_current()
+        self._platform.delete_context()
 
 
-def _import_pyrender(backend: Backend) -> Any:
+class _Drawing:
+    """The program, the buffers and the calls of the context that is current.
+
+    Parameters
+    ----------
+    side_px
+        Width and height of the picture.
+    in_buffer
+        Whether the context has no picture of its own, so that one is made. It has one sample a pixel, at its centre:
+        with several, drivers that honour multisampling (EGL) give the depth of one that lies off-centre.
+    """
+
+    def __init__(self, side_px: int, *, in_buffer: bool) -> None:
+        from OpenGL import GL
+
+        self.gl = GL
+        self.side_px = side_px
+        self.corners = self.things = 0
+        program = _program()
+        GL.glUseProgram(program)
+        self.view, self.projection = (GL.glGetUniformLocation(program, name) for name in ("view", "projection"))
+        self.ground_array, self.things_array = GL.glGenVertexArrays(2)
+        self.vertices, self.faces, self.triangles, self.numbers = GL.glGenBuffers(4)
+        for array, vertices in ((self.ground_array, self.vertices), (self.things_array, self.triangles)):
+            GL.glBindVertexArray(array)
+            GL.glBindBuffer(GL.GL_ARRAY_BUFFER, vertices)
+            GL.glVertexAttribPointer(_POSITION, 3, GL.GL_FLOAT, False, 0, None)
+            GL.glEnableVertexAttribArray(_POSITION)
+        GL.glBindBuffer(GL.GL_ARRAY_BUFFER, self.numbers)
+        GL.glVertexAttribPointer(_NUMBER, 4, GL.GL_UNSIGNED_BYTE, True, 0, None)
+        GL.glEnableVertexAttribArray(_NUMBER)
+        # the ground's corners have no numbers of their own
+        GL.glVertexAttrib4f(_NUMBER, 0.0, 0.0, 0.0, 1.0)
+        if in_buffer:
+            self._make_buffer()
+        else:
+            GL.glReadBuffer(GL.GL_FRONT)
+        for what in (GL.GL_DEPTH_TEST, GL.GL_CULL_FACE):
+            GL.glEnable(what)
+        GL.glViewport(0, 0, side_px, side_px)
+        GL.glClearColor(0.0, 0.0, 0.0, 0.0)
+
+    def _make_buffer(self) -> None:
+        gl = self.gl
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, gl.glGenFramebuffers(1))
+        for place, kind in ((gl.GL_COLOR_ATTACHMENT0, gl.GL_RGBA8), (gl.GL_DEPTH_ATTACHMENT, gl.GL_DEPTH_COMPONENT24)):
+            buffer = gl.glGenRenderbuffers(1)
+            gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
+            gl.glRenderbufferStorage(gl.GL_RENDERBUFFER, kind, self.side_px, self.side_px)
+            gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, place, gl.GL_RENDERBUFFER, buffer)
+
+    def load(self, vertices: _Numbers, faces: _Numbers, triangles: _Numbers, numbers: _Numbers) -> None:
+        """Fills the buffers: the ground's vertices and faces, triangles on it, the number of each of their corners."""
+        gl = self.gl
+        gl.glBindVertexArray(self.ground_array)
+        self._fill(gl.GL_ARRAY_BUFFER, self.vertices, vertices)
+        self._fill(gl.GL_ELEMENT_ARRAY_BUFFER, self.faces, faces)
+        if len(triangles) or self.things:
+            self._fill(gl.GL_ARRAY_BUFFER, self.triangles, triangles)
+            self._fill(gl.GL_ARRAY_BUFFER, self.numbers, numbers)
+        self.corners, self.things = faces.size, 3 * len(triangles)
+
+    def _fill(self, kind: int, buffer: int, values: _Numbers) -> None:
+        self.gl.glBindBuffer(kind, buffer)
+        self.gl.glBufferData(kind, values.nbytes, np.ascontiguousarray(values), self.gl.GL_STREAM_DRAW)
+
+    def draw(self, view: Float64[np.ndarray, "4 4"], projection: Float64[np.ndarray, "4 4"]) -> None:
+        """Draws what is loaded."""
+        gl = self.gl
+        gl.glClear(gl.GL_COLOR_BUFFER_BIT | gl.GL_DEPTH_BUFFER_BIT)
+        for place, matrix in ((self.view, view), (self.projection, projection)):
+            gl.glUniformMatrix4fv(place, 1, True, matrix.astype(np.float32))
+        gl.glBindVertexArray(self.ground_array)
+        gl.glDrawElements(gl.GL_TRIANGLES, self.corners, gl.GL_UNSIGNED_INT, None)
+        if self.things:
+            gl.glBindVertexArray(self.things_array)
+            gl.glDrawArrays(gl.GL_TRIANGLES, 0, self.things)
+
+    def depth(self) -> Float32[np.ndarray, "side side"]:
+        """OpenGL's depths, from 0 to 1, the lowest row first."""
+        return self._read(self.gl.GL_DEPTH_COMPONENT, self.gl.GL_FLOAT, np.empty(self._size, dtype=np.float32))
+
+    def colours(self) -> UInt32[np.ndarray, "side side"]:
+        """Colours, red in the least significant byte, the lowest row first."""
+        read = self._read(self.gl.GL_RGBA, self.gl.GL_UNSIGNED_BYTE, np.empty((*self._size, 4), dtype=np.uint8))
+        return read.view("<u4")[..., 0]
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self.side_px, self.side_px
+
+    def _read(self, what: int, kind: int, pixels: Any) -> Any:
+        self.gl.glReadPixels(0, 0, *self._size, what, kind, pixels)
+        return pixels
+
+
+def _program() -> int:
+    """The program that draws."""
+    from OpenGL import GL
+
+    program: int = GL.glCreateProgram()
+    for kind, source in ((GL.GL_VERTEX_SHADER, _CORNERS), (GL.GL_FRAGMENT_SHADER, _SAMPLES)):
+        shader = GL.glCreateShader(kind)
+        GL.glShaderSource(shader, source)
+        GL.glCompileShader(shader)
+        if not GL.glGetShaderiv(shader, GL.GL_COMPILE_STATUS):
+            raise RenderingError(f"a shader does not compile: {GL.glGetShaderInfoLog(shader)}")
+        GL.glAttachShader(program, shader)
+    GL.glLinkProgram(program)
+    if not GL.glGetProgramiv(program, GL.GL_LINK_STATUS):
+        raise RenderingError(f"the shaders do not link: {GL.glGetProgramInfoLog(program)}")
+    return program
+
+
+def _projection(view: PinholeView, side_px: int) -> Float64[np.ndarray, "4 4"]:
+    """OpenGL's projection matrix of a view whose principal point is the picture's middle."""
+    scale = 2.0 * view.focal_px / side_px
+    near, far = view.near_m, view.far_m
+    matrix = np.diag([scale, scale, (far + near) / (near - far), 0.0])
+    matrix[2, 3], matrix[3, 2] = 2.0 * far * near / (near - far), -1.0
+    return matrix
+
+
+def _metres(drawn: Float32[np.ndarray, "side side"], near_m: float, far_m: float) -> Float32[np.ndarray, "side side"]:
+    """Depth along the view's axis from OpenGL's, 0 where nothing was drawn."""
+    # NumPy's own floats would have all of it computed in double precision
+    near_m, far_m = float(near_m), float(far_m)
+    metres: Float32[np.ndarray, "side side"] = np.multiply(drawn, -2.0, order="C")
+    metres += 1.0
+    metres *= far_m - near_m
+    metres += far_m + near_m
+    np.divide(2.0 * near_m * far_m, metres, out=metres)
+    metres[drawn == 1.0] = 0.0
+    return metres
+
+
+def _context(side_px: int, backend: Backend) -> Any:
+    """A context, made current."""
+    if backend == "osmesa":
+        from pyrender.platforms.osmesa import OSMesaPlatform
+
+        platform = OSMesaPlatform(side_px, side_px)
+    else:
+        from pyrender.platforms import egl
+
+        device = egl.get_device_by_index(int(os.environ.get("EGL_DEVICE_ID", "0")))
+        platform = egl.EGLPlatform(side_px, side_px, device=device)
+    platform.init_context()
+    platform.make_current()
+    return platform
+
+
+def _import_pyrender(backend: Backend) -> None:
     if not __debug__:
         raise RenderingError("pyrender makes OpenGL calls inside assert statements: run Python without -O")
     chosen = os.environ.get("PYOPENGL_PLATFORM")
@@ -218,121 +347,9 @@ def _import_pyrender(backend: Backend) -> Any:
         )
     os.environ["PYOPENGL_PLATFORM"] = backend
     try:
-        import pyrender
+        import pyrender  # noqa: F401
     # PyOpenGL meets a missing library with an AttributeError of the functions that it could not find
     except (ImportError, AttributeError, OSError) as error:
         raise RenderingError(
             f"OpenGL through {backend} cannot be loaded ({error}); run 'marsyard doctor' to see what is missing"
         ) from error
-    return pyrender
-
-
-def compile_shaders_once(renderer: Any) -> None:
-    """Makes pyrender find the shaders that it has compiled.
-
-    pyrender looks them up by the current context. PyOpenGL tells OSMesa's context by a new pointer object each time, so
-    that every picture would compile its shaders anew and leave the old ones behind, some 0.3 MB. A renderer has one
-    context for life.
-    """
-    programs = renderer._program_cache
-    compile_program = programs.get_program
-    compiled: dict[Any, Any] = {}
-
-    def get_program(
-        vertex_shader: str,
-        fragment_shader: str,
-        geometry_shader: str | None = None,
-        defines: dict[str, Any] | None = None,
-    ) -> Any:
-        key = (vertex_shader, fragment_shader, geometry_shader, tuple(sorted((defines or {}).items())))
-        if key not in compiled:
-            compiled[key] = compile_program(vertex_shader, fragment_shader, geometry_shader, defines)
-        return compiled[key]
-
-    programs.get_program = get_program
-
-
-def _draw_single_sampled(renderer: Any) -> None:
-    """Makes pyrender draw into a buffer with one sample a pixel, at its centre.
-
-    pyrender draws into a buffer with four samples a pixel and reads the depth of one of them, which lies off-centre
-    where the driver honours multisampling (EGL): every picture would be shifted by about (0.125, 0.375) pixel.
-    """
-    configure = renderer._configure_main_framebuffer
-
-    def configure_single_sampled() -> None:
-        from OpenGL import GL
-
-        existing = renderer._main_fb
-        configure()
-        if renderer._main_fb == existing:
-            return
-        size = (renderer.viewport_width, renderer.viewport_height)
-        for buffer, kind in ((renderer._main_cb_ms, GL.GL_RGBA), (renderer._main_db_ms, GL.GL_DEPTH_COMPONENT24)):
-            GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, buffer)
-            GL.glRenderbufferStorage(GL.GL_RENDERBUFFER, kind, *size)
-
-    renderer._configure_main_framebuffer = configure_single_sampled
-
-
-def _read_quickly(renderer: Any) -> None:
-    """Makes pyrender read pictures in few passes over memory, to the same values, with four channels of colour.
-
-    Its own reading takes as long as drawing does.
-    """
-
-    def read(what: int, kind: int, values: Any) -> Any:
-        from OpenGL import GL
-
-        size = (renderer.viewport_width, renderer.viewport_height)
-        pixels = np.frombuffer(GL.glReadPixels(0, 0, *size, what, kind), dtype=values)
-        return pixels.reshape(size[1], size[0], -1)[::-1]
-
-    def depth(near_m: float, far_m: float) -> Float32[np.ndarray, "rows columns"]:
-        from OpenGL import GL
-
-        drawn = read(GL.GL_DEPTH_COMPONENT, GL.GL_FLOAT, np.float32)[..., 0]
-        metres: Float32[np.ndarray, "rows columns"] = np.multiply(drawn, -2.0, order="C")
-        metres += 1.0
-        metres *= far_m - near_m
-        metres += far_m + near_m
-        np.divide(2.0 * near_m * far_m, metres, out=metres)
-        metres[drawn == 1.0] = 0.0
-        return metres
-
-    def colours() -> UInt8[np.ndarray, "rows columns 4"]:
-        from OpenGL import GL
-
-        return np.ascontiguousarray(read(GL.GL_RGBA, GL.GL_UNSIGNED_BYTE, np.uint8))
-
-    def from_screen() -> None:
-        from OpenGL import GL
-
-        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, 0)
-        GL.glReadBuffer(GL.GL_FRONT)
-
-    def read_depth_buf() -> Float32[np.ndarray, "rows columns"]:
-        from_screen()
-        return depth(renderer._latest_znear, renderer._latest_zfar)
-
-    def read_color_buf() -> UInt8[np.ndarray, "rows columns 4"]:
-        from_screen()
-        return colours()
-
-    def read_main_framebuffer(scene: Any, flags: int) -> Any:
-        from OpenGL import GL
-        from pyrender import RenderFlags
-
-        width, height = renderer._main_fb_dims
-        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, renderer._main_fb_ms)
-        GL.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, renderer._main_fb)
-        for buffer in (GL.GL_COLOR_BUFFER_BIT, GL.GL_DEPTH_BUFFER_BIT):
-            GL.glBlitFramebuffer(0, 0, width, height, 0, 0, width, height, buffer, GL.GL_NEAREST)
-        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, renderer._main_fb)
-        camera = scene.main_camera_node.camera
-        metres = depth(camera.znear, camera.zfar)
-        return metres if flags & RenderFlags.DEPTH_ONLY else (colours(), metres)
-
-    renderer.read_depth_buf = read_depth_buf
-    renderer.read_color_buf = read_color_buf
-    renderer._read_main_framebuffer = read_main_framebuffer

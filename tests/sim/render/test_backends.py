@@ -7,10 +7,9 @@ import sys
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+import trimesh
 
-from sim.frames import rigid
-from sim.render import Photometry, PixelRays, Scene, Sun
+from sim.render.backend import DepthRenderer, PinholeView, RenderingError, default_backend
 
 DRAW = """
 import sys
@@ -62,8 +61,6 @@ def test_osmesa_and_egl_draw_the_same_picture(tmp_path) -> None:
 
 
 def test_an_unknown_backend_is_named(monkeypatch) -> None:
-    from sim.render.backend import RenderingError, default_backend
-
     monkeypatch.setenv("MARSYARD_GL", "vulkan")
     with pytest.raises(RenderingError, match="'vulkan'; allowed: osmesa, egl"):
         default_backend()
@@ -78,17 +75,30 @@ def test_without_a_choice_the_installed_backend_is_taken(monkeypatch, installed,
     assert backend.default_backend() == chosen
 
 
-def test_shaders_are_compiled_once(renderer, rough, descent_camera) -> None:
-    """Not once a picture: each would leave 0.3 MB behind."""
-    rays = PixelRays.of(descent_camera(64))
-    scene = Scene(rough, (0.0, 0.0), Sun(np.array([0.0, 0.0, 1.0])), Photometry())
-    pose = rigid(Rotation.identity(), np.array([0.0, 0.0, 500.0]))
-    renderer.render(scene, rays, pose)
-    programs = renderer._views[rays.view_side_px]._offscreen._renderer._program_cache._program_cache
-    compiled = len(programs)
-    for _ in range(3):
-        renderer.render(scene, rays, pose)
-    assert len(programs) == compiled
+def _view(height_m: float) -> PinholeView:
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = height_m
+    return PinholeView(pose, focal_px=40.0, near_m=1.0, far_m=100.0)
+
+
+def test_what_was_loaded_before_is_drawn_no_more() -> None:
+    """Depths of level ground and of a triangle above its middle, in closed form, in whatever order they are loaded."""
+    corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0], [-30.0, 30.0, 0.0]])
+    ground = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    above = np.array([[[-9.0, -9.0, 4.0], [9.0, -9.0, 4.0], [0.0, 9.0, 4.0]]])
+    renderer = DepthRenderer(64, default_backend())
+    with pytest.raises(RenderingError, match="no mesh"):
+        renderer.draw(_view(20.0))
+    nothing = (np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
+    for loaded, number in (((above, np.array([70000])), 70001), (nothing, 0), ((above, np.array([5])), 6)):
+        renderer.load(ground, *loaded)
+        for height in (20.0, 10.0):
+            depth, numbers = renderer.draw(_view(height))
+            # to the 24 bits of a depth between 1 and 100 m
+            assert depth[32, 32] == pytest.approx(height - (4.0 if number else 0.0), abs=1e-3)
+            assert depth[2, 2] == pytest.approx(height, abs=1e-3)
+            assert numbers.size == 0 if number == 0 else (numbers[32, 32], numbers[2, 2]) == (number, 0)
+    renderer.close()
 
 
 def test_a_process_keeps_to_one_backend() -> None:
