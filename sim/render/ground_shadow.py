@@ -52,6 +52,7 @@ def ground_shadow(
     if main == 0.0:
         return NO_SHADOW
     drop, slip = spacing * up / abs(main), side / abs(main)
+    rows = columns = np.arange(len(field))
     reach = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, len(field)))
     if shown_m is not None:
         # a walk towards the sun, and the shadows that fall on its end
@@ -64,8 +65,7 @@ def ground_shadow(
         count = max(x[1], y[1])
         if count < len(field):
             rows, columns = (_wrapped(first, count) & (len(field) - 1) for first in (y[0], x[0]))
-            field = field[np.ix_(rows, columns)]
-    height = heights_in_rows(field, along_x)
+    height = heights_in_rows(field, rows, columns, along_x)
     swept, casters = sweep_shadow(height, float(np.sign(main)), drop, slip, reach)
     return (swept, casters, along_x), spacing, level
 

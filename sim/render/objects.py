@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
+from sim.render.kernels.bodies import body_spheres, triangles_of
 from sim.render.kernels.hierarchy import Hierarchy, morton_codes, node_boxes
 
 #: Triangle numbers are drawn as colours of 24 bits, of which 0 is the ground.
@@ -102,20 +103,22 @@ class Objects:
 
     @cached_property
     def spheres(self) -> Float64[np.ndarray, "bodies 4"]:
-        """Centre and radius of a sphere around each body."""
-        return _spheres(self.triangles, self.first_triangle)
+        """Centre and radius of a sphere around each body: about the middle of its bounding box."""
+        spheres: Float64[np.ndarray, "bodies 4"] = body_spheres(self.triangles, self.first_triangle)
+        return spheres
 
     def in_cone(
         self, apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_angle_rad: float
     ) -> Int64[np.ndarray, "kept"]:
         """Numbers of the triangles of all bodies whose spheres reach into a cone."""
         kept = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
-        return np.flatnonzero(np.repeat(kept, np.diff(self.first_triangle)))
+        numbers: Int64[np.ndarray, "kept"] = triangles_of(kept, self.first_triangle)
+        return numbers
 
     def only(self, kept: Bool[np.ndarray, "bodies"]) -> Objects:
         """Some of the bodies, which are counted anew."""
         counts = np.diff(self.first_triangle)
-        triangles = np.flatnonzero(np.repeat(kept, counts))
+        triangles = triangles_of(kept, self.first_triangle)
         some = Objects(
             triangles=np.take(self.triangles, triangles, axis=0),
             normals=np.take(self.normals, triangles, axis=0),
@@ -154,18 +157,3 @@ def _with_spheres(objects: Objects, spheres: Float64[np.ndarray, "bodies 4"]) ->
     """Objects whose spheres are known: a scene's thousands of rocks are not gone through again for each rover there."""
     objects.__dict__["spheres"] = spheres
     return objects
-
-
-def _spheres(
-    triangles: Float64[np.ndarray, "triangles 3 3"], first: Int64[np.ndarray, "bodies+1"]
-) -> Float64[np.ndarray, "bodies 4"]:
-    """Spheres about the middle of each body's bounding box."""
-    if first.size == 1:
-        return np.empty((0, 4))
-    corners, starts = np.ascontiguousarray(triangles.reshape(-1, 3).T), 3 * first[:-1]
-    low, high = np.minimum.reduceat(corners, starts, axis=1), np.maximum.reduceat(corners, starts, axis=1)
-    middle = 0.5 * (low + high)
-    corners -= np.repeat(middle, 3 * np.diff(first), axis=1)
-    corners *= corners
-    farthest = np.maximum.reduceat(corners[0] + corners[1] + corners[2], starts)
-    return np.column_stack([*middle, np.sqrt(farthest)])

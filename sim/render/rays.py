@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from sim.camera import CameraModel
 from sim.render.backend import RenderingError
+from sim.render.kernels.angles import pixel_angles
 from sim.render.reach import Cone
 
 #: Samples along each side of the pinhole views: a camera takes the first that leaves `_SPARE_PX` of them beside its own
@@ -119,7 +120,7 @@ class PixelRays:
             origins=(origins - centre).reshape(-1, 3).astype(np.float32),
             directions=directions.reshape(-1, 3).astype(np.float32),
             size=(columns, rows),
-            pixel_angles=_pixel_angles(directions),
+            pixel_angles=pixel_angles(directions).ravel(),
             view_side_px=side,
             view_from_body=np.stack(axes),
             focal_px=np.array(focal),
@@ -167,24 +168,3 @@ def _focal_length(
     x, y, z = (directions.reshape(-1, 3) @ axes.T).T.copy()
     extent = max(np.abs(x / z).max(), np.abs(y / z).max())
     return float((side / 2.0 - MARGIN_PX) / extent)
-
-
-def _pixel_angles(directions: Float64[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "pixels"]:
-    # component by component: arrays of three-vectors are several times slower to go through
-    x, y, z = np.moveaxis(directions, -1, 0).copy()
-    along_row = [_gradient_along_row(one) for one in (x, y, z)]
-    along_column = [_gradient_along_row(one.T).T for one in (x, y, z)]
-    squared = np.zeros_like(x)
-    for one, other in ((1, 2), (2, 0), (0, 1)):
-        squared += (along_row[one] * along_column[other] - along_row[other] * along_column[one]) ** 2
-    angles: Float32[np.ndarray, "pixels"] = np.sqrt(np.sqrt(squared)).astype(np.float32).ravel()
-    return angles
-
-
-def _gradient_along_row(values: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarray, "rows columns"]:
-    """Central differences from pixel to pixel, at the ends one-sided, as `numpy.gradient` takes them."""
-    steps = np.empty_like(values)
-    steps[:, 1:-1] = (values[:, 2:] - values[:, :-2]) / 2.0
-    steps[:, 0] = values[:, 1] - values[:, 0]
-    steps[:, -1] = values[:, -1] - values[:, -2]
-    return steps

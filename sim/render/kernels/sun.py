@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sim.render.kernels.ground import Array32
 from sim.terrain.kernels import Array, Level, sample
 
+Longs = NDArray[np.int64]
 #: Height and reach of the ground's shadow on the posts of a grid (`sweep_shadow`), and whether its rows run along x.
 Shadow = tuple[Array32, NDArray[np.uint8], bool]
 #: Rows of the grid that one unit of a shadow's stored reach stands for.
@@ -24,18 +25,26 @@ BLOCK = 32
 
 
 @njit(cache=True)
-def heights_in_rows(field: Level, along_x: bool) -> Array32:
-    """Control values of height, their rows along y or along x."""
-    side = field.shape[0]
+def heights_in_rows(field: Level, rows: Longs, columns: Longs, along_x: bool) -> Array32:
+    """Control values of height at as many rows as columns of a level, their rows along y or along x.
+
+    Where they are as many as the level has they are taken in order.
+    """
+    side = rows.size
     heights = np.empty((side, side), dtype=np.float32)
-    if not along_x:
+    if not along_x and side == field.shape[0]:
         heights[:] = field[:, :, 0]
+        return heights
+    if not along_x:
+        for i in range(side):
+            for j in range(side):
+                heights[i, j] = field[rows[i], columns[j], 0]
         return heights
     for top in range(0, side, BLOCK):
         for left in range(0, side, BLOCK):
             for j in range(left, min(left + BLOCK, side)):
                 for i in range(top, min(top + BLOCK, side)):
-                    heights[j, i] = field[i, j, 0]
+                    heights[j, i] = field[rows[i], columns[j], 0]
     return heights
 
 

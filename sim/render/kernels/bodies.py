@@ -1,0 +1,63 @@
+"""Bodies of triangles that follow each other: spheres around them, and the triangles of some of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sim.terrain.kernels import Array
+
+Longs = NDArray[np.int64]
+
+
+@njit(cache=True)
+def body_spheres(triangles: Array, first: Longs) -> Array:
+    """Middle of each body's bounding box, and the distance of its farthest corner from there.
+
+    Parameters
+    ----------
+    triangles
+        Shape (triangles, 3 corners, 3).
+    first
+        First triangle of each body, and the number of triangles at the end.
+    """
+    bodies = first.size - 1
+    spheres = np.empty((bodies, 4))
+    for body in range(bodies):
+        for axis in range(3):
+            low = math.inf
+            high = -math.inf
+            for n in range(first[body], first[body + 1]):
+                for corner in range(3):
+                    low = min(low, triangles[n, corner, axis])
+                    high = max(high, triangles[n, corner, axis])
+            spheres[body, axis] = 0.5 * (low + high)
+        farthest = 0.0
+        for n in range(first[body], first[body + 1]):
+            for corner in range(3):
+                x = triangles[n, corner, 0] - spheres[body, 0]
+                y = triangles[n, corner, 1] - spheres[body, 1]
+                z = triangles[n, corner, 2] - spheres[body, 2]
+                farthest = max(farthest, x * x + y * y + z * z)
+        spheres[body, 3] = math.sqrt(farthest)
+    return spheres
+
+
+@njit(cache=True)
+def triangles_of(kept: NDArray[np.bool_], first: Longs) -> Longs:
+    """Numbers of the triangles of the bodies that are kept, in order."""
+    count = 0
+    for body in range(kept.size):
+        if kept[body]:
+            count += first[body + 1] - first[body]
+    numbers = np.empty(count, dtype=np.int64)
+    place = 0
+    for body in range(kept.size):
+        if kept[body]:
+            for n in range(first[body], first[body + 1]):
+                numbers[place] = n
+                place += 1
+    return numbers

@@ -1,0 +1,46 @@
+"""Bodies of triangles: the spheres around them, and some of them taken from all."""
+
+import numpy as np
+
+from sim.render import Objects
+
+#: Triangles of each body.
+COUNTS = (5, 1, 80, 3)
+
+
+def _bodies() -> Objects:
+    rng = np.random.default_rng(4)
+    names = np.repeat(np.array([7, 3, 12, 3], dtype=np.int32), COUNTS)
+    faces = np.arange(3 * names.size, dtype=np.int32).reshape(-1, 3)
+    places = np.repeat(50.0 * rng.normal(size=(4, 3)), 3 * np.array(COUNTS), axis=0)
+    vertices = places + rng.normal(0.0, 1.0, (3 * names.size, 3))
+    return Objects.of_mesh(vertices, rng.normal(size=vertices.shape), faces, names, albedo=0.2)
+
+
+def test_spheres_hold_their_bodies_and_touch_them() -> None:
+    objects = _bodies()
+    for body, sphere in enumerate(objects.spheres):
+        corners = objects.triangles[objects.body_of_triangle == body].reshape(-1, 3)
+        np.testing.assert_array_equal(sphere[:3], 0.5 * (corners.min(axis=0) + corners.max(axis=0)))
+        assert np.linalg.norm(corners - sphere[:3], axis=1).max() == np.float64(sphere[3])
+    assert Objects.none().spheres.shape == (0, 4)
+
+
+def test_some_of_the_bodies_are_those_that_were_asked_for() -> None:
+    objects = _bodies()
+    kept = np.array([True, False, False, True])
+    some = objects.only(kept)
+    wanted = kept[objects.body_of_triangle]
+    np.testing.assert_array_equal(some.triangles, objects.triangles[wanted])
+    np.testing.assert_array_equal(some.normals, objects.normals[wanted])
+    assert some.first_triangle.tolist() == [0, 5, 8]
+    assert some.names.tolist() == [7, 3]
+    np.testing.assert_array_equal(some.spheres, objects.spheres[kept])
+    assert len(objects.only(np.zeros(4, dtype=bool))) == 0
+
+
+def test_a_cone_meets_the_bodies_whose_spheres_reach_into_it() -> None:
+    objects = _bodies()
+    eye = objects.spheres[2, :3] + np.array([0.0, 0.0, 200.0])
+    found = objects.in_cone(eye, np.array([0.0, 0.0, -1.0]), 1e-3)
+    assert set(np.flatnonzero(objects.body_of_triangle == 2)) <= set(found)
