@@ -15,7 +15,7 @@ from scenarios.views import Eye, SiteGround, site_scene
 from sim.dynamics import RoverParameters, Stance
 from sim.frames import direction
 from sim.measurements import MastGeometry
-from sim.render import CloudLayer, Objects, Scene, Sun, may_shade, rover_objects
+from sim.render import CloudLayer, Objects, Scene, Sun, may_shade, rover_objects, rover_sphere
 from sim.streams import Streams
 from sim.terrain import PlacedRock, RockField, RockParameters, Site, Surface, TerrainBank, TerrainParameters, site
 from sim.terrain.landforms import Ramp
@@ -190,9 +190,13 @@ class RunWorld:
         time_s: float,
     ) -> Objects | None:
         """The rover, where its shadow may fall on what a subframe about the target shows; None where it stays clear."""
-        body = rover_objects(rover, stance, mast, *angles_rad)
         seen_m = SEEN_SHARE * float(np.linalg.norm(target_m - stance.world_from_rover.translation))
-        return body if may_shade(body, self.scene(time_s).sun.direction, target_m, seen_m) else None
+        sun = self.scene(time_s).sun.direction
+        # the rover is put together only where what holds it does not tell already
+        if not may_shade(rover_sphere(rover, stance, mast), sun, target_m, seen_m):
+            return None
+        body = rover_objects(rover, stance, mast, *angles_rad)
+        return body if may_shade(body.spheres, sun, target_m, seen_m) else None
 
     def brightness(self, time_s: float) -> float:
         """Direct sunlight on the ground over that at 1 AU."""

@@ -288,11 +288,11 @@ class _Frame:
         """
         unknown = start
         for _ in range(_NEWTON_STEPS):
-            gaps, slopes = self.gaps_and_slopes(unknown)
+            gaps, places = self._lowest(unknown)
             if float(np.abs(gaps).max()) < _CLOSED_M:
                 return unknown, gaps
             try:
-                unknown = unknown - np.linalg.solve(slopes, gaps)
+                unknown = unknown - np.linalg.solve(self._slopes(unknown, places), gaps)
             except np.linalg.LinAlgError:
                 break
         found = least_squares(self.gaps, start, jac=self.gap_slopes, method="lm", xtol=1e-8, ftol=1e-12)
@@ -302,21 +302,20 @@ class _Frame:
         return self._lowest(unknown)[0]
 
     def gap_slopes(self, unknown: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6 6"]:
-        return self.gaps_and_slopes(unknown)[1]
+        return self._slopes(unknown, self._lowest(unknown)[1])
 
-    def gaps_and_slopes(
-        self, unknown: Float64[np.ndarray, "6"]
-    ) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 6"]]:
-        """The gaps, and by differences how they change with each unknown.
+    def _slopes(
+        self, unknown: Float64[np.ndarray, "6"], places: Float64[np.ndarray, "6 3"]
+    ) -> Float64[np.ndarray, "6 6"]:
+        """By differences, how the gaps change with each unknown, given the lowest place of each tread.
 
         A wheel's gap changes as the height of that place of its tread which is lowest: only there are the differences
         taken.
         """
-        gaps, places = self._lowest(unknown)
         beside = _DIFFERENCE * np.eye(6)
         ends = self._heights(np.concatenate([unknown - beside, unknown + beside]), places[:, None])[..., 0]
         slopes: Float64[np.ndarray, "6 6"] = ((ends[6:] - ends[:6]) / (2.0 * _DIFFERENCE)).T
-        return gaps, slopes
+        return slopes
 
     def _lowest(self, unknown: Float64[np.ndarray, "6"]) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 3"]]:
         """Least height of each tread above the ground, and the place on the tread, from its wheel's middle."""

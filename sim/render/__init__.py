@@ -5,7 +5,7 @@ from sim.render.objects import Objects
 from sim.render.photometry import DustySky, Photometry, Sun, Texture
 from sim.render.rays import PixelRays
 from sim.render.renderer import Frame, Renderer, Scene, process_renderer
-from sim.render.rover import may_shade, rover_objects
+from sim.render.rover import may_shade, rover_objects, rover_sphere
 
 __all__ = [
     "CloudLayer",
@@ -22,4 +22,5 @@ __all__ = [
     "may_shade",
     "process_renderer",
     "rover_objects",
+    "rover_sphere",
 ]

@@ -68,18 +68,45 @@ def rover_objects(
     return Objects.of_mesh(triangles.reshape(-1, 3), np.repeat(normals, 3, axis=0), faces, names, ALBEDO)
 
 
+def rover_sphere(
+    rover: RoverParameters, stance: Stance, mast: MastGeometry, baseline_m: float = 0.3
+) -> Float64[np.ndarray, "1 4"]:
+    """Centre and radius of a sphere that holds `rover_objects`, whichever way suspension and mast turn.
+
+    Joints turn about axes, so that nothing is farther away than the way along the links that carry it.
+    """
+    front, middle, rear = wheel_centres(rover, 0.0, (0.0, 0.0))[:3]
+    bogie = bogie_pivots(rover, 0.0)[0]
+    rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
+    wheel = rover.wheel_radius_m + 0.5 * rover.wheel_width_m + _LEG_M
+    behind = _length(bogie - rocker) + max(_length(middle - bogie), _length(rear - bogie))
+    legs = _length(rocker) + max(_length(front - rocker), behind) + wheel
+    depth, height, wider = _HEAD_M
+    head = _length(_BEHIND_M + depth, 0.5 * (baseline_m + wider), 0.5 * height)
+    top = _length(mast.base_m) + _length(mast.elbow_m) + _length(mast.head_m) + head + _MAST_RADIUS_M
+    body = _length(0.5 * rover.body_length_m, 0.5 * rover.body_width_m, rover.deck_m + _DECK_M)
+    return np.array([[*stance.world_from_rover.translation, max(legs, top, body)]])
+
+
 def may_shade(
-    objects: Objects, sun_direction: Float64[np.ndarray, "3"], place_m: Float64[np.ndarray, "3"], radius_m: float
+    spheres: Float64[np.ndarray, "bodies 4"],
+    sun_direction: Float64[np.ndarray, "3"],
+    place_m: Float64[np.ndarray, "3"],
+    radius_m: float,
 ) -> bool:
-    """Whether bodies can hide the sun from any point within a radius of a place: false is certain, true is not.
+    """Whether bodies in spheres can hide the sun from a point within a radius of a place: false is certain, true not.
 
     Drawing a rover that cannot matter to what a picture shows takes time for nothing.
     """
-    away = objects.spheres[:, :3] - place_m
+    away = spheres[:, :3] - place_m
     along = away @ sun_direction
-    reach = objects.spheres[:, 3] + radius_m
+    reach = spheres[:, 3] + radius_m
     beside = np.linalg.norm(away - along[:, None] * sun_direction, axis=1)
     return bool(np.any((beside <= reach) & (along >= -reach)))
+
+
+def _length(*parts: float | Float64[np.ndarray, "3"]) -> float:
+    return float(np.linalg.norm(np.hstack(parts)))
 
 
 def _body(rover: RoverParameters, mast: MastGeometry) -> Triangles:

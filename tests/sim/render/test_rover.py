@@ -11,7 +11,7 @@ from sim.camera import Cahv
 from sim.dynamics import MER, ROCKY_8, RoverParameters, settle
 from sim.frames import direction, rigid
 from sim.measurements import MastGeometry
-from sim.render import Photometry, PixelRays, Renderer, Scene, Sun, may_shade, rover_objects
+from sim.render import Photometry, PixelRays, Renderer, Scene, Sun, may_shade, rover_objects, rover_sphere
 from sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
 from sim.terrain import Surface
 from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
@@ -107,6 +107,20 @@ def test_the_masts_shadow_falls_where_the_sun_says(renderer: Renderer) -> None:
     assert np.ptp(band[:, 1]) == pytest.approx(2 * 0.05, abs=0.02)
 
 
+@pytest.mark.parametrize(("rover", "mast"), [(MER, MER_MAST), (ROCKY_8, RESEARCH_MAST)])
+def test_the_sphere_holds_the_rover_however_it_stands(rover: RoverParameters, mast: MastGeometry) -> None:
+    rng = np.random.default_rng(2)
+    farthest = []
+    for _ in range(20):
+        blocks = Steps(tuple((float(x), float(y), 0.25) for x, y in rng.uniform(-0.8, 0.8, (3, 2))))
+        stance = settle(rover, blocks, 0.0, 0.0, float(rng.uniform(0.0, 6.0)))
+        corners = rover_objects(rover, stance, mast, *rng.uniform(-1.5, 1.5, 2)).triangles.reshape(-1, 3)
+        *centre, radius = rover_sphere(rover, stance, mast)[0]
+        farthest.append(np.linalg.norm(corners - centre, axis=1).max() / radius)
+    # not much wider than it must be, or it would tell nothing
+    assert 0.7 < max(farthest) <= 1.0
+
+
 def test_what_a_rover_cannot_shade() -> None:
     objects = rover_objects(MER, settle(MER, Plane(), 0.0, 0.0, EAST), MER_MAST, 0.0, 0.0)
     low = direction(EAST, np.radians(20.0))
@@ -114,8 +128,8 @@ def test_what_a_rover_cannot_shade() -> None:
     corners = objects.triangles.reshape(-1, 3)
     shadow = corners - corners[:, 2:] / low[2] * low
     for place in shadow[:: len(shadow) // 50]:
-        assert may_shade(objects, low, place, 0.0)
-    assert not may_shade(objects, low, np.array([2.5, 0.0, 0.0]), 0.3)
-    assert may_shade(objects, low, np.array([2.5, 0.0, 0.0]), 2.0)
-    assert not may_shade(objects, low, np.array([-8.0, 0.0, 0.0]), 0.3)
-    assert not may_shade(objects, low, np.array([-2.0, 4.0, 0.0]), 0.3)
+        assert may_shade(objects.spheres, low, place, 0.0)
+    assert not may_shade(objects.spheres, low, np.array([2.5, 0.0, 0.0]), 0.3)
+    assert may_shade(objects.spheres, low, np.array([2.5, 0.0, 0.0]), 2.0)
+    assert not may_shade(objects.spheres, low, np.array([-8.0, 0.0, 0.0]), 0.3)
+    assert not may_shade(objects.spheres, low, np.array([-2.0, 4.0, 0.0]), 0.3)
