@@ -59,14 +59,49 @@ class Registration:
     score: float
 
 
+@dataclass(frozen=True)
+class SplinedPart:
+    """The part of a window about a template's place, as a spline.
+
+    Attributes
+    ----------
+    near, far
+        Its first row and column, and those after its last.
+    coefficients
+        Of the quintic spline.
+    """
+
+    near: tuple[int, int]
+    far: tuple[int, int]
+    coefficients: Float[np.ndarray, "rows columns"]
+
+
+def splined(
+    window: Float[np.ndarray, "rows columns"],
+    corner: Float[np.ndarray, "2"],
+    side: int,
+    known: SplinedPart | None = None,
+) -> SplinedPart:
+    """The spline about a template of `side` pixels with its upper left one at `corner` (row, column).
+
+    What is `known` of the same window is given back where it is the same part.
+    """
+    first = np.maximum(np.floor(corner).astype(int) - SURROUND, 0)
+    last = np.ceil(corner).astype(int) + side + SURROUND
+    near, far = (int(first[0]), int(first[1])), (int(last[0]), int(last[1]))
+    if known is not None and (known.near, known.far) == (near, far):
+        return known
+    return SplinedPart(near, far, spline_coefficients(window[near[0] : far[0], near[1] : far[1]]))
+
+
 def registered(
     template: Float[np.ndarray, "n n"],
-    window: Float[np.ndarray, "rows columns"],
+    window: Float[np.ndarray, "rows columns"] | SplinedPart,
     corner: Float[np.ndarray, "2"],
     stretch: bool,
     limits: Limits = LIMITS,
 ) -> Registration | None:
-    """The place in the window, by its middle, at which the template matches best, to hundredths of a pixel.
+    """The place in the window, or in the part of it about `corner`, at which the template matches best, by its middle.
 
     Minimises ``sum (B(c + M d) - gain A(d) - offset)^2`` over the middle c, gain, offset and, with `stretch`, the
     matrix M, which else is 1; A is the template over offsets d from its middle, B the window by quintic splines. It
@@ -75,12 +110,11 @@ def registered(
     does not determine the unknowns.
     """
     half = 0.5 * (len(template) - 1)
-    near = np.maximum(np.floor(corner).astype(int) - SURROUND, 0)
-    far = np.ceil(corner).astype(int) + len(template) + SURROUND
-    coefficients = spline_coefficients(window[near[0] : far[0], near[1] : far[1]])
+    part = window if isinstance(window, SplinedPart) else splined(window, corner, len(template))
+    near = np.array(part.near)
     start = corner - near + half
     bounds = (limits.shift_px, limits.stretch, limits.steps)
     done, row, column, score = kernels.register(
-        template, coefficients, start[0], start[1], stretch, bounds, TOLERANCE, SINGULAR
+        template, part.coefficients, start[0], start[1], stretch, bounds, TOLERANCE, SINGULAR
     )
     return Registration(np.array([row, column]) - half + near, score) if done else None

@@ -29,22 +29,27 @@ def horizontal_axis(camera: CameraModel) -> Float[np.ndarray, "3"]:
     return np.asarray((camera.h - hc * camera.a) / hs)
 
 
-def roll_angle(
+def lever_pixels(
     old_position: Float[np.ndarray, "3"],
     old_camera: CameraModel,
     new_camera: CameraModel,
     new_from_old: RigidTransform,
     lever_m: float,
-) -> float | None:
-    """How far the target's picture turned, clockwise as seen, radians: Eq. 10 and the text after it.
+) -> Float[np.ndarray, "2 2"] | None:
+    """Pixels of the target and of the point beside it along the old picture's x axis, `lever_m` away (before Eq. 10).
 
-    The target and a point beside it along the old picture's x axis, `lever_m` away, are projected by the new camera.
-    The angle of what was horizontal is the roll. The old camera is in the old rover frame, the new one in the new;
-    None where the new camera sees one of the points not at all.
+    As the new camera sees them, (u, v) each. The old camera is in the old frame, the new one in the new; None where the
+    new camera sees one of the points not at all.
     """
     points = np.stack([old_position, old_position + lever_m * horizontal_axis(old_camera)])
     pixels, visible = new_camera.project(np.asarray(new_from_old.apply(points)))
-    if not np.all(visible):
-        return None
-    across, down = pixels[1] - pixels[0]
+    return pixels if np.all(visible) else None
+
+
+def roll_angle(lever_px: Float[np.ndarray, "2 2"]) -> float:
+    """How far the target's picture turned, clockwise as seen, radians: Eq. 10 and the text after it.
+
+    The angle of what was horizontal: from the target's pixel to that of the point beside it (`lever_pixels`).
+    """
+    across, down = lever_px[1] - lever_px[0]
     return float(np.arctan2(down, across))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, UInt16
@@ -12,9 +13,10 @@ from scipy.spatial.transform import RigidTransform
 from algorithms.image.alignment import SURROUND
 from algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
 from algorithms.image.peak import Peak, biquadratic_offset
-from algorithms.image.registration import Registration, registered
+from algorithms.image.registration import Registration, registered, splined
 from algorithms.image.resampling import similarity_patch
 from algorithms.vtt.options import VttOptions
+from algorithms.vtt.target import bearing_rad
 from sim.camera import CameraModel
 from sim.measurements import MastImage
 
@@ -51,6 +53,11 @@ class Sighting:
     def distance_m(self) -> float:
         """From the camera's centre to the target."""
         return float(np.linalg.norm(self.position_head - self.camera.c))
+
+    @cached_property
+    def azimuth_world_rad(self) -> float:
+        """Direction from the camera to the target in the world as estimated, clockwise from north."""
+        return bearing_rad(np.asarray(self.world_from_head.rotation.apply(self.position_head - self.camera.c)))
 
 
 @dataclass(frozen=True)
@@ -133,10 +140,14 @@ def refined(
     near = np.maximum(corner.astype(int) - SURROUND - 2, 0)
     far = corner.astype(int) + len(template) + SURROUND + 2
     region = image.counts[near[0] : far[0], near[1] : far[1]].astype(np.float64)
-    shifted = registered(template, region, corner + offset - near, stretch=False)
+    part = splined(region, corner + offset - near, len(template))
+    shifted = registered(template, part, corner + offset - near, stretch=False)
     if shifted is None:
         return Registration(corner + offset, whole.value)
-    stretched = registered(template, region, shifted.corner, stretch=True) if options.affine else None
+    stretched = None
+    if options.affine:
+        part = splined(region, shifted.corner, len(template), known=part)
+        stretched = registered(template, part, shifted.corner, stretch=True)
     return Registration((shifted if stretched is None else stretched).corner + near, shifted.score)
 
 

@@ -44,10 +44,24 @@ def epipolar_pixels(
 ) -> Float[np.ndarray, "n 2"]:
     """Where the right camera sees the points along the left pixel's line of sight, from the far range to the near.
 
-    Both cameras are in one frame. Points are about half a pixel of disparity apart; what the right camera does not see
-    is left out. Lens distortion bends the curve.
+    Both cameras are in one frame.
     """
-    origin, direction = left.rays(pixel)
+    return pixels_along(left.rays(pixel), left, right, ranges_m)
+
+
+#: Where a line of sight starts and its direction, a unit vector.
+Sight = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
+
+
+def pixels_along(
+    sight: Sight, left: CameraModel, right: CameraModel, ranges_m: tuple[float, float]
+) -> Float[np.ndarray, "n 2"]:
+    """As `epipolar_pixels`, given the left pixel's line of sight.
+
+    Points are about half a pixel of disparity apart; what the right camera does not see is left out. Lens distortion
+    bends the curve.
+    """
+    origin, direction = sight
     near, far = (1.0 / ranges_m[0], 1.0 / ranges_m[1])
     count = max(int(np.ceil(2.0 * disparity_px_m(left, right) * (near - far))) + 1, 2)
     points = origin + direction / np.linspace(far, near, count)[:, None]
@@ -127,11 +141,16 @@ def _off_curve(curve: Float[np.ndarray, "n 2"], shape: tuple[int, ...], toleranc
 def triangulated(
     left: CameraModel, right: CameraModel, left_pixel: Float[np.ndarray, "2"], right_pixel: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "3"] | None:
-    """The point half-way between the two lines of sight where they are nearest to each other.
+    """The point half-way between two pixels' lines of sight where they are nearest to each other: `nearest_point`."""
+    return nearest_point(left.rays(left_pixel), right.rays(right_pixel))
 
-    In the frame of the cameras, metres. None where they are parallel or meet behind a camera.
+
+def nearest_point(left: Sight, right: Sight) -> Float[np.ndarray, "3"] | None:
+    """The point half-way between two lines of sight where they are nearest to each other.
+
+    In their frame, metres. None where they are parallel or meet behind a camera.
     """
-    (a, d), (b, e) = left.rays(left_pixel), right.rays(right_pixel)
+    (a, d), (b, e) = left, right
     between, cosine = b - a, float(d @ e)
     across = 1.0 - cosine * cosine
     if not across > 1e-14:

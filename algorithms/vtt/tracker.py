@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
 from algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
-from algorithms.vtt.appearance import magnification, roll_angle
+from algorithms.vtt.appearance import lever_pixels, magnification, roll_angle
 from algorithms.vtt.details import VttDetails
 from algorithms.vtt.loss import Evidence, Journey, Tolerances, losses, next_state, tolerances
 from algorithms.vtt.matching import (
@@ -29,9 +29,8 @@ from algorithms.vtt.matching import (
 )
 from algorithms.vtt.options import VttOptions
 from algorithms.vtt.pointing import aim_at_pixel, aim_at_position
-from algorithms.vtt.stereo import epipolar_pixels, point_stereo, searched_ranges, triangulated
+from algorithms.vtt.stereo import nearest_point, pixels_along, point_stereo, searched_ranges
 from algorithms.vtt.target import (
-    bearing_rad,
     designated_position_world,
     pose_change,
     predicted_position,
@@ -207,10 +206,12 @@ def followed(
     stop = Stop.of(measurements)
     new_from_old = pose_change(last.world_from_head, stop.world_from_head)
     expected = np.asarray(new_from_old.apply(last.position_head.copy()))
-    predicted = stop.left.project(expected)[0]
-    change = appearance_change(last, expected, stop.left, new_from_old, options)
-    if not np.all(np.isfinite(predicted)) or change is None:
+    seen = lever_pixels(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
+    if seen is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
+    predicted = seen[0]
+    scale = magnification(last.position_head, last.camera.c, expected, stop.left.c)
+    change = Change(scale, roll_angle(seen))
     window, window_corner = search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
     applied = Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
@@ -226,23 +227,6 @@ def followed(
     return judged(track, last, placed, placed.sighting, stop, stop.distance_m(expected), options)
 
 
-def appearance_change(
-    last: Sighting,
-    expected: Float[np.ndarray, "3"],
-    camera: CameraModel,
-    new_from_old: RigidTransform,
-    options: VttOptions,
-) -> Change | None:
-    """Magnification and roll since the last sighting; None where the new camera does not see the target.
-
-    The target where it is expected and the new camera are in the head's frame now, into which `new_from_old` takes.
-    """
-    roll = roll_angle(last.position_head, last.camera, camera, new_from_old, options.roll_lever_m)
-    if roll is None:
-        return None
-    return Change(magnification(last.position_head, last.camera.c, expected, camera.c), roll)
-
-
 def ranged(
     stop: Stop,
     pixel: Float[np.ndarray, "2"],
@@ -252,21 +236,22 @@ def ranged(
     options: VttOptions,
 ) -> Finding:
     """The target's position by point stereo from its left pixel; the right picture is searched over these ranges."""
-    curve = epipolar_pixels(stop.left, stop.right, pixel, ranges_m)
+    sight = stop.left.rays(pixel)
+    curve = pixels_along(sight, stop.left, stop.right, ranges_m)
     stereo = point_stereo(template, stop.measurements.right, curve, options)
     if stereo is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
-    position = triangulated(stop.left, stop.right, pixel, stereo.pixel)
+    position = nearest_point(sight, stop.right.rays(stereo.pixel))
     if position is None:
         return Finding((TargetLoss.NO_RANGE,), replace(details, stereo=stereo))
     in_rover = np.asarray(stop.rover_from_head.apply(np.stack([position, stop.left.c])))
-    sight = in_rover[0] - in_rover[1]
+    ahead = in_rover[0] - in_rover[1]
     world_from_rover = stop.measurements.world_from_rover
     details = replace(
         details,
         stereo=stereo,
         distance_m=stop.distance_m(position),
-        azimuth_rad=float(np.arctan2(-sight[1], sight[0])),
+        azimuth_rad=float(np.arctan2(-ahead[1], ahead[0])),
         position_world=np.asarray(stop.world_from_head.apply(position)),
     )
     sighting = Sighting(stop.measurements.left, pixel, position, stop.left, stop.world_from_head, world_from_rover)
@@ -320,10 +305,8 @@ def _evidence(track: Track, details: VttDetails, expected_m: float) -> Evidence:
 
 def _turned(last: Sighting, now: Sighting) -> float:
     """By how much the line of sight turned in the world, clockwise seen from above, radians."""
-    before, after = (
-        bearing_rad(np.asarray(s.world_from_head.rotation.apply(s.position_head - s.camera.c))) for s in (last, now)
-    )
-    return float(np.arctan2(np.sin(after - before), np.cos(after - before)))
+    turned = now.azimuth_world_rad - last.azimuth_world_rad
+    return float(np.arctan2(np.sin(turned), np.cos(turned)))
 
 
 def advanced(track: Track, finding: Finding, measurements: RoverMeasurements, options: VttOptions) -> Track:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.vtt.appearance import horizontal_axis, magnification, roll_angle
+from algorithms.vtt.appearance import horizontal_axis, lever_pixels, magnification, roll_angle
 from algorithms.vtt.options import VttOptions
 from algorithms.vtt.pointing import aim_at_pixel, aim_at_position, mast_angles, middle
 from algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, searched_ranges, triangulated
@@ -159,8 +159,9 @@ def test_a_camera_that_rolls_one_way_sees_the_picture_roll_the_other(roll_deg: f
     # The head turned about its line of sight, clockwise as the camera sees it (+x forward): the picture turns back.
     turn = rigid(Rotation.from_rotvec(np.deg2rad(roll_deg) * camera.a), np.zeros(3))
     target = camera.c + 5.0 * camera.rays(middle(camera))[1]
-    roll = roll_angle(target, camera, camera, turn.inv(), 0.05)
-    assert roll is not None
+    seen = lever_pixels(target, camera, camera, turn.inv(), 0.05)
+    assert seen is not None
+    roll = roll_angle(seen)
     # The lens axis is 5 px off the middle, about which the head turned: it moves the target in the picture.
     assert np.degrees(roll) == pytest.approx(-roll_deg, abs=0.3)
 
@@ -178,10 +179,11 @@ def test_passing_by_a_target_rolls_its_picture() -> None:
         assert angles is not None
         heads.append(stop * mast.geometry.rover_from_head(*angles))
     new_from_old = heads[1].inv() * heads[0]
-    roll = roll_angle(heads[0].inv().apply(target), mast.left, mast.left, new_from_old, 0.001)
+    seen = lever_pixels(heads[0].inv().apply(target), mast.left, mast.left, new_from_old, 0.001)
+    assert seen is not None
+    roll = roll_angle(seen)
     turned = np.arctan2(0.9, 1.2)  # to the right
     down = np.arctan2(1.5, np.hypot(0.9, 1.2))
-    assert roll is not None
     assert abs(np.degrees(roll)) == pytest.approx(np.degrees(np.arctan(np.tan(turned) * np.sin(down))), abs=0.5)
     assert abs(np.degrees(roll)) > 25.0
     # The old right-hand side is now farther away than the target: higher up in the picture, counter-clockwise.
@@ -191,7 +193,7 @@ def test_passing_by_a_target_rolls_its_picture() -> None:
 def test_no_roll_is_given_for_what_the_camera_cannot_see() -> None:
     camera = navcam().left
     behind = rigid(Rotation.from_rotvec([0.0, 0.0, np.pi]), np.zeros(3))
-    assert roll_angle(np.array([5.0, 0.0, 0.0]), camera, camera, behind, 0.05) is None
+    assert lever_pixels(np.array([5.0, 0.0, 0.0]), camera, camera, behind, 0.05) is None
 
 
 # ----- stereo -----
