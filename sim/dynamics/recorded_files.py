@@ -9,12 +9,13 @@ into those of the world; what axes these are no format says, and whoever uses th
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -28,6 +29,8 @@ UNIT_TOLERANCE = 5e-3
 #: Ten hours at 100 Hz are 400 MB of text; nothing is read that is larger.
 MOST_BYTES = 1 << 29
 _KEPT_FILES = 4
+#: Cells of a table of text that hold no number.
+_MISSING = ("", "na", "n/a", "null", "none")
 _ALLOWED = (
     f"a CSV or Parquet table with the columns {', '.join(COLUMNS)}; TUM's lines of timestamp tx ty tz qx qy qz qw; "
     f"EuRoC's ground truth, whose header begins with #timestamp; or SPICE kernels, named in a file *{SUFFIX}"
@@ -117,34 +120,67 @@ def _from_kernels(path: str) -> RecordedPoses:
 
 def _values(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
     """Time, position, quaternion (x, y, z, w) of each row."""
-    import pandas as pd  # slow to import: for campaigns that have such a file
-
     text = head.decode("utf-8", errors="replace")
     first = text.lstrip("\ufeff").split("\n", 1)[0].strip()
-    if head.startswith(b"PAR1"):
-        return _columns(path, pd.read_parquet(path))
-    if first.startswith("#timestamp") and "," in first:
-        frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
-        values = frame.to_numpy(dtype=np.float64)
-        values[:, 0] = 1e-9 * (frame[0] - int(frame[0].iloc[0])).to_numpy(dtype=np.float64)
-        values[:, 0] += 1e-9 * int(frame[0].iloc[0])
-        return values[:, [0, 1, 2, 3, 5, 6, 7, 4]]
-    if "," in first and not first.startswith("#"):
-        return _columns(path, pd.read_csv(path, skipinitialspace=True, comment="#"))
+    if head.startswith(b"PAR1") or (first.startswith("#timestamp") and "," in first):
+        return _by_pandas(path, first)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that a file is empty is said below
+        if "," in first and not first.startswith("#"):
+            return _comma_separated(path, first)
         values = np.loadtxt(path, comments="#", ndmin=2)
     if values.size and values.shape[1] != 8:
         raise TrajectoryFileError(f"{path}: has {values.shape[1]} numbers in a line; allowed: {_ALLOWED}")
     return values.reshape(-1, 8)
 
 
-def _columns(path: str, frame: Any) -> Float64[np.ndarray, "n 8"]:
-    frame = frame.rename(columns=lambda name: str(name).strip())
-    missing = [name for name in COLUMNS if name not in frame.columns]
+def _by_pandas(path: str, first: str) -> Float64[np.ndarray, "n 8"]:
+    """A Parquet table, or EuRoC's, whose nanoseconds are too many for a float."""
+    import pandas as pd  # slow to import: for campaigns that have such a file
+
+    if not first.startswith("#timestamp"):
+        frame = pd.read_parquet(path)
+        frame = frame.rename(columns=lambda name: str(name).strip())
+        _place_columns(path, list(frame.columns))
+        return np.asarray(frame[list(COLUMNS)].to_numpy(dtype=np.float64))
+    frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
+    values = frame.to_numpy(dtype=np.float64)
+    values[:, 0] = 1e-9 * (frame[0] - int(frame[0].iloc[0])).to_numpy(dtype=np.float64)
+    values[:, 0] += 1e-9 * int(frame[0].iloc[0])
+    return np.asarray(values[:, [0, 1, 2, 3, 5, 6, 7, 4]])
+
+
+def _comma_separated(path: str, first: str) -> Float64[np.ndarray, "n 8"]:
+    """A table of text below this line of names; cells without a number become NaN."""
+    names = next(csv.reader([first], skipinitialspace=True))
+    read = partial(
+        np.loadtxt,
+        path,
+        delimiter=",",
+        skiprows=1,
+        usecols=_place_columns(path, [name.strip() for name in names]),
+        quotechar='"',
+        encoding="utf-8",
+        ndmin=2,
+    )
+    try:
+        values = read()
+    except ValueError:
+        # several times slower: only where a cell is no number
+        values = read(converters=_number)
+    return np.asarray(values.reshape(-1, len(COLUMNS)))
+
+
+def _number(cell: str) -> float:
+    return float("nan") if cell.strip().lower() in _MISSING else float(cell)
+
+
+def _place_columns(path: str, names: Sequence[str]) -> list[int]:
+    """Where the columns of poses stand among those of a table."""
+    missing = [name for name in COLUMNS if name not in names]
     if missing:
         raise TrajectoryFileError(f"{path}: has no column {', '.join(missing)}; allowed: {_ALLOWED}")
-    return np.asarray(frame[list(COLUMNS)].to_numpy(dtype=np.float64))
+    return [names.index(name) for name in COLUMNS]
 
 
 def _checked(path: str, digest: str, values: Float64[np.ndarray, "n 8"]) -> RecordedPoses:
