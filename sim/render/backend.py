@@ -264,20 +264,22 @@ class _Drawing:
 
     def depth(self) -> Float32[np.ndarray, "side side"]:
         """OpenGL's depths, from 0 to 1, the lowest row first."""
-        return self._read(self.gl.GL_DEPTH_COMPONENT, self.gl.GL_FLOAT, np.empty(self._size, dtype=np.float32))
+        depth = np.empty(self._size, dtype=np.float32)
+        self._read(self.gl.GL_DEPTH_COMPONENT, self.gl.GL_FLOAT, depth)
+        return depth
 
     def colours(self) -> UInt32[np.ndarray, "side side"]:
         """Colours, red in the least significant byte, the lowest row first."""
-        read = self._read(self.gl.GL_RGBA, self.gl.GL_UNSIGNED_BYTE, np.empty((*self._size, 4), dtype=np.uint8))
-        return read.view("<u4")[..., 0]
+        spelled = np.empty((*self._size, 4), dtype=np.uint8)
+        self._read(self.gl.GL_RGBA, self.gl.GL_UNSIGNED_BYTE, spelled)
+        return spelled.view(np.uint32)[..., 0]
 
     @property
     def _size(self) -> tuple[int, int]:
         return self.side_px, self.side_px
 
-    def _read(self, what: int, kind: int, pixels: Any) -> Any:
+    def _read(self, what: int, kind: int, pixels: _Numbers) -> None:
         self.gl.glReadPixels(0, 0, *self._size, what, kind, pixels)
-        return pixels
 
 
 def _program() -> int:
