@@ -13,6 +13,7 @@ from algorithms.vtt.stereo import disparity_px_m
 from scenarios.interface import Scalar
 from scenarios.parts.scores import ScoredRun
 from scenarios.provenance import rendered_as
+from scenarios.rover.own_shadow import shades, template_patch
 from scenarios.rover.parameters import RoverScenarioParameters
 from scenarios.rover.run import Run
 from scenarios.rover.stops import RunOutcome, Stop
@@ -187,7 +188,7 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         else float(np.linalg.norm(last.estimated.translation - last.stance.world_from_rover.translation))
     )
     sun = [world.sun.direction(0.0 if one is None else one.time_s) for one in (first, last)]
-    rock = chosen.rock
+    rock, shadowed = chosen.rock, _own_shadow(p, run)
     eyes = [run.rig.eyes(one.world_from_head) for one in stops]
     seen = sightings(world, chosen.point_world, eyes, run.rig.pixel_rad, p.vtt) if eyes else None
     return {
@@ -209,6 +210,8 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "point_in_view": seen is not None and seen.in_view,
         "obliquity_start_deg": float("nan") if seen is None else seen.obliquity_start_deg,
         "obliquity_max_deg": float("nan") if seen is None else seen.obliquity_max_deg,
+        "own_shadow": shadowed,
+        "no_own_shadow": not shadowed,
         "incline": p.world.incline.name,
         "slope_deg": p.world.incline.slope_deg,
         "range_start_m": float("nan") if first is None else first.range_m,
@@ -234,6 +237,24 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "exposure_max_s": _most(np.array([one.pictures.exposure_s for one in stops], dtype=np.float64)),
         **run.rig.applied(),
     }
+
+
+def _own_shadow(p: RoverScenarioParameters, run: Run) -> bool:
+    """Whether the rover's shadow lay on the template about the designated point before the tracker had gone wrong.
+
+    Looked at are the stops up to the first at which the point was lost or reported elsewhere: where a run goes after
+    that is the tracker's doing.
+    """
+    reach, mast = 0.5 * p.vtt.template_px * run.rig.pixel_rad, run.rig.calibrated.geometry
+    for stop, error in zip(run.stops, np.hypot(*errors_px(run).T), strict=True):
+        eye = run.rig.eyes(stop.world_from_head)[0]
+        patch = template_patch(eye, run.target.point_world, reach)
+        sun = run.world.sun.direction(stop.time_s)
+        if p.rover_shadow and shades(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):
+            return True
+        if not error <= p.score.tracked_px:
+            return False
+    return False
 
 
 def provenance(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
