@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import re
 import subprocess
@@ -209,12 +210,15 @@ def test_a_worker_that_cannot_begin_is_an_error_of_the_campaign(monkeypatch: pyt
 
 def test_memory_counts_what_is_the_processs_own(tmp_path: Path) -> None:
     size = 40_000_000
+    # what earlier tests have left in this process may be released meanwhile
+    gc.collect()
     before = used_memory(os.getpid())
     mapped = np.memmap(tmp_path / "terrain", dtype=np.uint8, mode="w+", shape=size)
     mapped[:] = 1
-    assert used_memory(os.getpid()) - before < 0.5 * size
+    with_map = used_memory(os.getpid())
+    assert with_map - before < 0.5 * size
     own = np.ones(size, np.uint8)
-    assert used_memory(os.getpid()) - before > 0.9 * own.size
+    assert used_memory(os.getpid()) - with_map > 0.5 * own.size
     assert used_memory(2**22 + 1) == 0.0
 
 
