@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from scenarios.rover.points import distances
+from scenarios.rover.points import distances, sight_axes
 from sim.dynamics import RoverParameters, Stance
 from sim.measurements import MastGeometry
 from sim.render import may_shade, rover_objects, rover_sphere
@@ -36,10 +36,8 @@ def template_patch(
     eye: Float64[np.ndarray, "3"], point: Float64[np.ndarray, "3"], reach_rad: float
 ) -> Float64[np.ndarray, "places 3"]:
     """A point, and places around it on rings up to an angle from it as seen from a place, across the line of sight."""
-    ahead = point - eye
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    up = np.cross(right, ahead / np.linalg.norm(ahead))
+    _, right, up = sight_axes(point - eye)
     turns = np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
-    ring = np.tan(reach_rad) * np.linalg.norm(ahead) * (np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * up)
+    reach_m = float(np.tan(reach_rad) * np.linalg.norm(point - eye))
+    ring = reach_m * (np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * up)
     return np.vstack([point, *(point + share * ring for share in _SHARES)])

@@ -16,31 +16,32 @@ _CLOSER_M = 1e-3
 _ACROSS_PATCH = 5
 
 
+def sight_axes(ahead: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """Forward, right and up, rows of unit length, of a line of sight that is not vertical."""
+    forward = ahead / np.linalg.norm(ahead)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return np.stack([forward, right, np.cross(right, forward)])
+
+
 def distances(
     triangles: Float64[np.ndarray, "triangles 3 3"],
     origin: Float64[np.ndarray, "3"],
     directions: Float64[np.ndarray, "rays 3"],
 ) -> Float64[np.ndarray, "rays"]:
-    """Distance along rays from one place to the nearest triangle, infinite where none is met (Moeller & Trumbore)."""
-    nearest, _ = _met(triangles, origin, directions)
-    return nearest
+    """Distance along rays from one place to the nearest triangle, infinite where none is met."""
+    return first_met(triangles, origin, directions)[0]
 
 
 def first_met(
     triangles: Float64[np.ndarray, "triangles 3 3"],
     origin: Float64[np.ndarray, "3"],
     directions: Float64[np.ndarray, "rays 3"],
-) -> Int64[np.ndarray, "rays"]:
-    """Number of the triangle that each ray meets first, -1 where none is met."""
-    _, numbers = _met(triangles, origin, directions)
-    return numbers
-
-
-def _met(
-    triangles: Float64[np.ndarray, "triangles 3 3"],
-    origin: Float64[np.ndarray, "3"],
-    directions: Float64[np.ndarray, "rays 3"],
 ) -> tuple[Float64[np.ndarray, "rays"], Int64[np.ndarray, "rays"]]:
+    """Distance to the triangle that each ray meets first, and its number: infinite and -1 where none is met.
+
+    Moeller & Trumbore's intersection.
+    """
     corner = triangles[:, 0]
     first, second = triangles[:, 1] - corner, triangles[:, 2] - corner
     beside = origin - corner
@@ -91,19 +92,17 @@ def facing(
     reach_rad
         Half of the square's side, as an angle. Rays that pass the rock do not count.
     """
-    ahead = (point - eye) / np.linalg.norm(point - eye)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
+    axes = sight_axes(point - eye)
     steps = np.tan(reach_rad) * np.linspace(-1.0, 1.0, _ACROSS_PATCH)
     offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    rays = ahead + offsets @ np.stack([right, np.cross(right, ahead)])
+    rays = axes[0] + offsets @ axes[1:]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     near = about_line(triangles, eye, point, np.sqrt(2.0) * reach_rad)
-    met = first_met(near, eye, rays)
+    _, met = first_met(near, eye, rays)
     corners = near[met[met >= 0]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    normals *= -np.sign(normals @ ahead)[:, None]
+    normals *= -np.sign(normals @ axes[0])[:, None]
     mean = normals.sum(axis=0)
     normal: Float64[np.ndarray, "3"] = mean / np.linalg.norm(mean)
     return normal
@@ -137,11 +136,7 @@ class Sight:
         """The rock above a height as it is seen from a place."""
         above = triangles.reshape(-1, 3)
         above = above[above[:, 2] > ground_m]
-        forward = 0.5 * (above.min(axis=0) + above.max(axis=0)) - eye
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        axes = np.stack([forward, right, np.cross(right, forward)])
+        axes = sight_axes(0.5 * (above.min(axis=0) + above.max(axis=0)) - eye)
         view = (above - eye) @ axes.T
         across, up = view[:, 1] / view[:, 0], view[:, 2] / view[:, 0]
         rows = []

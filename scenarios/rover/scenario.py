@@ -14,7 +14,7 @@ from scenarios.parts.named import SCORE, Kind
 from scenarios.parts.scores import scored
 from scenarios.rover.parameters import RoverScenarioParameters
 from scenarios.rover.run import Run, run_case
-from scenarios.rover.score import conditions, products, provenance, score, scored_run, stored_updates, tracking
+from scenarios.rover.score import conditions, products, provenance, score, scored_run, sighted, stored_updates, tracking
 from scenarios.rover.stops import RunOutcome
 from scenarios.rover.world import terrain_parameters
 from scenarios.trial import Judged, attempted, case_result
@@ -56,7 +56,12 @@ class RoverScenario:
             run, row = attempt.answer
             judged = algorithm == p.algorithm
             if judged:
-                row |= {**stored_updates(run, p.score.stored_updates), **conditions(p, run), **provenance(p, run)}
+                row |= {
+                    **stored_updates(run, p.score.stored_updates),
+                    **conditions(p, run),
+                    **sighted(p, run),
+                    **provenance(p, run),
+                }
             row |= scored(p.scores, scored_run(run), row)
             return _judged(run, row, products(p, run) if judged else None)
 

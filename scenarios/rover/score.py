@@ -189,8 +189,6 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     )
     sun = [world.sun.direction(0.0 if one is None else one.time_s) for one in (first, last)]
     rock, shadowed = chosen.rock, _own_shadow(p, run)
-    eyes = [run.rig.eyes(one.world_from_head) for one in stops]
-    seen = sightings(world, chosen.point_world, eyes, run.rig.pixel_rad, p.vtt) if eyes else None
     return {
         "site": p.world.site,
         "terrain": p.world.terrain,
@@ -207,9 +205,6 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "point_on_edge": chosen.on_edge,
         "point_lit": chosen.lit,
         "selectable": chosen.lit and not chosen.on_edge,
-        "point_in_view": seen is not None and seen.in_view,
-        "obliquity_start_deg": float("nan") if seen is None else seen.obliquity_start_deg,
-        "obliquity_max_deg": float("nan") if seen is None else seen.obliquity_max_deg,
         "own_shadow": shadowed,
         "no_own_shadow": not shadowed,
         "incline": p.world.incline.name,
@@ -236,6 +231,19 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "exposure_min_s": _least(np.array([one.pictures.exposure_s for one in stops], dtype=np.float64)),
         "exposure_max_s": _most(np.array([one.pictures.exposure_s for one in stops], dtype=np.float64)),
         **run.rig.applied(),
+    }
+
+
+def sighted(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
+    """How the designated point showed itself at the stops of a run (`Sightings`)."""
+    eyes = [run.rig.eyes(one.world_from_head) for one in run.stops]
+    if not eyes:
+        return {"point_in_view": False, "obliquity_start_deg": float("nan"), "obliquity_max_deg": float("nan")}
+    seen = sightings(run.world, run.target.point_world, eyes, run.rig.pixel_rad, p.vtt)
+    return {
+        "point_in_view": seen.in_view,
+        "obliquity_start_deg": seen.obliquity_start_deg,
+        "obliquity_max_deg": seen.obliquity_max_deg,
     }
 
 

@@ -13,7 +13,7 @@ from algorithms.vtt import VttOptions
 from algorithms.vtt.pointing import mast_angles
 from algorithms.vtt.stereo import triangulated
 from scenarios.rover.parameters import RoverScenarioParameters
-from scenarios.rover.points import Sight, about_line, distances, facing, hidden, shaded
+from scenarios.rover.points import Sight, about_line, distances, facing, hidden, shaded, sight_axes
 from scenarios.rover.rig import Rig
 from scenarios.rover.world import RunWorld
 from sim.camera import CameraModel
@@ -187,12 +187,8 @@ def _on_edge(
     reach_rad: float,
 ) -> bool:
     """Whether some line of sight within an angle of the point passes the rock and meets the ground only well behind."""
-    ahead = point - eye
-    distance = float(np.linalg.norm(ahead))
-    ahead /= distance
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    up = np.cross(right, ahead)
+    distance = float(np.linalg.norm(point - eye))
+    ahead, right, up = sight_axes(point - eye)
     turns = np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
     around = ahead + reach_rad * (np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * up)
     around /= np.linalg.norm(around, axis=1, keepdims=True)
