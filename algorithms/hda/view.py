@@ -76,8 +76,7 @@ def flat_fielded(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]:
     known = image.calibration
     response = np.maximum(known.flat_field, LEAST_RESPONSE).astype(np.float32)
     signal = image.counts - np.float32(known.offset_dn)
-    if known.transfer_row_s > 0.0 or known.clear_row_s > 0.0:
-        signal = without_frame_transfer(signal, known, known.rows_summed).astype(np.float32)
+    signal = without_frame_transfer(signal, known, known.rows_summed).astype(np.float32, copy=False)
     return np.asarray(np.rint(np.clip(signal / response, 0.0, 65535.0)).astype(np.uint16))
 
 

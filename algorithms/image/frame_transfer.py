@@ -34,7 +34,8 @@ def without_frame_transfer(
 ) -> Float[np.ndarray, "rows columns"]:
     """The signal of the exposure alone, in the units of `signal`, from whole columns of a delivered picture.
 
-    Inverts the transfer exactly for a scene that does not move during it and is constant within each delivered row.
+    Inverts the transfer exactly for a scene that does not move during it and is constant within each delivered row. Of
+    a camera without frame transfer it is the signal itself, whatever the exposure.
 
     Parameters
     ----------
@@ -51,6 +52,8 @@ def without_frame_transfer(
         If the exposure is too short against the row times for the transfer to be inverted.
     """
     n, a, b = rows_summed, calibration.transfer_row_s, calibration.clear_row_s
+    if a == 0.0 and b == 0.0:
+        return signal
     own = calibration.exposure_s + 0.5 * (n - 1) * (a + b) - n * b
     before = n * (a - b)
     if own <= 0.5 * abs(before):

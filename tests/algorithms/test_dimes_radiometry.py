@@ -51,6 +51,13 @@ def test_exposure_shorter_than_the_transfer_is_refused_with_its_numbers() -> Non
         without_frame_transfer(np.ones((256, 4)), known, 4)
 
 
+def test_without_frame_transfer_the_exposure_need_not_be_known() -> None:
+    """Real pictures come without it, and there is nothing to take off."""
+    known = replace(calibration(0.0, 0.0), exposure_s=0.0)
+    signal = np.arange(12.0).reshape(4, 3)
+    np.testing.assert_array_equal(without_frame_transfer(signal, known, 2), signal)
+
+
 def picture(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, View]:
     """Radiance of a textured scene and the view that DIMES makes of its picture."""
     attitude = Rotation.from_euler("zy", [30.0, 12.0], degrees=True)

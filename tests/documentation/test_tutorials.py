@@ -13,7 +13,7 @@ import pytest
 
 TUTORIALS = sorted((Path(__file__).parents[2] / "docs" / "tutorials").glob("*.md"))
 FENCED = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-SAVED_AS = re.compile(r"Save it as `([\w.]+)`:\s*\Z")
+SAVED_AS = re.compile(r"Save it as `([\w./]+)`:\s*\Z")
 #: What a tutorial says is there in the end.
 PROMISED = {
     "first-campaign": (
@@ -24,6 +24,7 @@ PROMISED = {
         "first/campaign.json",
         "first/cases/3/dimes.png",
     ),
+    "measured-data": ("checked/report.html",),
     "own-dynamics": ("powered/report.html",),
     "own-instrument": ("lidar/report.html",),
     "own-score": ("airbags/report.html",),
