@@ -29,8 +29,20 @@ from scenarios.landing.truth import GroundTruth
 from scenarios.parts.instruments import InstrumentTruth, checked_readings
 from scenarios.parts.motions import DescentPlace, Poses, checked_poses
 from scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, Kind, checked_columns, installed
-from scenarios.parts.scores import SCORED, ScoredDescent, ScoredLanding, ScoredRun, score_of, taken_by
+from scenarios.parts.scores import (
+    SCORED,
+    ScoredCase,
+    ScoredDescent,
+    ScoredFlight,
+    ScoredLanding,
+    ScoredRun,
+    ScoredSite,
+    ScoredVelocity,
+    score_of,
+    taken_by,
+)
 from sim.dynamics.recorded import RecordedMotion
+from sim.frames import rigid
 
 _GRAVITY_M_S2 = 3.72
 #: How steep the suite's ground is, and its normal.
@@ -264,9 +276,8 @@ def truths() -> tuple[InstrumentTruth, ...]:
 
 
 @cache
-def scored_cases() -> tuple[ScoredDescent | ScoredLanding | ScoredRun, ...]:
-    """Descents, landings and runs, each with an answer and with an expected failure."""
-    states = tuple(motion().state(3.75 * number) for number in range(3))
+def scored_cases() -> tuple[ScoredCase, ...]:
+    """Cases of all kinds, each with an answer and with an expected failure; of real ones truth is known, and is not."""
     velocities = (
         VelocityEstimate(VelocityOutcome.VALID, np.array([11.0, -7.5])),
         VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None),
@@ -275,12 +286,32 @@ def scored_cases() -> tuple[ScoredDescent | ScoredLanding | ScoredRun, ...]:
         SiteEstimate(SiteOutcome.SAFE_SITE, np.array([1.0, 2.0, 0.05])),
         SiteEstimate(SiteOutcome.NO_SAFE_SITE, None),
     )
-    descents = (
-        ScoredDescent(states, motion(), motion().state(20.0), np.array([3.0, -1.0]), inputs.descent(), answer)
-        for answer in velocities
-    )
-    landings = (ScoredLanding((states[0], states[1]), _ground(), inputs.landing(), answer) for answer in sites)
+    descents = [case for answer in velocities for case in _descents(answer)]
+    landings = [case for answer in sites for case in _landings(answer)]
     return (*descents, *landings, _run(TrackingState.NORMAL), _run(TrackingState.FAILURE))
+
+
+def _descents(answer: VelocityEstimate) -> Iterator[ScoredVelocity]:
+    """Descents with this answer: simulated to the ground, simulated in the air, real with and without truth."""
+    asked: dict[str, Any] = {"measurements": inputs.descent(), "answer": answer}
+    true: dict[str, Any] = {"true_velocity_m_s": inputs.DESCENT_VELOCITY_M_S[:2].copy()}
+    states = tuple(motion().state(3.75 * number) for number in range(3))
+    flown: dict[str, Any] = {"states": states, "motion": motion()}
+    firing = motion().state(20.0)
+    yield ScoredDescent(**asked, **true, **flown, at_firing=firing, touchdown_m_s=np.array([3.0, -1.0]))
+    yield ScoredFlight(**asked, **true, **flown)
+    yield ScoredVelocity(**asked, **true)
+    yield ScoredVelocity(**asked, true_velocity_m_s=None)
+
+
+def _landings(answer: SiteEstimate) -> Iterator[ScoredSite]:
+    """Flights for a site with this answer: simulated, real with and without truth."""
+    asked: dict[str, Any] = {"measurements": inputs.landing(), "answer": answer}
+    states = motion().state(0.0), motion().state(3.75)
+    first, second = (rigid(state.attitude, state.position_m) for state in states)
+    yield ScoredLanding(**asked, true_poses=(first, second), states=states, ground=_ground())
+    yield ScoredSite(**asked, true_poses=(first, second))
+    yield ScoredSite(**asked, true_poses=None)
 
 
 def _ground() -> GroundTruth:

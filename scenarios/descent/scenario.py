@@ -131,12 +131,13 @@ class DescentScenario:
             }
             if estimate is not None:
                 case = ScoredDescent(
+                    measurements=measurements,
+                    answer=estimate,
+                    true_velocity_m_s=true,
                     states=tuple(states),
                     motion=flown.motion,
                     at_firing=at_firing,
                     touchdown_m_s=landed.with_answer,
-                    measurements=measurements,
-                    answer=estimate,
                 )
                 row |= scored(p.scores, case, {*row, *conditions_row})
             return Judged(

@@ -8,6 +8,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, field_validato
 
 from scenarios.chosen import ChosenAlgorithms
 from scenarios.estimators import VELOCITY, Task
+from scenarios.parts.scores import OwnScores, ScoredFlight
 from sim.dynamics.helicopter import HelicopterParameters
 from sim.render import CloudParameters
 from sim.render.backend import Backend, default_backend
@@ -132,10 +133,11 @@ class TripleParameters(BaseModel):
     most_step_m: Annotated[Positive, Field(description="most height between pictures apart, m (assumed)")] = 390.0
 
 
-class FieldTestParameters(ChosenAlgorithms):
+class FieldTestParameters(ChosenAlgorithms, OwnScores):
     """A field test: its runs and what is common to them. Case i is a triple of one of the runs."""
 
     task: ClassVar[Task[Any, Any]] = VELOCITY
+    scored = ScoredFlight
 
     algorithm: Annotated[str, Field(description="velocity estimator under test, see `scenarios.estimators`")] = "dimes"
     runs: Annotated[tuple[RunParameters, ...], Field(min_length=1, description="in the report's order")]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,6 +17,8 @@ from scenarios.fieldtest.pictures import cloud_transmittances, field_optics, tak
 from scenarios.fieldtest.run import Run, RunKey, worked_out
 from scenarios.fieldtest.triples import Category, Triple
 from scenarios.interface import CaseResult, Scalar
+from scenarios.parts.named import SCORE, Kind
+from scenarios.parts.scores import ScoredFlight, scored
 from scenarios.provenance import rendered
 from scenarios.trial import Judged, attempted, case_result
 from scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
@@ -46,6 +48,7 @@ class FieldTestScenario:
     parameters_type = FieldTestParameters
     task = VELOCITY
     algorithm_table = ()
+    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the sites."""
@@ -68,6 +71,11 @@ class FieldTestScenario:
         pictures = [one.counts for one in taken]
         measurements = measure(p, case, pictures, detector)
         truth = truth_velocities(p, case)[1, :2]
+        known = {
+            **_conditions(p, case, measurements),
+            **_clouding(case, taken[1].ground_m),
+            **rendered(p.backend, pictures),
+        }
 
         def judge(algorithm: str) -> Judged:
             estimator = partial(VELOCITY.make, algorithm, DimesOptions(), p.executable, streams.case)
@@ -76,19 +84,24 @@ class FieldTestScenario:
             )
             estimate = attempt.answer
             velocity = None if estimate is None else estimate.velocity_m_s
+            row = {**velocity_row("velocity", velocity, truth), **consistency_row(estimate, truth), **attempt.row}
+            if estimate is not None:
+                flown = ScoredFlight(
+                    measurements=measurements,
+                    answer=estimate,
+                    true_velocity_m_s=truth,
+                    states=case.states,
+                    motion=case.run.flight,
+                )
+                row |= scored(p.scores, flown, {*row, *known})
             return Judged(
                 outcome=attempt.outcome(lambda answer: answer.outcome.name),
                 answered=velocity is not None,
-                row={**velocity_row("velocity", velocity, truth), **consistency_row(estimate, truth), **attempt.row},
+                row=row,
                 products=velocity_products(pictures, estimate, truth),
                 failure=attempt.failure,
             )
 
-        known = {
-            **_conditions(p, case, measurements),
-            **_clouding(case, taken[1].ground_m),
-            **rendered(p.backend, pictures),
-        }
         return case_result(p.algorithms, judge, known)
 
 

@@ -24,6 +24,7 @@ from scenarios.parts.scores import ScoredLanding, scored
 from scenarios.provenance import rendered
 from scenarios.samples import Sample
 from scenarios.trial import Judged, attempted, case_result
+from sim.frames import rigid
 from sim.streams import Streams
 from sim.terrain import TerrainBank
 
@@ -80,7 +81,14 @@ class LandingScenario:
                 **attempt.row,
             }
             if attempt.answer is not None:
-                case = ScoredLanding(flight.states, truth, measurements, attempt.answer)
+                first, second = (rigid(state.attitude, state.position_m) for state in flight.states)
+                case = ScoredLanding(
+                    measurements=measurements,
+                    answer=attempt.answer,
+                    true_poses=(first, second),
+                    states=flight.states,
+                    ground=truth,
+                )
                 row |= scored(p.scores, case, {*row, *known})
             return Judged(
                 outcome=attempt.outcome(lambda answer: answer.outcome.name),

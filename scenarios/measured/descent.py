@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel
@@ -15,6 +17,8 @@ from scenarios.measured.case import NAN, MeasuredScenario, about, checked, dista
 from scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
 from scenarios.measured.parameters import MeasuredVelocityParameters
 from scenarios.measured.store import StoredCase, descent_measurements, images_of
+from scenarios.parts.named import SCORE, Kind
+from scenarios.parts.scores import ScoredVelocity, scored
 from scenarios.trial import Judged, case_result
 from scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
 from sim.frames import rigid
@@ -29,6 +33,7 @@ class MeasuredVelocityScenario(MeasuredScenario):
     parameters_type = MeasuredVelocityParameters
     task = VELOCITY
     algorithm_table = ()
+    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One descent."""
@@ -40,6 +45,8 @@ class MeasuredVelocityScenario(MeasuredScenario):
             p, p.dimes, measurements, lambda answer: checked_last_interval(answer, measurements), streams.case
         )
 
+        known = {**about(p, images), **_conditions(p.case, measurements)}
+
         def judge(algorithm: str) -> Judged:
             attempt = attempts[algorithm]
             poses = descent_poses(p.case, measurements, _velocity(attempt.answer))
@@ -47,16 +54,21 @@ class MeasuredVelocityScenario(MeasuredScenario):
             row = answer_row(attempt.answer, p.case, measurements)
             if algorithm != p.algorithm:
                 row["apart_m_s"] = distance(_velocity(attempt.answer), _velocity(attempts[p.algorithm].answer))
+            row |= {**agreement_row(pairs), **attempt.row}
+            if attempt.answer is not None:
+                truth = None if p.case.truth.velocity_m_s is None else _true(p.case)
+                case = ScoredVelocity(measurements=measurements, answer=attempt.answer, true_velocity_m_s=truth)
+                row |= scored(p.scores, case, {*row, *known})
             kept = velocity_products([image.counts for image in images], attempt.answer, _true(p.case))
             return Judged(
                 outcome=attempt.outcome(lambda answer: answer.outcome.name),
                 answered=_velocity(attempt.answer) is not None,
-                row={**row, **agreement_row(pairs), **attempt.row},
+                row=row,
                 products={**kept, **agreement_products(images, pairs)},
                 failure=attempt.failure,
             )
 
-        return case_result(p.algorithms, judge, {**about(p, images), **_conditions(p.case, measurements)})
+        return case_result(p.algorithms, judge, known)
 
 
 def descent_poses(

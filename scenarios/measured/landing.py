@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel
@@ -18,6 +20,8 @@ from scenarios.measured.case import NAN, MeasuredScenario, about, checked, dista
 from scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
 from scenarios.measured.parameters import MeasuredLandingParameters
 from scenarios.measured.store import StoredCase, images_of, landing_measurements, pose_of
+from scenarios.parts.named import SCORE, Kind
+from scenarios.parts.scores import ScoredSite, scored
 from scenarios.trial import Judged, case_result
 from sim.measurements import LandingMeasurements
 from sim.streams import Streams
@@ -30,6 +34,7 @@ class MeasuredLandingScenario(MeasuredScenario):
     parameters_type = MeasuredLandingParameters
     task = LANDING
     algorithm_table = ()
+    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One flight."""
@@ -39,6 +44,7 @@ class MeasuredLandingScenario(MeasuredScenario):
         pairs = agreements(images, matched(images), [pose(picture) for picture in p.case.pictures])
         attempts = tried(p, p.hda, measurements, checked_site, streams.case)
         shown = agreement_products(images, pairs)
+        known = {**about(p, images), **_conditions(p.case), **agreement_row(pairs)}
 
         def judge(algorithm: str) -> Judged:
             attempt = attempts[algorithm]
@@ -46,15 +52,19 @@ class MeasuredLandingScenario(MeasuredScenario):
             row = answer_row(attempt.answer, p.case, measurements)
             if algorithm != p.algorithm:
                 row["apart_m"] = distance(_site(attempt.answer), _site(attempts[p.algorithm].answer))
+            row |= attempt.row
+            if attempt.answer is not None:
+                case = ScoredSite(measurements=measurements, answer=attempt.answer, true_poses=_true_poses(p.case))
+                row |= scored(p.scores, case, {*row, *known})
             return Judged(
                 outcome=attempt.outcome(lambda answer: answer.outcome.name),
                 answered=attempt.answer is not None and attempt.answer.outcome.converged,
-                row={**row, **attempt.row},
+                row=row,
                 products={**(hda_products(details) if isinstance(details, HdaDetails) else {}), **shown},
                 failure=attempt.failure,
             )
 
-        return case_result(p.algorithms, judge, {**about(p, images), **_conditions(p.case), **agreement_row(pairs)})
+        return case_result(p.algorithms, judge, known)
 
 
 def answer_row(estimate: SiteEstimate | None, case: StoredCase, measurements: LandingMeasurements) -> dict[str, Scalar]:
@@ -80,13 +90,21 @@ def answer_row(estimate: SiteEstimate | None, case: StoredCase, measurements: La
     measured = _camera_motion([one.world_from_body for one in measurements.poses], measurements)
     beside = motion_errors(found, measured)
     row |= {name.replace("_error_", "_beside_poses_"): value for name, value in beside.items()}
-    if case.truth.poses is not None:
-        true = _camera_motion([pose_of(*one) for one in case.truth.poses], measurements)
-        row |= motion_errors(found, true)
+    true_poses = _true_poses(case)
+    if true_poses is not None:
+        row |= motion_errors(found, _camera_motion(true_poses, measurements))
     return row
 
 
-def _camera_motion(poses: list[RigidTransform], measurements: LandingMeasurements) -> RigidTransform:
+def _true_poses(case: StoredCase) -> tuple[RigidTransform, RigidTransform] | None:
+    """Of the body at the two pictures; None where they are not known."""
+    if case.truth.poses is None:
+        return None
+    first, second = (pose_of(*one) for one in case.truth.poses)
+    return first, second
+
+
+def _camera_motion(poses: Sequence[RigidTransform], measurements: LandingMeasurements) -> RigidTransform:
     """From the first to the second camera's frame."""
     first, second = (body * camera_pose(image.camera) for body, image in zip(poses, measurements.images, strict=True))
     return second.inv() * first

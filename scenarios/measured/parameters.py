@@ -13,6 +13,7 @@ from scenarios.descent.parameters import check_binning
 from scenarios.estimators import LANDING, VELOCITY
 from scenarios.measured.layout import TaskName
 from scenarios.measured.store import CasesFile, StoredCase
+from scenarios.parts.scores import OwnScores, ScoredSite, ScoredVelocity
 
 
 class MeasuredParameters(BaseModel):
@@ -50,10 +51,12 @@ class MatchingParameters(MeasuredParameters):
         return self
 
 
-class MeasuredVelocityParameters(ChosenAlgorithms, MeasuredParameters):
+class MeasuredVelocityParameters(ChosenAlgorithms, OwnScores, MeasuredParameters):
     """Three pictures of a descent."""
 
     task = VELOCITY
+    scored = ScoredVelocity
+
     algorithm: Annotated[str, Field(description="the velocity estimator under test, whose answers are judged")] = (
         "dimes"
     )
@@ -68,10 +71,12 @@ class MeasuredVelocityParameters(ChosenAlgorithms, MeasuredParameters):
         return self
 
 
-class MeasuredLandingParameters(ChosenAlgorithms, MeasuredParameters):
+class MeasuredLandingParameters(ChosenAlgorithms, OwnScores, MeasuredParameters):
     """Two pictures of the ground."""
 
     task = LANDING
+    scored = ScoredSite
+
     algorithm: Annotated[
         str, Field(description="the estimator of landing sites under test, whose answers are judged")
     ] = "hda"

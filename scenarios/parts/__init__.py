@@ -6,7 +6,14 @@ what each kind is handed and what it gives.
 
 from scenarios.parts.instruments import InstrumentReadings, InstrumentTruth
 from scenarios.parts.motions import DescentPlace, Poses
-from scenarios.parts.scores import ScoredDescent, ScoredLanding, ScoredRun
+from scenarios.parts.scores import (
+    ScoredDescent,
+    ScoredFlight,
+    ScoredLanding,
+    ScoredRun,
+    ScoredSite,
+    ScoredVelocity,
+)
 
 __all__ = [
     "DescentPlace",
@@ -14,6 +21,9 @@ __all__ = [
     "InstrumentTruth",
     "Poses",
     "ScoredDescent",
+    "ScoredFlight",
     "ScoredLanding",
     "ScoredRun",
+    "ScoredSite",
+    "ScoredVelocity",
 ]

@@ -1,12 +1,12 @@
-"""Scores by functions of a user's own: `scores` of a campaign of descents, landings or rovers.
+"""Scores by functions of a user's own: `scores` of a campaign.
 
 A function ``score(case) -> Mapping[str, float | bool]``, handed one case, gives numbers (NaN where there is none) or
 truth values, the same names in every case. They become columns of the row, behind the function's name: `energy` that
 gives `lateral_j` fills `energy_lateral_j`. Requirements take them as metrics, or truth values as populations. Each
 algorithm's answer is scored; where an algorithm crashed there is no answer, and nothing is scored.
 
-The annotation of its argument says which cases it takes: `ScoredDescent`, `ScoredLanding` or `ScoredRun`, or a union of
-them; without one it must take them all.
+The annotation of its argument says which cases it takes, one kind or a union of several; without one it must take them
+all. A kind is taken with those that hold more: who takes `ScoredVelocity` takes `ScoredFlight` and `ScoredDescent`.
 """
 
 from __future__ import annotations
@@ -32,9 +32,29 @@ if TYPE_CHECKING:
     from scenarios.landing.truth import GroundTruth
 
 
-@dataclass(frozen=True)
-class ScoredDescent:
-    """A descent with an answer.
+@dataclass(frozen=True, kw_only=True)
+class ScoredVelocity:
+    """An answer to three pictures of a descent or more, wherever they are from: rendered, or really taken.
+
+    Attributes
+    ----------
+    measurements
+        What the estimator was handed.
+    answer
+        What it said; `answer.velocity_m_s` is None where it ended with a failure.
+    true_velocity_m_s
+        True horizontal velocity of what the answer is of, east and north: its span, by default the last interval; None
+        where it is not known.
+    """
+
+    measurements: DescentMeasurements
+    answer: VelocityEstimate
+    true_velocity_m_s: Float[np.ndarray, "2"] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoredFlight(ScoredVelocity):
+    """The same of pictures whose true motion is known: of a simulated descent, or of the field test's helicopter.
 
     Attributes
     ----------
@@ -42,27 +62,50 @@ class ScoredDescent:
         True states at the pictures, in their order.
     motion
         The true motion, all of it.
-    at_firing
-        True state at the thrusters' firing.
-    touchdown_m_s
-        True horizontal velocity at the ground, east and north, the answer used.
-    measurements
-        What the estimator was handed.
-    answer
-        What it said; `answer.velocity_m_s` is None where it ended with a failure.
     """
 
     states: tuple[State, ...]
     motion: Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoredDescent(ScoredFlight):
+    """A simulated descent, down to the ground.
+
+    Attributes
+    ----------
+    at_firing
+        True state at the thrusters' firing.
+    touchdown_m_s
+        True horizontal velocity at the ground, east and north, the answer used.
+    """
+
     at_firing: State
     touchdown_m_s: Float[np.ndarray, "2"]
-    measurements: DescentMeasurements
-    answer: VelocityEstimate
 
 
-@dataclass(frozen=True)
-class ScoredLanding:
-    """A flight for a landing site with an answer.
+@dataclass(frozen=True, kw_only=True)
+class ScoredSite:
+    """An answer to two pictures of the ground, rendered or really taken.
+
+    Attributes
+    ----------
+    measurements
+        What the estimator was handed.
+    answer
+        What it said; `answer.site_world` is None where it found no site.
+    true_poses
+        Of the body at the two pictures, in the world; None where they are not known.
+    """
+
+    measurements: LandingMeasurements
+    answer: SiteEstimate
+    true_poses: tuple[RigidTransform, RigidTransform] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoredLanding(ScoredSite):
+    """A simulated flight for a landing site.
 
     Attributes
     ----------
@@ -70,16 +113,10 @@ class ScoredLanding:
         True states at the two pictures.
     ground
         The true ground: where a lander would stand safely (`scenarios.landing.truth.GroundTruth`).
-    measurements
-        What the estimator was handed.
-    answer
-        What it said; `answer.site_world` is None where it found no site.
     """
 
     states: tuple[State, State]
     ground: GroundTruth
-    measurements: LandingMeasurements
-    answer: SiteEstimate
 
 
 @dataclass(frozen=True)
@@ -108,18 +145,26 @@ class ScoredRun:
     answers: tuple[TargetUpdate, ...]
 
 
-ScoredCase = ScoredDescent | ScoredLanding | ScoredRun
-SCORED: tuple[type[Any], ...] = (ScoredDescent, ScoredLanding, ScoredRun)
+ScoredCase = ScoredVelocity | ScoredSite | ScoredRun
+SCORED: tuple[type[Any], ...] = (
+    ScoredVelocity,
+    ScoredFlight,
+    ScoredDescent,
+    ScoredSite,
+    ScoredLanding,
+    ScoredRun,
+)
 
 
 def taken_by(found: Any) -> tuple[type[Any], ...]:
-    """The cases that a score takes, by its annotation; all where it has none."""
+    """The cases that a score takes, by its annotation, and with each what holds more; all where it has none."""
     if inspect.isroutine(found):
         annotations = inspect.get_annotations(found)
     else:
         annotations = inspect.get_annotations(type(found).__call__)
     stated = [str(kind) for name, kind in annotations.items() if name != "return"]
-    return tuple(one for one in SCORED if any(one.__name__ in kind for kind in stated)) if stated else SCORED
+    named = tuple(one for one in SCORED if any(one.__name__ in kind for kind in stated))
+    return tuple(one for one in SCORED if issubclass(one, named)) if stated else SCORED
 
 
 def score_of(spec: str, kind: type[Any] | None = None) -> Any:

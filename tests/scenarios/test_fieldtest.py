@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
@@ -19,6 +20,7 @@ from scenarios.fieldtest.parameters import ElevationParameters
 from scenarios.fieldtest.run import Run, RunKey, worked_out
 from scenarios.fieldtest.scenario import case_order
 from scenarios.fieldtest.triples import Category
+from scenarios.parts import ScoredFlight
 from scenarios.views import Eye, site_scene
 from sim.streams import Streams
 from sim.terrain import Surface
@@ -160,10 +162,19 @@ def test_too_many_triples_are_refused() -> None:
         worked_out(RunKey(stated(runs=[{**runs[0], "short_time": 5000}]), 0, 5, "test"))
 
 
+def handed(case: ScoredFlight) -> dict[str, float]:
+    """A user's own score: what it is handed must agree with the row."""
+    assert case.answer.velocity_m_s is not None
+    assert case.true_velocity_m_s is not None
+    error = case.answer.velocity_m_s - case.true_velocity_m_s
+    moved = case.motion.state(case.states[2].time_s).position_m - case.states[2].position_m
+    return {"error_m_s": float(np.hypot(*error)), "off_m": float(np.abs(moved).max())}
+
+
 def test_case_is_answered_and_repeats() -> None:
     """A short-time triple over the lake bed: attitude and altitude errors leave under 2 m/s."""
     parameters = stated(runs=[stated().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}])
-    several = parameters.model_copy(update={"compared": ("phase-correlation",)})
+    several = parameters.model_copy(update={"compared": ("phase-correlation",), "scores": (f"{__name__}:handed",)})
     found = FieldTestScenario().run(several, Streams(5, "test", 0))
     assert found.row["algorithm"] == "dimes"
     assert found.row["phase_correlation.outcome"] in VelocityOutcome.__members__
@@ -171,8 +182,11 @@ def test_case_is_answered_and_repeats() -> None:
     assert found.row["category"] == "short time"
     assert found.answered
     assert float(found.row["velocity_error_m_s"]) < 2.0
+    for label in ("", "phase_correlation."):
+        assert found.row[f"{label}handed_error_m_s"] == found.row[f"{label}velocity_error_m_s"]
+    assert found.row["handed_off_m"] == 0.0
     again = FieldTestScenario().run(parameters, Streams(5, "test", 0))
-    same = {name: value for name, value in found.row.items() if "time" not in name and "." not in name}
+    same = {name: value for name, value in found.row.items() if not re.search(r"time|\.|handed", name)}
     assert same.items() <= again.row.items()
     with pytest.raises(ValueError, match="allowed: 0 to 138"):
         FieldTestScenario().run(parameters, Streams(5, "test", 139))

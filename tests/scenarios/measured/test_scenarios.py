@@ -16,6 +16,7 @@ from scenarios.measured.descent import MeasuredVelocityScenario
 from scenarios.measured.ingest import ingest
 from scenarios.measured.landing import MeasuredLandingScenario
 from scenarios.measured.matching import MatchingScenario
+from scenarios.parts import ScoredSite, ScoredVelocity
 from sim.streams import Streams
 
 STREAMS = Streams(seed=1, campaign="measured", case=0)
@@ -30,13 +31,28 @@ def ran(folder: Path, out: Path, **parameters: object) -> CaseResult:
     return scenario.run(scenario.parameters_type.model_validate({"cases": {"file": str(path)}, **parameters}), STREAMS)
 
 
+def descent_score(case: ScoredVelocity) -> dict[str, float | bool]:
+    """A user's own score of a descent: its error where the truth is known."""
+    known = case.true_velocity_m_s is not None and case.answer.velocity_m_s is not None
+    error = np.hypot(*(case.answer.velocity_m_s - case.true_velocity_m_s)) if known else np.nan
+    return {"error_m_s": float(error), "known": known}
+
+
+def site_score(case: ScoredSite) -> dict[str, float]:
+    """A user's own score of a flight for a site: the true distance between the pictures, where it is known."""
+    if case.true_poses is None:
+        return {"moved_m": np.nan}
+    first, second = case.true_poses
+    return {"moved_m": float(np.linalg.norm(second.translation - first.translation))}
+
+
 @pytest.mark.parametrize("ned", [False, True])
 def test_descents_come_through_as_they_were_measured(tmp_path: Path, ned: bool) -> None:
     given = inputs.descent()
     expected = DimesEstimator().estimate(given)
     assert expected.velocity_m_s is not None
     folder = velocity_folder(tmp_path / "in", {"drop": given}, {"drop": TRUE}, ned=ned)
-    result = ran(folder, tmp_path / "out", compared=["phase-correlation"])
+    result = ran(folder, tmp_path / "out", compared=["phase-correlation"], scores=[f"{__name__}:descent_score"])
     row = result.row
     found = [row["velocity_estimated_x_m_s"], row["velocity_estimated_y_m_s"]]
     # what turns in rounding: the axes there and back
@@ -49,12 +65,17 @@ def test_descents_come_through_as_they_were_measured(tmp_path: Path, ned: bool) 
     # the answer takes the constant error of (9, -4) m/s, 34 m between pictures, out of the inertial velocities
     assert row["residual_median_px"] < 1.5
     assert row["matches"] == row["phase_correlation.matches"]
+    for label in ("", "phase_correlation."):
+        assert row[f"{label}descent_score_error_m_s"] == row[f"{label}velocity_error_m_s"]
     assert result.outcome == "VALID"
     assert row["measured_case"] == "drop"
 
 
 def test_without_truth_no_error_is_told(tmp_path: Path) -> None:
-    row = ran(velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {}), tmp_path / "out").row
+    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    row = dict(ran(folder, tmp_path / "out", scores=[f"{__name__}:descent_score"]).row)
+    assert row["descent_score_known"] is False
+    assert np.isnan(row.pop("descent_score_error_m_s"))
     assert not [name for name in row if "error_" in name or "true_" in name]
     assert row["truth_known"] is False
 
@@ -78,12 +99,14 @@ def test_positions_stand_in_for_inertial_velocities_and_for_truth(tmp_path: Path
 
 
 def test_landings_are_held_against_measured_and_true_poses(tmp_path: Path) -> None:
-    row = ran(landing_folder(tmp_path / "in", inputs.landing(), "landing", true_poses=True), tmp_path / "out").row
+    folder = landing_folder(tmp_path / "in", inputs.landing(), "landing", true_poses=True)
+    row = ran(folder, tmp_path / "out", scores=[f"{__name__}:site_score"]).row
     assert row["site_reported"]
     assert row["rotation_error_deg"] == row["rotation_beside_poses_deg"]
     assert row["rotation_error_deg"] < 0.5
     assert row["residual_median_px"] < 0.5
     assert np.isclose(row["moved_most_m"], np.linalg.norm([1.2, 0.2, -0.2]))
+    assert np.isclose(row["site_score_moved_m"], row["moved_most_m"])
 
 
 @pytest.mark.parametrize(("turned_deg", "least", "most"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])

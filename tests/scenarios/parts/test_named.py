@@ -14,7 +14,7 @@ from scenarios.descent import DescentScenarioParameters
 from scenarios.parts import named
 from scenarios.parts.motions import OwnMotion
 from scenarios.parts.named import DYNAMICS, SCORE, checked_columns
-from scenarios.parts.scores import SCORED, ScoredDescent, ScoredLanding, score_of, taken_by
+from scenarios.parts.scores import SCORED, ScoredDescent, ScoredFlight, ScoredLanding, score_of, taken_by
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
 
@@ -102,19 +102,23 @@ def test_an_entry_point_names_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "scores_here.py").write_text(
-        "from scenarios.parts import ScoredDescent, ScoredLanding\n"
+        "from scenarios.parts import ScoredDescent, ScoredFlight, ScoredLanding\n"
         "def any_case(case): return {}\n"
         "def two(case: ScoredDescent | ScoredLanding): return {}\n"
         "def landing(case: 'ScoredLanding'): return {}\n"
+        "def flown(case: ScoredFlight): return {}\n"
         "def none_at_all(): return {}\n"
         "class Kept:\n    def __call__(self, case: ScoredLanding): return {}\n"
         "kept = Kept()\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    taken = {name: taken_by(score_of(f"scores_here:{name}")) for name in ("any_case", "two", "landing", "kept")}
+    names = ("any_case", "two", "landing", "flown", "kept")
+    taken = {name: taken_by(score_of(f"scores_here:{name}")) for name in names}
     assert taken["any_case"] == SCORED
     assert taken["two"] == (ScoredDescent, ScoredLanding)
     assert taken["landing"] == taken["kept"] == (ScoredLanding,)
+    # what holds more is taken as well
+    assert taken["flown"] == (ScoredFlight, ScoredDescent)
     with pytest.raises(ValueError, match="scores ScoredLanding; allowed here: ScoredDescent"):
         score_of("scores_here:landing", ScoredDescent)
     with pytest.raises(ValueError, match="does not take one argument"):
