@@ -43,7 +43,9 @@ def campaign_text(choices: Choices) -> str:
     """The campaign's file. Raises CampaignError for files that the system has no place for."""
     c = choices
     if c.system == "tracking" and (c.camera or c.detector):
-        raise CampaignError("--camera and --detector: tracking looks through a mast's stereo pair; see camera.preset")
+        raise CampaignError(
+            "--camera and --detector: tracking looks through a mast's stereo pair; see camera.preset and camera.own"
+        )
     if c.flight and c.system != "velocity":
         raise CampaignError(f"--flight: only descents fly a file's trajectory, and {c.system} is none")
     parts = {"velocity": _velocity, "landing": _landing, "tracking": _tracking}[c.system](c)

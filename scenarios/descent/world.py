@@ -15,9 +15,6 @@ from sim.render import Objects, Photometry, Scene, Sun
 from sim.render.clouds import CloudLayer
 from sim.terrain import Environment, Surface, TerrainBank
 
-#: Sunlight over that at 1 AU for which the descent camera's responsivity is stated: Mars at 1.5 AU.
-SUNLIGHT_OF_RESPONSIVITY = 1.0 / 1.5**2
-
 #: Finest spacing of a plain terrain's mesh: that of pictures from 1200 m and more, and its share of a lower height.
 MESH_FINEST_M, MESH_FINEST_HEIGHTS = 12.0, 0.01
 
@@ -63,7 +60,7 @@ class World:
             return cls(surface, None, Sun(towards_sun), p.meshes)
         air = p.preset.environment
         sun = Sun(towards_sun, air.sun_radius_rad)
-        brightness = air.direct_share(elevation) * air.solar_irradiance / SUNLIGHT_OF_RESPONSIVITY
+        brightness = air.direct_share(elevation) * air.solar_irradiance / p.detector.sunlight
         ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.place.terrain))
         return cls(surface, ground, sun, p.meshes, brightness)
 

@@ -57,7 +57,7 @@ def take_picture(run: Run, state: State, detector: Detector, rng: np.random.Gene
         state.attitude.apply(state.body_rate_rad_s),
     )
     air = site(run.parameters.site).environment
-    brightness = air.direct_share(float(np.arcsin(scene.sun.direction[2]))) * air.solar_irradiance
+    brightness = air.direct_share(float(np.arcsin(scene.sun.direction[2]))) * air.solar_irradiance / p.detector.sunlight
     counts = detector.expose(frame.radiance * np.float32(brightness), rng, motion)
     return Picture(counts, frame.points_world(GRID_PX))
 

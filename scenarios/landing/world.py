@@ -15,7 +15,6 @@ from scenarios.views import Eye, SiteGround, site_scene
 from sim.camera import CameraModel
 from sim.frames import direction
 from sim.render import Objects, Scene, Sun
-from sim.sensor import OwnCamera, preset
 from sim.terrain import TerrainBank, TerrainParameters, site
 from sim.terrain.sites import SiteTexture
 
@@ -36,7 +35,7 @@ class World:
     meshes
         Own bodies on the ground.
     brightness
-        Sunlight at the ground over that for which the camera's responsivity is stated.
+        Sunlight at the ground over that for which the detector's responsivity is stated.
     """
 
     ground: SiteGround
@@ -56,7 +55,7 @@ class World:
         air = p.preset.environment
         elevation = float(np.radians(faulty_sun_deg(p.faults, p.sun.elevation_deg)))
         sun = Sun(direction(np.radians(p.sun.azimuth_deg), elevation), air.sun_radius_rad)
-        brightness = air.direct_share(elevation) * air.solar_irradiance / camera_sunlight(p.camera)
+        brightness = air.direct_share(elevation) * air.solar_irradiance / p.detector.sunlight
         return cls(ground, sun, p.meshes, brightness)
 
     def scene(self, eye: Eye, caster_diameter_m: float) -> Scene:
@@ -73,11 +72,6 @@ def site_ground(site_name: str, terrain: TerrainParameters, bank_seed: int, numb
     """A terrain of a site's bank with its rocks, kept by the process."""
     bank = TerrainBank(terrain, bank_seed)
     return SiteGround(site(site_name), terrain, bank.terrain(number), bank.rocks(number))
-
-
-def camera_sunlight(camera: str | OwnCamera) -> float:
-    """Sunlight, over that at 1 AU, for which a camera's responsivity is stated; 1 for an own camera."""
-    return 1.0 if isinstance(camera, OwnCamera) else preset(camera).sunlight
 
 
 @lru_cache(maxsize=4)

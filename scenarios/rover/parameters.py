@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -11,11 +12,24 @@ from algorithms.vtt import VttOptions
 from scenarios.chosen import ChosenAlgorithms
 from scenarios.estimators import TRACKING
 from scenarios.parts.scores import OwnScores, ScoredRun
+from sim.camera import CameraModel
 from sim.dynamics import SlipParameters
+from sim.measurements import MastCalibration
 from sim.render import CloudParameters
 from sim.render.backend import Backend, default_backend
-from sim.sensor import AutoExposureParameters, OdometryParameters, PointingParameters, StereoCalibrationParameters
-from sim.sensor.mast import MASTS
+from sim.sensor import (
+    MASTS,
+    AutoExposureParameters,
+    DetectorChoice,
+    DetectorParameters,
+    OdometryParameters,
+    OwnCameraChoice,
+    PointingParameters,
+    StereoCalibrationParameters,
+    on_head,
+    preset,
+    stereo_mast,
+)
 from sim.terrain import site, sites
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -210,10 +224,37 @@ class ExposureParameters(_Parameters):
     auto: AutoExposureParameters = AutoExposureParameters()
 
 
+class OwnPair(_Parameters):
+    """A stereo pair of one's own on the mast's head: where files put the cameras does not matter."""
+
+    left: Annotated[OwnCameraChoice, Field(description="camera file: a path, or a table with file")]
+    right: Annotated[OwnCameraChoice | None, Field(description="likewise; by default as the left one")] = None
+    baseline_m: Annotated[float, Field(gt=0.0, le=5.0, description="distance of the two, m")]
+    toe_in_deg: Annotated[float, Field(ge=-30.0, le=30.0, description="turn of each towards the other")] = 0.0
+
+    @model_validator(mode="after")
+    def _are_of_a_size(self) -> OwnPair:
+        if self.right is not None and self.right.size != self.left.size:
+            sizes = [f"{columns} x {rows}" for columns, rows in (self.left.size, self.right.size)]
+            raise ValueError(f"the left camera has {sizes[0]} pixels, the right one {sizes[1]}; allowed: as many")
+        return self
+
+    def cameras(self) -> tuple[CameraModel, CameraModel]:
+        """The left and the right camera in the head's frame."""
+        right = self.left if self.right is None else self.right
+        return on_head(self.left.camera(), right.camera(), self.baseline_m, self.toe_in_deg)
+
+
 class CameraParameters(_Parameters):
     """The stereo pair on the mast."""
 
-    preset: Annotated[str, Field(description="a pair of `sim.sensor.mast.MASTS`")] = "mer-navcam"
+    preset: Annotated[
+        str, Field(description="a pair of `sim.sensor.mast.MASTS`, with the mast and the rover that carry it")
+    ] = "mer-navcam"
+    own: Annotated[OwnPair | None, Field(description="an own pair, on that mast in place of the preset's")] = None
+    detector: Annotated[
+        DetectorChoice | None, Field(description="of both cameras; by default the preset's, whatever the pair")
+    ] = None
     detector_noise: Annotated[bool, Field(description="whether pictures have a detector's noise and response")] = True
 
     @field_validator("preset")
@@ -222,6 +263,30 @@ class CameraParameters(_Parameters):
         if name not in MASTS:
             raise ValueError(f"no mast carries cameras called '{name}'; allowed: {', '.join(MASTS)}")
         return name
+
+    @field_validator("detector")
+    @classmethod
+    def _sums_no_rows(cls, detector: DetectorParameters | None) -> DetectorParameters | None:
+        if detector is not None and detector.rows_summed != 1:
+            raise ValueError(f"rows_summed is {detector.rows_summed}; allowed for cameras on a mast: 1")
+        return detector
+
+    @property
+    def name(self) -> str:
+        """What the cameras are called: the preset, or the file of the left one."""
+        return self.preset if self.own is None else self.own.left.file or "own"
+
+    def mast(self) -> MastCalibration:
+        """The design of the mast and its pair."""
+        design = stereo_mast(self.preset)
+        if self.own is None:
+            return design
+        left, right = self.own.cameras()
+        return replace(design, left=left, right=right)
+
+    def settings(self) -> DetectorParameters:
+        """Of both cameras' detectors."""
+        return preset(self.preset).detector if self.detector is None else self.detector
 
 
 class ScoreParameters(_Parameters):

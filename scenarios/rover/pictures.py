@@ -11,21 +11,15 @@ from jaxtyping import Float32
 from scipy.spatial.transform import RigidTransform
 
 from algorithms.interface import PixelBox
-from scenarios.rover.parameters import ExposureParameters
+from scenarios.rover.parameters import CameraParameters, ExposureParameters
 from sim.camera import CameraModel
 from sim.measurements import MastImage
 from sim.render import Objects, PixelRays, Scene, process_renderer
 from sim.render.backend import Backend
-from sim.sensor import Detector, auto_expose, natural_fall_off, preset
+from sim.sensor import Detector, auto_expose, natural_fall_off
 
 #: The full frame is judged for its exposure in a picture so many times smaller.
 _BINNED = 16
-
-
-@lru_cache(maxsize=8)
-def sunlight_of_preset(name: str) -> float:
-    """Sunlight over that at 1 AU for which a camera's responsivity is stated; kept, as it is asked for each picture."""
-    return preset(name).sunlight
 
 
 @lru_cache(maxsize=8)
@@ -46,11 +40,16 @@ class Detectors:
     noise: bool
 
     @classmethod
-    def drawn(cls, name: str, noise: bool, rng: np.random.Generator) -> Detectors:
-        """Detectors of a preset's pair."""
-        chosen = preset(name)
-        left, right = (Detector.drawn(fall_off(camera), chosen.detector, rng) for camera in chosen.cameras())
-        return cls(left, right, noise)
+    def drawn(cls, p: CameraParameters, rng: np.random.Generator) -> Detectors:
+        """Detectors of a pair as designed."""
+        design, settings = p.mast(), p.settings()
+        left, right = (Detector.drawn(fall_off(camera), settings, rng) for camera in (design.left, design.right))
+        return cls(left, right, p.detector_noise)
+
+    @property
+    def sunlight(self) -> float:
+        """Sunlight, over that at 1 AU, for which their responsivity is stated."""
+        return self.left.parameters.sunlight
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class Photographer:
         boxes
             Parts of the full frames to deliver.
         brightness
-            Sunlight over that for which the detectors' responsivity is stated.
+            Sunlight over that at 1 AU.
         time_s
             When.
         """
@@ -124,6 +123,7 @@ class Photographer:
             PixelRays.of(camera.cropped(*box.corner, box.size)) for camera, box in zip(cameras, boxes, strict=True)
         ]
         near = _joined(scene.within([rays.cone(world_from_head) for rays in shown]), rover)
+        brightness /= self.detectors.sunlight
         light = [self._light(near, world_from_head, rays, brightness, time_s) for rays in shown]
         if not self.detectors.noise:
             counts = [_noise_free(one, light[0]) for one in light]

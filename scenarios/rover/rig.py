@@ -13,7 +13,7 @@ from scenarios.interface import Scalar
 from scenarios.rover.parameters import RoverScenarioParameters
 from sim.camera import CameraModel
 from sim.measurements import MastCalibration
-from sim.sensor import Mast, MastState, StereoHead, stereo_mast
+from sim.sensor import Mast, MastState, StereoHead
 from sim.streams import Streams
 
 
@@ -41,7 +41,7 @@ class Rig:
     @classmethod
     def of(cls, p: RoverScenarioParameters, streams: Streams) -> Rig:
         """The mast and pair of a run, their errors drawn."""
-        design = stereo_mast(p.camera.preset)
+        design = p.camera.mast()
         head = StereoHead.drawn(design, p.stereo, streams.generator("stereo calibration"))
         mast = Mast.drawn(p.pointing, design.geometry, streams.generator("mast zeros"))
         return cls(head, mast, mast.rest, streams.generator("mast motors"))

@@ -15,7 +15,7 @@ from algorithms.vtt import GoalReached, HandOffOutcome, hand_off
 from scenarios.estimators import TRACKING
 from scenarios.rover.mapping import Mapper
 from scenarios.rover.parameters import LegParameters, RoverScenarioParameters
-from scenarios.rover.pictures import Detectors, Photographer, sunlight_of_preset
+from scenarios.rover.pictures import Detectors, Photographer
 from scenarios.rover.rig import Rig
 from scenarios.rover.route import GOAL_TOLERANCE_M, Belief, commands, finished
 from scenarios.rover.stops import RunOutcome, Stop
@@ -76,7 +76,7 @@ def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
     target = choose_target(p, world, rig, vehicle.stance)
     photographer = Photographer(
         p.backend,
-        Detectors.drawn(p.camera.preset, p.camera.detector_noise, streams.generator("detector response")),
+        Detectors.drawn(p.camera, streams.generator("detector response")),
         p.exposure,
         streams.generator("detector noise"),
     )
@@ -185,7 +185,7 @@ class _Loop:
         shading = (
             world.shading(body, stance, mast, rig.state.true_rad, point, run.time_s) if self.p.rover_shadow else None
         )
-        brightness = world.brightness(run.time_s) / sunlight_of_preset(self.p.camera.preset)
+        brightness = world.brightness(run.time_s)
         scene = world.scene(run.time_s)
         pictures = self.photographer.take(
             scene, shading, world_from_head, (rig.left, rig.right), (aim.left, aim.right), brightness, run.time_s

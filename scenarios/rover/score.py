@@ -192,9 +192,9 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     return {
         "site": p.world.site,
         "terrain": p.world.terrain,
-        "camera": p.camera.preset,
-        "navcam": p.camera.preset.endswith("navcam"),
-        "pancam": p.camera.preset.endswith("pancam"),
+        "camera": p.camera.name,
+        "navcam": p.camera.name.endswith("navcam"),
+        "pancam": p.camera.name.endswith("pancam"),
         "search_px": p.vtt.search_px,
         "rock_diameter_m": rock.diameter_m,
         "rock_height_m": rock.height_m,

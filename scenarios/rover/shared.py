@@ -30,7 +30,7 @@ from scenarios.interface import CaseResult, Scalar
 from scenarios.parts.named import SCORE, Kind
 from scenarios.parts.scores import scored
 from scenarios.rover.parameters import LegParameters, RoverScenarioParameters
-from scenarios.rover.pictures import Detectors, Photographer, StereoPictures, sunlight_of_preset
+from scenarios.rover.pictures import Detectors, Photographer, StereoPictures
 from scenarios.rover.rig import Rig
 from scenarios.rover.route import Belief, commands, finished
 from scenarios.rover.run import Run
@@ -166,7 +166,7 @@ def shared_drive(p: RoverScenarioParameters, margin_px: float, seed: int, campai
     vehicle = Vehicle.placed(p, world, rig, streams)
     photographer = Photographer(
         p.backend,
-        Detectors.drawn(p.camera.preset, p.camera.detector_noise, streams.generator("detector response")),
+        Detectors.drawn(p.camera, streams.generator("detector response")),
         p.exposure,
         streams.generator("detector noise"),
     )
@@ -240,7 +240,7 @@ def _view(
     rover, mast, true = vehicle.rover, known.geometry, rig.state.true_rad
     shading = world.shading(rover, stance, mast, true, middle, time_s) if p.rover_shadow else None
     scene, cameras = world.scene(time_s), (rig.left, rig.right)
-    brightness = world.brightness(time_s) / sunlight_of_preset(p.camera.preset)
+    brightness = world.brightness(time_s)
     pictures = photographer.take(scene, shading, world_from_head, cameras, boxes, brightness, time_s)
     return View(time_s, stance, vehicle.estimated, rig.state.readings_rad, world_from_head, pictures)
 

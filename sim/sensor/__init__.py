@@ -17,6 +17,7 @@ from sim.sensor.mast import (
     PointingParameters,
     StereoCalibrationParameters,
     StereoHead,
+    on_head,
     stereo_mast,
 )
 from sim.sensor.motion import ImageMotion
@@ -85,6 +86,7 @@ __all__ = [
     "auto_expose",
     "height_above_ground",
     "natural_fall_off",
+    "on_head",
     "preset",
     "read_datasheet",
     "stereo_mast",

@@ -102,7 +102,9 @@ class Datasheet(_Part):
     exposure_s: Annotated[
         float | None, Field(gt=0.0, le=10.0, description="not stated: radiance factor 0.3 fills 60 % of the full well")
     ] = None
-    sun_au: Annotated[float, Field(gt=0.1, le=100.0, description="distance of the sun where it is used")] = 1.5
+    sun_au: Annotated[
+        float, Field(gt=0.1, le=100.0, description="distance of the sun where it is used; sets exposure_s")
+    ] = 1.5
     lens: Lens
 
     @model_validator(mode="after")
@@ -136,6 +138,7 @@ class Datasheet(_Part):
         return DetectorParameters(
             exposure_s=exposure,
             responsivity_e_s=responsivity,
+            sun_au=self.sun_au,
             rows_summed=1,
             transfer_row_s=self.transfer_row_s,
             clear_row_s=0.0,

@@ -206,6 +206,26 @@ class StereoHead:
         return calibrated - true
 
 
+#: From a body whose camera looks along -z, its columns along x, to a head whose cameras look along x, columns along -y.
+_HEAD_FROM_DOWN = Rotation.from_matrix(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+
+
+def on_head(
+    left: CameraModel, right: CameraModel, baseline_m: float, toe_in_deg: float
+) -> tuple[CameraModel, CameraModel]:
+    """Two cameras at a body's origin that look down (`sim.camera.looking_down`), put onto a head as a stereo pair.
+
+    Both look forwards, half the baseline to either side of the head's origin, each turned towards the other by the
+    toe-in.
+    """
+
+    def put(camera: CameraModel, side: float) -> CameraModel:
+        turn = Rotation.from_rotvec([0.0, 0.0, -side * np.radians(toe_in_deg)])
+        return camera.moved(rigid(turn * _HEAD_FROM_DOWN, np.array([0.0, 0.5 * side * baseline_m, 0.0])))
+
+    return put(left, 1.0), put(right, -1.0)
+
+
 def stereo_mast(name: str) -> MastCalibration:
     """The design of a mast and its stereo pair, by the name of the cameras' preset (`MASTS`).
 

@@ -25,6 +25,9 @@ class DetectorParameters(BaseModel):
     responsivity_e_s: Annotated[
         float, Field(gt=0.0, description="electrons per second in a pixel on axis at radiance factor 1")
     ] = 1.019e7
+    sun_au: Annotated[
+        float, Field(gt=0.1, le=100.0, description="distance from the sun for which that responsivity is stated, AU")
+    ] = 1.5
     rows_summed: Annotated[int, Field(ge=1, le=16, description="rows summed on the chip")] = 4
     transfer_row_s: Annotated[NonNegative, Field(description="time under each row during the transfer, s")] = 5.0e-6
     clear_row_s: Annotated[NonNegative, Field(description="time under each row during the clearing, s")] = 1.0e-6
@@ -49,6 +52,11 @@ class DetectorParameters(BaseModel):
     optics: OpticsParameters = OpticsParameters()
     defects: DefectParameters = DefectParameters()
     bursts: BurstParameters = BurstParameters()
+
+    @property
+    def sunlight(self) -> float:
+        """Sunlight, over that at 1 AU, for which the responsivity is stated."""
+        return 1.0 / self.sun_au**2
 
     @property
     def full_scale_dn(self) -> int:

@@ -95,19 +95,11 @@ class Preset:
     ----------
     design, light, detector
         Geometry, light path and detector.
-    sun_au
-        Distance from the sun for which the detector's responsivity is stated.
     """
 
     design: CameraDesign
     light: LightPath
     detector: DetectorParameters
-    sun_au: float
-
-    @property
-    def sunlight(self) -> float:
-        """Sunlight, over that at 1 AU, for which the detector's responsivity is stated."""
-        return 1.0 / self.sun_au**2
 
     def cameras(self) -> tuple[CameraModel, ...]:
         """The camera, or the left and the right one of a pair."""
@@ -118,10 +110,11 @@ def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float
     """A camera with the MER detector, of which the descent camera's parameters are the defaults."""
     settings = {
         "responsivity_e_s": light.responsivity_e_s(sun_au),
+        "sun_au": sun_au,
         "dark_e_s": DARK_E_S,
         "optics": OpticsParameters(diffraction_px=light.diffraction_px()),
     }
-    return Preset(design, light, DetectorParameters.model_validate(settings | changes), sun_au)
+    return Preset(design, light, DetectorParameters.model_validate(settings | changes))
 
 
 _DESCENT = CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, down=True)
@@ -169,6 +162,7 @@ def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
     detector = DetectorParameters(
         exposure_s=bright_exposure_s(full_well_e, responsivity),
         responsivity_e_s=responsivity,
+        sun_au=1.0,
         rows_summed=1,
         transfer_row_s=0.0,
         clear_row_s=0.0,
@@ -182,7 +176,7 @@ def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
         dark_e_s=DARK_E_S * (design.pixel_pitch_um / 12.0) ** 2,
         optics=OpticsParameters(diffraction_px=light.diffraction_px()),
     )
-    return Preset(design, light, detector, sun_au=1.0)
+    return Preset(design, light, detector)
 
 
 def _research_navcam() -> Preset:

@@ -69,6 +69,10 @@ def test_a_site_is_lit_as_it_is() -> None:
     assert mars.sun.angular_radius_rad == pytest.approx(0.00308, rel=0.01)
     # twice the sunlight and more: Mars' air is dusty
     assert earth.brightness / mars.brightness > 1.0 / 0.44
+    # of a detector whose responsivity is stated for Earth's sun, Mars' light is 0.44 of that
+    stated_for_earth = {"site": SITES[0], "detector": {"sun_au": 1.0}} | small
+    dimmer = World.of(DescentScenarioParameters.model_validate(stated_for_earth))
+    assert dimmer.brightness == pytest.approx(mars.brightness / 1.5**2)
     scene = mars.scene(0.0, 0.0, 1400.0, 8.2e-4, caster_diameter_m=10.9)
     assert scene.caster_diameter_m == 10.9
     assert scene.photometry == mars.ground.photometry(mars.sun)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from scenarios.landing.world import camera_sunlight
-from sim.sensor import OwnCamera
+from scenarios.landing.parameters import LandingScenarioParameters
+from scenarios.landing.world import World
+from sim.sensor import preset
 from sim.terrain import site
 
 
@@ -13,8 +14,15 @@ from sim.terrain import site
 def test_a_camera_at_the_place_that_it_is_stated_for_sees_that_places_sun(site_name: str, camera: str) -> None:
     # Mars at 1.5 AU has 0.44 of Earth's sun, whose square is what was counted before.
     air = site(site_name).environment
-    assert air.solar_irradiance / camera_sunlight(camera) == pytest.approx(1.0, abs=0.02)
+    assert air.solar_irradiance / preset(camera).detector.sunlight == pytest.approx(1.0, abs=0.02)
 
 
-def test_an_own_camera_is_stated_for_one_astronomical_unit() -> None:
-    assert camera_sunlight(OwnCamera.model_construct(file="camera.cahvor")) == 1.0
+def test_a_detectors_electrons_do_not_depend_on_where_the_sun_stood_in_its_datasheet() -> None:
+    """Responsivity is stated in proportion to the sunlight that is stated with it."""
+    small = {"terrain": {"samples": 256}, "place": {"bank": 1}}
+    electrons = []
+    for sun_au in (1.0, 1.5, 3.0):
+        detector = {"preset": "xc-55", "sun_au": sun_au, "responsivity_e_s": 1e7 / sun_au**2}
+        p = LandingScenarioParameters.model_validate({**small, "detector": detector})
+        electrons.append(World.of(p).brightness * p.detector.responsivity_e_s)
+    assert electrons == pytest.approx([electrons[0]] * 3, rel=1e-12)

@@ -59,6 +59,10 @@ def test_responsivity_is_the_suns_photons(tmp_path: Path) -> None:
     by_hand = 0.65 * 0.9 * (3.45e-6) ** 2 * photons / (4.0 * 4.0**2)
     # the sun is taken for a black body, which is up to 9 % fainter in the green
     assert p.responsivity_e_s == pytest.approx(by_hand, rel=0.1)
+    # and the detector says for which sun that holds
+    assert p.sunlight == 1.0
+    elsewhere = read_datasheet(written(tmp_path, "sun_au = 3.0\n" + SHEET)).parameters()
+    assert elsewhere.responsivity_e_s / elsewhere.sunlight == pytest.approx(p.responsivity_e_s)
 
 
 def test_a_flat_curve_is_the_mean(tmp_path: Path) -> None:

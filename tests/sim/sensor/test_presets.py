@@ -97,9 +97,9 @@ def test_a_picture_of_each(name: str) -> None:
 def test_responsivity_is_that_of_the_sunlight_that_is_stated_with_it(name: str) -> None:
     camera = preset(name)
     of_earth = camera.light.responsivity_e_s(1.0)
-    assert camera.detector.responsivity_e_s == pytest.approx(camera.sunlight * of_earth, rel=1e-12)
+    assert camera.detector.responsivity_e_s == pytest.approx(camera.detector.sunlight * of_earth, rel=1e-12)
     # MER's cameras are at Mars, but for the descent camera that was flown over deserts
-    assert camera.sunlight == pytest.approx(
+    assert camera.detector.sunlight == pytest.approx(
         0.444 if name in ("mer-descent-flown", "mer-navcam", "mer-hazcam") else 1.0, abs=1e-3
     )
 
