@@ -2,4 +2,5 @@
 # Runs the tests on all cores; words given are passed to pytest.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-exec .venv/bin/python -m pytest -n auto "$@"
+# tests that share something costly stay in one process: `xdist_group`
+exec .venv/bin/python -m pytest -n auto --dist loadgroup "$@"
