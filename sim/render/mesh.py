@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int
 from scipy.optimize import brentq
 from scipy.spatial import ConvexHull
 
 from sim.terrain import Surface
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 def graded_offsets(reach_m: float, finest_m: float, count: int) -> Float[np.ndarray, "count"]:
@@ -50,6 +54,8 @@ def ground_mesh(
         Of each strip of cells between two lines of y the first cell that is drawn, and the one after the last; by
         default all are.
     """
+    import trimesh  # here, as it is slow to import
+
     if spans is None:
         spans = np.tile([0, x.size - 1], (y.size - 1, 1))
     first, end = spans.T

@@ -9,7 +9,6 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-import trimesh
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
@@ -156,12 +155,16 @@ def _box(size_m: tuple[float, float, float], middle_m: tuple[float, float, float
 
 @cache
 def _unit_box() -> Triangles:
+    import trimesh  # here and below, as it is slow to import
+
     return np.asarray(trimesh.creation.box().triangles, dtype=np.float64)
 
 
 @cache
 def _unit_rod() -> Triangles:
     """A cylinder along z from 0 to 1, of radius 1."""
+    import trimesh
+
     rod = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=_SIDES)
     return np.asarray(rod.triangles + np.array([0.0, 0.0, 0.5]), dtype=np.float64)
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-import trimesh
 from jaxtyping import Float64, Int32
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
@@ -54,10 +53,6 @@ class ShapeSet:
     faces: Int32[np.ndarray, "faces 3"]
     reach: Float64[np.ndarray, "shapes"]
 
-    def mesh(self, shape: int) -> trimesh.Trimesh:
-        """One unit shape as a mesh."""
-        return trimesh.Trimesh(self.vertices[shape], self.faces, process=False, validate=False)
-
 
 @cache
 def rock_shapes(detail: int) -> ShapeSet:
@@ -90,6 +85,8 @@ def pixels_held(bound_px: float = DEVIATION_PX) -> Float64[np.ndarray, "shapes l
 @cache
 def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarray, "faces 3"]]:
     """Unit vectors and triangles of the subdivided icosahedron."""
+    import trimesh  # here, as it is slow to import
+
     sphere = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS[detail])
     vertices = np.array(sphere.vertices, dtype=np.float64)
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), np.ascontiguousarray(sphere.faces, np.int32)
