@@ -318,6 +318,17 @@ def test_help_answers_at_once() -> None:
         assert f" {heavy}\n" not in ended.stderr
 
 
+def test_a_bad_campaign_is_refused_before_what_is_slow_is_imported(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text('name = "bad"\nscenario = "descent"\ncases = 1\n[parameters.camera]\nfocal_length_mmm = 1\n')
+    command = [sys.executable, "-X", "importtime", "-m", "marsyard", "run", str(path)]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert "did you mean 'focal_length_mm'?" in ended.stderr
+    for heavy in ("pandas", "matplotlib", "pyarrow", "joblib", "trimesh", "networkx", "rasterio", "pyrender"):
+        assert f" {heavy}\n" not in ended.stderr
+
+
 def test_a_terminal_gets_a_bar(tmp_path: Path) -> None:
     path = write_campaign(tmp_path, dispersions="", requirement="")
     command = [

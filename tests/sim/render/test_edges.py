@@ -57,6 +57,13 @@ def rocky() -> View:
     return View(scene, _camera((192, 160), 6e-3), rigid(Rotation.from_euler("y", 8.0, degrees=True), eye))
 
 
+@pytest.fixture(scope="module")
+def reference(renderer, rocky: View) -> np.ndarray:
+    """The rocks by 256 rays a pixel, each of which sees ground and texture as smooth as the pixel."""
+    single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
+    return supersampled(renderer, replace(single, footprint=float(SAMPLES)), SAMPLES)
+
+
 def test_rays_within_a_pixel_are_spread_evenly_about_its_middle() -> None:
     camera = _camera((7, 5))
     rays = PixelRays.of(camera)
@@ -83,13 +90,11 @@ def test_the_nearest_triangle_is_that_of_an_exhaustive_search(rocky) -> None:
 
 
 @pytest.mark.parametrize(("side", "share"), [(2, 0.5), (3, 0.4)])
-def test_outlines_are_those_of_256_rays_a_pixel(renderer, rocky, side: int, share: float) -> None:
-    """Each of the 256 sees ground and texture as smooth as the pixel: what differs is the edges."""
+def test_outlines_are_those_of_256_rays_a_pixel(renderer, rocky, reference, side: int, share: float) -> None:
     single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
     rays = rocky.rays(rocky.camera)
     one = renderer.render(single.scene, rays, rocky.world_from_body)
     several = renderer.render(replace(rocky.scene, edge_rays=side), rays, rocky.world_from_body)
-    reference = supersampled(renderer, replace(single, footprint=float(SAMPLES)), SAMPLES)
     edges = edge_pixels(one.radiance, one.range_m, one.body)
     assert 500 < edges.size < 0.2 * one.radiance.size
 
