@@ -16,6 +16,7 @@ from scipy import ndimage
 from algorithms.dimes.binning import View
 from algorithms.dimes.ground import pixels_from_ground
 from algorithms.dimes.radiometry import corrected_patch
+from algorithms.image.kernels import cubic as kernels
 
 #: Pixels around the samples that the spline's coefficients are computed from; what is beyond changes them by 1e-6.
 SPLINE_MARGIN = 10
@@ -28,10 +29,10 @@ def ground_lattice(centre: Float[np.ndarray, "2"], side_px: int, gsd_m: float) -
     return np.stack([east, north], axis=-1)
 
 
-def _span(values: Float[np.ndarray, "*shape"], size: int) -> slice:
-    """Whole pixels around the values, with the spline's margin, within 0 .. size."""
-    low, high = np.clip([values.min() - SPLINE_MARGIN, values.max() + SPLINE_MARGIN + 1], 0, size).astype(int)
-    return slice(int(min(low, size - 1)), int(max(high, 1)))
+def _span(least: float, largest: float, size: int) -> slice:
+    """Whole pixels around values from `least` to `largest`, with the spline's margin, within 0 .. size."""
+    low, high = max(int(least - SPLINE_MARGIN), 0), min(int(largest + SPLINE_MARGIN + 1), size)
+    return slice(min(low, size - 1), max(high, 1))
 
 
 def rectified_patch(
@@ -44,8 +45,10 @@ def rectified_patch(
     """
     pixels, visible = pixels_from_ground(view, ground_lattice(centre, side_px, gsd_m))
     columns, rows = view.size
-    pixels = np.clip(np.where(visible[..., None], pixels, 0.0), 0.0, [columns - 1.0, rows - 1.0])
-    in_rows, in_columns = _span(pixels[..., 1], rows), _span(pixels[..., 0], columns)
+    left, right, top, bottom = kernels.hold(pixels, visible, columns, rows)
+    in_rows, in_columns = _span(top, bottom, rows), _span(left, right, columns)
     patch = corrected_patch(view, in_rows, in_columns)
-    places = np.stack([pixels[..., 1] - in_rows.start, pixels[..., 0] - in_columns.start])
-    return np.asarray(ndimage.map_coordinates(patch, places, order=3, mode="mirror"))
+    coefficients = ndimage.spline_filter(patch, order=3, mode="mirror")
+    values = np.empty((side_px, side_px))
+    kernels.sample(coefficients, pixels, in_rows.start, in_columns.start, values)
+    return values

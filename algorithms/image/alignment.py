@@ -13,12 +13,14 @@ from jaxtyping import Float
 from scipy import ndimage
 from scipy.interpolate import BSpline
 
+from algorithms.image.kernels import quintic as kernels
+
 ORDER: Final = 5
 #: A step below this, pixels, ends the iteration; the one that would follow is smaller by a factor of ten or more.
 TOLERANCE = 1e-3
 #: Pixels around the start that the spline is computed from; what is beyond shifts the result by less than 1e-4 px.
 SURROUND = 12
-_TAPS = np.arange(ORDER + 1)
+_TAPS = np.arange(ORDER + 1) - ORDER // 2
 _BASIS = BSpline.basis_element(np.arange(ORDER + 2) - (ORDER + 1) / 2.0, extrapolate=False)
 _SLOPE = _BASIS.derivative()
 
@@ -30,30 +32,18 @@ def spline_coefficients(image: Float[np.ndarray, "rows columns"]) -> Float[np.nd
 
 def shifted_patch(
     coefficients: Float[np.ndarray, "rows columns"], corner: Float[np.ndarray, "2"], shape: tuple[int, int]
-) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
+) -> Float[np.ndarray, "3 n m"]:
     """The patch of `shape` with its upper left pixel at `corner` (row, column), and its derivatives by row and column.
 
     All pixels share the fraction of the shift, so the spline is a separable filter of six taps. The patch must lie at
     least three pixels inside the picture.
     """
-    whole = np.floor(corner).astype(int)
-    reach = ORDER // 2
-    region = coefficients[
-        whole[0] - reach : whole[0] + shape[0] + reach + 1, whole[1] - reach : whole[1] + shape[1] + reach + 1
-    ]
-    fraction = corner - whole
-    rows = [f(fraction[0] - (_TAPS - reach)) for f in (_BASIS, _SLOPE)]
-    columns = [f(fraction[1] - (_TAPS - reach)) for f in (_BASIS, _SLOPE)]
-    by_rows = [sum(w[k] * region[k : k + shape[0]] for k in _TAPS) for w in rows]
-
-    def along_columns(part: Float[np.ndarray, "_ _"], w: Float[np.ndarray, "_"]) -> Float[np.ndarray, "_ _"]:
-        return np.asarray(sum(w[k] * part[:, k : k + shape[1]] for k in _TAPS))
-
-    return (
-        along_columns(by_rows[0], columns[0]),
-        along_columns(by_rows[1], columns[0]),
-        along_columns(by_rows[0], columns[1]),
-    )
+    whole = np.floor(corner)
+    places = (corner - whole)[:, np.newaxis] - _TAPS
+    taps = np.stack([_BASIS(places), _SLOPE(places)])
+    taken = np.empty((3, *shape))
+    kernels.shifted(coefficients, int(whole[0]), int(whole[1]), taps[:, 0], taps[:, 1], taken)
+    return taken
 
 
 def refine_shift(
@@ -80,7 +70,7 @@ def refine_shift(
     for _ in range(iterations):
         if np.hypot(*(place - start)) > reach or np.any(place < 3.0) or np.any(place > room):
             return None
-        step = _step(a, *shifted_patch(coefficients, place, (template.shape[0], template.shape[1])))
+        step = _step(a, shifted_patch(coefficients, place, (template.shape[0], template.shape[1])))
         if step is None:
             return None
         place = place + step
@@ -89,19 +79,15 @@ def refine_shift(
     return place + near if np.hypot(*(place - start)) <= reach else None
 
 
-def _step(
-    a: Float[np.ndarray, "n m"],
-    patch: Float[np.ndarray, "n m"],
-    by_row: Float[np.ndarray, "n m"],
-    by_column: Float[np.ndarray, "n m"],
-) -> Float[np.ndarray, "2"] | None:
-    """One Gauss-Newton step of the shift (row, column), the gain solved for at once."""
-    b = patch - patch.mean()
+def _step(a: Float[np.ndarray, "n m"], taken: Float[np.ndarray, "3 n m"]) -> Float[np.ndarray, "2"] | None:
+    """One Gauss-Newton step of the shift (row, column), the gain solved for at once; see `shifted_patch`."""
+    b = taken[0] - taken[0].mean()
     energy = float(np.sum(b * b))
     gain = float(np.sum(a * b)) / energy if energy > 0.0 else 0.0
     if gain <= 0.0:
         return None
-    jacobian = gain * np.stack([(by_row - by_row.mean()).ravel(), (by_column - by_column.mean()).ravel()])
+    slopes = taken[1:].reshape(2, -1)
+    jacobian = gain * (slopes - slopes.mean(axis=1, keepdims=True))
     normal = jacobian @ jacobian.T
     if np.linalg.det(normal) <= 1e-10 * np.trace(normal) ** 2:
         return None

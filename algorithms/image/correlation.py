@@ -6,20 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy import fft
 
+from algorithms.image.kernels import correlation as kernels
+
 #: Energy of a patch, relative to that of its brightest value, below which it is rounding and counts as flat.
 FLAT_ENERGY = 1e-12
-
-
-def box_sums(image: Float[np.ndarray, "rows columns"], rows: int, columns: int) -> Float[np.ndarray, "_ _"]:
-    """Sums over every `rows` x `columns` box that fits, shape (rows of image - rows + 1, likewise columns)."""
-    integral = np.zeros((image.shape[0] + 1, image.shape[1] + 1))
-    np.cumsum(np.cumsum(image, axis=0, dtype=np.float64), axis=1, out=integral[1:, 1:])
-    return (
-        integral[rows:, columns:]
-        - integral[:-rows, columns:]
-        - integral[rows:, :-columns]
-        + integral[:-rows, :-columns]
-    )
 
 
 def cross_sums(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ _"]) -> Float[np.ndarray, "_ _"]:
@@ -42,15 +32,9 @@ def pseudo_normalized_correlation(
     columns - m + 1). Values lie in [-1, 1], 1 for equal patches up to a constant; unlike normalised correlation it
     falls when the contrasts of the two differ. Zero where neither has contrast. (DIMES, section II.A.)
     """
-    count = template.size
     scale = max(float(np.abs(template).max()), float(np.abs(window).max()))
     a = template - template.mean(dtype=np.float64)
-    b = window - window.mean(dtype=np.float64)
-    sums = box_sums(b, *template.shape)
-    energy_b = box_sums(b * b, *template.shape) - sums * sums / count
-    energy = float(np.sum(a * a)) + np.maximum(energy_b, 0.0)
-    cross = cross_sums(a, b)
-    correlation = np.divide(
-        2.0 * cross, energy, out=np.zeros_like(energy), where=energy > FLAT_ENERGY * count * scale * scale
-    )
-    return np.asarray(np.clip(correlation, -1.0, 1.0))
+    b = np.ascontiguousarray(window - window.mean(dtype=np.float64))
+    cross = np.ascontiguousarray(cross_sums(a, b))
+    floor = FLAT_ENERGY * template.size * scale * scale
+    return np.asarray(kernels.pseudo_normalized(cross, b, template.shape, float(np.sum(a * a)), floor))

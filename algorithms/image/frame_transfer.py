@@ -15,18 +15,10 @@ Given T this is a linear recursion in P; T itself follows because P_M = T is lin
 from __future__ import annotations
 
 import numpy as np
-import scipy  # its signal is slow to import, and so left until it is called
 from jaxtyping import Float
 
+from algorithms.image.kernels import frame_transfer as kernels
 from sim.measurements import DetectorCalibration
-
-
-def _row_sums(
-    signal: Float[np.ndarray, "rows columns"], own: float, before: float
-) -> Float[np.ndarray, "rows_and_one columns"]:
-    """P_0 = 0, P_(R+1) = P_R + x_R with x_R = (y_R - before P_R) / own, shape (rows + 1, columns)."""
-    sums = scipy.signal.lfilter([1.0 / own], [1.0, before / own - 1.0], signal, axis=0)
-    return np.concatenate([np.zeros((1, signal.shape[1])), sums])
 
 
 def without_frame_transfer(
@@ -61,9 +53,5 @@ def without_frame_transfer(
             f"an exposure of {calibration.exposure_s} s is too short to invert a frame transfer of "
             f"{a} s and {b} s per row with {n} rows summed"
         )
-    values = np.asarray(signal, dtype=np.float64)
-    for_no_total = _row_sums(values, own, before)
-    per_total = _row_sums(np.full((len(values), 1), n * b), own, before)
-    total = for_no_total[-1] / (1.0 + per_total[-1])
-    rates = np.diff(for_no_total - per_total * total, axis=0)
-    return np.asarray(calibration.exposure_s * rates)
+    values = np.ascontiguousarray(signal, dtype=np.float64)
+    return np.asarray(kernels.without(values, calibration.exposure_s, own, before, n * b))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from algorithms.image import kernels
+from algorithms.image.kernels import correlation as kernels
 from algorithms.image.peak import Peak
 
 #: Places searched about a candidate of the level above, pixels: it is right to one pixel, and one more for sampling.

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.image import kernels
 from algorithms.image.alignment import SURROUND, spline_coefficients
+from algorithms.image.kernels import registration as kernels
 
 #: A step below this, pixels, ends the iteration; what is left is less than 1e-3 px.
 TOLERANCE = 3e-3

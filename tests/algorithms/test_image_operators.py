@@ -10,8 +10,9 @@ from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
 from algorithms.image.alignment import refine_shift, shifted_patch, spline_coefficients
-from algorithms.image.correlation import box_sums, pseudo_normalized_correlation
+from algorithms.image.correlation import pseudo_normalized_correlation
 from algorithms.image.interest import harris_interest, local_mean
+from algorithms.image.kernels import cubic
 from algorithms.image.peak import Peak, biquadratic_offset, highest_peak, peak_width, second_peak
 
 
@@ -63,12 +64,6 @@ def test_correlation_is_bounded_and_finite(window: np.ndarray, n: int, m: int) -
     surface = pseudo_normalized_correlation(window[:n, :m], window)
     assert surface.shape == (12 - n, 14 - m)
     assert np.all(np.abs(surface) <= 1.0)
-
-
-def test_box_sums() -> None:
-    image = np.arange(30.0).reshape(5, 6)
-    expected = [[image[i : i + 2, j : j + 3].sum() for j in range(4)] for i in range(4)]
-    np.testing.assert_allclose(box_sums(image, 2, 3), expected)
 
 
 def blobs(seed: int, shift: tuple[float, float] = (0.0, 0.0), size: int = 55, width: float = 1.2) -> np.ndarray:
@@ -127,6 +122,28 @@ def test_shifted_patch_equals_scipys_spline() -> None:
     right = shifted_patch(spline_coefficients(image), corner + np.array([0.0, step]), (9, 11))[0]
     np.testing.assert_allclose(by_row, (ahead - patch) / step, atol=1e-3)
     np.testing.assert_allclose(by_column, (right - patch) / step, atol=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 2), (23, 17)])
+def test_cubic_sampling_equals_scipys(shape: tuple[int, int]) -> None:
+    """Of a part that begins at row 40 and column 30 of a picture, up to the middles of its outermost pixels."""
+    rng = np.random.default_rng(6)
+    image = rng.normal(size=shape)
+    ends = np.stack(np.meshgrid([0.0, shape[1] - 1.0], [0.0, shape[0] - 1.0]), axis=-1)
+    places = np.concatenate([ends, rng.uniform(0.0, 1.0, (2, 30, 2)) * (np.array(shape[::-1]) - 1.0)], axis=1)
+    found = np.empty(places.shape[:2])
+    coefficients = ndimage.spline_filter(image, order=3, mode="mirror")
+    cubic.sample(coefficients, places + np.array([30.0, 40.0]), 40, 30, found)
+    theirs = ndimage.map_coordinates(image, np.moveaxis(places, -1, 0)[::-1], order=3, mode="mirror")
+    # places up to 60 are rounded to 7e-15, slopes are a few units per pixel
+    np.testing.assert_allclose(found, theirs, rtol=0.0, atol=1e-12)
+
+
+def test_pixels_are_held_in_the_picture() -> None:
+    pixels = np.array([[[-3.0, 5.0], [12.5, 99.0]], [[np.nan, np.nan], [31.0, 2.0]]])
+    extent = cubic.hold(pixels, np.array([[True, True], [False, True]]), 20, 10)
+    np.testing.assert_array_equal(pixels, [[[0.0, 5.0], [12.5, 9.0]], [[0.0, 0.0], [19.0, 2.0]]])
+    assert extent == (0.0, 19.0, 0.0, 9.0)
 
 
 def test_biquadratic_is_exact_on_a_quadric() -> None:

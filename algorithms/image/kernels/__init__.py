@@ -1,0 +1,1 @@
+"""Compiled kernels of pictures; the typed functions around them say what they compute."""

@@ -1,0 +1,109 @@
+"""Compiled sampling of quintic splines, from their coefficients."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True)
+def quintic_weights(fraction: float, weights: Array) -> None:
+    """The quintic B-spline's six values about a point `fraction` beyond its pixel, from two pixels before it on."""
+    for k in range(6):
+        x = abs(fraction - (k - 2))
+        if x < 1.0:
+            square = x * x
+            weights[k] = 0.55 + square * (-0.5 + square * (0.25 - x / 12.0))
+        elif x < 2.0:
+            weights[k] = 0.425 + x * (0.625 + x * (-1.75 + x * (1.25 + x * (-0.375 + x / 24.0))))
+        else:
+            rest = 3.0 - x
+            square = rest * rest
+            weights[k] = square * square * rest / 120.0
+
+
+@njit(cache=True)
+def sample(coefficients: Array, side: int, row: float, column: float, matrix: Array, values: Array) -> bool:
+    """Values of the spline at ``middle + matrix @ offset`` for the square of `side` pixels; False if it leaves it."""
+    half = 0.5 * (side - 1)
+    down, across = np.empty(6), np.empty(6)
+    last_row, last_column = coefficients.shape[0] - 4, coefficients.shape[1] - 4
+    for i in range(side):
+        for j in range(side):
+            y, x = i - half, j - half
+            v = row + matrix[0, 0] * y + matrix[0, 1] * x
+            u = column + matrix[1, 0] * y + matrix[1, 1] * x
+            if not (v >= 2.0 and u >= 2.0 and v <= last_row and u <= last_column):
+                return False
+            r, c = int(v), int(u)
+            quintic_weights(v - r, down)
+            quintic_weights(u - c, across)
+            total = 0.0
+            for a in range(6):
+                line = coefficients[r + a - 2]
+                part = 0.0
+                for b in range(6):
+                    part += across[b] * line[c + b - 2]
+                total += down[a] * part
+            values[i * side + j] = total
+    return True
+
+
+@njit(cache=True)
+def sample_shifted(coefficients: Array, side: int, row: float, column: float, values: Array) -> bool:
+    """`sample` without stretch: all pixels share the fraction of the shift, so that rows and columns separate."""
+    half = 0.5 * (side - 1)
+    v, u = row - half, column - half
+    if not (v >= 2.0 and u >= 2.0 and v + side <= coefficients.shape[0] - 3):
+        return False
+    if not u + side <= coefficients.shape[1] - 3:
+        return False
+    r, c = int(v), int(u)
+    down, across = np.empty(6), np.empty(6)
+    quintic_weights(v - r, down)
+    quintic_weights(u - c, across)
+    lines = np.empty((side + 5, side))
+    for i in range(side + 5):
+        line = coefficients[r + i - 2]
+        out = lines[i]
+        for j in range(side):
+            total = 0.0
+            for b in range(6):
+                total += across[b] * line[c + j + b - 2]
+            out[j] = total
+    for i in range(side):
+        for j in range(side):
+            total = 0.0
+            for a in range(6):
+                total += down[a] * lines[i + a, j]
+            values[i * side + j] = total
+    return True
+
+
+@njit(cache=True)
+def shifted(coefficients: Array, row: int, column: int, down: Array, across: Array, taken: Array) -> None:
+    """A patch of the spline with its upper left pixel at (row, column) and a fraction, and its two derivatives.
+
+    `down` and `across` are the six taps along rows and columns, first of values, then of slopes, shape (2, 6), from two
+    pixels before it on. `taken`, shape (3, rows, columns), gets values, derivatives by row and derivatives by column.
+    """
+    _, height, width = taken.shape
+    values, slopes = np.empty(width + 5), np.empty(width + 5)
+    for i in range(height):
+        for j in range(width + 5):
+            value, slope = 0.0, 0.0
+            for k in range(6):
+                place = coefficients[row + i + k - 2, column + j - 2]
+                value += down[0, k] * place
+                slope += down[1, k] * place
+            values[j], slopes[j] = value, slope
+        for j in range(width):
+            value, by_row, by_column = 0.0, 0.0, 0.0
+            for k in range(6):
+                value += across[0, k] * values[j + k]
+                by_row += across[0, k] * slopes[j + k]
+                by_column += across[1, k] * values[j + k]
+            taken[0, i, j], taken[1, i, j], taken[2, i, j] = value, by_row, by_column

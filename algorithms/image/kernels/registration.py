@@ -1,0 +1,145 @@
+"""Compiled registration; `algorithms.image.registration` says what it is and checks what it is given."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from algorithms.image.kernels.quintic import sample, sample_shifted
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True)
+def design_rows(template: Array, unknowns: int) -> Array:
+    """What a patch is explained by, one row each: the template and a constant; shift (2); stretch (4, if asked for)."""
+    side = template.shape[0]
+    half = 0.5 * (side - 1)
+    mean = template.mean()
+    rows = np.empty((unknowns, side * side))
+    for i in range(side):
+        for j in range(side):
+            up, down = max(i - 1, 0), min(i + 1, side - 1)
+            left, right = max(j - 1, 0), min(j + 1, side - 1)
+            by_row = (template[down, j] - template[up, j]) / (down - up)
+            by_column = (template[i, right] - template[i, left]) / (right - left)
+            k = i * side + j
+            rows[0, k], rows[1, k] = template[i, j] - mean, 1.0
+            rows[2, k], rows[3, k] = by_row, by_column
+            if unknowns == 8:
+                y, x = i - half, j - half
+                rows[4, k], rows[5, k] = by_row * y, by_row * x
+                rows[6, k], rows[7, k] = by_column * y, by_column * x
+    return rows
+
+
+@njit(cache=True)
+def cholesky(matrix: Array, singular: float) -> bool:
+    """Replaces a matrix with ones on its diagonal by its lower factor; False where a pivot is below `singular`."""
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= matrix[i, k] * matrix[j, k]
+            if i == j:
+                if not rest > singular:
+                    return False
+                matrix[i, i] = math.sqrt(rest)
+            else:
+                matrix[i, j] = rest / matrix[j, j]
+    return True
+
+
+@njit(cache=True)
+def solve(lower: Array, right: Array) -> None:
+    """Replaces the right side by the solution of ``lower lower^T x = right``."""
+    size = len(right)
+    for i in range(size):
+        for k in range(i):
+            right[i] -= lower[i, k] * right[k]
+        right[i] /= lower[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            right[i] -= lower[k, i] * right[k]
+        right[i] /= lower[i, i]
+
+
+@njit(cache=True)
+def register(
+    template: Array,
+    coefficients: Array,
+    row: float,
+    column: float,
+    stretch: bool,
+    limits: tuple[float, float, int],
+    tolerance: float,
+    singular: float,
+) -> tuple[bool, float, float, float]:
+    """Whether it converged, the middle's row and column and the correlation there: see `registration.registered`.
+
+    `limits` are the largest shift, the largest entry of the stretch and the number of steps.
+    """
+    side = template.shape[0]
+    unknowns = 8 if stretch else 4
+    rows = design_rows(template, unknowns)
+    scales = np.sqrt(np.sum(rows * rows, axis=1))
+    failed = (False, row, column, 0.0)
+    for p in range(unknowns):
+        if not scales[p] > 0.0:
+            return failed
+        rows[p] /= scales[p]
+    lower = np.empty((unknowns, unknowns))
+    for p in range(unknowns):
+        for q in range(p + 1):
+            lower[p, q] = np.sum(rows[p] * rows[q])
+    if not cholesky(lower, singular):
+        return failed
+    values = np.empty(side * side)
+    found = np.empty(unknowns)
+    matrix = np.eye(2)
+    v, u, score = row, column, 0.0
+    for step in range(limits[2]):
+        if stretch and step > 0:
+            inside = sample(coefficients, side, v, u, matrix, values)
+        else:
+            inside = sample_shifted(coefficients, side, v, u, values)
+        if not inside:
+            return failed
+        values -= values.mean()
+        for p in range(unknowns):
+            found[p] = np.sum(rows[p] * values)
+        spread = math.sqrt(np.sum(values * values))
+        if not (found[0] > 0.0 and spread > 0.0):
+            return failed
+        score = found[0] / spread
+        solve(lower, found)
+        for p in range(unknowns):
+            found[p] /= scales[p]
+        gain = found[0]
+        if not gain > 0.0:
+            return failed
+        turn = 0.0
+        if stretch:
+            # the template was stretched by 1 + e: undo it before (composition with the inverse)
+            a, b, c, d = 1.0 + found[4] / gain, found[5] / gain, found[6] / gain, 1.0 + found[7] / gain
+            determinant = a * d - b * c
+            if abs(determinant) < 0.1:
+                return failed
+            turn = max(abs(a - 1.0), abs(b), abs(c), abs(d - 1.0))
+            m00, m01, m10, m11 = matrix[0, 0], matrix[0, 1], matrix[1, 0], matrix[1, 1]
+            matrix[0, 0] = (m00 * d - m01 * c) / determinant
+            matrix[0, 1] = (m01 * a - m00 * b) / determinant
+            matrix[1, 0] = (m10 * d - m11 * c) / determinant
+            matrix[1, 1] = (m11 * a - m10 * b) / determinant
+        dv = (matrix[0, 0] * found[2] + matrix[0, 1] * found[3]) / gain
+        du = (matrix[1, 0] * found[2] + matrix[1, 1] * found[3]) / gain
+        v, u = v - dv, u - du
+        largest = max(abs(matrix[0, 0] - 1.0), abs(matrix[0, 1]), abs(matrix[1, 0]), abs(matrix[1, 1] - 1.0))
+        if math.hypot(v - row, u - column) > limits[0] or largest > limits[1]:
+            return failed
+        if math.hypot(dv, du) < tolerance and turn * side < 20.0 * tolerance:
+            return True, v, u, score
+    return failed
