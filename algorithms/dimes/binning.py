@@ -79,22 +79,41 @@ def bin_mean(
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def view(image: DetectorImage, world_from_body: Rotation, altitude_m: float, binned_size: tuple[int, int]) -> View:
-    """The binned picture, with its camera placed above the ground plane by measured attitude and altitude.
+def placed_camera(
+    camera: CameraModel, world_from_body: Rotation, altitude_m: float
+) -> tuple[CameraModel, Float[np.ndarray, "3"]]:
+    """A body's camera above the ground plane by attitude and altitude, in a view's ground frame, and its place there.
 
     The altitude is taken as that of the body's origin; the camera's own height follows from its place in the body.
     """
-    columns, rows = bin_factors(image.counts.shape, binned_size)
-    lever = world_from_body.as_matrix() @ image.camera.c
+    lever = world_from_body.as_matrix() @ camera.c
     placed = rigid(world_from_body, np.array([-lever[0], -lever[1], altitude_m]))
+    return camera.moved(placed), np.array([0.0, 0.0, altitude_m + lever[2]])
+
+
+def view(
+    image: DetectorImage,
+    world_from_body: Rotation,
+    altitude_m: float,
+    binned_size: tuple[int, int],
+    before: View | None = None,
+) -> View:
+    """The binned picture, with its camera placed above the ground plane by measured attitude and altitude.
+
+    The view `before` lends its flat field where both have one calibration.
+    """
+    columns, rows = bin_factors(image.counts.shape, binned_size)
+    known = image.calibration
+    camera, centre = placed_camera(image.camera.binned(columns, rows), world_from_body, altitude_m)
+    shared = before if before is not None and before.calibration is known else None
     return View(
-        signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(image.calibration.offset_dn),
-        flat_field=bin_mean(image.calibration.flat_field, columns, rows),
-        camera=image.camera.binned(columns, rows).moved(placed),
-        centre=np.array([0.0, 0.0, altitude_m + lever[2]]),
+        signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(known.offset_dn),
+        flat_field=bin_mean(known.flat_field, columns, rows) if shared is None else shared.flat_field,
+        camera=camera,
+        centre=centre,
         time_s=image.time_s,
-        calibration=image.calibration,
-        rows_summed=image.calibration.rows_summed * rows,
+        calibration=known,
+        rows_summed=known.rows_summed * rows,
     )
 
 
@@ -127,10 +146,11 @@ def usable_views(measurements: DescentMeasurements, binned_size: tuple[int, int]
     times = np.array([image.time_s for image in measurements.images])
     if not (np.all(np.isfinite(altitudes)) and np.all(np.isfinite(times)) and np.all(np.diff(times) > 0.0)):
         return None
-    first, second, third = (
-        view(image, attitude.world_from_body, float(altitude), binned_size)
-        for image, attitude, altitude in zip(measurements.images, measurements.attitudes, altitudes, strict=True)
-    )
+    views: list[View] = []
+    for image, attitude, altitude in zip(measurements.images, measurements.attitudes, altitudes, strict=True):
+        before = views[-1] if views else None
+        views.append(view(image, attitude.world_from_body, float(altitude), binned_size, before))
+    first, second, third = views
     lowest, highest = HEIGHTS_M
-    in_range = all(lowest <= one.centre[2] <= highest for one in (first, second, third))
+    in_range = all(lowest <= one.centre[2] <= highest for one in views)
     return (first, second, third) if in_range else None

@@ -30,9 +30,10 @@ def pixels_from_ground(
     view: View, ground: Float[np.ndarray, "*shape 2"]
 ) -> tuple[Float[np.ndarray, "*shape 2"], Bool[np.ndarray, "*shape"]]:
     """Pixels (u, v) of ground points (east, north), and whether the optics can image them (in frame or out of it)."""
-    flat = ground.reshape(-1, 2)
-    pixels, visible = view.camera.project(np.column_stack([flat, np.zeros(len(flat))]))
-    return pixels.reshape(ground.shape), visible.reshape(ground.shape[:-1])
+    points = np.zeros((*ground.shape[:-1], 3))
+    points[..., :2] = ground
+    pixels, visible = view.camera.project(points)
+    return pixels, visible
 
 
 def inside_frame(
@@ -70,6 +71,6 @@ def square(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
 
 def square_outline(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
     """The points of `square` that lie on its outline."""
-    points = square(half_m, per_side)
-    on_edge = np.isclose(np.abs(points).max(axis=1), half_m)
-    return np.asarray(points[on_edge])
+    on_edge = np.ones((per_side, per_side), dtype=bool)
+    on_edge[1:-1, 1:-1] = False
+    return np.asarray(square(half_m, per_side)[on_edge.ravel()])

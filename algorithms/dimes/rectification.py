@@ -25,8 +25,10 @@ SPLINE_MARGIN = 10
 def ground_lattice(centre: Float[np.ndarray, "2"], side_px: int, gsd_m: float) -> Float[np.ndarray, "side side 2"]:
     """Ground points (east, north) of the pixels of a square patch about `centre`, shape (side, side, 2), metres."""
     steps = (np.arange(side_px) - 0.5 * (side_px - 1)) * gsd_m
-    east, north = np.meshgrid(centre[0] + steps, centre[1] - steps)
-    return np.stack([east, north], axis=-1)
+    lattice = np.empty((side_px, side_px, 2))
+    lattice[..., 0] = centre[0] + steps
+    lattice[..., 1] = (centre[1] - steps)[:, np.newaxis]
+    return lattice
 
 
 def _span(least: float, largest: float, size: int) -> slice:

@@ -8,26 +8,22 @@ from jaxtyping import Bool, Float
 from algorithms.dimes.binning import View
 from algorithms.dimes.options import DimesOptions
 from algorithms.dimes.overlap import Candidates
-from algorithms.image.interest import harris_interest, local_mean
+from algorithms.image.interest import harris_interest, local_mean, structure_tensor
 
 #: Fraction of the full scale below which a mean signal no longer divides the interest: darkness is not contrast.
 DARK_FRACTION = 0.01
 
 
-def contrast_map(view: View, support: int) -> Float[np.ndarray, "rows columns"]:
-    """Harris interest over a square of `support` pixels over the mean signal there, per pixel, shape (rows, columns).
+def contrasts(view: View, pixels: Float[np.ndarray, "n 2"], support: int) -> Float[np.ndarray, "n"]:
+    """Harris interest over a square of `support` pixels about whole pixels (u, v), over the mean signal there.
 
     Computed on the picture as delivered: only templates and windows are corrected. The frame-transfer ramp is smooth
     along columns and changes the interest little, because Harris asks for structure in both directions.
     """
-    mean = np.maximum(local_mean(view.signal, support), DARK_FRACTION * view.calibration.full_scale_dn)
-    return np.asarray(harris_interest(view.signal, support) / mean)
-
-
-def at_pixels(image: Float[np.ndarray, "rows columns"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-    """Values of the image at whole pixels (u, v)."""
-    whole = np.rint(pixels).astype(int)
-    return np.asarray(image[whole[:, 1], whole[:, 0]])
+    columns, rows = np.rint(pixels).astype(int).T
+    uu, vv, uv = (part[rows, columns] for part in structure_tensor(view.signal, support))
+    mean = local_mean(view.signal, support)[rows, columns]
+    return np.asarray(harris_interest(uu, vv, uv) / np.maximum(mean, DARK_FRACTION * view.calibration.full_scale_dn))
 
 
 def best_candidates(
@@ -54,9 +50,9 @@ def best_candidates(
 def select_templates(
     view: View, candidates: Candidates, options: DimesOptions
 ) -> tuple[list[int], Float[np.ndarray, "k"]]:
-    """The chosen candidates' indices, best first, and the contrast of each (see `contrast_map`)."""
-    contrasts = at_pixels(contrast_map(view, options.template_px), candidates.pixels)
+    """The chosen candidates' indices, best first, and the contrast of each (see `contrasts`)."""
+    found = contrasts(view, candidates.pixels, options.template_px)
     chosen = best_candidates(
-        contrasts, candidates.pixels, candidates.preferred, options.templates_per_pair, options.exclusion_px
+        found, candidates.pixels, candidates.preferred, options.templates_per_pair, options.exclusion_px
     )
-    return chosen, contrasts[chosen]
+    return chosen, found[chosen]

@@ -29,7 +29,7 @@ class TrackMetrics:
     Attributes
     ----------
     contrast
-        Harris interest of the template divided by its mean signal, per binned pixel (see `selection.contrast_map`).
+        Harris interest of the template divided by its mean signal, per binned pixel (see `selection.contrasts`).
     peak
         Height of the correlation peak, at most 1.
     peak_width_px

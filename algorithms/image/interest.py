@@ -30,14 +30,15 @@ def structure_tensor(
     )
 
 
-def harris_interest(image: Float[np.ndarray, "rows columns"], support: int) -> Float[np.ndarray, "rows columns"]:
-    """Harris interest over a square of `support` pixels, in counts per pixel.
+def harris_interest(
+    uu: Float[np.ndarray, "*shape"], vv: Float[np.ndarray, "*shape"], uv: Float[np.ndarray, "*shape"]
+) -> Float[np.ndarray, "*shape"]:
+    """Harris interest of entries of `structure_tensor`, in counts per pixel.
 
     It is Noble's form of the Harris operator, ``determinant / trace`` of the mean structure tensor, which needs no
     constant to be chosen; ``sqrt(2 determinant / trace)`` is the root mean square gradient per axis when structure is
     the same in all directions, and near zero when there is none, or when it runs in one direction only.
     """
-    uu, vv, uv = structure_tensor(image, support)
     determinant = np.maximum(uu * vv - uv * uv, 0.0)
     trace = uu + vv
     ratio = np.divide(2.0 * determinant, trace, out=np.zeros_like(trace), where=trace > 0)

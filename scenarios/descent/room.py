@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from algorithms.dimes import DimesOptions
-from algorithms.dimes.binning import View, view
+from algorithms.dimes.binning import View, bin_factors, placed_camera
 from algorithms.dimes.overlap import search_geometry, template_candidates
 from sim.camera import CameraModel
 from sim.dynamics import State
-from sim.measurements import DetectorCalibration, DetectorImage
+from sim.measurements import DetectorCalibration
 from sim.terrain import Surface
 
 #: Width of the ground patch whose mean height is the ground's, m.
@@ -52,6 +52,8 @@ def _view(
     state: State, surface: Surface, camera: CameraModel, calibration: DetectorCalibration, options: DimesOptions
 ) -> View:
     """A picture's geometry; what it shows does not matter."""
-    columns, rows = camera.size
-    image = DetectorImage(np.zeros((rows, columns), dtype=np.uint16), state.time_s, camera, calibration)
-    return view(image, state.attitude, true_altitude_m(surface, state.position_m), options.binned_size)
+    columns, rows = bin_factors(camera.size[::-1], options.binned_size)
+    altitude_m = true_altitude_m(surface, state.position_m)
+    placed, centre = placed_camera(camera.binned(columns, rows), state.attitude, altitude_m)
+    blank = np.zeros(options.binned_size[::-1], dtype=np.float32)
+    return View(blank, blank, placed, centre, state.time_s, calibration, calibration.rows_summed * rows)

@@ -28,7 +28,7 @@ from algorithms.dimes.overlap import (
     zero_phase_pixel,
 )
 from algorithms.dimes.rectification import ground_lattice, rectified_patch
-from algorithms.dimes.selection import at_pixels, best_candidates, contrast_map, select_templates
+from algorithms.dimes.selection import best_candidates, contrasts, select_templates
 from sim.frames import direction
 from sim.measurements import DetectorImage
 
@@ -208,11 +208,11 @@ def test_selection_finds_the_only_textured_place() -> None:
     seen = blank(Rotation.identity(), 2000.0, 0.0, counts)
     pixels = grid_pixels(seen.size, OPTIONS.grid_step_px)
     places = Candidates(pixels, pixels, np.ones(len(pixels), dtype=bool))
-    chosen, contrasts = select_templates(seen, places, OPTIONS)
+    chosen, of_chosen = select_templates(seen, places, OPTIONS)
     np.testing.assert_allclose(pixels[chosen[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
-    assert contrasts[0] > 0.02
-    assert contrasts[1] < 0.001
-    assert at_pixels(contrast_map(seen, OPTIONS.template_px), pixels)[chosen[0]] == contrasts[0]
+    assert of_chosen[0] > 0.02
+    assert of_chosen[1] < 0.001
+    assert contrasts(seen, pixels, OPTIONS.template_px)[chosen[0]] == of_chosen[0]
 
 
 def chart() -> Texture:

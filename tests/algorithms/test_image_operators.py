@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from algorithms.image.alignment import refine_shift, shifted_patch, spline_coefficients
 from algorithms.image.correlation import pseudo_normalized_correlation
-from algorithms.image.interest import harris_interest, local_mean
+from algorithms.image.interest import harris_interest, local_mean, structure_tensor
 from algorithms.image.kernels import cubic
 from algorithms.image.peak import Peak, biquadratic_offset, highest_peak, peak_width, second_peak
 
@@ -190,11 +190,12 @@ def test_second_peak_is_a_maximum_of_its_own() -> None:
 def test_interest_asks_for_structure_in_both_directions() -> None:
     u, v = np.meshgrid(np.arange(64.0), np.arange(64.0))
     one_way, both_ways = 10.0 * np.sin(0.3 * u), 10.0 * (np.sin(0.3 * u) + np.sin(0.3 * v))
-    assert harris_interest(one_way, 21)[32, 32] < 0.05 * harris_interest(both_ways, 21)[32, 32]
+    interest = [harris_interest(*structure_tensor(image, 21)) for image in (one_way, both_ways)]
+    assert interest[0][32, 32] < 0.05 * interest[1][32, 32]
     # RMS gradient per axis is 10 * 0.3 / sqrt(2) = 2.12; Sobel's difference over two pixels damps by sin(0.3) / 0.3,
     # and 21 pixels are one period of 20.9.
-    assert harris_interest(both_ways, 21)[32, 32] == pytest.approx(2.12 * np.sin(0.3) / 0.3, rel=0.02)
-    assert np.all(harris_interest(np.full((64, 64), 7.0), 21) == 0.0)
+    assert interest[1][32, 32] == pytest.approx(2.12 * np.sin(0.3) / 0.3, rel=0.02)
+    assert np.all(harris_interest(*structure_tensor(np.full((64, 64), 7.0), 21)) == 0.0)
 
 
 def test_local_mean() -> None:
