@@ -46,12 +46,15 @@ class Source:
         return contents.decode("latin-1")
 
     def head(self, count: int) -> bytes:
-        """The file's first bytes."""
+        """The file's first bytes, of which there must be some."""
         try:
             with Path(self.path).open("rb") as file:
-                return file.read(count)
+                read = file.read(count)
         except OSError as fault:
             raise self.error("file", f"cannot be read ({fault.strerror})", "a readable camera file") from fault
+        if not read:
+            raise self.error("file", "is empty (0 bytes)", "a camera file")
+        return read
 
 
 #: The models by their names, whose letters are the names of their vectors.

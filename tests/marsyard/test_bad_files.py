@@ -1,0 +1,138 @@
+"""Files that cannot be meant: the command names file and fault, and ends with status 2, whatever the file is."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from folders import read_rows, velocity_folder, write_texts
+from rasterio.crs import CRS
+from rasterio.transform import Affine
+from typer.testing import CliRunner
+
+from marsyard.cli import app
+from scenarios.conformance import inputs
+
+MARS = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
+DEGREES = CRS.from_string("+proj=longlat +R=3396190 +no_defs")
+HOLE = -32767.0
+
+#: Writes a file into a folder.
+Write = Callable[[Path], object]
+
+
+def dtm(path: Path, *, crs: CRS = MARS, unit: str = "m", nodata: float | None = HOLE, side: int = 40) -> None:
+    heights = np.full((40, 40), -4450.0, dtype=np.float32)
+    heights[7, 7] = HOLE
+    profile = {"driver": "GTiff", "count": 1, "dtype": "float32", "nodata": nodata, "SPARSE_OK": "TRUE"}
+    place = {"crs": crs, "transform": Affine(1.0, 0.0, 8e6, 0.0, -1.0, -3e5), "height": side, "width": side}
+    with warnings.catch_warnings(), rasterio.open(path, "w", **profile, **place) as file:
+        warnings.simplefilter("ignore")
+        if side == 40:
+            file.write(heights, 1)
+        file.units = (unit,)
+
+
+def flight(path: Path, place: int, column: int, value: float) -> None:
+    """A fall with one number of one pose changed; of a quaternion's x, all poses are turned upside down."""
+    times = np.arange(-6.0, 22.0, 0.5)
+    poses = np.zeros((times.size, 8))
+    poses[:, 0], poses[:, 3], poses[:, 7] = times, 1900.0 - 75.0 * times, 1.0
+    poses[place, column] = value
+    if column == 4:
+        poses[:, 4:] = [1.0, 0.0, 0.0, 0.0]
+    head = "time_s,x_m,y_m,z_m,qx,qy,qz,qw"
+    np.savetxt(path, poses, delimiter=",", header=head, comments="")
+
+
+def gigabyte(path: Path, head: bytes = b"") -> None:
+    """A file of 1 GiB, of which nothing but its head takes room on the disk."""
+    with path.open("wb") as file:
+        file.write(head)
+        file.truncate(1 << 30)
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+CAMERA = '[parameters.camera]\nmodel = "{}"'
+TERRAIN = '[parameters.terrain.source]\ndtm = "{}"'
+FLIGHT = '[parameters.flight]\nfile = "{}"\naxes = "enu"\nattitude_of = "body"'
+MESH = '[[parameters.meshes]]\nfile = "{}"\nkind = "rock"\neast_m = 1.0\nnorth_m = 1.0\nsize_m = 1.0'
+DETECTOR = '[parameters.detector]\nfile = "{}"'
+
+
+@pytest.mark.parametrize(
+    ("table", "name", "write", "said"),
+    [
+        (TERRAIN, "projection.tif", lambda path: dtm(path, crs=DEGREES), "is in degrees; project it to metres"),
+        (TERRAIN, "nodata.tif", lambda path: dtm(path, nodata=None), "states no nodata value"),
+        (TERRAIN, "units.tif", lambda path: dtm(path, unit="ft"), "its heights are in 'ft'; metres are needed"),
+        (TERRAIN, "huge.tif", lambda path: dtm(path, side=16384), "has 16384 x 16384 values; at most 5461"),
+        (TERRAIN, "empty.tif", empty, "is empty (0 bytes)"),
+        (FLIGHT, "nan.csv", lambda path: flight(path, 9, 2, np.nan), "pose 10: y_m is not finite"),
+        (FLIGHT, "back.csv", lambda path: flight(path, 9, 0, -9.0), "pose 10: time goes from -2.000000 to -9.000000"),
+        (FLIGHT, "length.csv", lambda path: flight(path, 9, 7, 2.0), "pose 10: the quaternion's length is 2; allowed"),
+        (FLIGHT, "up.csv", lambda path: flight(path, 9, 4, 1.0), "at picture 1 the camera looks up, 90.0 deg"),
+        (FLIGHT, "huge.csv", gigabyte, "larger than 512 MiB"),
+        (FLIGHT, "empty.csv", empty, "has 0 poses; allowed: at least 4"),
+        (CAMERA, "empty.yaml", empty, "is empty (0 bytes)"),
+        (CAMERA, "huge.yaml", lambda path: gigabyte(path, b"image_width: 640\n"), "is larger than 8 MiB"),
+        (CAMERA, "huge.IMG", lambda path: gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"), "END: missing in the first"),
+        (MESH, "empty.stl", empty, "holds no triangle"),
+        (MESH, "huge.stl", gigabyte, "is larger than 256 MiB"),
+        (DETECTOR, "empty_sheet.toml", empty, "pixel_pitch_um: Field required"),
+        (DETECTOR, "huge_sheet.toml", gigabyte, "larger than 1 MiB"),
+    ],
+    ids=lambda value: value if isinstance(value, str) and "." in value and "\n" not in value else "",
+)
+def test_a_campaign_that_names_it_is_refused(tmp_path: Path, table: str, name: str, write: Write, said: str) -> None:
+    write(tmp_path / name)
+    campaign = tmp_path / "campaign.toml"
+    campaign.write_text(f'name = "bad"\nscenario = "descent"\ncases = 1\n{table.format(tmp_path / name)}\n')
+    refused(["run", str(campaign), "--out", str(tmp_path / "run")], tmp_path / name, said)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("write", "said"),
+    [
+        (lambda path: gigabyte(path, b"P5 32768 32768 255\n"), "has 32768 x 32768 pixels; its camera has 1024 x 256"),
+        (lambda path: gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"), "END: missing in the first"),
+        (empty, "is empty (0 bytes)"),
+    ],
+)
+def test_a_picture_is_refused(tmp_path: Path, write: Write, said: str) -> None:
+    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    write(folder / "drop-1.png")
+    refused(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "drop-1.png", said)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("cells", "said"),
+    [
+        ({"qx": "nan"}, "line 3: qx is 'nan'; allowed: a finite number"),
+        ({"time_s": "0.0"}, "line 3: time goes from 100 to 0 s"),
+        ({"qw": "2.0"}, "line 3: the quaternion qx to qw has the length"),
+        ({"qx": "1", "qy": "0", "qz": "0", "qw": "0"}, "line 3: the camera looks up, 90.0 deg"),
+    ],
+)
+def test_a_table_is_refused(tmp_path: Path, cells: dict[str, str], said: str) -> None:
+    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    write_texts(folder, [row | cells if place == 1 else row for place, row in enumerate(read_rows(folder))])
+    refused(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "pictures.csv", said)
+
+
+def refused(words: list[str], path: Path, said: str) -> None:
+    ended = CliRunner().invoke(app, words)
+    assert (ended.exit_code, type(ended.exception)) == (2, SystemExit)
+    message = ended.output
+    assert message.startswith("error: ")
+    assert str(path) in message
+    assert said in message
