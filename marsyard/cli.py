@@ -109,11 +109,13 @@ def show(
 
 
 @app.command()
-def doctor() -> None:
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
     """Examine the machine and the installation, and say how to mend what is amiss."""
     from marsyard.doctor import run as examine
 
-    raise typer.Exit(examine(console()))
+    raise typer.Exit(examine(console(), as_json=as_json))
 
 
 def _version(asked: bool) -> None:

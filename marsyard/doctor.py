@@ -69,9 +69,18 @@ class Check:
     mend: str = ""
 
 
-def run(console: Console) -> int:
-    """Examines the machine and the installation and prints a table; 0 if a campaign can run here, otherwise 1."""
+def run(console: Console, *, as_json: bool = False) -> int:
+    """Examines the machine and the installation, and prints a table or JSON; 0 if a campaign can run here, else 1."""
     checks = list(examine())
+    failed = [check.name for check in checks if check.verdict is Verdict.FAIL]
+    if as_json:
+        told = {"version": importlib.metadata.version("marsyard"), "root": str(ROOT), "can_run": not failed}
+        plain = [
+            {"check": check.name, "found": check.found, "verdict": check.verdict.name.lower(), "mend": check.mend}
+            for check in checks
+        ]
+        console.print(json.dumps({**told, "checks": plain}, indent=2), markup=False, highlight=False, soft_wrap=True)
+        return 1 if failed else 0
     table = Table(title=f"Marsyard {importlib.metadata.version('marsyard')} in {ROOT}", title_justify="left")
     for heading in ("check", "found", "verdict"):
         table.add_column(heading, overflow="fold")
@@ -81,7 +90,6 @@ def run(console: Console) -> int:
     for check in checks:
         if check.mend:
             console.print(Text(f"{check.name}: {check.mend}"), soft_wrap=True)
-    failed = [check.name for check in checks if check.verdict is Verdict.FAIL]
     if failed:
         console.print(Text(f"A campaign cannot run here: {', '.join(failed)}.", "red"), soft_wrap=True)
         return 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import tempfile
@@ -62,18 +63,23 @@ def report(
 def compare(
     first: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a campaign that was run.")],
     second: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of another.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Set two stored campaigns side by side: success, answers and errors, and whether they differ.
 
     Exit status 0 in any event: a difference is no verdict.
     """
     from marsyard.showing import grid_table
-    from reports.between import contrast_grid, contrasts, same_grounds
+    from reports.between import contrast_data, contrast_grid, contrasts, same_grounds
     from reports.stored import read_run
 
     runs = [read_run(directory) for directory in (first, second)]
     paired, found = contrasts(*runs)
     names = [str(run.directory) for run in runs]
+    if as_json:
+        told = {"first": names[0], "second": names[1], "paired": paired, "same_terrains": same_grounds(*runs)}
+        typer.echo(json.dumps({**told, "figures": contrast_data(found)}, indent=2))
+        return
     out = console()
     out.print(grid_table("Side by side", contrast_grid(["first", "second"], found)))
     for place, name in zip(("first", "second"), names, strict=True):

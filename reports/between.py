@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -133,6 +134,24 @@ def contrast_grid(names: Sequence[str], found: Sequence[Contrast]) -> Grid:
     """The figures side by side, as texts."""
     head = ["", *names, "p"]
     return Grid(head, [[one.name, one.first.text, one.second.text, p_text(one.p_value)] for one in found])
+
+
+def contrast_data(found: Sequence[Contrast]) -> list[dict[str, Any]]:
+    """The same as plain data: a rate or a median of each campaign with its cases; None for what is not known."""
+    return [
+        {
+            "name": one.name,
+            "first": _level_data(one.first),
+            "second": _level_data(one.second),
+            "p": None if math.isnan(one.p_value) else one.p_value,
+        }
+        for one in found
+    ]
+
+
+def _level_data(figure: Figure) -> dict[str, Any]:
+    cases = int(np.isfinite(figure.values).sum())
+    return {"rate" if figure.larger_is_better else "median": figure.level if cases else None, "cases": cases}
 
 
 def p_text(value: float) -> str:

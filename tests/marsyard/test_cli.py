@@ -299,7 +299,7 @@ def test_names_in_brackets_are_not_markup(tmp_path: Path, marsyard: Command) -> 
 
 def test_version_and_doctor(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     assert re.fullmatch(r"marsyard \d+\.\d+\.\d+\n", marsyard("--version").out)
-    monkeypatch.setattr("marsyard.doctor.run", lambda console: console.print("looked") or 1)
+    monkeypatch.setattr("marsyard.doctor.run", lambda console, as_json: console.print("looked") or 1)
     ended = marsyard("doctor")
     assert (ended.status, ended.out) == (1, "looked\n")
 

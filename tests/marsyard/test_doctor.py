@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import io
+import json
 import os
 import sys
 import tomllib
@@ -24,9 +25,9 @@ SOUND = Probe({"renderer": "r", "version": "v", "depth_error_m": 1e-5, "offset_p
 ABSENT = Probe(None, "ImportError: no library")
 
 
-def examined() -> tuple[int, str]:
+def examined(*, as_json: bool = False) -> tuple[int, str]:
     console = Console(file=io.StringIO(), width=200)
-    status = doctor.run(console)
+    status = doctor.run(console, as_json=as_json)
     assert isinstance(console.file, io.StringIO)
     return status, console.file.getvalue()
 
@@ -50,6 +51,12 @@ def test_only_failures_count(one_check: Callable[[Check], None], verdict: Verdic
     assert got == status
     assert "three [left]" in text
     assert "teeth: see a dentist" in text
+    got, text = examined(as_json=True)
+    told = json.loads(text)
+    assert (got, told["can_run"]) == (status, status == 0)
+    assert told["checks"] == [
+        {"check": "teeth", "found": "three [left]", "verdict": verdict.name.lower(), "mend": "see a dentist"}
+    ]
 
 
 def test_depth_of_a_frame_is_measured_against_the_plane() -> None:

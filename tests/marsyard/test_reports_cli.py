@@ -108,10 +108,15 @@ def test_a_pdf_is_printed(make_run: MakeRun, marsyard: Command, monkeypatch: pyt
 
 
 def test_two_campaigns_side_by_side(make_run: MakeRun, marsyard: Command) -> None:
-    status, out, err = marsyard("compare", make_run("a"), make_run("b", 2, seed=8))
+    both = make_run("a"), make_run("b", 2, seed=8)
+    status, out, err = marsyard("compare", *both)
     assert (status, err) == (0, "")
     assert "came to an end" in out
     assert "draws of their own" in out
+    told = json.loads(marsyard("compare", *both, "--json")[1])
+    assert (told["second"], told["paired"]) == (str(both[1]), False)
+    figures = {one["name"]: one for one in told["figures"]}
+    assert figures["came to an end"]["first"] == {"rate": 1.0, "cases": 40}
 
 
 def test_a_dashboard_is_written_and_served_on_this_machine_alone(
