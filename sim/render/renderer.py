@@ -218,6 +218,7 @@ class Renderer:
         self._backend = backend
         self._views: dict[int, DepthRenderer] = {}
         self._last: Scene | None = None
+        self._scenes = 0
 
     def description(self) -> str:
         """Renderer and version strings of OpenGL."""
@@ -320,7 +321,9 @@ class Renderer:
         self._view_renderer(rays.view_side_px).load(ground, scene.objects.triangles[numbers], numbers)
         if self._last is not scene:
             self._last = scene
-            _return_freed_memory()
+            self._scenes += 1
+            if self._scenes % _SCENES_KEPT == 0:
+                _return_freed_memory()
 
     def _draw(
         self,
@@ -386,8 +389,13 @@ def _shaded(
     return radiance, body, normal
 
 
+#: Scenes after which their freed memory goes back to the system. What goes back has to be asked for again, a page at a
+#: time: after every scene that was a tenth of a rover's run.
+_SCENES_KEPT = 16
+
+
 def _return_freed_memory() -> None:
-    """Gives the memory of the scene before back to the system.
+    """Gives the memory of the scenes before back to the system.
 
     A scene's large arrays come and go between small ones; without this the C library keeps some 1 MB a scene.
     """
