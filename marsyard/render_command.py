@@ -245,8 +245,9 @@ def _exposed(
     streams = Streams(shot.seed, "render", number)
     of_camera, air = preset(shot.camera), ground.site.environment
     # The preset's light may be another planet's.
-    responsivity = of_camera.light.responsivity_e_s(1.0 / math.sqrt(air.solar_irradiance))
-    parameters = of_camera.detector.model_copy(update={"responsivity_e_s": responsivity, "rows_summed": 1})
+    sun_au = 1.0 / math.sqrt(air.solar_irradiance)
+    lit = {"responsivity_e_s": of_camera.light.responsivity_e_s(sun_au), "sun_au": sun_au}
+    parameters = of_camera.detector.model_copy(update={**lit, "rows_summed": 1})
     detector = Detector.drawn(natural_fall_off(camera), parameters, streams.generator("detector response"))
     radiance = _above_air(ground, shot, frame)
     exposed = auto_expose(detector, radiance, AutoExposureParameters(), streams.generator("test pictures"))
