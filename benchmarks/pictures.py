@@ -107,13 +107,12 @@ def memory(frames: int) -> list[Figure]:
     _, surface = descent_scene()
     optics = camera_optics(CameraParameters())
     rocky = SiteGround.of(site("pisgah"), "descent")
-    pixel_rad = float(np.median(optics.rays.pixel_angles))
     sizes = []
     scenes = frames // PICTURES_OF_A_SCENE
     for number in range(scenes):
         east = 40.0 * number
         if number % ROCKY_OF == ROCKY_OF - 1:
-            scene, ground = site_scene(rocky, Eye(east, 0.0, 1200.0, pixel_rad), SUN), rocky.surface
+            scene, ground = site_scene(rocky, Eye(east, 0.0, 1200.0, optics.rays.pixel_rad), SUN), rocky.surface
         else:
             scene, ground = Scene(surface, (east, 0.0), SUN, Photometry()), surface
         for picture in range(PICTURES_OF_A_SCENE):

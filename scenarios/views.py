@@ -141,7 +141,7 @@ class Eye:
             east,
             north,
             height,
-            float(np.median(rays.pixel_angles)),
+            rays.pixel_rad,
             float(np.arctan2(axis[0], axis[1])),
             float(min(half_width + np.radians(3.0), np.pi)),
             float(reach),

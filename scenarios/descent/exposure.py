@@ -79,7 +79,7 @@ def _scene(
         float(first[0]),
         float(first[1]),
         float(last[2]) - below_last,
-        float(np.median(optics.rays.pixel_angles)),
+        optics.rays.pixel_rad,
         caster_diameter_m=p.lander.caster_diameter_m,
         clouds=clouds_over(p.faults, below_first, streams.generator("clouds")),
     )

@@ -107,7 +107,6 @@ def _ground(key: RunKey) -> SiteGround:
 def _first_light(key: RunKey) -> Scene:
     """A run's scene as it begins: what stands on the ground stays as the sun moves. Kept for each run of the paper."""
     run, p = worked_out(key), key.field_test
-    pixel_rad = float(np.median(field_optics().rays.pixel_angles))
     east, north, _ = run.flight.origin_m.tolist()
-    eye = Eye(east, north, p.helicopter.lowest_m, pixel_rad)
+    eye = Eye(east, north, p.helicopter.lowest_m, field_optics().rays.pixel_rad)
     return replace(site_scene(_ground(key), eye, sun_at(run, 0.0)), clouds=run.clouds)

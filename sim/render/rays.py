@@ -89,6 +89,11 @@ class PixelRays:
         return middle
 
     @cached_property
+    def pixel_rad(self) -> float:
+        """Median of the angles that pixels take, radians."""
+        return float(np.median(self.pixel_angles))
+
+    @cached_property
     def half_angle_rad(self) -> float:
         """Widest angle of a ray from the axis, radians."""
         return float(np.arccos(np.clip((self.directions @ self.axis).min(), -1.0, 1.0)))

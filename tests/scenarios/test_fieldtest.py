@@ -147,7 +147,7 @@ def test_the_sun_moves_over_rocks_that_stay() -> None:
     assert len(early.objects) > 0
     assert late.objects is early.objects
     east, north, _ = run.flight.origin_m.tolist()
-    pixel_rad = float(np.median(pictures.field_optics().rays.pixel_angles))
+    pixel_rad = pictures.field_optics().rays.pixel_rad
     eye = Eye(east, north, key.field_test.helicopter.lowest_m, pixel_rad)
     alone = site_scene(pictures._ground(key), eye, pictures.sun_at(run, time_s))
     assert np.array_equal(late.sun.direction, alone.sun.direction)

@@ -79,7 +79,7 @@ def test_a_picture_is_the_same_with_what_concerns_it_alone(elevation: float) -> 
     rays = PixelRays.of(preset("research-navcam").cameras()[0].cropped(400, 380, (161, 161)))
     pose = mast_pose(ground.surface, 12.0, 11.0, 1.5, 30.0, -14.0)
     for azimuth in (0.5, 3.0):
-        eye = Eye(12.0, 11.0, 1.5, float(np.median(rays.pixel_angles)), 0.5, 1.2, 25.0)
+        eye = Eye(12.0, 11.0, 1.5, rays.pixel_rad, 0.5, 1.2, 25.0)
         scene = site_scene(ground, eye, Sun(direction(azimuth, elevation)))
         near = scene.within([rays.cone(pose)])
         assert 0 < len(near.objects) < 0.5 * len(scene.objects)
