@@ -8,7 +8,6 @@ Distortion is therefore exact and not a resampling of a pinhole picture.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -21,6 +20,7 @@ from sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingErr
 from sim.render.clouds import CloudLayer, no_cover
 from sim.render.edges import Sight, edge_pixels, look_within, rays_within
 from sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow
+from sim.render.heap import keep_freed_memory, return_freed_memory
 from sim.render.kernels.casters import Casters
 from sim.render.kernels.ground import Bounds, height_range
 from sim.render.kernels.shading import Clouds, Reach, shade
@@ -205,6 +205,11 @@ class Frame:
         return points.reshape(*distance.shape, 3)
 
 
+#: Scenes after which their freed memory goes back to the system. What goes back has to be asked for again, a page at a
+#: time: after every scene that was a tenth of a rover's run.
+_SCENES_KEPT = 16
+
+
 class Renderer:
     """Renders scenes through cameras. One per process, made inside the worker that uses it.
 
@@ -219,6 +224,7 @@ class Renderer:
         self._views: dict[int, DepthRenderer] = {}
         self._last: Scene | None = None
         self._scenes = 0
+        keep_freed_memory()
 
     def description(self) -> str:
         """Renderer and version strings of OpenGL."""
@@ -323,7 +329,7 @@ class Renderer:
             self._last = scene
             self._scenes += 1
             if self._scenes % _SCENES_KEPT == 0:
-                _return_freed_memory()
+                return_freed_memory()
 
     def _draw(
         self,
@@ -387,21 +393,6 @@ def _shaded(
         normal,
     )
     return radiance, body, normal
-
-
-#: Scenes after which their freed memory goes back to the system. What goes back has to be asked for again, a page at a
-#: time: after every scene that was a tenth of a rover's run.
-_SCENES_KEPT = 16
-
-
-def _return_freed_memory() -> None:
-    """Gives the memory of the scenes before back to the system.
-
-    A scene's large arrays come and go between small ones; without this the C library keeps some 1 MB a scene.
-    """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
 
 
 #: Rays along each side of a picture from which the ground that it shows is found.
