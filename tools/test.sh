@@ -2,5 +2,5 @@
 # Runs the tests on all cores; words given are passed to pytest.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-# tests that share something costly stay in one process: `xdist_group`
-exec .venv/bin/python -m pytest -n auto --dist loadgroup "$@"
+# a file's tests stay in one process: what they share is made once
+exec .venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder "$@"

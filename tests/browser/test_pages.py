@@ -15,9 +15,6 @@ from playwright.sync_api import Page
 from reports.campaign import write_report
 from reports.dashboard.site import write_site
 
-# what they share is made once
-pytestmark = pytest.mark.xdist_group("pages")
-
 Open = Callable[..., tuple[Page, Any]]
 #: The success criteria of WCAG 2.2 of levels A and AA, as axe-core names its rules' sets.
 LEVELS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22a", "wcag22aa"]

@@ -11,9 +11,6 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-# what they share is made once
-pytestmark = pytest.mark.xdist_group("site")
-
 DOCS = Path(__file__).parents[2] / "docs"
 LEAST_PAGES = 40
 

@@ -8,9 +8,6 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-# what they share is made once
-pytestmark = pytest.mark.xdist_group("descent campaign")
-
 #: The smoke campaign over a small world, with fewer dispersions.
 CAMPAIGN = """
 name = "small-descents"

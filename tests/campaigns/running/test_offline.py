@@ -25,9 +25,6 @@ from campaigns.running.offline import (
 from campaigns.running.replay import differing_columns
 from sim.measurements import DescentMeasurements
 
-# what they share is made once
-pytestmark = pytest.mark.xdist_group("offline")
-
 CASES = 3
 FILE = f"""
 name = "fake-velocity"
