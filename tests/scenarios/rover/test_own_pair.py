@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
+from short_run import SHORT
 
 from scenarios.rover import RoverScenario, RoverScenarioParameters
 from scenarios.rover.parameters import CameraParameters
@@ -27,14 +28,6 @@ SHEET = (
     "dark_current_e_s = 20\ndark_temperature_c = 20\nrows = 480\nreadout_s = 0.02\nsun_au = 1.0\n"
     "[lens]\nf_number = 4\nband_nm = [450, 700]\n"
 )
-#: Two legs of 0.3 m over a small ground.
-RUN = {
-    "world": {"samples": 1024, "rock_abundance": 0.005, "bank": 1},
-    "start": {"distance_m": 3.6},
-    "target": {"diameter_m": 0.8, "shape": 8, "yaw_deg": 30.0},
-    "sun": {"azimuth_deg": 260.0, "elevation_deg": 50.0},
-    "legs": [{"motion": "approach", "goal_m": 3.3, "step_share": 0.1}],
-}
 
 
 @pytest.mark.parametrize(
@@ -61,7 +54,7 @@ def test_a_target_is_tracked_through_an_own_pair(tmp_path: Path) -> None:
     camera.write_text(OPENCV)
     sheet.write_text(SHEET)
     own = {"preset": "research-navcam", "own": {"left": str(camera), "baseline_m": 0.24}, "detector": str(sheet)}
-    p = RoverScenarioParameters.model_validate({**RUN, "camera": own})
+    p = RoverScenarioParameters.model_validate({**SHORT, "camera": own})
     # all that the files said is in the campaign
     camera.unlink()
     sheet.unlink()

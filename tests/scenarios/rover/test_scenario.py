@@ -2,20 +2,12 @@
 
 import numpy as np
 import pytest
+from short_run import SHORT
 
 from scenarios.rover import RoverScenario, RoverScenarioParameters, SharedDriveParameters, SharedDriveScenario, run_case
 from scenarios.rover.shared import shared_drive, tracked
 from sim.render import PixelRays, process_renderer
 from sim.streams import Streams
-
-#: A short approach over a small, nearly bare ground.
-SHORT = {
-    "world": {"samples": 1024, "rock_abundance": 0.005, "bank": 1},
-    "start": {"distance_m": 3.6},
-    "target": {"diameter_m": 0.8, "shape": 8, "yaw_deg": 30.0},
-    "sun": {"azimuth_deg": 260.0, "elevation_deg": 50.0},
-    "legs": [{"motion": "approach", "goal_m": 3.3, "step_share": 0.1}],
-}
 
 
 def parameters(**changes: object) -> RoverScenarioParameters:

@@ -1,0 +1,14 @@
+"""A run that tests can afford."""
+
+from __future__ import annotations
+
+from typing import Any
+
+#: A short approach, two legs of 0.3 m, over a small, nearly bare ground.
+SHORT: dict[str, Any] = {
+    "world": {"samples": 1024, "rock_abundance": 0.005, "bank": 1},
+    "start": {"distance_m": 3.6},
+    "target": {"diameter_m": 0.8, "shape": 8, "yaw_deg": 30.0},
+    "sun": {"azimuth_deg": 260.0, "elevation_deg": 50.0},
+    "legs": [{"motion": "approach", "goal_m": 3.3, "step_share": 0.1}],
+}
