@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from sim.camera.vectors import Gradient, Real, Vector, blocks, checked_size, frozen_vector, unit
+from sim.camera.vectors import Gradient, Real, Vector, blocks, checked_size, cross, frozen_vector, unit
 
 #: Labels round A and O to six digits or fewer.
 UNIT_TOLERANCE = 1e-4
@@ -365,12 +365,12 @@ class CameraModel(ABC):
 
     @cached_property
     def _determinant(self) -> float:
-        return float(self.a @ np.cross(self.h, self.v))
+        return float(self.a @ cross(self.h, self.v))
 
     @cached_property
     def _direction_from_pixel(self) -> NDArray[np.float64]:
         """Matrix that takes (u, v, 1) to the vector d with d.A = 1, d.H = u, d.V = v."""
-        columns = (np.cross(self.v, self.a), np.cross(self.a, self.h), np.cross(self.h, self.v))
+        columns = (cross(self.v, self.a), cross(self.a, self.h), cross(self.h, self.v))
         return np.stack(columns, axis=1) / self._determinant
 
     def _from_centre(self, points: NDArray[Any]) -> Gradient:

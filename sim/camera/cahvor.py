@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from sim.camera import kernels
 from sim.camera.base import UNIT_TOLERANCE, CameraModel
 from sim.camera.cahv import Cahv
 from sim.camera.linearisation import linearised
@@ -124,17 +125,15 @@ class Cahvor(RadialModel):
         return cls(cahv.c, cahv.a, cahv.h, cahv.v, axis, np.asarray(r, dtype=np.float64), cahv.size)
 
     def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
-        omega, tau = self._omega_tau(x, y, z)
-        mu = self._mu(tau)
-        columns, rows, depth = (
-            (straight := dot(vector, x, y, z)) + mu * (straight - onto * omega)
-            for vector, onto in zip((self.h, self.v, self.a), self._axis_image, strict=True)
+        image: tuple[Vector, Vector, NDArray[np.bool_]] = kernels.radial_image(
+            (x, y, z), self._axis, (self.h, self.v, self.a), self._axis_image, self.r, self._polynomial.tau_limit
         )
-        return columns / depth, rows / depth, (omega > 0) & (tau < self._polynomial.tau_limit) & (depth > 0)
+        return image
 
     def _image_gradient(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
-        omega, tau = self._omega_tau(x, y, z)
-        kappa = (1 + self._mu(tau)) / omega
+        omega = dot(self._axis, x, y, z)
+        tau = np.maximum((x * x + y * y + z * z) / (omega * omega) - 1, 0)
+        kappa = (1 + (self.r[0] + tau * (self.r[1] + tau * self.r[2]))) / omega
         mu_slope = (self.r[1] + 2 * self.r[2] * tau) * 2 / omega**3
         along, off = self._off_axis(x, y, z)
         # d tau = 2 (lambda / omega^2 - tau / omega O).dP, because lambda is perpendicular to O
@@ -150,11 +149,3 @@ class Cahvor(RadialModel):
         ratio = self._polynomial.undistortion(distorted_tau)
         x, y, z = (along * self._axis[i] + ratio * off[i] for i in range(3))
         return (x, y, z), None
-
-    def _omega_tau(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector]:
-        omega = dot(self._axis, x, y, z)
-        return omega, np.maximum((x * x + y * y + z * z) / (omega * omega) - 1, 0)
-
-    def _mu(self, tau: Vector) -> Vector:
-        rho0, rho1, rho2 = (float(rho) for rho in self.r)
-        return rho0 + tau * (rho1 + tau * rho2)
