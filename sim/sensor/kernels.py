@@ -153,19 +153,30 @@ def _split(position: float, size: int) -> tuple[int, np.float32]:
 
 
 @njit(cache=True)
-def _add_moved(source: Array32, y: float, x: float, factor: np.float32, line: Array32, width: int) -> None:
-    """Adds factor times the source at row y and columns x, x + 1, ... to a line, bilinear between samples."""
-    i, fy = _split(y, source.shape[0])
-    j, fx = _split(x, source.shape[1] - width)
-    one = np.float32(1.0)
+def _add_moved(
+    source: Array32, shape: tuple[int, int], y: float, x: float, factor: np.float32, line: Array32, width: int
+) -> None:
+    """Adds factor times a picture at row y and columns x, x + 1, ... to a line, bilinear between samples.
+
+    The picture is given as one row of numbers and its shape: to cut rows out of it would take longer than to add them.
+    """
+    i, fy = _split(y, shape[0])
+    j, fx = _split(x, shape[1] - width)
+    one, next_to = np.float32(1.0), np.uint64(1)
     a = factor * (one - fy) * (one - fx)
     b = factor * (one - fy) * fx
     c = factor * fy * (one - fx)
     d = factor * fy * fx
-    upper = source[i, j : j + width + 1]
-    lower = source[i + 1, j : j + width + 1]
-    for k in range(width):
-        line[k] += a * upper[k] + b * upper[k + 1] + c * lower[k] + d * lower[k + 1]
+    upper = np.uint64(i * shape[1] + j)
+    lower = np.uint64((i + 1) * shape[1] + j)
+    for n in range(width):
+        k = np.uint64(n)
+        line[n] += (
+            a * source[upper + k]
+            + b * source[upper + k + next_to]
+            + c * source[lower + k]
+            + d * source[lower + k + next_to]
+        )
 
 
 @njit(cache=True)
@@ -226,6 +237,7 @@ def passed_blocks(
     """
     blocks, columns = response.shape
     line = np.empty(TILE, dtype=np.float32)
+    sums = prefix.reshape(-1)
     out[:] = 0.0
     for start in range(1, blocks + 1):
         for block in range(start):
@@ -237,8 +249,8 @@ def passed_blocks(
                 y = pad - by_row * time
                 x = pad + left - by_column * time
                 line[:] = 0.0
-                _add_moved(prefix, edges[block + 1] + y, x, np.float32(1.0), line, width)
-                _add_moved(prefix, edges[block] + y, x, np.float32(-1.0), line, width)
+                _add_moved(sums, prefix.shape, edges[block + 1] + y, x, np.float32(1.0), line, width)
+                _add_moved(sums, prefix.shape, edges[block] + y, x, np.float32(-1.0), line, width)
                 for c in range(width):
                     out[start, left + c] += response[block, left + c] * line[c]
 
@@ -274,34 +286,35 @@ def add_passed(
     """
     columns = response.shape[1]
     seconds = np.float32(row_s)
+    scene, weights, gathered = padded.reshape(-1), response.reshape(-1), charge.reshape(-1)
     moved = np.empty((np.max(np.diff(edges)), TILE), dtype=np.float32)
     own = np.empty(TILE, dtype=np.float32)
+    before = np.empty(TILE, dtype=np.float32)
     change = np.empty(TILE, dtype=np.float32)
-    for left in range(0, columns, TILE):
-        width = min(TILE, columns - left)
-        for block in range(len(edges) - 1):
-            first, last = edges[block], edges[block + 1]
-            time = start_s + 0.5 * (last - first) * row_s
+    for block in range(len(edges) - 1):
+        first, last = edges[block], edges[block + 1]
+        time = start_s + 0.5 * (last - first) * row_s
+        for left in range(0, columns, TILE):
+            width = min(TILE, columns - left)
             by_row, by_column = velocity_at(field, step, 0.5 * (first + last - 1), left + 0.5 * (width - 1))
             y = pad - by_row * time
             x = pad + left - by_column * time
             moved[:] = 0.0
             own[:] = 0.0
-            before = passed[block, left : left + width]
-            after = passed[block + 1, left : left + width]
             for k in range(width):
-                change[k] = after[k] - before[k]
+                before[k] = passed[block, left + k]
+                change[k] = passed[block + 1, left + k] - before[k]
             for r in range(first, last):
                 line = moved[r - first]
-                _add_moved(padded, r + y, x, np.float32(1.0), line, width)
-                weights = response[r, left : left + width]
+                _add_moved(scene, padded.shape, r + y, x, np.float32(1.0), line, width)
+                start = np.uint64(r * columns + left)
                 for k in range(width):
-                    line[k] *= weights[k]
+                    line[k] *= weights[start + np.uint64(k)]
                     change[k] -= line[k]
             for r in range(first, last):
                 share = np.float32((r - first) / (last - first))
                 line = moved[r - first]
-                out = charge[r, left : left + width]
+                start = np.uint64(r * columns + left)
                 for k in range(width):
-                    out[k] += seconds * (before[k] + share * change[k] + own[k])
+                    gathered[start + np.uint64(k)] += seconds * (before[k] + share * change[k] + own[k])
                     own[k] += line[k]
