@@ -50,13 +50,24 @@ def _jumps(before: float, here: float, there: float, after: float) -> bool:
 
 
 @njit(cache=True)
-def _differ(line: Array32, beside: Array32, shift: int, differs: NDArray[np.bool_]) -> None:
-    """Whether pixels of a line differ enough for an edge from those `shift` columns on in the line beside; few do."""
-    for j in range(line.size - shift):
-        here = line[j]
-        there = beside[j + shift]
+def _differ(
+    line: Array32,
+    beside: Array32,
+    far: Array,
+    far_beside: Array,
+    body: Ints,
+    body_beside: Ints,
+    differs: NDArray[np.bool_],
+) -> None:
+    """Whether pixels of a line differ enough for an edge from those beside them, in all that one needs; few do."""
+    for j in range(beside.size):
+        here, there = line[j], beside[j]
         brighter = here if here > there else there
-        differs[j] = abs(there - here) >= np.float32(EDGE_CONTRAST) * brighter
+        change = abs(there - here)
+        farther = far[j] if far[j] > far_beside[j] else far_beside[j]
+        jumps = abs(far_beside[j] - far[j]) > JUMP * farther
+        other = (body[j] != body_beside[j]) | (change > np.float32(LIGHT_CONTRAST) * brighter) | jumps
+        differs[j] = (change >= np.float32(EDGE_CONTRAST) * brighter) & other
 
 
 @njit(cache=True)
@@ -78,11 +89,20 @@ def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: NDArray[n
             if i2 >= rows:
                 continue
             last = columns - 1 + side
-            _differ(radiance[i], radiance[i2], 1 - side, differs)
+            shift = 1 - side
+            _differ(
+                radiance[i],
+                radiance[i2, shift:],
+                distance[i],
+                distance[i2, shift:],
+                body[i],
+                body[i2, shift:],
+                differs,
+            )
             for j in range(last):
                 if not differs[j]:
                     continue
-                j2 = j + 1 - side
+                j2 = j + shift
                 here = radiance[i, j]
                 there = radiance[i2, j2]
                 edge = body[i, j] != body[i2, j2] or abs(there - here) > LIGHT_CONTRAST * max(here, there)
