@@ -202,10 +202,9 @@ class _Block:
         return beyond
 
     def _radius(self, d: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-        # sums over few terms, written out so that no BLAS with its own order of summation takes part
-        towards = np.maximum(np.sum(d[:, None, :] * self.cut_normals, axis=-1), 0.0) / self.cut_distances
+        towards = np.maximum(_products(d, self.cut_normals), 0.0) / self.cut_distances
         radius = (1.0 + np.sum(towards**self.sharpness, axis=1)) ** (-1.0 / self.sharpness)
-        phase = np.sum(d[:, None, :] * self.waves, axis=-1) + self.wave_phases
+        phase = _products(d, self.waves) + self.wave_phases
         wave = np.cos(phase)
         if self.folded:
             # of the same mean square, 1/2, about the mean 0; the cusps outwards
@@ -235,6 +234,13 @@ class _Block:
         middle = 0.5 * (seen.max(axis=0) + seen.min(axis=0))
         across = 2.0 / (diameters.max() + diameters.min())
         return np.array([*middle, ground]), np.array([across, across, UNIT_HEIGHT / (highest - ground)])
+
+
+def _products(d: Float64[np.ndarray, "n 3"], vectors: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "n m"]:
+    """Scalar products of each with each, written out so that no BLAS with its own order of summation takes part."""
+    x, y, z = (d[:, axis, None] * vectors[:, axis] for axis in range(3))
+    products: Float64[np.ndarray, "n m"] = x + y + z
+    return products
 
 
 @cache
