@@ -140,7 +140,7 @@ def first_ground(
 @njit(cache=True)
 def height_range(field: Level) -> tuple[float, float]:
     """Lowest and highest control value of height: bounds of the surface."""
-    # row by row into lines, heights and albedos alike: least and greatest of numbers side by side in vector instructions
+    # row by row, heights and albedos alike: numbers side by side are compared by vector instructions
     flat = field.reshape(field.shape[0], -1)
     low = np.full(flat.shape[1], np.inf, dtype=np.float32)
     high = np.full(flat.shape[1], -np.inf, dtype=np.float32)
