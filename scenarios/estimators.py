@@ -164,8 +164,8 @@ class Task(Generic[Algorithm, Options]):
 
 
 def _pure_ncc(options: VttOptions) -> TargetTracker:
-    """The paper's baseline: without scale, roll and stretch, whatever the options say of them."""
-    return VisualTargetTracker(replace(options, scale=PURE_NCC.scale, roll=PURE_NCC.roll, affine=PURE_NCC.affine))
+    """The paper's baseline: without scale, roll and warp, whatever the options say of them."""
+    return VisualTargetTracker(replace(options, scale=PURE_NCC.scale, roll=PURE_NCC.roll, warp=PURE_NCC.warp))
 
 
 def _executable_velocity(command: Command, limits: ExecutableLimits) -> VelocityEstimator:

@@ -89,7 +89,7 @@ def aligned(
     half = options.template_half_px
     row, column = place
     template = first[row - half : row + half + 1, column - half : column + half + 1]
-    match = registered(template, second, found[::-1] - half, stretch=True, limits=ALIGNMENT)
+    match = registered(template, second, found[::-1] - half, "stretch", limits=ALIGNMENT)
     if match is None or match.score < options.min_aligned_correlation:
         return None
     return np.asarray(match.corner[::-1] + half)

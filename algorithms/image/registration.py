@@ -1,12 +1,15 @@
-"""Registration of a template that may have been stretched as well as shifted: Gauss-Newton on quintic splines.
+"""Registration of a template that may have been shifted, stretched and bent: Gauss-Newton on quintic splines.
 
 Shifting alone leans: where the picture is longer one way than the template, texture that is denser on one side pulls
-the match to that side, by up to tenths of a pixel. Solving for the stretch as well takes that out.
+the match to that side, by up to tenths of a pixel. Solving for the stretch as well takes that out. Of a round surface
+seen from another height the picture bends: its middle moves otherwise than its border does on the mean, always to the
+same side, and solving for the bend takes that out.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +17,9 @@ from jaxtyping import Float
 from algorithms.image.alignment import SURROUND, spline_coefficients
 from algorithms.image.kernels import registration as kernels
 
+#: What a template may have undergone: a shift; a linear map too; a quadratic map of its offsets too.
+Warp = Literal["shift", "stretch", "bend"]
+_ORDERS: dict[Warp, int] = {"shift": 0, "stretch": 1, "bend": 2}
 #: A step below this, pixels, ends the iteration; what is left is less than 1e-3 px.
 TOLERANCE = 3e-3
 #: A pivot of the normal equations, their diagonal made 1, below which texture does not tell one unknown from another.
@@ -29,7 +35,7 @@ class Limits:
     shift_px
         Largest distance of the middle from where it started.
     stretch
-        Largest entry of the affine map's difference from the identity.
+        Largest entry of the linear map's difference from the identity, and of the bend at the template's border.
     steps
         Steps allowed; four to six are the rule.
     """
@@ -98,16 +104,16 @@ def registered(
     template: Float[np.ndarray, "n n"],
     window: Float[np.ndarray, "rows columns"] | SplinedPart,
     corner: Float[np.ndarray, "2"],
-    stretch: bool,
+    warp: Warp,
     limits: Limits = LIMITS,
 ) -> Registration | None:
     """The place in the window, or in the part of it about `corner`, at which the template matches best, by its middle.
 
-    Minimises ``sum (B(c + M d) - gain A(d) - offset)^2`` over the middle c, gain, offset and, with `stretch`, the
-    matrix M, which else is 1; A is the template over offsets d from its middle, B the window by quintic splines. It
-    goes from `corner` (row, column) by the inverse compositional method (Baker & Matthews 2004): derivatives are those
-    of the template, taken once. None when it leaves the limits or the window, does not converge, or when the texture
-    does not determine the unknowns.
+    Minimises ``sum (B(c + M d + Q(d)) - gain A(d) - offset)^2`` over the middle c, gain, offset and, as `warp` allows,
+    the matrix M, which else is 1, and the quadratic form Q, which else is 0; A is the template over offsets d from its
+    middle, B the window by quintic splines. It goes from `corner` (row, column) by the inverse compositional method
+    (Baker & Matthews 2004): derivatives are those of the template, taken once. None when it leaves the limits or the
+    window, does not converge, or when the texture does not determine the unknowns.
     """
     half = 0.5 * (len(template) - 1)
     part = window if isinstance(window, SplinedPart) else splined(window, corner, len(template))
@@ -115,6 +121,6 @@ def registered(
     start = corner - near + half
     bounds = (limits.shift_px, limits.stretch, limits.steps)
     done, row, column, score = kernels.register(
-        template, part.coefficients, start[0], start[1], stretch, bounds, TOLERANCE, SINGULAR
+        template, part.coefficients, start[0], start[1], _ORDERS[warp], bounds, TOLERANCE, SINGULAR
     )
     return Registration(np.array([row, column]) - half + near, score) if done else None

@@ -39,7 +39,9 @@ def similarity_patch(
     ValueError
         If the centre is not in the picture.
     """
-    turned = np.array([[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]) / magnification
+    turned = np.zeros((2, 5))
+    turned[:, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
+    turned /= magnification
     reach = int(np.ceil(0.5 * (side - 1) * np.abs(turned).sum(axis=1).max())) + SURROUND
     place = centre[::-1]
     near = np.floor(place).astype(int) - reach

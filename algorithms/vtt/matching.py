@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from algorithms.image.alignment import SURROUND
 from algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
 from algorithms.image.peak import Peak, biquadratic_offset
-from algorithms.image.registration import Registration, registered, splined
+from algorithms.image.registration import Registration, Warp, registered, splined
 from algorithms.image.resampling import similarity_patch
 from algorithms.vtt.options import VttOptions
 from algorithms.vtt.target import bearing_rad
@@ -87,6 +87,8 @@ class Match:
     template: Float[np.ndarray, "n n"]
 
 
+#: What a match is registered with after its shift, in this order.
+_WARPS: dict[Warp, tuple[Warp, ...]] = {"shift": (), "stretch": ("stretch",), "bend": ("stretch", "bend")}
 #: Finds what was seen at a sighting in a new picture near a full-frame pixel; None where there is no room for it.
 Matcher = Callable[[Sighting, MastImage, Float[np.ndarray, "2"], Change, VttOptions], Match | None]
 
@@ -135,20 +137,24 @@ def refined(
 
     `corner` is that of the best whole pixel, with the correlation of `whole`, and `offset` where the fit to the
     correlation has its top: the answer where registration of the pictures themselves fails. The stretch, where the
-    options allow it, decides the place only; the correlation stays that of the template as it was searched for.
+    options allow it, decides the place only; the correlation stays that of the template as it was searched for. So does
+    the bend; where the texture does not tell one, the stretch stands, and where it does not tell that, the shift.
     """
     near = np.maximum(corner.astype(int) - SURROUND - 2, 0)
     far = corner.astype(int) + len(template) + SURROUND + 2
     region = image.counts[near[0] : far[0], near[1] : far[1]].astype(np.float64)
     part = splined(region, corner + offset - near, len(template))
-    shifted = registered(template, part, corner + offset - near, stretch=False)
+    shifted = registered(template, part, corner + offset - near, "shift")
     if shifted is None:
         return Registration(corner + offset, whole.value)
-    stretched = None
-    if options.affine:
-        part = splined(region, shifted.corner, len(template), known=part)
-        stretched = registered(template, part, shifted.corner, stretch=True)
-    return Registration((shifted if stretched is None else stretched).corner + near, shifted.score)
+    best = shifted
+    for warp in _WARPS[options.warp]:
+        part = splined(region, best.corner, len(template), known=part)
+        warped = registered(template, part, best.corner, warp)
+        if warped is None:
+            break
+        best = warped
+    return Registration(best.corner + near, shifted.score)
 
 
 def match_by_correlation(

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from algorithms.image.registration import Warp
+
 
 @dataclass(frozen=True)
 class VttOptions:
@@ -30,11 +32,11 @@ class VttOptions:
         Whether the matches, left and right, are refined below a pixel (the paper does not say that VTT did). Every
         step's error is magnified by all later steps: 16 steps from 10 m to 2 m turn 0.3 px, the error of whole pixels,
         into 3 px.
-    affine
-        Whether the refinement solves for a stretch of the picture too. The paper's tracker did not; approaching a
-        slanted or round surface stretches the picture, and a match by shift alone leans with every step. From 10 m to
-        2 m in 10 % steps, noise-free, the drift is 0.09 rather than 0.18 px rms on slanted planes, 0.55 rather than
-        0.74 px on spheres of 0.2 to 0.6 m. The score stays that of the shifted template.
+    warp
+        What the refinement solves for besides the place: nothing (``shift``), a stretch of the picture (``stretch``),
+        or a quadratic bend too (``bend``). The paper's tracker did not; approaching a slanted surface stretches the
+        picture and approaching a round one, seen ever more from above, bends it: a match by less leans the same way at
+        each step (docs/adr/0010). The score stays that of the shifted template.
     epipolar_tolerance_px
         How far from the epipolar curve the right picture is searched (paper: 2, default).
     stereo_search_share
@@ -68,7 +70,7 @@ class VttOptions:
     coarse_levels: int = 1
     coarse_candidates: int = 6
     subpixel: bool = True
-    affine: bool = True
+    warp: Warp = "bend"
     epipolar_tolerance_px: float = 2.0
     stereo_search_share: float = 0.5
     seed_range_m: tuple[float, float] = (1.0, 100.0)
@@ -108,4 +110,4 @@ class VttOptions:
 
 
 #: The paper's baseline: normalised correlation of the template as it was cut (section 5.1).
-PURE_NCC = VttOptions(scale=False, roll=False, affine=False)
+PURE_NCC = VttOptions(scale=False, roll=False, warp="shift")

@@ -1,4 +1,4 @@
-"""Operators that find a template again, magnified, rolled or stretched, against definitions and analytic pictures."""
+"""Operators that find a template again, magnified, rolled or warped, against definitions and analytic pictures."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import pytest
 from scipy import ndimage
 
 from algorithms.image.normalized import coarse_to_fine_peak, halved, normalized_correlation
-from algorithms.image.registration import registered
+from algorithms.image.registration import Warp, registered
 from algorithms.image.resampling import similarity_patch
+
+WARPS: tuple[Warp, ...] = ("shift", "stretch", "bend")
 
 
 def brute_force(template: np.ndarray, window: np.ndarray) -> np.ndarray:
@@ -112,8 +114,8 @@ def test_registration_finds_shifts_to_thousandths() -> None:
     for centre in np.random.default_rng(1).uniform(35.0, 45.0, (10, 2)):
         template = 0.7 * blobs(6, centre + grid(21) - 10.0) + 3.0
         start = np.rint(centre[::-1]) - 10.0
-        for stretch in (False, True):
-            found = registered(template, image, start, stretch)
+        for warp in WARPS:
+            found = registered(template, image, start, warp)
             assert found is not None
             np.testing.assert_allclose(found.corner + 10.0, centre[::-1], atol=3e-3)
             assert found.score > 0.9999
@@ -122,23 +124,39 @@ def test_registration_finds_shifts_to_thousandths() -> None:
 def test_without_stretch_a_stretched_picture_pulls_the_match_aside() -> None:
     image = blobs(7, grid(80))
     stretch = np.array([[1.04, 0.05], [-0.03, 1.1]])
-    errors: dict[bool, list[float]] = {False: [], True: []}
+    errors: dict[Warp, list[float]] = {warp: [] for warp in WARPS}
     for centre in np.random.default_rng(2).uniform(35.0, 45.0, (20, 2)):
         template = blobs(7, centre + (grid(21) - 10.0) @ np.linalg.inv(stretch).T)
-        for allowed, found in errors.items():
-            match = registered(template, image, centre[::-1] - 10.0, allowed)
+        for warp, found in errors.items():
+            match = registered(template, image, centre[::-1] - 10.0, warp)
             assert match is not None
             found.append(float(np.hypot(*(match.corner + 10.0 - centre[::-1]))))
-    assert np.max(errors[True]) < 0.02
-    assert np.sqrt(np.mean(np.square(errors[False]))) > 0.05
+    assert np.max(errors["stretch"]) < 0.02
+    assert np.max(errors["bend"]) < 0.02
+    assert np.sqrt(np.mean(np.square(errors["shift"]))) > 0.05
+
+
+def test_without_bend_a_bent_picture_pulls_the_match_aside() -> None:
+    """As a round rock's does by 0.04 px a step, always to the same side: the border moves down by half a pixel."""
+    image, offsets = blobs(11, grid(80)), grid(21) - 10.0
+    bent = offsets + 0.005 * np.stack([np.zeros_like(offsets[..., 0]), (offsets**2).sum(axis=-1)], axis=-1)
+    errors: dict[Warp, list[float]] = {"stretch": [], "bend": []}
+    for centre in np.random.default_rng(4).uniform(35.0, 45.0, (20, 2)):
+        template = blobs(11, centre + bent)
+        for warp, found in errors.items():
+            match = registered(template, image, centre[::-1] - 10.0, warp)
+            assert match is not None
+            found.append(float(match.corner[0] + 10.0 - centre[1]))
+    assert np.max(np.abs(errors["bend"])) < 0.02
+    assert np.mean(errors["stretch"]) > 0.2
 
 
 def test_registration_refuses_what_it_cannot_determine() -> None:
     image = blobs(8, grid(80))
     template = image[30:51, 30:51]
-    assert registered(np.full((21, 21), 5.0), image, np.array([30.0, 30.0]), False) is None
+    assert registered(np.full((21, 21), 5.0), image, np.array([30.0, 30.0]), "shift") is None
     stripes = np.broadcast_to(np.sin(0.4 * np.arange(80.0)), (80, 80)).copy()
-    assert registered(stripes[30:51, 30:51], stripes, np.array([30.0, 30.0]), False) is None  # free along the stripes
-    assert registered(template, image, np.array([26.0, 27.0]), False) is None  # further away than the limit
-    assert registered(image[:21, :21], image, np.array([0.0, 0.0]), False) is None  # the spline needs neighbours
-    assert registered(template, -image, np.array([30.0, 30.0]), False) is None  # only its negative is there
+    assert registered(stripes[30:51, 30:51], stripes, np.array([30.0, 30.0]), "shift") is None  # free along the stripes
+    assert registered(template, image, np.array([26.0, 27.0]), "shift") is None  # further away than the limit
+    assert registered(image[:21, :21], image, np.array([0.0, 0.0]), "shift") is None  # the spline needs neighbours
+    assert registered(template, -image, np.array([30.0, 30.0]), "shift") is None  # only its negative is there

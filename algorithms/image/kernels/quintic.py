@@ -26,16 +26,17 @@ def quintic_weights(fraction: float, weights: Array) -> None:
 
 
 @njit(cache=True)
-def sample(coefficients: Array, side: int, row: float, column: float, matrix: Array, values: Array) -> bool:
-    """Values of the spline at ``middle + matrix @ offset`` for the square of `side` pixels; False if it leaves it."""
+def sample(coefficients: Array, side: int, row: float, column: float, warp: Array, values: Array) -> bool:
+    """Values of the spline at ``middle + warp @ (y, x, yy, yx, xx)`` of a square's offsets; False if it leaves it."""
     half = 0.5 * (side - 1)
     down, across = np.empty(6), np.empty(6)
     last_row, last_column = coefficients.shape[0] - 4, coefficients.shape[1] - 4
     for i in range(side):
         for j in range(side):
             y, x = i - half, j - half
-            v = row + matrix[0, 0] * y + matrix[0, 1] * x
-            u = column + matrix[1, 0] * y + matrix[1, 1] * x
+            yy, yx, xx = y * y, y * x, x * x
+            v = row + warp[0, 0] * y + warp[0, 1] * x + warp[0, 2] * yy + warp[0, 3] * yx + warp[0, 4] * xx
+            u = column + warp[1, 0] * y + warp[1, 1] * x + warp[1, 2] * yy + warp[1, 3] * yx + warp[1, 4] * xx
             if not (v >= 2.0 and u >= 2.0 and v <= last_row and u <= last_column):
                 return False
             r, c = int(v), int(u)
@@ -54,7 +55,7 @@ def sample(coefficients: Array, side: int, row: float, column: float, matrix: Ar
 
 @njit(cache=True)
 def sample_shifted(coefficients: Array, side: int, row: float, column: float, values: Array) -> bool:
-    """`sample` without stretch: all pixels share the fraction of the shift, so that rows and columns separate."""
+    """`sample` of a shift alone: all pixels share the fraction of the shift, so that rows and columns separate."""
     half = 0.5 * (side - 1)
     v, u = row - half, column - half
     if not (v >= 2.0 and u >= 2.0 and v + side <= coefficients.shape[0] - 3):

@@ -12,10 +12,13 @@ from algorithms.image.kernels.quintic import sample, sample_shifted
 
 Array = NDArray[np.float64]
 
+#: Unknowns of each order of warp: gain and offset, shift, stretch, bend.
+UNKNOWNS = (4, 8, 14)
+
 
 @njit(cache=True)
 def design_rows(template: Array, unknowns: int) -> Array:
-    """What a patch is explained by, one row each: the template and a constant; shift (2); stretch (4, if asked for)."""
+    """What a patch is explained by, one row each: template and constant, shift (2), stretch (4), bend (6)."""
     side = template.shape[0]
     half = 0.5 * (side - 1)
     mean = template.mean()
@@ -29,10 +32,13 @@ def design_rows(template: Array, unknowns: int) -> Array:
             k = i * side + j
             rows[0, k], rows[1, k] = template[i, j] - mean, 1.0
             rows[2, k], rows[3, k] = by_row, by_column
-            if unknowns == 8:
-                y, x = i - half, j - half
+            y, x = i - half, j - half
+            if unknowns >= 8:
                 rows[4, k], rows[5, k] = by_row * y, by_row * x
                 rows[6, k], rows[7, k] = by_column * y, by_column * x
+            if unknowns >= 14:
+                rows[8, k], rows[9, k], rows[10, k] = by_row * y * y, by_row * y * x, by_row * x * x
+                rows[11, k], rows[12, k], rows[13, k] = by_column * y * y, by_column * y * x, by_column * x * x
     return rows
 
 
@@ -68,22 +74,56 @@ def solve(lower: Array, right: Array) -> None:
 
 
 @njit(cache=True)
+def unwarp(warp: Array, change: Array) -> bool:
+    """Composes a warp with the inverse of a small one; False where there is none.
+
+    Both are of shape (2, 5): what multiplies y, x, y^2, y x and x^2. Of the bends, products with one another are left
+    out: they vanish as the change does.
+    """
+    a, b, c, d = 1.0 + change[0, 0], change[0, 1], change[1, 0], 1.0 + change[1, 1]
+    determinant = a * d - b * c
+    if abs(determinant) < 0.1:
+        return False
+    m00, m01, m10, m11 = warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1]
+    warp[0, 0] = (m00 * d - m01 * c) / determinant
+    warp[0, 1] = (m01 * a - m00 * b) / determinant
+    warp[1, 0] = (m10 * d - m11 * c) / determinant
+    warp[1, 1] = (m11 * a - m10 * b) / determinant
+    for k in range(2, 5):
+        warp[0, k] -= warp[0, 0] * change[0, k] + warp[0, 1] * change[1, k]
+        warp[1, k] -= warp[1, 0] * change[0, k] + warp[1, 1] * change[1, k]
+    return True
+
+
+@njit(cache=True)
+def strength(warp: Array, half: float) -> float:
+    """Largest share by which a warp, less the identity, displaces what is `half` away from the middle."""
+    most = max(abs(warp[0, 0] - 1.0), abs(warp[0, 1]), abs(warp[1, 0]), abs(warp[1, 1] - 1.0))
+    for i in range(2):
+        for k in range(2, 5):
+            most = max(most, abs(warp[i, k]) * half)
+    return most
+
+
+@njit(cache=True)
 def register(
     template: Array,
     coefficients: Array,
     row: float,
     column: float,
-    stretch: bool,
+    order: int,
     limits: tuple[float, float, int],
     tolerance: float,
     singular: float,
 ) -> tuple[bool, float, float, float]:
     """Whether it converged, the middle's row and column and the correlation there: see `registration.registered`.
 
-    `limits` are the largest shift, the largest entry of the stretch and the number of steps.
+    `order` is 0 for shift alone, 1 with stretch, 2 with bend too. `limits` are the largest shift, the largest strength
+    of the warp and the number of steps.
     """
     side = template.shape[0]
-    unknowns = 8 if stretch else 4
+    half = 0.5 * (side - 1)
+    unknowns = UNKNOWNS[order]
     rows = design_rows(template, unknowns)
     scales = np.sqrt(np.sum(rows * rows, axis=1))
     failed = (False, row, column, 0.0)
@@ -99,11 +139,11 @@ def register(
         return failed
     values = np.empty(side * side)
     found = np.empty(unknowns)
-    matrix = np.eye(2)
+    warp, change = np.eye(2, 5), np.zeros((2, 5))
     v, u, score = row, column, 0.0
     for step in range(limits[2]):
-        if stretch and step > 0:
-            inside = sample(coefficients, side, v, u, matrix, values)
+        if order > 0 and step > 0:
+            inside = sample(coefficients, side, v, u, warp, values)
         else:
             inside = sample_shifted(coefficients, side, v, u, values)
         if not inside:
@@ -122,23 +162,22 @@ def register(
         if not gain > 0.0:
             return failed
         turn = 0.0
-        if stretch:
-            # the template was stretched by 1 + e: undo it before (composition with the inverse)
-            a, b, c, d = 1.0 + found[4] / gain, found[5] / gain, found[6] / gain, 1.0 + found[7] / gain
-            determinant = a * d - b * c
-            if abs(determinant) < 0.1:
+        if order > 0:
+            # the template was warped by this: undo it before (composition with the inverse)
+            for i in range(2):
+                change[i, 0], change[i, 1] = found[4 + 2 * i] / gain, found[5 + 2 * i] / gain
+                if order > 1:
+                    for k in range(3):
+                        change[i, 2 + k] = found[8 + 3 * i + k] / gain
+            if not unwarp(warp, change):
                 return failed
-            turn = max(abs(a - 1.0), abs(b), abs(c), abs(d - 1.0))
-            m00, m01, m10, m11 = matrix[0, 0], matrix[0, 1], matrix[1, 0], matrix[1, 1]
-            matrix[0, 0] = (m00 * d - m01 * c) / determinant
-            matrix[0, 1] = (m01 * a - m00 * b) / determinant
-            matrix[1, 0] = (m10 * d - m11 * c) / determinant
-            matrix[1, 1] = (m11 * a - m10 * b) / determinant
-        dv = (matrix[0, 0] * found[2] + matrix[0, 1] * found[3]) / gain
-        du = (matrix[1, 0] * found[2] + matrix[1, 1] * found[3]) / gain
+            change[0, 0] += 1.0
+            change[1, 1] += 1.0
+            turn = strength(change, half)
+        dv = (warp[0, 0] * found[2] + warp[0, 1] * found[3]) / gain
+        du = (warp[1, 0] * found[2] + warp[1, 1] * found[3]) / gain
         v, u = v - dv, u - du
-        largest = max(abs(matrix[0, 0] - 1.0), abs(matrix[0, 1]), abs(matrix[1, 0]), abs(matrix[1, 1] - 1.0))
-        if math.hypot(v - row, u - column) > limits[0] or largest > limits[1]:
+        if math.hypot(v - row, u - column) > limits[0] or strength(warp, half) > limits[1]:
             return failed
         if math.hypot(dv, du) < tolerance and turn * side < 20.0 * tolerance:
             return True, v, u, score

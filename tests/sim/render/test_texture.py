@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from sim.render.kernels.texture import NOISE_VARIANCE, add_texture, gradient_noise
+from sim.render.kernels.texture import CELLS_LEAST, NOISE_VARIANCE, add_texture, gradient_noise
 from sim.terrain import sites
 
 PLACES = np.random.default_rng(5).uniform(-500.0, 500.0, (60000, 3))
@@ -23,11 +24,26 @@ def test_mean_albedo_is_kept_at_any_distance(footprint_m: float) -> None:
     assert np.mean(np.exp(log)) == pytest.approx(1.0, abs=0.005)
 
 
-def test_detail_finer_than_half_a_footprint_is_left_out() -> None:
+def test_detail_finer_than_a_footprint_is_left_out() -> None:
     octaves = np.array([0.2, 0.3])
     change = np.zeros(3)
     place = np.array([[0.3], [0.4], [0.1]]) @ np.ones((1, 3))
-    add_texture(*place, np.array([0.51, 0.2, np.inf]), 1.0, octaves, change)
+    add_texture(*place, np.array([1.001 / CELLS_LEAST, 0.2, np.inf]), 1.0, octaves, change)
     assert change[0] == 0.0
     assert change[1] != 0.0
     assert change[2] == 0.0
+
+
+@pytest.mark.parametrize("cell_px", [4, 3, 2])
+def test_an_octave_fades_as_a_gaussian_of_half_a_pixel_blurs_it(cell_px: float) -> None:
+    """A plane through the noise, ten samples a pixel, blurred, against what a pixel's footprint leaves of it."""
+    fine, side = 10, 400
+    rng = np.random.default_rng(7)
+    turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    y, x = np.mgrid[:side, :side].reshape(2, -1) / fine / cell_px
+    places = 50.0 + x[:, None] * turned[0] + y[:, None] * turned[1]
+    sharp, seen = np.zeros(len(places)), np.zeros(len(places))
+    add_texture(*places.T.copy(), np.full(len(places), 1e-6), 1.0, np.array([0.1]), sharp)
+    add_texture(*places.T.copy(), np.full(len(places), 1.0 / cell_px), 1.0, np.array([0.1]), seen)
+    blurred = ndimage.gaussian_filter(sharp.reshape(side, side), 0.5 * fine, mode="nearest")
+    assert np.std(seen) / np.std(sharp) == pytest.approx(np.std(blurred) / np.std(sharp), abs=0.05)
