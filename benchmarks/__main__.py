@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks import beside, descent, engine, estimators, hda, pictures, reporting, vtt
+from benchmarks import beside, descent, engine, estimators, hda, pictures, reporting, starting, vtt
 from benchmarks.page import PAGE, write_page
 from benchmarks.timing import Figure
 from sim.processor import processor_features
@@ -33,13 +33,13 @@ def main() -> None:
         *descent.frame(15),
         *descent.case(7),
         *estimators.side_by_side(8),
-        *pictures.wall_seconds_of_a_frame(9),
         *beside.figures(5),
         *pictures.rover_pictures(3),
         *descent.new_terrains(2),
         *vtt.figures(9),
         *hda.figures(9),
         *engine.figures(),
+        *starting.figures(5),
         *reporting.figures(),
     ]
     print(f"{'core-seconds, unless said otherwise':<52}{'median':>8}{'least':>8}{'most':>8}  {'bar':<8}")

@@ -30,7 +30,7 @@ def frame(repeats: int) -> list[Figure]:
         Figure(
             "descent frame, 1024 x 1024",
             core_seconds(lambda: renderer.render(scene, optics.rays, pose), repeats),
-            bar=0.6,
+            bar=0.2,
         )
     ]
 

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from joblib import Parallel, delayed
 from pydantic import BaseModel, ConfigDict
 
 from benchmarks.timing import Figure
@@ -90,9 +91,33 @@ def figures(repeats: int = 3) -> list[Figure]:
         Figure("engine: beside an empty case (ms)", [1e3 * (one.case_s - one.own_s) for one in empty], bar=2.0),
         Figure("engine: beside a case of 50 ms (%)", [100.0 * (one.case_s / one.own_s - 1.0) for one in busy], bar=3.0),
         Figure("engine: parent grows, 10,000 to 100,000 cases (MB)", [long.grown_mb], bar=10.0),
+        *_a_hundred_thousand(),
         Figure("engine: two workers over one, rendered cases (times)", [gain()], least=1.85),
         Figure(f"engine: table of 1,000,000 rows of {COLUMNS} numbers (s)", [table_seconds(1_000_000)], bar=30.0),
     ]
+
+
+def _a_hundred_thousand(cases: int = 100_000) -> list[Figure]:
+    """A whole campaign of empty cases on two workers, from its start to its table, and joblib's loop over the same."""
+    configuration = CampaignConfiguration(
+        name="empty", scenario="benchmarks.engine:BusyScenario", cases=cases, retain=Retain(showcase="none")
+    )
+    campaign = Campaign(configuration, BusyScenario())
+    with TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        run_campaign(campaign, Path(folder, "run"), Crew(2), Stopwatch(()))
+        ours = time.perf_counter() - began
+    began = time.perf_counter()
+    Parallel(2)(delayed(_one)(campaign, case) for case in range(cases))
+    loop = time.perf_counter() - began
+    return [
+        Figure(f"engine: {cases:,} empty cases, two workers (wall s)", [ours], bar=60.0),
+        Figure("the same in a plain loop of joblib, nothing kept (wall s)", [loop]),
+    ]
+
+
+def _one(campaign: Campaign, case: int) -> CaseResult:
+    return campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
 
 
 def span(busy_s: float, first: int, last: int) -> Span:

@@ -91,7 +91,7 @@ def tried(estimator: VelocityEstimator, descents: list[Descent]) -> Tried:
 def side_by_side(cases: int) -> list[Figure]:
     """Core-seconds of each estimator on the same triples, binned to 256 x 256."""
     descents = recorded("dimes-smoke", cases)
-    bars = {"DIMES": 0.030}
+    bars = {"DIMES": 0.015}
     return [
         Figure(f"a triple: {name}", tried(estimator, descents).seconds.tolist(), bar=bars.get(name))
         for name, estimator in ESTIMATORS.items()

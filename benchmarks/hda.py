@@ -110,12 +110,12 @@ def _whole(given: LandingMeasurements, repeats: int) -> list[Figure]:
         Figure(
             "HDA, the paper's parameters (paper: 0.77 s)",
             core_seconds(lambda: HdaEstimator(PAPER).estimate(given), repeats),
-            bar=0.06,
+            bar=0.03,
         ),
         Figure(
             "HDA, 160 x 120 points of 640 x 480",
             core_seconds(lambda: HdaEstimator(DENSE).estimate(given), repeats),
-            bar=0.4,
+            bar=0.2,
         ),
         Figure(
             "the same by semi-global matching",

@@ -60,7 +60,7 @@ def updates(repeats: int) -> list[Figure]:
     options = VttOptions()
     brute = replace(options, coarse_levels=0)
     return [
-        Figure("target tracking update, ms", _update_ms(VisualTargetTracker(options), repeats), bar=4.0),
+        Figure("target tracking update, ms", _update_ms(VisualTargetTracker(options), repeats), bar=2.0),
         Figure("the same by the full search, ms", _update_ms(VisualTargetTracker(brute), repeats)),
         Figure("the same by OpenCV's Lucas-Kanade, ms", _update_ms(lucas_kanade_tracker(), repeats)),
     ]
@@ -99,7 +99,7 @@ def runs(repeats: int) -> list[Figure]:
     }
     parameters = RoverScenarioParameters.model_validate(of_run)
     taken = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)
-    return [Figure("a rover's run from 10 m to 2 m, rendered", taken, bar=3.0)]
+    return [Figure("a rover's run from 10 m to 2 m, rendered", taken, bar=1.5)]
 
 
 def figures(repeats: int) -> list[Figure]:

@@ -32,6 +32,7 @@ from sim.render.photometry import Photometry, Sun, Texture
 from sim.render.pyramid import pyramid
 from sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
 from sim.render.reach import EVERYWHERE, Cone, casters_towards, concerned, shade_reach
+from sim.render.threads import in_parts
 from sim.terrain import Surface
 
 NO_TEXTURE = Texture()
@@ -259,26 +260,31 @@ class Renderer:
         columns, rows = rays.size
         light = scene.light(time_s)
         sight = Sight.unseen(rows * columns, scene.objects)
-        look(
-            *pyramid(scene.surface),
-            scene.surface.spacing_m,
-            scene.bounds_m,
-            depth,
-            numbers,
-            rays.focal_px,
-            rays.view_from_body,
-            rays.view_of_pixel,
-            rotation,
-            position,
-            rays.origins,
-            rays.directions,
-            rays.pixel_angles,
-            scene.objects.hierarchy,
-            sight.distance,
-            sight.triangle,
-            sight.weights,
-            sight.level,
-        )
+        levels, hierarchy = pyramid(scene.surface), scene.objects.hierarchy
+
+        def look_at(part: slice) -> None:
+            look(
+                *levels,
+                scene.surface.spacing_m,
+                scene.bounds_m,
+                depth,
+                numbers,
+                rays.focal_px,
+                rays.view_from_body,
+                rays.view_of_pixel[part],
+                rotation,
+                position,
+                rays.origins[part],
+                rays.directions[part],
+                rays.pixel_angles[part],
+                hierarchy,
+                sight.distance[part],
+                sight.triangle[part],
+                sight.weights[part],
+                sight.level[part],
+            )
+
+        in_parts(look_at, rows * columns)
         radiance, body, normal = _shaded(scene, rotation, position, rays.bundle, sight, light)
         frame = Frame(
             radiance.reshape(rows, columns),
@@ -366,32 +372,37 @@ def _shaded(
     radiance = np.empty(count, dtype=np.float32)
     body = np.empty(count, dtype=np.int32)
     normal = np.empty((count, 3), dtype=np.float32)
-    shade(
-        *pyramid(scene.surface),
-        scene.surface.spacing_m,
-        sight.distance,
-        sight.triangle,
-        sight.weights,
-        sight.level,
-        rotation,
-        position,
-        rays.origins,
-        rays.directions,
-        rays.pixel_angles,
-        *light,
-        *scene.shadow,
-        scene.height_range_m[1],
-        scene.ground_texture.arrays(),
-        scene.object_texture.arrays(),
-        scene.objects.normals,
-        scene.objects.body_of_triangle,
-        scene.objects.albedo,
-        scene.casters,
-        scene.reach,
-        radiance,
-        body,
-        normal,
-    )
+    levels, shadow, textures = pyramid(scene.surface), scene.shadow, (scene.ground_texture, scene.object_texture)
+    casters, reach = scene.casters, scene.reach
+
+    def shade_part(part: slice) -> None:
+        shade(
+            *levels,
+            scene.surface.spacing_m,
+            sight.distance[part],
+            sight.triangle[part],
+            sight.weights[part],
+            sight.level[part],
+            rotation,
+            position,
+            rays.origins[part],
+            rays.directions[part],
+            rays.pixel_angles[part],
+            *light,
+            *shadow,
+            scene.height_range_m[1],
+            *(texture.arrays() for texture in textures),
+            scene.objects.normals,
+            scene.objects.body_of_triangle,
+            scene.objects.albedo,
+            casters,
+            reach,
+            radiance[part],
+            body[part],
+            normal[part],
+        )
+
+    in_parts(shade_part, count)
     return radiance, body, normal
 
 

@@ -174,7 +174,7 @@ def _keep_normals(width: int, work: Array, normal: Array32) -> None:
         normal[3 * k + 2] = work[NZ + k]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def shade(
     levels: tuple[Level, ...],
     top_level: int,

@@ -228,7 +228,7 @@ def _meet_ground(
         count = left
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def look(
     levels: tuple[Level, ...],
     top_level: int,

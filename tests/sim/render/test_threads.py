@@ -1,0 +1,52 @@
+"""Pixels shared among threads: every one once, and the same picture to the bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numba import config
+from scipy.spatial.transform import Rotation
+
+from sim.frames import direction, rigid
+from sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture, threads
+from sim.terrain.rocks import PlacedRock, RockField, RockParameters
+
+
+@pytest.mark.parametrize(("pixels", "count"), [(100_001, 1), (100_001, 2), (99_999, 7), (20_001, 3), (5, 2)])
+def test_every_pixel_belongs_to_one_part(pixels: int, count: int) -> None:
+    visits = np.zeros(pixels, dtype=np.int64)
+
+    def visit(part: slice) -> None:
+        visits[part] += 1
+
+    threads.in_parts(visit, pixels, count)
+    np.testing.assert_array_equal(visits, 1)
+
+
+def test_a_thread_that_fails_is_heard() -> None:
+    def fail(part: slice) -> None:
+        if part.start > 0:
+            raise ValueError("the second half")
+
+    with pytest.raises(ValueError, match="the second half"):
+        threads.in_parts(fail, 100_000, 2)
+
+
+def test_pictures_do_not_depend_on_threads(renderer, rough, descent_camera, monkeypatch) -> None:
+    rock = PlacedRock(name="rock", east_m=380.0, north_m=205.0, diameter_m=30.0, shape=3, yaw_deg=20.0)
+    field = RockField.on(rough, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
+    mesh = field.near(380.0, 205.0, 60.0, above_m=200.0)
+    rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=0.15)
+    light = Sun(direction(2.0, 0.6))
+    scene = Scene(
+        rough, (380.0, 200.0), light, Photometry(), rocks, Texture(3.0, (0.03,) * 6), Texture(0.5, (0.05,) * 3)
+    )
+    rays = PixelRays.of(descent_camera().cropped(400, 400, (161, 161)))
+    pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
+    monkeypatch.setattr(config, "NUMBA_NUM_THREADS", 1)
+    alone = renderer.render(scene, rays, pose)
+    assert np.any(alone.body >= 0)
+    monkeypatch.setattr(config, "NUMBA_NUM_THREADS", 3)
+    shared = renderer.render(scene, rays, pose)
+    for name in ("radiance", "range_m", "body", "normal"):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(shared, name))
