@@ -98,7 +98,7 @@ def unwarp(warp: Array, change: Array) -> bool:
 @njit(cache=True)
 def strength(warp: Array, half: float) -> float:
     """Largest share by which a warp, less the identity, displaces what is `half` away from the middle."""
-    most = max(abs(warp[0, 0] - 1.0), abs(warp[0, 1]), abs(warp[1, 0]), abs(warp[1, 1] - 1.0))
+    most: float = max(abs(warp[0, 0] - 1.0), abs(warp[0, 1]), abs(warp[1, 0]), abs(warp[1, 1] - 1.0))
     for i in range(2):
         for k in range(2, 5):
             most = max(most, abs(warp[i, k]) * half)
