@@ -18,6 +18,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt32
 from numpy.typing import NDArray
 
+from sim.render.kernels.depth import metres
+
 if TYPE_CHECKING:
     import trimesh
 
@@ -166,10 +168,11 @@ class DepthRenderer:
             raise RenderingError("no mesh has been loaded")
         self._platform.make_current()
         self._drawing.draw(np.linalg.inv(view.world_from_view @ _VIEW_FROM_GL), _projection(view, self.side_px))
-        depth = _metres(self._drawing.depth()[::-1], view.near_m, view.far_m)
+        depth = metres(self._drawing.depth(), float(view.near_m), float(view.far_m))
         if self._drawing.things == 0:
             return depth, np.zeros((0, 0), dtype=np.int32)
-        return depth, np.bitwise_and(self._drawing.colours()[::-1], np.uint32(_SPELLED)).view(np.int32)
+        numbers = np.bitwise_and(self._drawing.colours()[::-1], np.uint32(_SPELLED), order="C")
+        return depth, numbers.view(np.int32)
 
     def description(self) -> str:
         """Renderer and version strings of OpenGL."""
@@ -307,19 +310,6 @@ def _projection(view: PinholeView, side_px: int) -> Float64[np.ndarray, "4 4"]:
     matrix = np.diag([scale, scale, (far + near) / (near - far), 0.0])
     matrix[2, 3], matrix[3, 2] = 2.0 * far * near / (near - far), -1.0
     return matrix
-
-
-def _metres(drawn: Float32[np.ndarray, "side side"], near_m: float, far_m: float) -> Float32[np.ndarray, "side side"]:
-    """Depth along the view's axis from OpenGL's, 0 where nothing was drawn."""
-    # NumPy's own floats would have all of it computed in double precision
-    near_m, far_m = float(near_m), float(far_m)
-    metres: Float32[np.ndarray, "side side"] = np.multiply(drawn, -2.0, order="C")
-    metres += 1.0
-    metres *= far_m - near_m
-    metres += far_m + near_m
-    np.divide(2.0 * near_m * far_m, metres, out=metres)
-    metres[drawn == 1.0] = 0.0
-    return metres
 
 
 def _context(side_px: int, backend: Backend) -> Any:

@@ -356,6 +356,9 @@ class Renderer:
             # only the first guess, so that its coarseness far away does no harm.
             far = 2.0 * scene.mesh_reach_m + clearance_m
             drawn.append(renderer.draw(PinholeView(pose, float(focal), near_m=0.05 * clearance_m, far_m=far)))
+        if len(drawn) == 1:
+            depth, numbers = drawn[0]
+            return depth[np.newaxis], numbers[np.newaxis]
         return np.stack([depth for depth, _ in drawn]), np.stack([numbers for _, numbers in drawn])
 
 
