@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from algorithms.image.alignment import SURROUND
 from algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
 from algorithms.image.peak import Peak, biquadratic_offset
-from algorithms.image.registration import Registration, Warp, registered, splined
+from algorithms.image.registration import Warp, registered, splined
 from algorithms.image.resampling import similarity_patch
 from algorithms.vtt.options import VttOptions
 from algorithms.vtt.target import bearing_rad
@@ -125,6 +125,25 @@ def has_room(image: MastImage, pixel: Float[np.ndarray, "2"], side: int) -> bool
     return bool(np.all(local >= reach) and np.all(local <= np.array([columns, rows]) - 1.0 - reach))
 
 
+@dataclass(frozen=True)
+class Refinement:
+    """A match below a pixel.
+
+    Attributes
+    ----------
+    corner
+        Row and column of its upper left pixel in the picture's counts, shape (2,).
+    score
+        Normalised correlation of the template as it was searched for, shifted there.
+    warped_score
+        The same of the template as it was registered, warped.
+    """
+
+    corner: Float[np.ndarray, "2"]
+    score: float
+    warped_score: float
+
+
 def refined(
     template: Float[np.ndarray, "n n"],
     image: MastImage,
@@ -132,13 +151,12 @@ def refined(
     offset: Float[np.ndarray, "2"],
     whole: Peak,
     options: VttOptions,
-) -> Registration:
-    """The match's upper left corner (row, column of `image.counts`) below a pixel, and the correlation there.
+) -> Refinement:
+    """The match below a pixel, by registration: a shift, then the stretch and the bend that the options allow.
 
     `corner` is that of the best whole pixel, with the correlation of `whole`, and `offset` where the fit to the
-    correlation has its top: the answer where registration of the pictures themselves fails. The stretch, where the
-    options allow it, decides the place only; the correlation stays that of the template as it was searched for. So does
-    the bend; where the texture does not tell one, the stretch stands, and where it does not tell that, the shift.
+    correlation has its top: the answer where registration fails. Where the texture does not tell a bend the stretch
+    stands, and where it does not tell that, the shift.
     """
     near = np.maximum(corner.astype(int) - SURROUND - 2, 0)
     far = corner.astype(int) + len(template) + SURROUND + 2
@@ -146,7 +164,7 @@ def refined(
     part = splined(region, corner + offset - near, len(template))
     shifted = registered(template, part, corner + offset - near, "shift")
     if shifted is None:
-        return Registration(corner + offset, whole.value)
+        return Refinement(corner + offset, whole.value, whole.value)
     best = shifted
     for warp in _WARPS[options.warp]:
         part = splined(region, best.corner, len(template), known=part)
@@ -154,7 +172,7 @@ def refined(
         if warped is None:
             break
         best = warped
-    return Registration(best.corner + near, shifted.score)
+    return Refinement(best.corner + near, shifted.score, best.score)
 
 
 def match_by_correlation(
@@ -169,7 +187,7 @@ def match_by_correlation(
     peak = coarse_to_fine_peak(template, window, options.coarse_levels, options.coarse_candidates)
     half = 0.5 * (options.template_px - 1)
     corner = np.array([peak.row, peak.column]) + np.array(window_corner[::-1], dtype=np.float64) - image.corner[::-1]
-    best = Registration(corner, peak.value)
+    best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
         best = refined(template, image, corner, _top(template, window, peak), peak, options)
     return Match(best.corner[::-1] + half + image.corner, best.score, template)

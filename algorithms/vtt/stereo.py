@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float
 
 from algorithms.image.normalized import normalized_correlation
 from algorithms.image.peak import biquadratic_offset, highest_peak
-from algorithms.image.registration import Registration
-from algorithms.vtt.matching import refined
+from algorithms.vtt.matching import Refinement, refined
 from algorithms.vtt.options import VttOptions
 from sim.camera import CameraModel
 from sim.measurements import MastImage
@@ -26,7 +25,9 @@ class StereoMatch:
     pixel
         (u, v) in the right full frame, shape (2,).
     score
-        Normalised correlation there.
+        Normalised correlation there of the template as it was registered. The other camera sees a slanted face
+        stretched, whatever the rover did: at 63 to 76 deg the template as it was cut correlates by 0.66 to 0.70 at the
+        right place, stretched by over 0.9.
     band
         The part of the right picture that was searched, counts, shape (rows, columns).
     band_corner
@@ -120,12 +121,12 @@ def point_stereo(
     surface = normalized_correlation(template, band)
     peak = highest_peak(np.where(_off_curve(local - near - half, surface.shape, tolerance), -1.0, surface))
     corner = near[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
-    best = Registration(corner, peak.value)
+    best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
         best = refined(template, image, corner, biquadratic_offset(surface, peak), peak, options)
     return StereoMatch(
         pixel=best.corner[::-1] + half + image.corner,
-        score=best.score,
+        score=best.warped_score,
         band=band,
         band_corner=(int(near[0]) + image.corner[0], int(near[1]) + image.corner[1]),
     )
