@@ -9,7 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from reports.statistics.proportions import proportion_lower
+from sim.camera import CameraModel
 from sim.render import Photometry
+from sim.sensor.presets import preset
 
 mpl.rcParams["svg.hashsalt"] = "marsyard"
 INCIDENCE_DEG = 30.0
@@ -19,13 +21,44 @@ LAWS = {
     "Lunar-Lambert, Mars": Photometry(surge_amplitude=0.0),
     "with the opposition surge": Photometry(),
 }
+#: Cameras whose distortion is shown.
+CAMERAS = ("mer-descent-flown", "mer-navcam", "mer-hazcam", "xc-55")
 
 
 def draw_figures(folder: Path) -> None:
     """Writes them all."""
     folder.mkdir(exist_ok=True)
-    for name, figure in {"light": light(), "statistics": statistics()}.items():
+    for name, figure in {"cameras": cameras(), "light": light(), "statistics": statistics()}.items():
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+
+
+def cameras() -> Figure:
+    """How far lenses move pixels from where a pinhole of their focal length has them, over the angle to the axis."""
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for name, style in zip(CAMERAS, ("-", "--", "-.", ":"), strict=True):
+        angle, moved = _distortion(preset(name).cameras()[0])
+        axes.plot(np.degrees(angle), moved, style, label=name)
+    axes.axhline(0.0, color="0.7", linewidth=0.8)
+    axes.set_yscale("symlog", linthresh=0.1)
+    axes.set(xlabel="angle to the optical axis (deg)", ylabel="moved away from the middle (px)")
+    axes.legend(frameon=False)
+    return figure
+
+
+def _distortion(camera: CameraModel) -> tuple[np.ndarray, np.ndarray]:
+    """Angles to the axis of pixels along the middle row, and how far out they lie beyond ``focal length x tangent``."""
+    columns = np.linspace(0.5 * camera.size[0], camera.size[0] - 1.0, 200)
+    pixels = np.stack([columns, np.full_like(columns, 0.5 * (camera.size[1] - 1))], axis=1)
+    directions = camera.rays(pixels)[1]
+    right = camera.rays(pixels[-1])[1] - camera.rays(pixels[0])[1]
+    axis = np.asarray(camera.a) / np.linalg.norm(camera.a)
+    across = directions - (directions @ axis)[:, None] * axis
+    side = right - (right @ axis) * axis
+    tangent = across @ (side / np.linalg.norm(side)) / (directions @ axis)
+    # the focal length is that of the middle, where the lens moves nothing
+    focal = (columns[1] - columns[0]) / (tangent[1] - tangent[0])
+    return np.arctan(tangent), (columns - columns[0]) - focal * (tangent - tangent[0])
 
 
 def light() -> Figure:
