@@ -8,10 +8,10 @@ from functools import cache
 
 from numba import config
 
+from sim.render.kernels.strips import STRIP
+
 #: Pixels below which the threads' start costs more than they save.
 FEWEST = 20_000
-#: Pixels that kernels work on at once: parts begin at a multiple of them.
-TOGETHER = 4
 
 
 def in_parts(work: Callable[[slice], None], pixels: int, threads: int | None = None) -> None:
@@ -30,7 +30,8 @@ def in_parts(work: Callable[[slice], None], pixels: int, threads: int | None = N
     if count == 1 or pixels < FEWEST:
         work(slice(0, pixels))
         return
-    size = -(-pixels // count // TOGETHER) * TOGETHER
+    # parts begin where kernels begin a strip of pixels anyway
+    size = -(-pixels // count // STRIP) * STRIP
     parts = [slice(first, min(first + size, pixels)) for first in range(0, pixels, size)]
     for _ in _pool(count).map(work, parts):
         pass

@@ -13,7 +13,8 @@ from sim.terrain.kernels import Array
 NOISE_VARIANCE = 0.0732
 #: Optics and pixel blur a picture as a Gaussian of half a pixel does: contrast is 0.29 at Nyquist's frequency, as flown
 #: cameras have it. Noise whose cells are c footprints wide, of 0.53 waves a cell in the median, keeps
-#: ``exp(-2 (0.53 pi 0.5 / c)^2)`` of its amplitude; ``(1 - FADING / c^2)^2`` is that to 0.04, and ends where it is 0.
+#: ``exp(-2 (0.53 pi 0.5 / c)^2)`` of its amplitude; ``(1 - FADING / c^2)^2`` is that to 0.04 down to 1.25 footprints a
+#: cell, less below, where sampling would alias, and ends where it is 0.
 FADING = 9.0 / 16.0
 #: Footprints a cell at which an octave is gone.
 CELLS_LEAST = 0.75

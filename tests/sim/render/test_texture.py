@@ -45,5 +45,6 @@ def test_an_octave_fades_as_a_gaussian_of_half_a_pixel_blurs_it(cell_px: float) 
     sharp, seen = np.zeros(len(places)), np.zeros(len(places))
     add_texture(*places.T.copy(), np.full(len(places), 1e-6), 1.0, np.array([0.1]), sharp)
     add_texture(*places.T.copy(), np.full(len(places), 1.0 / cell_px), 1.0, np.array([0.1]), seen)
+    # by 0.036 at three pixels a cell: the median wave stands for all, of which the longer are blurred less
     blurred = ndimage.gaussian_filter(sharp.reshape(side, side), 0.5 * fine, mode="nearest")
     assert np.std(seen) / np.std(sharp) == pytest.approx(np.std(blurred) / np.std(sharp), abs=0.05)

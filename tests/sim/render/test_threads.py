@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
-from numba import config
 from scipy.spatial.transform import Rotation
 
 from sim.frames import direction, rigid
@@ -43,10 +44,10 @@ def test_pictures_do_not_depend_on_threads(renderer, rough, descent_camera, monk
     )
     rays = PixelRays.of(descent_camera().cropped(400, 400, (161, 161)))
     pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
-    monkeypatch.setattr(config, "NUMBA_NUM_THREADS", 1)
+    monkeypatch.setattr("sim.render.renderer.in_parts", partial(threads.in_parts, threads=1))
     alone = renderer.render(scene, rays, pose)
     assert np.any(alone.body >= 0)
-    monkeypatch.setattr(config, "NUMBA_NUM_THREADS", 3)
+    monkeypatch.setattr("sim.render.renderer.in_parts", partial(threads.in_parts, threads=3))
     shared = renderer.render(scene, rays, pose)
     for name in ("radiance", "range_m", "body", "normal"):
         np.testing.assert_array_equal(getattr(alone, name), getattr(shared, name))
