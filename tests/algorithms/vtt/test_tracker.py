@@ -248,6 +248,20 @@ def test_a_near_target_is_ranged_by_a_pair_that_is_centred_on_it() -> None:
     np.testing.assert_allclose(update.position_rover, target, atol=0.001)
 
 
+def test_a_slanted_face_is_scored_as_the_other_camera_sees_it() -> None:
+    """At 66 deg and 3 m a baseline of 0.2 m makes the right picture of a face 15 % longer or shorter."""
+    target, slant = np.array([3.0, 0.0, 0.5]), np.radians(66.0)
+    face = Plane(target, np.array([-np.cos(slant), np.sin(slant), 0.0]))
+    scores = {}
+    for warp in ("shift", "bend"):
+        drive = Drive(scene_of(face, target, 3), navcam(), VisualTargetTracker(replace(SMALL, warp=warp)))
+        drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
+        stereo = details(drive.stop(pose(0.0, 0.0))).stereo
+        scores[warp] = 0.0 if stereo is None else stereo.score
+    assert scores["bend"] > 0.95
+    assert scores["shift"] < scores["bend"] - 0.1
+
+
 def test_slip_shows_as_a_correction_and_not_as_an_error() -> None:
     # The rover drives 4 % less than it believes: 4 cm of the first metre, 5 px of the picture's middle row and less.
     target = np.array([8.0, 0.1, 0.2])
