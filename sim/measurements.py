@@ -5,6 +5,7 @@ Nothing here holds truth. Cameras are as calibrated, times are as tagged, attitu
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -13,7 +14,7 @@ from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from sim.camera import CameraModel
-from sim.frames import rigid
+from sim.frames import rigid_from_axes
 
 
 @dataclass(frozen=True)
@@ -220,9 +221,10 @@ class MastGeometry:
 
     def rover_from_head(self, azimuth_rad: float, elevation_rad: float) -> RigidTransform:
         """The head's pose in the rover frame at these angles, within the limits or not."""
-        pan = Rotation.from_rotvec([0.0, 0.0, -azimuth_rad])
-        turn = pan * Rotation.from_rotvec([0.0, -elevation_rad, 0.0])
-        return rigid(turn, self.base_m + pan.apply(self.elbow_m.copy()) + turn.apply(self.head_m.copy()))
+        (sa, ca), (se, ce) = ((math.sin(angle), math.cos(angle)) for angle in (azimuth_rad, elevation_rad))
+        pan = np.array([[ca, sa, 0.0], [-sa, ca, 0.0], [0.0, 0.0, 1.0]])
+        turn = pan @ np.array([[ce, 0.0, -se], [0.0, 1.0, 0.0], [se, 0.0, ce]])
+        return rigid_from_axes(turn, self.base_m + pan @ self.elbow_m + turn @ self.head_m)
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ class Sighting:
     @cached_property
     def azimuth_world_rad(self) -> float:
         """Direction from the camera to the target in the world as estimated, clockwise from north."""
-        return bearing_rad(np.asarray(self.world_from_head.rotation.apply(self.position_head - self.camera.c)))
+        return bearing_rad(self.world_from_head.as_matrix()[:3, :3] @ (self.position_head - self.camera.c))
 
 
 @dataclass(frozen=True)

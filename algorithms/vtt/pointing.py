@@ -18,6 +18,8 @@ from sim.measurements import MastCalibration, MastGeometry, PixelTarget
 
 #: Newton's steps, and the error before a step that makes it the last: each about squares the error of the one before.
 STEPS, TOLERANCE_PX = 12, 1e-2
+#: A target in the middle of the frame puts a part's border on a whole pixel: rounding of the last bit must not move it.
+_SLACK_PX = 1e-6
 
 
 def mast_angles(
@@ -90,8 +92,8 @@ def box_around(
     if not bool(np.all(camera.in_frame(pixels))):
         return None
     margin = margin_px + np.array([beside_px, 0.0])
-    near = np.maximum(np.floor(pixels.min(axis=0) - margin).astype(int), 0)
-    far = np.minimum(np.ceil(pixels.max(axis=0) + margin).astype(int) + 1, camera.size)
+    near = np.maximum(np.floor(pixels.min(axis=0) - margin + _SLACK_PX).astype(int), 0)
+    far = np.minimum(np.ceil(pixels.max(axis=0) + margin - _SLACK_PX).astype(int) + 1, camera.size)
     return PixelBox((int(near[0]), int(near[1])), (int(far[0] - near[0]), int(far[1] - near[1])))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
-from sim.frames import SITE_FROM_WORLD
+from sim.frames import SITE_FROM_WORLD, composed
 from sim.measurements import RoverTarget, SiteTarget
 
 
@@ -21,7 +21,7 @@ def designated_position_world(
 
 def pose_change(old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform) -> RigidTransform:
     """The transform from the frame as it lay into the frame as it lies."""
-    return new_world_from_frame.inv() * old_world_from_frame
+    return composed(new_world_from_frame.inv(), old_world_from_frame)
 
 
 def predicted_position(

@@ -36,6 +36,7 @@ from algorithms.vtt.target import (
     predicted_position,
 )
 from sim.camera import CameraModel
+from sim.frames import composed
 from sim.measurements import MastCalibration, PixelTarget, RoverMeasurements, TargetDesignation
 
 
@@ -150,7 +151,7 @@ class Stop:
         """The stop at which this was measured."""
         angles = (measurements.azimuth_rad, measurements.elevation_rad)
         rover_from_head = measurements.mast.geometry.rover_from_head(*angles)
-        return cls(measurements, rover_from_head, measurements.world_from_rover * rover_from_head)
+        return cls(measurements, rover_from_head, composed(measurements.world_from_rover, rover_from_head))
 
     @property
     def left(self) -> CameraModel:

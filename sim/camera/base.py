@@ -355,6 +355,10 @@ class CameraModel(ABC):
         return all(np.array_equal(value, theirs[name]) for name, value in self._fields().items())
 
     def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
         values = (value.tobytes() if isinstance(value, np.ndarray) else value for value in self._fields().values())
         return hash((type(self), *values))
 

@@ -143,9 +143,8 @@ class Cahvor(RadialModel):
         return self._radial_gradient(off, kappa, (kappa_x, kappa_y, kappa_z))
 
     def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
-        along, off = self._off_axis(*self._image_plane_direction(u, v))
-        along = np.where(along > 0, along, np.nan)
-        distorted_tau = (off[0] * off[0] + off[1] * off[1] + off[2] * off[2]) / (along * along)
-        ratio = self._polynomial.undistortion(distorted_tau)
-        x, y, z = (along * self._axis[i] + ratio * off[i] for i in range(3))
-        return (x, y, z), None
+        polynomial = self._polynomial
+        sight: Gradient = kernels.radial_sight(
+            u, v, self._direction_from_pixel, self._axis, polynomial.coefficients, polynomial.limits
+        )
+        return sight, None

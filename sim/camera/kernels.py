@@ -1,6 +1,8 @@
-"""Compiled projection through a lens with radial distortion: few points at a time, where NumPy's calls cost most."""
+"""Compiled projection through a lens with radial distortion, and back: where NumPy's calls cost most."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import njit
@@ -8,6 +10,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
+
+#: Most steps of Newton's method, and the last step's share of the solution: the error is of its square.
+NEWTON_STEPS, CONVERGED = 12, 1e-9
+BISECTIONS = 70
 
 
 @njit(cache=True, inline="always")
@@ -55,3 +61,102 @@ def radial_image(
         columns[n], rows[n] = column / depth, row / depth
         seen[n] = omega > 0.0 and tau < tau_limit and depth > 0.0
     return columns, rows, seen
+
+
+@njit(cache=True, inline="always")
+def _excess(polynomial: Triple, tau: float, ratio: float) -> float:
+    s = tau * ratio * ratio
+    return ratio * (polynomial[0] + s * (polynomial[1] + s * polynomial[2])) - 1.0
+
+
+@njit(cache=True, error_model="numpy")
+def _bisected(polynomial: Triple, tau: float, upper: float) -> float:
+    low, high = 0.0, upper
+    if upper == math.inf:
+        high = 1.0
+        while _excess(polynomial, tau, high) < 0.0:
+            high *= 2.0
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if _excess(polynomial, tau, middle) > 0.0:
+            high = middle
+        else:
+            low = middle
+    return 0.5 * (low + high)
+
+
+@njit(cache=True, error_model="numpy")
+def _undistortion(polynomial: Triple, limits: tuple[float, float], tau: float) -> float:
+    """As `undistortion`, of one."""
+    if not tau < limits[1]:
+        return math.nan
+    k1, k3, k5 = polynomial
+    ratio, step = 1.0 / k1, 0.0
+    for _ in range(NEWTON_STEPS):
+        s = tau * ratio * ratio
+        step = (ratio * (k1 + s * (k3 + s * k5)) - 1.0) / (k1 + s * (3.0 * k3 + s * (5.0 * k5)))
+        ratio -= step
+        if abs(step) <= CONVERGED * ratio:
+            break
+    upper = math.sqrt(limits[0] / tau)
+    if abs(step) <= CONVERGED * ratio and 0.0 < ratio <= upper:
+        return ratio
+    found: float = _bisected(polynomial, tau, upper)
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def undistortion(polynomial: Triple, limits: tuple[float, float], distorted_tau: Array) -> Array:
+    """The ratio chi / f(chi) of each f(chi)^2: `sim.camera.radial` says how it is solved for.
+
+    Parameters
+    ----------
+    polynomial
+        k1, k3 and k5 of f.
+    limits
+        chi^2 and f(chi)^2 where f stops growing.
+    distorted_tau
+        Shape (n,); NaN comes out where f does not reach it.
+    """
+    ratio = np.empty(distorted_tau.size)
+    for n in range(distorted_tau.size):
+        ratio[n] = _undistortion(polynomial, limits, distorted_tau[n])
+    return ratio
+
+
+@njit(cache=True, error_model="numpy")
+def radial_sight(
+    u: Array,
+    v: Array,
+    direction_from_pixel: NDArray[np.float64],
+    axis: Array,
+    polynomial: Triple,
+    limits: tuple[float, float],
+) -> tuple[Array, Array, Array]:
+    """Directions of pixels, of any length; NaN where no ray reaches one: `sim.camera.Cahvor` says by what model.
+
+    Parameters
+    ----------
+    u, v
+        Pixels, shape (n,) each.
+    direction_from_pixel
+        Matrix that takes (u, v, 1) to a direction before distortion.
+    axis
+        O, to full length.
+    polynomial, limits
+        As for `undistortion`.
+    """
+    m = direction_from_pixel
+    along_x, along_y, along_z = np.empty(u.size), np.empty(u.size), np.empty(u.size)
+    for n in range(u.size):
+        x = m[0, 0] * u[n] + m[0, 1] * v[n] + m[0, 2]
+        y = m[1, 0] * u[n] + m[1, 1] * v[n] + m[1, 2]
+        z = m[2, 0] * u[n] + m[2, 1] * v[n] + m[2, 2]
+        along = _dot(axis, x, y, z)
+        x, y, z = x - along * axis[0], y - along * axis[1], z - along * axis[2]
+        tau = (x * x + y * y + z * z) / (along * along) if along > 0.0 else math.nan
+        ratio = _undistortion(polynomial, limits, tau)
+        along_x[n] = along * axis[0] + ratio * x
+        along_y[n] = along * axis[1] + ratio * y
+        along_z[n] = along * axis[2] + ratio * z
+    return along_x, along_y, along_z

@@ -17,10 +17,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.camera import kernels
+
 Vector = NDArray[np.float64]
 
-_NEWTON_STEPS = 12
-_BISECTIONS = 70
 _UNLIMITED_TAU = 1e30
 
 
@@ -55,6 +55,16 @@ class RadialPolynomial:
         tau = self.tau_limit
         return tau * self.gain(tau) ** 2 if np.isfinite(tau) else np.inf
 
+    @property
+    def coefficients(self) -> tuple[float, float, float]:
+        """k1, k3 and k5."""
+        return self.k1, self.k3, self.k5
+
+    @cached_property
+    def limits(self) -> tuple[float, float]:
+        """chi^2 and f(chi)^2 where f stops growing."""
+        return float(self.tau_limit), float(self.distorted_tau_limit)
+
     def gain(self, tau: float) -> float:
         """f(chi) / chi for one tau = chi^2."""
         return self.k1 + tau * (self.k3 + tau * self.k5)
@@ -65,38 +75,5 @@ class RadialPolynomial:
         Solved for the ratio g itself, which stays finite on the axis: g (k1 + s (k3 + s k5)) = 1 with s = f^2 g^2.
         Newton from g = 1 / k1 approaches from one side where the polynomial bends one way; what it leaves is bisected.
         """
-        reached = distorted_tau < self.distorted_tau_limit
-        tau = np.where(reached, distorted_tau, 0.0)
-        ratio = np.full_like(tau, 1 / self.k1)
-        step = np.zeros_like(tau)
-        for _ in range(_NEWTON_STEPS):
-            s = tau * ratio * ratio
-            excess = ratio * (self.k1 + s * (self.k3 + s * self.k5)) - 1
-            step = excess / (self.k1 + s * (3 * self.k3 + s * (5 * self.k5)))
-            ratio -= step
-            if not np.any(np.abs(step) > 1e-9 * ratio):  # the error is of the step's square
-                break
-        upper = np.sqrt(self.tau_limit / tau)
-        stuck = ~((np.abs(step) <= 1e-9 * ratio) & (ratio > 0) & (ratio <= upper))
-        if np.any(stuck):
-            ratio[stuck] = self._bisected(tau[stuck], upper[stuck])
-        ratio[~reached] = np.nan
+        ratio: Vector = kernels.undistortion(self.coefficients, self.limits, distorted_tau)
         return ratio
-
-    def _bisected(self, tau: Vector, upper: Vector) -> Vector:
-        low = np.zeros_like(tau)
-        high = np.where(np.isfinite(upper), upper, 1.0)
-        growing = ~np.isfinite(upper)
-        while np.any(growing):
-            high[growing] *= 2
-            growing &= self._excess(tau, high) < 0
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            above = self._excess(tau, middle) > 0
-            high = np.where(above, middle, high)
-            low = np.where(above, low, middle)
-        return 0.5 * (low + high)
-
-    def _excess(self, tau: Vector, ratio: Vector) -> Vector:
-        s = tau * ratio * ratio
-        return ratio * (self.k1 + s * (self.k3 + s * self.k5)) - 1

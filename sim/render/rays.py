@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from sim.camera import CameraModel
 from sim.render.backend import RenderingError
-from sim.render.kernels.angles import pixel_angles
+from sim.render.kernels.angles import extent, least_along, pixel_angles, summed
 from sim.render.reach import Cone
 
 #: Samples along each side of the pinhole views: a camera takes the first that leaves `_SPARE_PX` of them beside its own
@@ -84,7 +84,7 @@ class PixelRays:
     @cached_property
     def axis(self) -> Float64[np.ndarray, "3"]:
         """Unit vector along the middle of all rays, body axes."""
-        middle: Float64[np.ndarray, "3"] = self.directions.mean(axis=0, dtype=np.float64)
+        middle = np.array(summed(self.directions))
         middle /= np.linalg.norm(middle)
         return middle
 
@@ -96,7 +96,7 @@ class PixelRays:
     @cached_property
     def half_angle_rad(self) -> float:
         """Widest angle of a ray from the axis, radians."""
-        return float(np.arccos(np.clip((self.directions @ self.axis).min(), -1.0, 1.0)))
+        return float(np.arccos(np.clip(least_along(self.directions, self.axis), -1.0, 1.0)))
 
     def cone(self, world_from_body: RigidTransform) -> Cone:
         """What holds all rays where the camera stands so."""
@@ -107,8 +107,7 @@ class PixelRays:
     def of(cls, camera: CameraModel) -> PixelRays:
         """The rays of this camera, given in the body frame. Raises RenderingError where pixels have no ray."""
         columns, rows = camera.size
-        origins, directions = camera.rays(camera.pixel_grid())
-        origins = np.broadcast_to(origins, directions.shape)
+        starts, directions = camera.rays(camera.pixel_grid())
         if not np.isfinite(directions).all():
             raise RenderingError("the camera model has pixels without a ray")
         side = next((one for one in VIEW_SIDES_PX if max(columns, rows) <= one - _SPARE_PX), VIEW_SIDE_PX)
@@ -119,10 +118,10 @@ class PixelRays:
             view_of_pixel[part] = len(axes)
             axes.append(_view_axes(directions[part]))
             focal.append(_focal_length(directions[part], axes[-1], side))
-        centre = origins.reshape(-1, 3).mean(axis=0)
+        centre, origins = _from_centre(starts)
         return cls(
             centre=centre,
-            origins=(origins - centre).reshape(-1, 3).astype(np.float32),
+            origins=origins,
             directions=directions.reshape(-1, 3).astype(np.float32),
             size=(columns, rows),
             pixel_angles=pixel_angles(directions).ravel(),
@@ -131,6 +130,17 @@ class PixelRays:
             focal_px=np.array(focal),
             view_of_pixel=view_of_pixel.ravel(),
         )
+
+
+def _from_centre(
+    starts: Float64[np.ndarray, "rows columns 3"],
+) -> tuple[Float64[np.ndarray, "3"], Float32[np.ndarray, "pixels 3"]]:
+    """The mean of where rays start, and where each starts from there."""
+    count = starts.shape[0] * starts.shape[1]
+    if starts.strides[:2] == (0, 0):
+        return starts[0, 0].copy(), np.zeros((count, 3), dtype=np.float32)
+    centre = starts.reshape(-1, 3).mean(axis=0)
+    return centre, (starts - centre).reshape(-1, 3).astype(np.float32)
 
 
 def _parts(directions: Float64[np.ndarray, "rows columns 3"]) -> list[tuple[slice, slice]]:
@@ -170,6 +180,4 @@ def _focal_length(
     directions: Float64[np.ndarray, "rows columns 3"], axes: Float64[np.ndarray, "3 3"], side: int
 ) -> float:
     """The focal length at which these rays just fill a view."""
-    x, y, z = (directions.reshape(-1, 3) @ axes.T).T.copy()
-    extent = max(np.abs(x / z).max(), np.abs(y / z).max())
-    return float((side / 2.0 - MARGIN_PX) / extent)
+    return float((side / 2.0 - MARGIN_PX) / extent(directions, axes))

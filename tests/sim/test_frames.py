@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.frames import SITE_FROM_WORLD, direction, rigid
+from sim.frames import SITE_FROM_WORLD, composed, direction, rigid, rigid_from_axes
 
 
 @pytest.mark.parametrize(
@@ -24,3 +24,16 @@ def test_rigid_rotates_then_translates() -> None:
     quarter_turn = Rotation.from_euler("z", 90, degrees=True)
     moved = rigid(quarter_turn, np.array([10.0, 0.0, 0.0])).apply([1.0, 0.0, 0.0])
     np.testing.assert_allclose(moved, [10.0, 1.0, 0.0], atol=1e-15)
+
+
+def test_transforms_made_without_checks_are_scipys() -> None:
+    turns, places = Rotation.random(20, rng=1), np.random.default_rng(1).normal(size=(20, 3))
+    for turn, place in zip(turns, places, strict=True):
+        checked = RigidTransform.from_components(place, turn)
+        np.testing.assert_allclose(
+            rigid_from_axes(turn.as_matrix(), place).as_matrix(), checked.as_matrix(), atol=1e-15
+        )
+        twice = composed(checked, rigid(turns[0], places[0]))
+        np.testing.assert_allclose(
+            twice.as_matrix(), (checked * rigid(turns[0], places[0])).as_matrix(), rtol=0.0, atol=4e-15
+        )

@@ -17,29 +17,55 @@ UNKNOWNS = (4, 8, 14)
 
 
 @njit(cache=True)
-def design_rows(template: Array, unknowns: int) -> Array:
-    """What a patch is explained by, one row each: template and constant, shift (2), stretch (4), bend (6)."""
+def design(template: Array, unknowns: int) -> Array:
+    """What each pixel is explained by, one row each: template and constant, shift (2), stretch (4), bend (6)."""
     side = template.shape[0]
     half = 0.5 * (side - 1)
     mean = template.mean()
-    rows = np.empty((unknowns, side * side))
+    rows = np.empty((side * side, unknowns))
     for i in range(side):
         for j in range(side):
             up, down = max(i - 1, 0), min(i + 1, side - 1)
             left, right = max(j - 1, 0), min(j + 1, side - 1)
             by_row = (template[down, j] - template[up, j]) / (down - up)
             by_column = (template[i, right] - template[i, left]) / (right - left)
-            k = i * side + j
-            rows[0, k], rows[1, k] = template[i, j] - mean, 1.0
-            rows[2, k], rows[3, k] = by_row, by_column
+            of_pixel = rows[i * side + j]
+            of_pixel[0], of_pixel[1] = template[i, j] - mean, 1.0
+            of_pixel[2], of_pixel[3] = by_row, by_column
             y, x = i - half, j - half
             if unknowns >= 8:
-                rows[4, k], rows[5, k] = by_row * y, by_row * x
-                rows[6, k], rows[7, k] = by_column * y, by_column * x
+                of_pixel[4], of_pixel[5] = by_row * y, by_row * x
+                of_pixel[6], of_pixel[7] = by_column * y, by_column * x
             if unknowns >= 14:
-                rows[8, k], rows[9, k], rows[10, k] = by_row * y * y, by_row * y * x, by_row * x * x
-                rows[11, k], rows[12, k], rows[13, k] = by_column * y * y, by_column * y * x, by_column * x * x
+                of_pixel[8], of_pixel[9], of_pixel[10] = by_row * y * y, by_row * y * x, by_row * x * x
+                of_pixel[11], of_pixel[12], of_pixel[13] = by_column * y * y, by_column * y * x, by_column * x * x
     return rows
+
+
+# Sums are taken side by side, each over the pixels in their order: vector instructions add up several at once.
+
+
+@njit(cache=True)
+def products(rows: Array) -> Array:
+    """``rows^T rows``."""
+    unknowns = rows.shape[1]
+    sums = np.zeros((unknowns, unknowns))
+    for k in range(rows.shape[0]):
+        of_pixel = rows[k]
+        for p in range(unknowns):
+            for q in range(unknowns):
+                sums[p, q] += of_pixel[p] * of_pixel[q]
+    return sums
+
+
+@njit(cache=True)
+def projected(rows: Array, values: Array, sums: Array) -> None:
+    """``rows^T values``."""
+    sums[:] = 0.0
+    for k in range(rows.shape[0]):
+        of_pixel = rows[k]
+        for p in range(sums.size):
+            sums[p] += of_pixel[p] * values[k]
 
 
 @njit(cache=True)
@@ -124,17 +150,14 @@ def register(
     side = template.shape[0]
     half = 0.5 * (side - 1)
     unknowns = UNKNOWNS[order]
-    rows = design_rows(template, unknowns)
-    scales = np.sqrt(np.sum(rows * rows, axis=1))
+    rows = design(template, unknowns)
+    scales = np.sqrt(np.sum(rows * rows, axis=0))
     failed = (False, row, column, 0.0)
     for p in range(unknowns):
         if not scales[p] > 0.0:
             return failed
-        rows[p] /= scales[p]
-    lower = np.empty((unknowns, unknowns))
-    for p in range(unknowns):
-        for q in range(p + 1):
-            lower[p, q] = np.sum(rows[p] * rows[q])
+    rows /= scales
+    lower = products(rows)
     if not cholesky(lower, singular):
         return failed
     values = np.empty(side * side)
@@ -149,8 +172,7 @@ def register(
         if not inside:
             return failed
         values -= values.mean()
-        for p in range(unknowns):
-            found[p] = np.sum(rows[p] * values)
+        projected(rows, values, found)
         spread = math.sqrt(np.sum(values * values))
         if not (found[0] > 0.0 and spread > 0.0):
             return failed

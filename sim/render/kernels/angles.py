@@ -1,4 +1,4 @@
-"""Compiled kernel of cameras' rays: the angle that each pixel takes."""
+"""Compiled kernels of cameras' rays: the angle that each pixel takes, their middle, and how wide they are."""
 
 from __future__ import annotations
 
@@ -39,3 +39,45 @@ def pixel_angles(directions: Array) -> Array32:
             x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
             angles[i, j] = math.sqrt(math.sqrt(x * x + y * y + z * z))
     return angles
+
+
+@njit(cache=True)
+def summed(directions: Array32) -> tuple[float, float, float]:
+    """Sum of vectors, shape (n, 3)."""
+    x, y, z = 0.0, 0.0, 0.0
+    for n in range(directions.shape[0]):
+        x += directions[n, 0]
+        y += directions[n, 1]
+        z += directions[n, 2]
+    return x, y, z
+
+
+@njit(cache=True)
+def least_along(directions: Array32, axis: Array) -> float:
+    """Least component along an axis of vectors, shape (n, 3)."""
+    least = math.inf
+    for n in range(directions.shape[0]):
+        least = min(least, directions[n, 0] * axis[0] + directions[n, 1] * axis[1] + directions[n, 2] * axis[2])
+    return least
+
+
+@njit(cache=True, error_model="numpy")
+def extent(directions: Array, view: Array) -> float:
+    """Greatest distance from the middle of a view's picture, across or down, at a focal length of 1.
+
+    Parameters
+    ----------
+    directions
+        Rays of the pixels shown, shape (rows, columns, 3).
+    view
+        Right, down and forward of the view, one row each.
+    """
+    most = 0.0
+    for i in range(directions.shape[0]):
+        for j in range(directions.shape[1]):
+            x, y, z = directions[i, j, 0], directions[i, j, 1], directions[i, j, 2]
+            right = view[0, 0] * x + view[0, 1] * y + view[0, 2] * z
+            down = view[1, 0] * x + view[1, 1] * y + view[1, 2] * z
+            forward = view[2, 0] * x + view[2, 1] * y + view[2, 2] * z
+            most = max(most, abs(right / forward), abs(down / forward))
+    return most

@@ -70,6 +70,27 @@ def test_azimuth_turns_to_the_right_and_elevation_up() -> None:
     np.testing.assert_allclose(MAST.rover_from_head(np.pi / 2, 0.0).translation, expected, atol=1e-12)
 
 
+def test_the_mast_turns_about_its_two_axes_one_after_the_other() -> None:
+    for azimuth, elevation in ((0.7, -0.4), (-2.1, 0.3)):
+        pan = Rotation.from_rotvec([0.0, 0.0, -azimuth])
+        turn = pan * Rotation.from_rotvec([0.0, -elevation, 0.0])
+        head = MAST.rover_from_head(azimuth, elevation)
+        np.testing.assert_allclose(head.rotation.as_matrix(), turn.as_matrix(), atol=1e-14)
+        place = MAST.base_m + pan.apply(MAST.elbow_m) + turn.apply(MAST.head_m)
+        np.testing.assert_allclose(head.translation, place, atol=1e-14)
+
+
+def test_rounding_does_not_move_the_borders_of_a_subframe() -> None:
+    # a target in the middle of the frame puts them on whole pixels, which the last bit would round either way
+    target, options = np.array([6.0, 0.5, 0.1]), VttOptions()
+    aim = aim_at_position(target, navcam(), options)
+    assert aim is not None
+    for nudge in (-1e-13, 1e-13, -3e-12, 3e-12):
+        again = aim_at_position(target + nudge, navcam(), options)
+        assert again is not None
+        assert (again.left, again.right) == (aim.left, aim.right)
+
+
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
 def test_pointing_brings_the_target_to_the_middle(mast: MastCalibration) -> None:
     for target in targets(2, 20):
