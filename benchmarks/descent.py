@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 
+from benchmarks.bounds import bounds
 from benchmarks.pictures import descent_pose, descent_scene
 from benchmarks.stages import stages
 from benchmarks.timing import Figure, core_seconds
@@ -36,7 +37,7 @@ def frame(repeats: int) -> list[Figure]:
 
 
 def case(repeats: int) -> list[Figure]:
-    """Whole cases as the campaign `dimes-gusev` runs them, all over one terrain that is built, and their stages."""
+    """Whole cases as the campaign `dimes-gusev` runs them, over one terrain that is built, their stages and bounds."""
     campaign = load_campaign("dimes-gusev")
     numbers = itertools.count()
 
@@ -48,6 +49,7 @@ def case(repeats: int) -> list[Figure]:
     return [
         Figure("dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), bar=1.0),
         *stages(run_next, repeats),
+        *bounds(run_next, repeats),
     ]
 
 

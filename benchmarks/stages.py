@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import cProfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from benchmarks.timing import Figure
 
 #: Stages by their functions: the end of the file's name, and the function. What a stage calls counts as its own.
-STAGES: dict[str, tuple[tuple[str, str], ...]] = {
+Stages = Mapping[str, tuple[tuple[str, str], ...]]
+STAGES: Stages = {
     "terrain, its rocks": (("descent/world.py", "of"), ("descent/exposure.py", "_scene")),
     "flight": (("descent/flight.py", "flown_descent"),),
     "mesh and OpenGL": (("render/renderer.py", "_load"), ("render/renderer.py", "_draw")),
@@ -37,24 +38,30 @@ def stages(run: Callable[[], object], repeats: int) -> list[Figure]:
     They are taken by Python's profiler, which slows stages of many small calls, the flight and the instruments, by up
     to a half.
     """
-    run()
-    found: dict[str, list[float]] = {name: [] for name in (*STAGES, REST)}
-    for _ in range(repeats):
-        profile = cProfile.Profile(time.process_time)
-        profile.runcall(run)
-        for name, seconds in _of_each_stage(profile).items():
-            found[name].append(seconds)
+    found = profiled(run, repeats, STAGES)
     return [Figure(f"  of a case, profiled: {name}", values) for name, values in found.items()]
 
 
-def _of_each_stage(profile: cProfile.Profile) -> dict[str, float]:
+def profiled(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:
+    """What `stages` shows, of stages of one's own, by their names."""
+    run()
+    found: dict[str, list[float]] = {name: [] for name in (*stages, REST)}
+    for _ in range(repeats):
+        profile = cProfile.Profile(time.process_time)
+        profile.runcall(run)
+        for name, seconds in _of_each_stage(profile, stages).items():
+            found[name].append(seconds)
+    return found
+
+
+def _of_each_stage(profile: cProfile.Profile, stages: Stages) -> dict[str, float]:
     """Seconds in the functions of each stage and all that they call, and in all else."""
     entries = profile.getstats()
-    seconds = dict.fromkeys(STAGES, 0.0)
+    seconds = dict.fromkeys(stages, 0.0)
     for entry in entries:
         if isinstance(entry.code, str):
             continue
-        for name, functions in STAGES.items():
+        for name, functions in stages.items():
             if any(
                 entry.code.co_name == function and entry.code.co_filename.endswith(file) for file, function in functions
             ):
