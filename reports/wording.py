@@ -99,11 +99,16 @@ def interval(lower: float, upper: float) -> str:
 
 
 def percent(fraction: float) -> str:
-    """A measured fraction in per cent, never rounded up to 100 nor down to 0; a dash for NaN."""
+    """A measured fraction in per cent, never rounded up to 100 nor down to 0; a dash for NaN.
+
+    Some shares exceed 1: wheels slip by more where they slide back.
+    """
     if math.isnan(fraction):
         return NOTHING
     if fraction in (0.0, 1.0):
         return f"{100.0 * fraction:.0f} %"
+    if not 0.0 < fraction < 1.0:
+        return f"{100.0 * fraction:.2f} %"
     for decimals in range(2, 8):
         text = f"{100.0 * fraction:.{decimals}f}"
         if 0.0 < float(text) < 100.0:

@@ -97,7 +97,15 @@ def test_primary_metric(make_rows: Rows, velocity: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(
     ("fraction", "text"),
-    [(1.0, "100 %"), (0.0, "0 %"), (0.5, "50.00 %"), (0.99999, "99.999 %"), (1e-9, "0.0000001 %"), (math.nan, "–")],
+    [
+        (1.0, "100 %"),
+        (0.0, "0 %"),
+        (0.5, "50.00 %"),
+        (0.99999, "99.999 %"),
+        (1e-9, "0.0000001 %"),
+        (math.nan, "–"),
+        (1.000673416, "100.07 %"),
+    ],
 )
 def test_rates_are_never_rounded_to_certainty(fraction: float, text: str) -> None:
     assert percent(fraction) == text
