@@ -113,7 +113,7 @@ def percent(fraction: float) -> str:
         text = f"{100.0 * fraction:.{decimals}f}"
         if 0.0 < float(text) < 100.0:
             return f"{text} %"
-    return f"{100.0 * fraction} %"
+    return "< 0.0000001 %" if fraction < 0.5 else "> 99.9999999 %"
 
 
 def stated(fraction: float) -> str:
