@@ -19,6 +19,7 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.engine import BusyParameters, BusyScenario, Stopwatch
 from benchmarks.pictures import descent_pose, descent_scene
@@ -166,7 +167,7 @@ def _least(run: Callable[[], object]) -> float:
 
 
 def drawn(found: Sequence[Curve]) -> Figure:
-    """A panel each, both axes logarithmic."""
+    """A panel each, both axes logarithmic, costs over a decade at least: what hardly grows shall look like it."""
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     panels = figure.subplots(2, 4).ravel()
     for axes, curve in zip(panels, found, strict=False):
@@ -176,6 +177,14 @@ def drawn(found: Sequence[Curve]) -> Figure:
         axes.set_xlabel(curve.size, fontsize=8)
         axes.set_ylabel(curve.cost, fontsize=8)
         axes.tick_params(labelsize=7, which="both")
+        middle, reach = np.sqrt(min(costs) * max(costs)), np.sqrt(max(10.0, 1.5 * max(costs) / min(costs)))
+        axes.set_ylim(middle / reach, middle * reach)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        if max(sizes) < 10.0 * min(sizes):
+            axes.set_xticks(sizes, [f"{size:g}" for size in sizes], minor=False)
+            axes.set_xticks([], minor=True)
         axes.grid(visible=True, color="0.9")
     for axes in panels[len(found) :]:
         axes.set_axis_off()
