@@ -24,7 +24,7 @@ from sim.terrain.kernels import Array, Level
 PICTURES, SIDE_PX = 3, 1024
 #: Splines that a pixel needs: where its ray meets the ground, and how bright that is.
 SPLINES = 2
-#: Mean of the electrons of a pixel, as a descent exposes its pictures.
+#: Mean of the electrons of a pixel; from some ten on, a Poisson number costs the same whatever its mean.
 ELECTRONS = 3e4
 #: Calls of libraries in cases.
 CALLS: Stages = {
