@@ -23,8 +23,8 @@ from campaigns.execution.crew import Crew
 from campaigns.running.engine import run_campaign
 from campaigns.store import record
 from marsyard import cli
-from marsyard.dashboard_command import server
 from marsyard.deciding import run_until_decided
+from marsyard.site_server import server
 from reports.deciding import next_look
 from reports.notable import notable_cases
 from reports.sampled import Sampled
