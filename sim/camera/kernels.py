@@ -13,6 +13,7 @@ Triple = tuple[float, float, float]
 
 #: Most steps of Newton's method, and the last step's share of the solution: the error is of its square.
 NEWTON_STEPS, CONVERGED = 12, 1e-9
+#: Halvings of what Newton's method leaves: more than a float has digits.
 BISECTIONS = 70
 
 
@@ -65,12 +66,14 @@ def radial_image(
 
 @njit(cache=True, inline="always")
 def _excess(polynomial: Triple, tau: float, ratio: float) -> float:
+    """What the ratio chi / f(chi) satisfies as zero: it grows with the ratio as far as f grows."""
     s = tau * ratio * ratio
     return ratio * (polynomial[0] + s * (polynomial[1] + s * polynomial[2])) - 1.0
 
 
 @njit(cache=True, error_model="numpy")
 def _bisected(polynomial: Triple, tau: float, upper: float) -> float:
+    """The solution of `_undistortion` below a bound, which may be infinite."""
     low, high = 0.0, upper
     if upper == math.inf:
         high = 1.0

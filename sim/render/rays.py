@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from sim.camera import CameraModel
 from sim.render.backend import RenderingError
-from sim.render.kernels.angles import extent, least_along, pixel_angles, summed
+from sim.render.kernels.rays import extent, least_along, pixel_angles, summed
 from sim.render.reach import Cone
 
 #: Samples along each side of the pinhole views: a camera takes the first that leaves `_SPARE_PX` of them beside its own

@@ -2,77 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
-from algorithms.interface import TargetLoss, TargetTracker, TargetUpdate, TrackingState
-from algorithms.vtt.details import VttDetails
+from algorithms.interface import TargetLoss, TargetTracker, TrackingState
 from algorithms.vtt.lucas_kanade import lucas_kanade_tracker
 from algorithms.vtt.options import PURE_NCC, VttOptions
 from algorithms.vtt.tracker import VisualTargetTracker
 from sim.camera import Cahvor
-from sim.measurements import MastImage, PixelTarget, RoverTarget, SiteTarget, TargetDesignation
-from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, Sphere, navcam, pancam, pose, waves
-
-#: A smaller window than the paper's keeps the pictures that must be computed small.
-SMALL = VttOptions(search_px=101)
-
-Body = Callable[[int, np.ndarray], Plane | Sphere]
-
-
-def slanted(seed: int, target: np.ndarray) -> Plane:
-    """A face through the target, turned and tilted at random, towards a rover at the origin."""
-    rng = np.random.default_rng(seed)
-    normal = np.array([-1.0, rng.uniform(-0.5, 0.5), rng.uniform(0.0, 1.0)])
-    return Plane(target, normal / np.linalg.norm(normal))
-
-
-def boulder(seed: int, target: np.ndarray) -> Sphere:
-    """A sphere of 0.3 to 0.6 m whose front holds the target."""
-    rng = np.random.default_rng(seed)
-    normal = np.array([-1.0, rng.uniform(-0.4, 0.4), rng.uniform(0.2, 0.8)])
-    radius = rng.uniform(0.3, 0.6)
-    return Sphere(target - radius * normal / np.linalg.norm(normal), radius)
-
-
-def scene_of(body: Plane | Sphere, target: np.ndarray, seed: int) -> Scene:
-    return Scene((body,), waves(seed, count=100), target)
-
-
-def details(update: TargetUpdate | None) -> VttDetails:
-    assert update is not None
-    assert isinstance(update.details, VttDetails)
-    return update.details
-
-
-def pixel_of(update: TargetUpdate) -> np.ndarray:
-    match = details(update).match
-    assert match is not None
-    return match.pixel
-
-
-def approach(
-    drive: Drive, target: np.ndarray, share: float, goal_m: float = 2.0, slip: float = 0.0
-) -> list[tuple[RigidTransform, TargetUpdate]]:
-    """Stops on the way to the target, each step a share of its distance, until it is near or lost."""
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    stops, x, believed = [], 0.0, 0.0
-    while True:
-        update = drive.stop(pose(x, 0.0), pose(believed, 0.0))
-        assert update is not None
-        stops.append((pose(x, 0.0), update))
-        distance = details(update).distance_m
-        if not update.found or distance < goal_m + 0.02:
-            return stops
-        step = min(share * distance, 1.3 * (distance - goal_m))
-        believed += step
-        x += step * (1.0 - slip)
-
+from sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
+from tests.algorithms.vtt.approach import SMALL, Body, approach, boulder, details, pixel_of, scene_of, slanted
+from tests.algorithms.vtt.synthetic_drive import Drive, Plane, navcam, pancam, pose
 
 # ----- drift -----
 
@@ -330,98 +274,6 @@ def test_noise_of_a_detector_costs_little() -> None:
     true, last = approach(drive, target, 0.1)[-1]
     assert last.found
     assert np.linalg.norm(pixel_of(last) - drive.true_pixel(true, target)) < 1.0
-
-
-# ----- loss and recovery -----
-
-
-def hidden(scene: Scene) -> Scene:
-    """The scene behind a board of another texture, half-way to the target."""
-    board = Plane(np.array([3.0, 0.0, 0.5]), np.array([-1.0, 0.0, 0.0]))
-    return Scene((board,), waves(99, count=100), board.point)
-
-
-@pytest.mark.parametrize(
-    ("behind", "expected"),
-    [
-        ([1], [TrackingState.LOST, TrackingState.NORMAL, TrackingState.NORMAL]),
-        ([1, 2, 3], [TrackingState.LOST, TrackingState.LOST, TrackingState.FAILURE]),
-    ],
-)
-def test_an_occluded_target_is_lost_and_found_again_or_given_up(
-    behind: list[int], expected: list[TrackingState]
-) -> None:
-    target = np.array([6.0, 0.1, 0.2])
-    clear = scene_of(slanted(3, target), target, 3)
-    tracker = VisualTargetTracker(SMALL)
-    drive = Drive(clear, navcam(), tracker)
-    tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
-    states = []
-    for stop in (1, 2, 3):
-        drive.scene = hidden(clear) if stop in behind else clear
-        true = pose(0.25 * stop, 0.0)
-        update = drive.stop(true)
-        assert update is not None
-        states.append(update.state)
-        if update.found:
-            np.testing.assert_allclose(pixel_of(update), drive.true_pixel(true, target), atol=0.2)
-        else:
-            # Where it should be is all that is known: exact here, as the poses are.
-            assert update.losses
-            assert update.position_rover is not None
-            np.testing.assert_allclose(update.position_rover, true.inv().apply(target), atol=0.03)
-    assert states == expected
-    if states[-1] is TrackingState.FAILURE:
-        drive.scene = clear
-        again = drive.stop(pose(1.0, 0.0))
-        assert again is not None
-        assert (again.state, again.losses, again.found) == (TrackingState.FAILURE, (), False)
-    tracker.clear()
-    assert tracker.state is TrackingState.NO_TARGET
-    assert tracker.aim(pose(0.0, 0.0), navcam()) is None
-    assert tracker.update(drive.measurements[-1]).state is TrackingState.NO_TARGET
-
-
-def test_a_picture_that_does_not_show_the_target_is_a_loss() -> None:
-    target = np.array([6.0, 0.1, 0.2])
-    scene = scene_of(slanted(3, target), target, 3)
-    drive = Drive(scene, navcam(), VisualTargetTracker(SMALL))
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
-    seen = drive.measurements[-1]
-    blank = MastImage(np.full((40, 40), 1000, dtype=np.uint16), (0, 0))
-    for wrong, loss in (
-        (replace(seen, left=blank), TargetLoss.OUT_OF_VIEW),
-        (replace(seen, right=blank), TargetLoss.OUT_OF_VIEW),
-        (replace(seen, azimuth_rad=seen.azimuth_rad + 2.5), TargetLoss.OUT_OF_VIEW),
-        (
-            replace(seen, left=replace(seen.left, counts=np.full_like(seen.left.counts, 900))),
-            TargetLoss.LOW_MATCH_SCORE,
-        ),
-        (replace(seen, right=replace(seen.right, counts=seen.left.counts * 0)), TargetLoss.LOW_STEREO_SCORE),
-    ):
-        drive.tracker.clear()
-        drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-        assert drive.tracker.update(seen).found
-        update = drive.tracker.update(wrong)
-        assert update.state is TrackingState.LOST
-        assert loss in update.losses
-
-
-def test_a_target_that_cannot_be_seeded_is_given_up() -> None:
-    tracker = VisualTargetTracker(SMALL)
-    target = np.array([6.0, 0.1, 0.2])
-    drive = Drive(scene_of(slanted(3, target), target, 3), navcam(), tracker)
-    tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
-    away = replace(drive.measurements[-1], azimuth_rad=2.0)
-    tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    assert [tracker.update(away).state for _ in range(3)] == [
-        TrackingState.LOST,
-        TrackingState.LOST,
-        TrackingState.FAILURE,
-    ]
 
 
 # ----- another tracker behind the same protocol -----
