@@ -1,0 +1,51 @@
+"""Light over a run: the sun goes on its way, and a sky in view misleads the exposure of full frames."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from short_run import SHORT
+
+from scenarios.rover import RoverScenarioParameters, Run, run_case
+from scenarios.rover.parameters import SunParameters
+from scenarios.rover.world import SunPath
+from sim.streams import Streams
+
+
+def run(**changes: Any) -> Run:
+    return run_case(RoverScenarioParameters.model_validate({**SHORT, **changes}), Streams(1, "rover tests", 0))
+
+
+def test_the_sun_turns_about_the_pole_westwards() -> None:
+    # from the equator's zenith it sinks by its hour angle, into the west; 16 deg in the 66 minutes of Table IV
+    sun = SunPath(SunParameters(azimuth_deg=0.0, elevation_deg=90.0, latitude_deg=0.0))
+    for minutes in (0.0, 66.0, 132.0):
+        angle = np.radians(16.0 * minutes / 66.0)
+        np.testing.assert_allclose(sun.direction(60.0 * minutes), [-np.sin(angle), 0.0, np.cos(angle)], atol=1e-12)
+
+
+def test_pictures_of_a_run_are_lit_by_the_sun_of_their_time() -> None:
+    # an hour between two pictures: the second is another than without the sun's motion, the first the same
+    slow = {"timing": {"track_s": 3600.0}, "camera": {"detector_noise": False}}
+    still = {"sun": {**SHORT["sun"], "hour_angle_deg_min": 0.0}, "rover_shadow": False}
+    moving = {"sun": {**SHORT["sun"], "held_s": 1.0}, "rover_shadow": False}
+    under_one, under_moving = run(**slow, **still), run(**slow, **moving)
+    assert under_one.stops[1].time_s - under_one.stops[0].time_s >= 3600.0
+    suns = [under_moving.world.scene(stop.time_s).sun.direction for stop in under_moving.stops[:2]]
+    turned = np.degrees(np.arccos(suns[0] @ suns[1]))
+    assert 10.0 < turned < 16.0 / 66.0 * (under_moving.stops[1].time_s - under_moving.stops[0].time_s) / 60.0 + 0.01
+    fixed = [under_one.world.scene(stop.time_s).sun.direction for stop in under_one.stops[:2]]
+    np.testing.assert_allclose(fixed[0], fixed[1], atol=1e-12)
+
+
+def test_a_bright_sky_in_view_makes_full_frames_too_short() -> None:
+    """Section 4.5: exposed for the subframe, what is about the target keeps its contrast, whatever else is in view."""
+    eastwards = {"start": {"distance_m": 9.0}, "legs": [{"motion": "approach", "goal_m": 8.5, "step_share": 0.1}]}
+    sun_ahead = {"sun": {"azimuth_deg": 90.0, "elevation_deg": 30.0}}
+    first = {
+        of: run(**eastwards, **sun_ahead, exposure={"of": of}).stops[0].pictures for of in ("subframe", "full-frame")
+    }
+    shorter = first["full-frame"].exposure_s / first["subframe"].exposure_s
+    assert shorter < 0.3
+    contrast = {of: float(np.std(pair.left.counts.astype(float))) for of, pair in first.items()}
+    assert contrast["full-frame"] == pytest.approx(contrast["subframe"] * shorter, rel=0.1)

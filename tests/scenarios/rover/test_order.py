@@ -1,0 +1,38 @@
+"""In which order a step's activities come (Fig. 12): visual odometry within the drive, tracking, navigation."""
+
+import pytest
+from short_run import SHORT
+
+from scenarios.rover import RoverScenarioParameters, run_case
+from scenarios.rover import run as loop
+from scenarios.rover.mapping import Mapper
+from scenarios.rover.vehicle import Vehicle
+from sim.streams import Streams
+
+
+def test_a_step_drives_by_what_was_tracked_and_mapped_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    def told(kind: type, name: str, word: str) -> None:
+        before = getattr(kind, name)
+
+        def after(*args: object, **more: object) -> object:
+            done.append(word)
+            return before(*args, **more)
+
+        monkeypatch.setattr(kind, name, after)
+
+    told(Mapper, "sense", "map")
+    told(Vehicle, "drive", "drive and see how far")
+    told(loop._Loop, "_track", "track")
+    leg = {"motion": "approach", "goal_m": 3.0, "step_share": 0.08, "autonav": True, "visual_odometry": True}
+    run = run_case(RoverScenarioParameters.model_validate({**SHORT, "legs": [leg]}), Streams(1, "rover tests", 0))
+    steps = " ".join(word[0] for word in done).replace("d d", "d")
+    while "d d" in steps:
+        steps = steps.replace("d d", "d")
+    # the target is seen first; then each step is mapped, driven in parts that visual odometry joins, and tracked
+    assert steps.split(" m d t")[0] == "t"
+    assert set(steps.split(" m d t")[1:]) == {""}
+    assert run.autonav_updates == done.count("map") >= 2
+    assert run.visual_odometry_updates == done.count("drive and see how far")
+    assert len(run.stops) == done.count("track")
