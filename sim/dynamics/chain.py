@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, model_validator
 
-from sim.dynamics.kernels import Chain
+from sim.dynamics.kernels.swing import Chain
 from sim.dynamics.wind import WindParameters
 
 #: Greatest tilt of a coning lander over the line's tilt for which the start of a flight is known well enough.

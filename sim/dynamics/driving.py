@@ -27,6 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
 from sim.dynamics.rover import Ground, RoverParameters, Stance, settle
+from sim.frames import turn_matrix
 from sim.measurements import DriveCommand
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -233,7 +234,7 @@ def _slipped(
     strayed_rad: float,
 ) -> Stance:
     """The rover after a part of a command."""
-    turn = here.world_from_rover.rotation.as_matrix()
+    turn = turn_matrix(here.world_from_rover)
     path = _moved(p, factor, turn, told)
     kept = max(1.0 - factor * (p.turn + p.turn_slope * _share(p, here.tilt_rad)), 0.0)
     turned = kept * told.turn_left_rad + strayed_rad

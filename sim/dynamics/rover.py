@@ -28,7 +28,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.frames import rigid
+from sim.dynamics.kernels import suspension
+from sim.frames import rigid, turn_matrix
 
 Metres = Annotated[float, Field(gt=0.0, le=5.0)]
 
@@ -106,6 +107,12 @@ class RoverParameters(BaseModel):
         return np.stack([along, across, np.full(6, self.wheel_radius_m)], axis=1)
 
     @property
+    def pivots_m(self) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
+        """(x, z) of the rockers' axis and of the bogies' on level ground, rover frame."""
+        rocker = np.array([self.rocker_pivot_x_m, self.rocker_pivot_z_m])
+        return rocker, np.array([self.bogie_pivot_x_m, self.bogie_pivot_z_m])
+
+    @property
     def reach_m(self) -> float:
         """Radius of the circle about the origin that holds wheels and body, seen from above, metres."""
         wheel = np.hypot(
@@ -170,7 +177,12 @@ class Stance:
 
     @cached_property
     def _yaw_pitch_roll(self) -> tuple[float, float, float]:
-        yaw, pitch, roll = self.world_from_rover.rotation.as_euler("ZYX")
+        turn = turn_matrix(self.world_from_rover)
+        yaw, pitch, roll = (
+            np.arctan2(turn[1, 0], turn[0, 0]),
+            np.arctan2(-turn[2, 0], np.hypot(turn[2, 1], turn[2, 2])),
+            np.arctan2(turn[2, 1], turn[2, 2]),
+        )
         return float(yaw), float(pitch), float(roll)
 
     @property
@@ -192,7 +204,7 @@ class Stance:
     @property
     def tilt_rad(self) -> float:
         """Angle of the rover's z axis from the vertical."""
-        return float(np.arccos(np.clip(self.world_from_rover.rotation.as_matrix()[2, 2], -1.0, 1.0)))
+        return float(np.arccos(np.clip(turn_matrix(self.world_from_rover)[2, 2], -1.0, 1.0)))
 
 
 def settle(
@@ -221,7 +233,7 @@ def settle(
     frame = _Frame(rover, ground, np.array([east_m, north_m]), 0.5 * np.pi - azimuth_rad)
     unknown, gaps = frame.solved(frame.start(near))
     differential, left, right = (float(angle) for angle in unknown[3:])
-    pose = rigid(frame.rotation(unknown[None])[0], np.array([east_m, north_m, unknown[0]]))
+    pose = rigid(frame.rotation(unknown), np.array([east_m, north_m, unknown[0]]))
     return Stance(pose, differential, (left, right), gaps)
 
 
@@ -229,36 +241,17 @@ def wheel_centres(
     rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]
 ) -> Float64[np.ndarray, "6 3"]:
     """Centres of the wheels in the rover frame at these angles of the joints, metres."""
-    centres: Float64[np.ndarray, "6 3"] = _wheel_centres(rover, np.array([[differential_rad, *bogies_rad]]))[0]
+    joints = np.array([differential_rad, *bogies_rad])
+    centres: Float64[np.ndarray, "6 3"] = suspension.wheel_centres(rover.wheel_places_m, *rover.pivots_m, joints)
     return centres
 
 
 def bogie_pivots(rover: RoverParameters, differential_rad: float) -> Float64[np.ndarray, "2 3"]:
     """Where the rockers carry the left and the right bogie, rover frame, metres."""
-    rocker_pivot = np.array([rover.rocker_pivot_x_m, rover.rocker_pivot_z_m])
-    away = np.tile(np.array([rover.bogie_pivot_x_m, rover.bogie_pivot_z_m]) - rocker_pivot, (6, 1))
-    turned = rocker_pivot + _turned(away, differential_rad * _SIDE[None])[0, [0, 3]]
+    (x, z), about = rover.pivots_m[1], rover.pivots_m[0]
     half = rover.half_track_m
-    return np.array([[turned[0, 0], half, turned[0, 1]], [turned[1, 0], -half, turned[1, 1]]])
-
-
-def _wheel_centres(rover: RoverParameters, joints: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 6 3"]:
-    rest = rover.wheel_places_m
-    rocker_pivot = np.array([rover.rocker_pivot_x_m, rover.rocker_pivot_z_m])
-    bogie_pivot = np.array([rover.bogie_pivot_x_m, rover.bogie_pivot_z_m])
-    rocker = joints[:, :1] * _SIDE
-    bogie = np.repeat(joints[:, 1:], 3, axis=1) * np.tile([0.0, 1.0, 1.0], 2)
-    about_bogie = bogie_pivot + _turned(rest[:, [0, 2]] - bogie_pivot, bogie)
-    centres = np.broadcast_to(rest, (len(joints), 6, 3)).copy()
-    centres[..., [0, 2]] = rocker_pivot + _turned(about_bogie - rocker_pivot, rocker)
-    return centres
-
-
-def _turned(points: Float64[np.ndarray, "*n 6 2"], angles: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6 2"]:
-    """Points (x, z) turned about y: a positive angle lowers what is in front."""
-    x, z = np.broadcast_to(points, (*angles.shape, 2))[..., 0], points[..., 1]
-    sine, cosine = np.sin(angles), np.cos(angles)
-    return np.stack([cosine * x + sine * z, cosine * z - sine * x], axis=-1)
+    left, right = (suspension.turned(x, z, angle, about) for angle in (differential_rad, -differential_rad))
+    return np.array([[left[0], half, left[1]], [right[0], -half, right[1]]])
 
 
 @dataclass(frozen=True)
@@ -276,9 +269,8 @@ class _Frame:
         height = float(near.world_from_rover.translation[2])
         return np.array([height, near.pitch_rad, near.roll_rad, near.differential_rad, *near.bogies_rad])
 
-    def rotation(self, unknown: Float64[np.ndarray, "n 6"]) -> Rotation:
-        yaw = np.full(len(unknown), self.yaw_rad)
-        return Rotation.from_euler("ZYX", np.stack([yaw, -unknown[:, 1], unknown[:, 2]], axis=1))
+    def rotation(self, unknown: Float64[np.ndarray, "6"]) -> Rotation:
+        return Rotation.from_euler("ZYX", [self.yaw_rad, -unknown[1], unknown[2]])
 
     def solved(self, start: Float64[np.ndarray, "6"]) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6"]]:
         """What closes the gaps, and what is left of them: by Newton's method, which needs few steps on most ground.
@@ -324,6 +316,11 @@ class _Frame:
         return heights[np.arange(6), lowest], self.tread[lowest]
 
     @cached_property
+    def shape(self) -> tuple[Float64[np.ndarray, "6 3"], Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
+        """Where the wheels are at rest, and the axes that they turn about."""
+        return (self.rover.wheel_places_m, *self.rover.pivots_m)
+
+    @cached_property
     def tread(self) -> Float64[np.ndarray, "places 3"]:
         """Places of a wheel's tread that may touch the ground, from its centre."""
         angle, line = np.meshgrid(_TREAD_RAD, _TREAD_LINES)
@@ -334,10 +331,6 @@ class _Frame:
         self, unknown: Float64[np.ndarray, "n 6"], treads: Float64[np.ndarray, "wheels places 3"]
     ) -> Float64[np.ndarray, "n 6 places"]:
         """Heights above the ground of places of the wheels' treads, the same for all wheels or each wheel's own."""
-        turn = self.rotation(unknown).as_matrix()
-        points = _wheel_centres(self.rover, unknown[:, 3:])[:, :, None, :] + treads
-        world = np.einsum("nij,nwtj->nwti", turn, points)
-        world[..., :2] += self.place_m
-        world[..., 2] += unknown[:, 0, None, None]
-        heights: Float64[np.ndarray, "n 6 places"] = world[..., 2] - self.ground.height(world[..., 0], world[..., 1])
+        x, y, z = suspension.tread_places(unknown, self.yaw_rad, self.place_m, *self.shape, treads)
+        heights: Float64[np.ndarray, "n 6 places"] = z - self.ground.height(x, y)
         return heights

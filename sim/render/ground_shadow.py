@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from sim.render.kernels.ground import Bounds
+from sim.render.kernels.ground import Bounds, greatest_rises
 from sim.render.kernels.sun import Shadow, heights_in_rows, sweep_shadow
 from sim.render.photometry import Sun
 from sim.render.reach import Cone
@@ -22,6 +22,29 @@ NO_SHADOW = ((np.full((1, 1), -np.inf, dtype=np.float32), np.zeros((1, 1), dtype
 _RIM, _WIDER = 64, 0.01
 #: Posts beyond what is needed: those between which is interpolated, and a row or two by rounding.
 _SPARE = 4
+
+
+def slope_bounds(surface: Surface, sun: Sun) -> tuple[float, float]:
+    """Bounds of the ground's slope along x and along y; infinite where ground so steep could hide part of the sun."""
+    east, north, _ = np.abs(sun.direction)
+    rises = greatest_rises(surface.levels[0], _lowest_ray(sun) * surface.spacing_m, float(east), float(north))
+    return rises[0] / surface.spacing_m, rises[1] / surface.spacing_m
+
+
+def sun_over_slopes(sun: Sun, steepest: tuple[float, float]) -> bool:
+    """Whether ground of no more than these slopes along x and y leaves the whole disc of the sun in sight everywhere.
+
+    No line between two places of it then rises as steeply as the rays to the disc's lower edge.
+    """
+    east, north, _ = np.abs(sun.direction)
+    return bool(steepest[0] * east + steepest[1] * north < _lowest_ray(sun))
+
+
+def _lowest_ray(sun: Sun) -> float:
+    """How far rays to the lower edge of the sun's disc rise on the way that those to its middle go across."""
+    across = float(np.hypot(sun.direction[0], sun.direction[1]))
+    elevation = np.arctan2(sun.direction[2], across) - sun.angular_radius_rad
+    return across * float(np.tan(max(elevation, 0.0)))
 
 
 def ground_shadow(

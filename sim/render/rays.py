@@ -10,6 +10,7 @@ from jaxtyping import Float32, Float64, UInt8
 from scipy.spatial.transform import RigidTransform
 
 from sim.camera import CameraModel
+from sim.frames import turn_matrix
 from sim.render.backend import RenderingError
 from sim.render.kernels.rays import extent, least_along, pixel_angles, summed
 from sim.render.reach import Cone
@@ -100,8 +101,7 @@ class PixelRays:
 
     def cone(self, world_from_body: RigidTransform) -> Cone:
         """What holds all rays where the camera stands so."""
-        tip, axis = world_from_body.apply(self.centre.copy()), world_from_body.rotation.apply(self.axis.copy())
-        return tip, axis, self.half_angle_rad
+        return world_from_body.apply(self.centre.copy()), turn_matrix(world_from_body) @ self.axis, self.half_angle_rad
 
     @classmethod
     def of(cls, camera: CameraModel) -> PixelRays:

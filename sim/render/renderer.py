@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 from scipy.spatial.transform import RigidTransform
 
+from sim.frames import turn_matrix
 from sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
 from sim.render.clouds import CloudLayer, no_cover
 from sim.render.edges import Sight, edge_pixels, look_within, rays_within
-from sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow
+from sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
 from sim.render.heap import keep_freed_memory, return_freed_memory
 from sim.render.kernels.casters import Casters
 from sim.render.kernels.ground import Bounds, height_range
@@ -99,11 +100,13 @@ class Scene:
 
     def with_objects(self, objects: Objects) -> Scene:
         """The same ground in the same light with other things on it; what was found of the ground is kept."""
-        return self._knowing(replace(self, objects=objects), "mesh_offsets", "height_range_m", "shadow")
+        return self._knowing(replace(self, objects=objects), "mesh_offsets", "height_range_m", "steepest", "shadow")
 
     def in_light(self, sun: Sun, photometry: Photometry) -> Scene:
         """The same ground with the same things on it under another sun."""
-        return self._knowing(replace(self, sun=sun, photometry=photometry), "mesh_offsets", "height_range_m")
+        other = self._knowing(replace(self, sun=sun, photometry=photometry), "mesh_offsets", "height_range_m")
+        # bounds that were not found for this sun may be for the other
+        return self._knowing(other, "steepest") if np.all(np.isfinite(self.steepest)) else other
 
     def _knowing(self, other: Scene, *found: str) -> Scene:
         """Another scene, with what was found of this one and holds for it too."""
@@ -120,7 +123,7 @@ class Scene:
         for cone in cones:
             kept |= concerned(self.objects.spheres, sun, lowest, cone)
         less = replace(self, objects=self.objects.only(kept), shown_m=ground_in_cones(cones, lowest))
-        return self._knowing(less, "mesh_offsets", "height_range_m")
+        return self._knowing(less, "mesh_offsets", "height_range_m", "steepest")
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
@@ -135,9 +138,14 @@ class Scene:
         return float(low), float(high)
 
     @cached_property
+    def steepest(self) -> tuple[float, float]:
+        """Bounds of the ground's slope along x and along y; infinite where it rises as steeply as the sun's rays."""
+        return slope_bounds(self.surface, self.sun)
+
+    @cached_property
     def shadow(self) -> tuple[Shadow, float, int]:
         """The ground's shadow on the grid of a level of the surface, the grid's spacing, and the level."""
-        if not self.ground_shadows or self.sun.direction[2] <= 0.0:
+        if not self.ground_shadows or self.sun.direction[2] <= 0.0 or sun_over_slopes(self.sun, self.steepest):
             return NO_SHADOW
         return ground_shadow(self.surface, self.sun, self.height_range_m, self.shown_m)
 
@@ -254,7 +262,7 @@ class Renderer:
         clearance = position[2] - float(scene.surface.height(position[0], position[1]))
         if clearance <= 0.0:
             raise RenderingError(f"the camera is {-clearance:.2f} m below the ground at {position}")
-        rotation = world_from_body.rotation.as_matrix()
+        rotation = turn_matrix(world_from_body)
         self._load(scene, rays, rotation, position)
         depth, numbers = self._draw(scene, rays, rotation, position, clearance)
         columns, rows = rays.size

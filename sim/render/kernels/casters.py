@@ -1,8 +1,9 @@
 """What hides the sun from a place: triangles, listed by where they lie across the sun's rays.
 
-All rays to the sun run the same way: seen along it, each is a point. The triangles of a body are listed in the cells of
-a grid over the body's outline as the sun sees it, and bodies in the cells of one grid over them all. A ray is then held
-against the few triangles of one cell of each body in whose outline it lies.
+All rays to the sun run the same way: seen along it, each is a point, and where it meets a triangle's plane, and with
+which weights of the corners, is linear in the point. The triangles of a body are listed in the cells of a grid over the
+body's outline as the sun sees it, and bodies in the cells of one grid over them all. A ray is then held against the few
+triangles of one cell of each body in whose outline it lies.
 """
 
 from __future__ import annotations
@@ -13,17 +14,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.intersection import hit_triangle
+from sim.render.kernels.strips import Longs, numbers, times
 from sim.terrain.kernels import Array
 
-Longs = NDArray[np.int64]
 #: Cells of a grid: least u and v, cells a metre along u and v; columns, rows; the first item of each cell, and one more
 #: at the end; the items.
 Grid = tuple[Array, Longs, Longs, Longs]
 #: The same for every body: rows of outlines (least u and v, cells a metre along both, greatest s) and of columns, rows
 #: and first cell; first item of each cell; triangles in cells; greatest s of each of these.
 BodyGrids = tuple[Array, Longs, Longs, Longs, Array]
-#: Triangles; two unit vectors across the sun's direction, u and v, and that itself, s; grids.
+#: What of each triangle is linear in u and v, as constant, slope along u and slope along v: the weights of its second
+#: and third corner, and s of its plane; unit vectors u and v across the sun's direction, and s along it; grids.
 Casters = tuple[Array, Array, Grid, BodyGrids]
 #: Triangles to a cell of a body's grid, if none reached over more than one, and most cells along a side of a grid.
 TO_A_CELL, MOST_CELLS = 4, 1024
@@ -31,26 +32,39 @@ TO_A_CELL, MOST_CELLS = 4, 1024
 SLACK_M = 1e-6
 
 
+#: Twice the area in which the sun sees a triangle, square metres, below which it is seen edge-on and hides nothing.
+EDGE_ON = 1e-18
+
+
 @njit(cache=True)
-def _bounds(triangles: Array, axes: Array) -> Array:
-    """Least u and v, greatest u, v and s of each triangle."""
+def _as_the_sun_sees(triangles: Array, axes: Array) -> tuple[Array, Array]:
+    """Least u and v, greatest u, v and s of each triangle; and what of it is linear in u and v (`Casters`)."""
     bounds = np.empty((triangles.shape[0], 5))
+    linear = np.empty((triangles.shape[0], 9))
+    at = np.empty((3, 3))
     for n in range(triangles.shape[0]):
+        for corner in range(3):
+            x, y, z = triangles[n, corner, 0], triangles[n, corner, 1], triangles[n, corner, 2]
+            for k in range(3):
+                at[k, corner] = axes[k, 0] * x + axes[k, 1] * y + axes[k, 2] * z
         for k in range(3):
-            low = math.inf
-            high = -math.inf
-            for corner in range(3):
-                value = (
-                    axes[k, 0] * triangles[n, corner, 0]
-                    + axes[k, 1] * triangles[n, corner, 1]
-                    + axes[k, 2] * triangles[n, corner, 2]
-                )
-                low = min(low, value)
-                high = max(high, value)
             if k < 2:
-                bounds[n, k] = low - SLACK_M
-            bounds[n, k + 2] = high + SLACK_M
-    return bounds
+                bounds[n, k] = min(min(at[k, 0], at[k, 1]), at[k, 2]) - SLACK_M
+            bounds[n, k + 2] = max(max(at[k, 0], at[k, 1]), at[k, 2]) + SLACK_M
+        u, v, s = at[0, 0], at[1, 0], at[2, 0]
+        u2, v2, s2 = at[0, 1] - u, at[1, 1] - v, at[2, 1] - s
+        u3, v3, s3 = at[0, 2] - u, at[1, 2] - v, at[2, 2] - s
+        area = u2 * v3 - u3 * v2
+        if abs(area) < EDGE_ON:
+            linear[n] = math.nan
+            continue
+        second_u, second_v = v3 / area, -u3 / area
+        third_u, third_v = -v2 / area, u2 / area
+        slope_u, slope_v = second_u * s2 + third_u * s3, second_v * s2 + third_v * s3
+        linear[n, 0], linear[n, 1], linear[n, 2] = -(second_u * u + second_v * v), second_u, second_v
+        linear[n, 3], linear[n, 4], linear[n, 5] = -(third_u * u + third_v * v), third_u, third_v
+        linear[n, 6], linear[n, 7], linear[n, 8] = s - slope_u * u - slope_v * v, slope_u, slope_v
+    return bounds, linear
 
 
 @njit(cache=True)
@@ -115,7 +129,7 @@ def _starts(counts: Longs) -> Longs:
 def listed_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Casters:
     """The lists for bodies of triangles that follow each other, and a sun in the direction of the third axis."""
     bodies = first_triangle.size - 1
-    bounds = _bounds(triangles, axes)
+    bounds, linear = _as_the_sun_sees(triangles, axes)
     outlines = np.empty((bodies, 5))
     sides = np.empty(bodies, dtype=np.int64)
     first_cells = np.empty(bodies, dtype=np.int64)
@@ -147,7 +161,7 @@ def listed_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Cast
         tops[k] = bounds[items[k], 4]
     shapes = np.empty((bodies, 2), dtype=np.int64)
     shapes[:, 0], shapes[:, 1] = sides, first_cells
-    return triangles, axes, _listed_bodies(rects), (outlines, shapes, starts, items, tops)
+    return linear, axes, _listed_bodies(rects), (outlines, shapes, starts, items, tops)
 
 
 @njit(cache=True)
@@ -169,33 +183,43 @@ def _listed_bodies(rects: Array) -> Grid:
 
 
 @njit(cache=True)
-def hides_sun(casters: Casters, x: float, y: float, z: float) -> bool:
-    """Whether a triangle stands between a place and the sun."""
-    triangles, axes, (grid, sides, starts, items), (outlines, shapes, first_items, listed, tops) = casters
-    u = axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z
-    v = axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z
-    s = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z
+def hide_sun(casters: Casters, x: Array, y: Array, z: Array, hidden: NDArray[np.bool_]) -> None:
+    """Whether a triangle stands between each of some places and the sun; `hidden` is the output.
+
+    All places in one call: handing over so many arrays takes longer than most places do.
+    """
+    linear, axes, (grid, sides, starts, items), (outlines, shapes, first_items, listed, tops) = casters
+    to_axes = numbers(axes)
     side = sides[0]
-    column = (u - grid[0]) * grid[2]
-    row = (v - grid[1]) * grid[3]
-    # bounds have slack: a ray on the border meets nothing
-    if not (0.0 <= column < side and 0.0 <= row < side):
-        return False
-    of_all = int(row) * side + int(column)
-    for k in range(starts[of_all], starts[of_all + 1]):
-        body = items[k]
-        if outlines[body, 4] < s:
+    west, south, per_u, per_v = grid[0], grid[1], grid[2], grid[3]
+    for place in range(x.size):
+        u, v, s = times(to_axes, x[place], y[place], z[place])
+        hidden[place] = False
+        column = (u - west) * per_u
+        row = (v - south) * per_v
+        # bounds have slack: a ray on the border meets nothing
+        if not (0.0 <= column < side and 0.0 <= row < side):
             continue
-        fine = shapes[body, 0]
-        column = (u - outlines[body, 0]) * outlines[body, 2]
-        row = (v - outlines[body, 1]) * outlines[body, 3]
-        if not (0.0 <= column < fine and 0.0 <= row < fine):
-            continue
-        cell = shapes[body, 1] + int(row) * fine + int(column)
-        for m in range(first_items[cell], first_items[cell + 1]):
-            if tops[m] < s:
+        of_all = int(row) * side + int(column)
+        k = starts[of_all]
+        while k < starts[of_all + 1] and not hidden[place]:
+            body = items[k]
+            k += 1
+            if outlines[body, 4] < s:
                 continue
-            t, second, third = hit_triangle(triangles, listed[m], x, y, z, axes[2, 0], axes[2, 1], axes[2, 2])
-            if 0.0 < t < math.inf and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
-                return True
-    return False
+            fine = shapes[body, 0]
+            column = (u - outlines[body, 0]) * outlines[body, 2]
+            row = (v - outlines[body, 1]) * outlines[body, 3]
+            if not (0.0 <= column < fine and 0.0 <= row < fine):
+                continue
+            cell = shapes[body, 1] + int(row) * fine + int(column)
+            for m in range(first_items[cell], first_items[cell + 1]):
+                if tops[m] < s:
+                    continue
+                n = listed[m]
+                second = linear[n, 0] + linear[n, 1] * u + linear[n, 2] * v
+                third = linear[n, 3] + linear[n, 4] * u + linear[n, 5] * v
+                above = linear[n, 6] + linear[n, 7] * u + linear[n, 8] * v > s
+                if above and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
+                    hidden[place] = True
+                    break

@@ -152,6 +152,33 @@ def height_range(field: Level) -> tuple[float, float]:
     return float(low[::2].min()), float(high[::2].max())
 
 
+@njit(cache=True)
+def greatest_rises(field: Level, most: float, along_x: float, along_y: float) -> tuple[float, float]:
+    """Greatest difference of height between control values side by side, along x and along y; infinite if in vain.
+
+    A spline's slope is a mean of such differences over the spacing, and so is a straight line's between any two places.
+    In vain is a sum beyond `most` of both, weighed by `along_x` and `along_y`: the rest of the ground is not looked at.
+    """
+    side = field.shape[0]
+    beside = np.zeros(side, dtype=np.float32)
+    before = np.zeros(side, dtype=np.float32)
+    rise_x = 0.0
+    rise_y = 0.0
+    for i in range(side):
+        here, above = field[i], field[i - 1]
+        beside[0] = max(beside[0], abs(here[0, 0] - here[side - 1, 0]))
+        for j in range(1, side):
+            beside[j] = max(beside[j], abs(here[j, 0] - here[j - 1, 0]))
+        for j in range(side):
+            before[j] = max(before[j], abs(here[j, 0] - above[j, 0]))
+        if i % 64 == 63 or i == side - 1:
+            rise_x = float(beside.max())
+            rise_y = float(before.max())
+            if rise_x * along_x + rise_y * along_y > most:
+                return math.inf, math.inf
+    return rise_x, rise_y
+
+
 __all__ = [
     "Array",
     "Array32",
@@ -159,6 +186,7 @@ __all__ = [
     "Level",
     "cross_ground",
     "first_ground",
+    "greatest_rises",
     "height_range",
     "turned",
     "way_out",

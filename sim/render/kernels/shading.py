@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.casters import Casters, hides_sun
+from sim.render.kernels.casters import Casters, hide_sun
 from sim.render.kernels.sight import FLATTEST, Ints
 from sim.render.kernels.sky import sky_brightness
 from sim.render.kernels.strips import ROW, STRIP, Array32, Matrix, Near, fetch_levels, no_cells, numbers, spline, times
@@ -265,6 +265,7 @@ def shade(
     ground = np.empty(STRIP, dtype=np.int64)
     mixed = np.empty(STRIP, dtype=np.int64)
     other = np.empty(STRIP, dtype=np.int64)
+    hidden = np.empty(STRIP, dtype=np.bool_)
     count = directions.shape[0]
     for first in range(0, count, STRIP):
         width = min(STRIP, count - first)
@@ -362,6 +363,7 @@ def shade(
         for k in range(width):
             if work[CHANGE + k] != 0.0:
                 work[ALBEDO + k] *= math.exp(work[CHANGE + k])
+        asked = 0
         for k in range(width):
             n = first + k
             if work[COS_I + k] <= 0.0 or body[n] == SKY:
@@ -375,6 +377,7 @@ def shade(
                     # the terrain itself, where the pixel saw it smoothed: its own bumps must not shade a smooth ground
                     height, _slope_x, _slope_y, _albedo = sample(levels[shadow_level], 1.0 / shadow_spacing, px, py)
                     pz = max(pz, height)
+                    work[Z + k] = pz
                 clear, rows = shadow_clearance(shadow, 1.0 / shadow_spacing, px, py, pz)
                 # half the depth of the penumbra, which a disc casts past what is so far away
                 soft = sun_radius * rows * row_m / across
@@ -387,21 +390,36 @@ def shade(
                     lit = sun_over_ground(
                         finest, inverse_spacing, shadow, shadow_spacing, row_m, px, py, pz, sun, sun_radius, highest
                     )
+            work[LIT + k] = lit
             if lit > 0.0 and things and (triangle >= 0 or _in_reach(reach, px, py)):
                 # lifted off its own facet, so that this and those beside do not shade it by rounding
                 lift = 1e-4 + (0.05 * distance[n] * pixel_angles[n] if triangle >= 0 else 0.0)
-                nx, ny, nz = work[NX + k], work[NY + k], work[NZ + k]
-                if hides_sun(casters, px + lift * nx, py + lift * ny, pz + lift * nz):
-                    lit = 0.0
-            cos_g = work[COS_G + k]
-            if caster > 0.0 and cos_g > 0.9:
-                lit *= 1.0 - disc_overlap(0.5 * caster / distance[n], sun_radius, math.acos(cos_g))
-            if dimmed:
-                up = max(drift[1] - pz, 0.0) / sun[2]
-                lit *= 1.0 - drift[4] * cloud_cover(
-                    cover, drift[0], px + up * sun[0] - drift[2], py + up * sun[1] - drift[3]
-                )
-            work[LIT + k] = lit
+                work[THING_X + asked] = px + lift * work[NX + k]
+                work[THING_Y + asked] = py + lift * work[NY + k]
+                work[THING_Z + asked] = pz + lift * work[NZ + k]
+                other[asked] = k
+                asked += 1
+        if asked > 0:
+            x, y, z = work[THING_X : THING_X + asked], work[THING_Y : THING_Y + asked], work[THING_Z : THING_Z + asked]
+            hide_sun(casters, x, y, z, hidden)
+            for m in range(asked):
+                work[LIT + other[m]] *= 0.0 if hidden[m] else 1.0
+        if caster > 0.0 or dimmed:
+            for k in range(width):
+                if work[COS_I + k] <= 0.0:
+                    continue
+                cos_g = work[COS_G + k]
+                if caster > 0.0 and cos_g > 0.9:
+                    seen_wide = 0.5 * caster / distance[first + k]
+                    work[LIT + k] *= 1.0 - disc_overlap(seen_wide, sun_radius, math.acos(cos_g))
+                if dimmed:
+                    up = max(drift[1] - work[Z + k], 0.0) / sun[2]
+                    work[LIT + k] *= 1.0 - drift[4] * cloud_cover(
+                        cover,
+                        drift[0],
+                        work[X + k] + up * sun[0] - drift[2],
+                        work[Y + k] + up * sun[1] - drift[3],
+                    )
         _reflect(reflectance, width, work, radiance[first:last])
         _keep_normals(width, work, flat_normals[3 * first : 3 * last])
         for k in range(width):

@@ -46,7 +46,7 @@ GUESS, STRETCHED, MET, START, X, Y, SCALE, GOING = (ROW * n for n in range(13, 2
 ROWS = 21
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _nearest_depth(depth: Array32, ids: Ints, shown: int, face: int, i: int, j: int, fu: float, fv: float) -> float:
     """Depth of the nearest sample of ground among the four around a place between samples; 0 where there is none.
 
@@ -64,7 +64,7 @@ def _nearest_depth(depth: Array32, ids: Ints, shown: int, face: int, i: int, j: 
     return nearest
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _meet_object(
     ids: Ints,
     face: int,

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from sim.dynamics import SwingDescent, SwingParameters
 from sim.dynamics.chain import Modes, chain_of
-from sim.dynamics.kernels import Chain, WindField, aerodynamic_force, derivatives
+from sim.dynamics.kernels.swing import Chain, WindField, aerodynamic_force, derivatives
 
 START = np.array([100.0, -50.0, 2100.0])
 GROUND_M = 100.0

@@ -8,8 +8,8 @@ from benchmarks.validation.raycast import Ground, meet_triangles
 from sim.camera import Cahv
 from sim.frames import direction, rigid
 from sim.render import Frame, Objects, Photometry, PixelRays, Scene, Sun
-from sim.render.ground_shadow import ground_in_cones, ground_shadow
-from sim.render.kernels.casters import hides_sun
+from sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
+from sim.render.kernels.casters import hide_sun
 from sim.render.kernels.ground import height_range
 from sim.render.reach import casters_towards
 from sim.terrain import Surface, TerrainParameters, synthesise
@@ -115,7 +115,8 @@ def test_places_are_hidden_from_the_sun_as_all_triangles_say(elevation: float) -
     sun = Sun(direction(0.7, elevation))
     places = rng.uniform(-9.0, 9.0, (3000, 3))
     casters = casters_towards(objects, sun)
-    found = np.array([hides_sun(casters, *place) for place in places])
+    found = np.empty(len(places), dtype=np.bool_)
+    hide_sun(casters, *places.T.copy(), found)
     rays = np.broadcast_to(sun.direction, places.shape)
     expected = np.isfinite(meet_triangles(objects, places, rays, nearest=0.0))
     assert 0.1 < np.mean(expected) < 0.9
@@ -136,6 +137,34 @@ def test_a_shadow_swept_where_it_is_seen_is_the_whole_ground_s_there(rough: Surf
     rows, columns = (x, y) if along_x else (y, x)
     of_whole, of_part = (each[np.ix_(rows & (len(each) - 1), columns & (len(each) - 1))] for each in (whole, part))
     np.testing.assert_array_equal(of_part, of_whole)
+
+
+@pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 225.0])
+def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_deg: float) -> None:
+    def at(elevation_rad: float) -> Sun:
+        return Sun(direction(np.radians(azimuth_deg), elevation_rad))
+
+    high = at(np.radians(80.0))
+    steepest = slope_bounds(rough, high)
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(0.0, rough.period_m, (2, 20000))
+    slopes = np.abs(rough.gradient(x, y))
+    assert np.all(slopes <= steepest)
+    assert np.all(slopes.max(axis=0) > 0.6 * np.array(steepest))
+    east, north = np.abs(high.direction[:2]) / np.hypot(*high.direction[:2])
+    rises = np.arctan(steepest[0] * east + steepest[1] * north)
+    just_above, just_below = (at(rises + high.angular_radius_rad + off) for off in (1e-4, -1e-4))
+    assert sun_over_slopes(just_above, steepest)
+    assert slope_bounds(rough, just_above) == steepest
+    assert not sun_over_slopes(just_below, steepest)
+    assert slope_bounds(rough, just_below) == (np.inf, np.inf)
+    # the sweep finds no shadow either, but for the rounding of its numbers
+    (swept, _, along_x), _, level = ground_shadow(rough, just_above, height_range(rough.levels[0]))
+    heights = rough.levels[level][..., 0].T if along_x else rough.levels[level][..., 0]
+    assert np.all(swept < heights + 1e-3)
+    scene = Scene(rough, (0.0, 0.0), just_above, Photometry())
+    assert scene.shadow is NO_SHADOW
+    assert scene.in_light(just_below, Photometry()).shadow is not NO_SHADOW
 
 
 def test_ground_in_cones_holds_all_places_in_them() -> None:
