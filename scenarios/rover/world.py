@@ -27,7 +27,7 @@ EYE_HEIGHT_M = 1.2
 #: How far behind the target ground and rocks are drawn.
 BACKGROUND_M = 25.0
 #: Spacing of the ground's mesh about the target, and by how much it grows from line to line.
-MESH_FINEST_M, MESH_GROWTH = 0.02, 0.012
+MESH_FINEST_M, MESH_GROWTH = 0.04, 0.012
 #: Even slopes: their length as a share of the terrain's period, which the landform centres at a quarter of it.
 RAMP_SHARE = 0.4
 #: How far beyond start and target the ground is cleared of rocks that would stand in the way.

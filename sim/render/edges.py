@@ -14,7 +14,7 @@ from jaxtyping import Float32, Float64, Int8, Int32, Int64
 
 from sim.render.kernels.edges import look_closely, mark_edges, split_rays
 from sim.render.objects import Objects
-from sim.render.pyramid import pyramid
+from sim.render.pyramid import Ceilings, pyramid
 from sim.render.rays import PixelRays, RayBundle
 from sim.terrain import Surface
 
@@ -74,6 +74,7 @@ def rays_within(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int)
 
 def look_within(
     surface: Surface,
+    tops: Ceilings,
     bounds_m: tuple[float, float, float, float],
     objects: Objects,
     rotation: Float64[np.ndarray, "3 3"],
@@ -87,8 +88,9 @@ def look_within(
 
     Parameters
     ----------
-    surface, bounds_m, objects
-        The ground, where it ends (least and greatest x, least and greatest y), and what stands on it.
+    surface, tops, bounds_m, objects
+        The ground, bounds of its height (`sim.render.pyramid.ceilings`), where it ends (least and greatest x, least and
+        greatest y), and what stands on it.
     rotation, position
         Pose of the camera: rotation matrix of the body, world position of its centre of projection.
     columns
@@ -101,6 +103,7 @@ def look_within(
     found = Sight.unseen(len(within.directions), objects)
     look_closely(
         pyramid(surface)[0],
+        tops,
         surface.spacing_m,
         bounds_m,
         objects.hierarchy,

@@ -17,9 +17,9 @@ from sim.render.reach import Cone
 
 #: Samples along each side of the pinhole views: a camera takes the first that leaves `_SPARE_PX` of them beside its own
 #: pixels, and the last where none does (full frames of 1024 x 1024 and 45 deg are drawn at about their own resolution).
-VIEW_SIDES_PX = (288, 352, 544, 1088)
+VIEW_SIDES_PX = (208, 288, 352, 544, 1088)
 VIEW_SIDE_PX = VIEW_SIDES_PX[-1]
-_SPARE_PX = 20
+_SPARE_PX = 16
 #: Samples left free around the pixels' field in a view.
 MARGIN_PX = 2.0
 #: Widest angle from its axis that a view is given; a wider field is cut into quarters.

@@ -25,12 +25,12 @@ from sim.render.heap import keep_freed_memory, return_freed_memory
 from sim.render.kernels.casters import Casters
 from sim.render.kernels.ground import Bounds, height_range
 from sim.render.kernels.shading import Clouds, Reach, shade
-from sim.render.kernels.sight import look
+from sim.render.kernels.sight import GRAZING, look
 from sim.render.kernels.sun import Shadow
 from sim.render.mesh import cells_in_hull, graded_offsets, ground_mesh, lines_in_view
 from sim.render.objects import Objects
 from sim.render.photometry import Photometry, Sun, Texture
-from sim.render.pyramid import pyramid
+from sim.render.pyramid import ceilings, pyramid
 from sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
 from sim.render.reach import EVERYWHERE, Cone, casters_towards, concerned, shade_reach
 from sim.render.threads import in_parts
@@ -268,11 +268,15 @@ class Renderer:
         columns, rows = rays.size
         light = scene.light(time_s)
         sight = Sight.unseen(rows * columns, scene.objects)
-        levels, hierarchy = pyramid(scene.surface), scene.objects.hierarchy
+        (levels, top_level), hierarchy = pyramid(scene.surface), scene.objects.hierarchy
+        highest_ray = np.arcsin(np.clip((rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
+        tops = ceilings(scene.surface, wanted=bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -GRAZING))
 
         def look_at(part: slice) -> None:
             look(
-                *levels,
+                levels,
+                tops,
+                top_level,
                 scene.surface.spacing_m,
                 scene.bounds_m,
                 depth,
@@ -306,7 +310,7 @@ class Renderer:
             pixels = edge_pixels(frame.radiance, frame.range_m, frame.body)
             within = rays_within(rays, pixels, scene.edge_rays)
             seen = look_within(
-                scene.surface, scene.bounds_m, scene.objects, rotation, position, columns, pixels, within, sight
+                scene.surface, tops, scene.bounds_m, scene.objects, rotation, position, columns, pixels, within, sight
             )
             finer, _, _ = _shaded(scene, rotation, position, within, seen, light)
             radiance[pixels] = finer.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)

@@ -97,6 +97,36 @@ def evaluate_field(field: Level, spacing: float, x: Array, y: Array) -> Array:
     return out
 
 
+#: Samples along each side of the blocks over which ceilings are found.
+CEILING_BLOCK = 2
+
+
+@njit(cache=True)
+def ceiling_of(field: Level) -> NDArray[np.float32]:
+    """Upper bounds of a level's height over blocks of samples: of the control values that a place in one has around it.
+
+    Block (a, b) holds the places between the samples ``CEILING_BLOCK * a`` and ``CEILING_BLOCK * (a + 1)`` along y, and
+    likewise along x.
+    """
+    side = field.shape[0]
+    mask = side - 1
+    count = side // CEILING_BLOCK
+    ceiling = np.empty((count, count), dtype=np.float32)
+    highest = np.empty(side, dtype=np.float32)
+    for a in range(count):
+        highest[:] = field[(a * CEILING_BLOCK - 1) & mask, :, 0]
+        for k in range(CEILING_BLOCK + 2):
+            row = field[(a * CEILING_BLOCK + k) & mask]
+            for j in range(side):
+                highest[j] = max(highest[j], row[j, 0])
+        for b in range(count):
+            top = highest[(b * CEILING_BLOCK - 1) & mask]
+            for k in range(CEILING_BLOCK + 2):
+                top = max(top, highest[(b * CEILING_BLOCK + k) & mask])
+            ceiling[a, b] = top
+    return ceiling
+
+
 @njit(cache=True)
 def reduce_level(fine: Level) -> Level:
     """The next coarser level: binomial (1 4 6 4 1)/16 along both axes, every second sample kept, periodic."""

@@ -12,11 +12,12 @@ every ``spacing_m * 2**l`` metres, sample (0, 0) at the same place on every leve
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sim.terrain.kernels import evaluate_field, reduce_level
+from sim.terrain.kernels import ceiling_of, evaluate_field, reduce_level
 
 #: Channels of the stored samples.
 HEIGHT, ALBEDO = 0, 1
@@ -61,6 +62,11 @@ class Surface:
     def period_m(self) -> float:
         """The distance after which the terrain repeats, metres."""
         return float(self.levels[0].shape[0] * self.spacing_m)
+
+    @cached_property
+    def ceilings(self) -> tuple[Float32[np.ndarray, "_ _"], ...]:
+        """Upper bounds of each level's height, metres, over blocks of `CEILING_BLOCK` samples along each side."""
+        return tuple(ceiling_of(level) for level in self.levels)
 
     def height(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch"]:
         """Height above the datum, metres, at world positions x, y (metres)."""

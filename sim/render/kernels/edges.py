@@ -198,6 +198,7 @@ def _nearest_listed(
 @njit(cache=True, fastmath={"contract"})
 def look_closely(
     levels: tuple[Level, ...],
+    ceilings: tuple[Array32, ...],
     spacing: float,
     bounds: Bounds,
     tree: Hierarchy,
@@ -225,7 +226,7 @@ def look_closely(
 
     Parameters
     ----------
-    levels, spacing, bounds, world_from_body, position
+    levels, ceilings, spacing, bounds, world_from_body, position
         As for `look`.
     tree
         Triangles that stand on the ground, and their hierarchy.
@@ -311,7 +312,7 @@ def look_closely(
                 end = min(end, way_out(bounds, x0, y0, dx, dy))
                 smooth = max(level, 0)
                 scale = inverse_spacing / (1 << smooth)
-                t = cross_ground(levels[smooth], scale, x0, y0, z0, dx, dy, dz, start, end)
+                t = cross_ground(levels[smooth], ceilings[smooth], scale, x0, y0, z0, dx, dy, dz, start, end)
                 c += 1
             triangle = -1
             second = 0.0

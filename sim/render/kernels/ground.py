@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.terrain.kernels import Array, Level, sample
+from sim.terrain.kernels import CEILING_BLOCK, Array, Level, sample
 
 Array32 = NDArray[np.float32]
 #: Where the ground that is drawn ends: least and greatest x, least and greatest y, metres.
@@ -40,8 +40,52 @@ def world_ray(
 
 
 @njit(cache=True)
+def pass_over(
+    ceiling: Array32,
+    inverse_spacing: float,
+    x0: float,
+    y0: float,
+    z0: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    start: float,
+    farthest: float,
+) -> float:
+    """Distance at which a ray comes into the first block of the ground that it may not be clear of, from a distance on.
+
+    At least `farthest` where it is clear of all on its way. The blocks are those of `Surface.ceilings`; they are gone
+    through one by one (Amanatides & Woo 1987).
+    """
+    per_metre = inverse_spacing / CEILING_BLOCK
+    mask = ceiling.shape[0] - 1
+    gx, gy = (x0 + start * dx) * per_metre, (y0 + start * dy) * per_metre
+    j, i = math.floor(gx), math.floor(gy)
+    across, along = dx * per_metre, dy * per_metre
+    step_x = 1.0 / abs(across) if across != 0.0 else math.inf
+    step_y = 1.0 / abs(along) if along != 0.0 else math.inf
+    next_x = start + ((j + 1 - gx) if across > 0.0 else (gx - j)) * step_x if across != 0.0 else math.inf
+    next_y = start + ((i + 1 - gy) if along > 0.0 else (gy - i)) * step_y if along != 0.0 else math.inf
+    t = start
+    while t < farthest:
+        out = min(next_x, next_y)
+        lowest = z0 + (out if dz < 0.0 else t) * dz
+        if lowest <= ceiling[i & mask, j & mask]:
+            break
+        t = out
+        if next_x < next_y:
+            next_x += step_x
+            j += 1 if across > 0.0 else -1
+        else:
+            next_y += step_y
+            i += 1 if along > 0.0 else -1
+    return t
+
+
+@njit(cache=True)
 def cross_ground(
     field: Level,
+    ceiling: Array32,
     inverse_spacing: float,
     x0: float,
     y0: float,
@@ -54,16 +98,20 @@ def cross_ground(
 ) -> float:
     """Distance at which a ray first dips below the ground between two distances; infinite where it does not.
 
-    The ray is followed by steps of a sample, longer far away and high above the ground. Where it nears the ground at
-    the beginning of a step and leaves it at the end, the crest between is looked at if it may reach the ray: it stands
-    no higher than where the tangents meet. The crossing is closed in on by false position (Illinois) to a hundredth of
-    a sample.
+    The ray is followed by steps of a sample, longer far away; blocks of ground that it is clear of by their ceilings
+    are passed over, or, where no ceilings are known (a single one), longer steps are taken high above the ground. Where
+    it nears the ground at the beginning of a step and leaves it at the end, the crest between is looked at if it may
+    reach the ray: it stands no higher than where the tangents meet. The crossing is closed in on by false position
+    (Illinois) to a hundredth of a sample.
     """
     spacing = 1.0 / inverse_spacing
-    before = start
+    bounded = ceiling.shape[0] > 1
+    t = start
+    if bounded:
+        t = pass_over(ceiling, inverse_spacing, x0, y0, z0, dx, dy, dz, start, farthest)
+    before = t
     above = 0.0
     rate_before = 0.0
-    t = start
     clearance = 0.0
     while t < farthest:
         height, slope_x, slope_y, _albedo = sample(field, inverse_spacing, x0 + t * dx, y0 + t * dy)
@@ -83,7 +131,15 @@ def cross_ground(
         rate_before = rate
         before = t
         above = clearance
-        t += max(spacing, 1.5 * clearance, FINEST_STEP * t)
+        step = max(spacing, FINEST_STEP * t)
+        if not bounded:
+            step = max(step, 1.5 * clearance)
+        elif clearance > spacing:
+            clear = pass_over(ceiling, inverse_spacing, x0, y0, z0, dx, dy, dz, t, farthest)
+            if clear > t + step:
+                step = clear - t
+                rate_before = 0.0
+        t += step
     if t >= farthest or t == before:
         return math.inf
     below = clearance
@@ -117,6 +173,7 @@ def way_out(bounds: Bounds, x: float, y: float, dx: float, dy: float) -> float:
 @njit(cache=True)
 def first_ground(
     field: Level,
+    ceiling: Array32,
     inverse_spacing: float,
     bounds: Bounds,
     x0: float,
@@ -133,7 +190,7 @@ def first_ground(
     bounds.
     """
     farthest = min(1.25 * guess + 4.0 / inverse_spacing, way_out(bounds, x0, y0, dx, dy))
-    met = cross_ground(field, inverse_spacing, x0, y0, z0, dx, dy, dz, 0.8 * guess, farthest)
+    met = cross_ground(field, ceiling, inverse_spacing, x0, y0, z0, dx, dy, dz, 0.8 * guess, farthest)
     return met if met < math.inf else guess
 
 

@@ -231,6 +231,7 @@ def _meet_ground(
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def look(
     levels: tuple[Level, ...],
+    ceilings: tuple[Array32, ...],
     top_level: int,
     spacing: float,
     bounds: Bounds,
@@ -254,9 +255,9 @@ def look(
 
     Parameters
     ----------
-    levels, top_level, spacing, bounds
-        The surface's pyramid (`sim.render.pyramid`), its coarsest level, the spacing of its level 0, and where the mesh
-        ends.
+    levels, ceilings, top_level, spacing, bounds
+        The surface's pyramid and its ceilings (`sim.render.pyramid`), its coarsest level, the spacing of its level 0,
+        and where the mesh ends.
     depth, ids, focal, view_from_body
         Pinhole views from `position`: depth along the axis, number of the triangle plus one (0 for ground; empty where
         no triangles were drawn, for none are in view), focal lengths in samples, and rotations from body axes to the
@@ -351,6 +352,7 @@ def look(
             if work[DZ + k] > -GRAZING:
                 work[MET + k] = first_ground(
                     levels[smooth[k]],
+                    ceilings[smooth[k]],
                     inverse_spacing / (1 << smooth[k]),
                     bounds,
                     work[X0 + k],

@@ -11,8 +11,10 @@ from sim.camera import Cahvor
 from sim.frames import direction, rigid
 from sim.render import Objects, Photometry, PixelRays, Scene, Sun
 from sim.render.backend import RenderingError
-from sim.render.kernels.ground import cross_ground
+from sim.render.kernels.ground import cross_ground, pass_over
+from sim.render.pyramid import ceilings
 from sim.terrain import Surface
+from sim.terrain.kernels import CEILING_BLOCK
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
 #: Ground that is as bright as its albedo, from wherever it is seen.
@@ -135,22 +137,43 @@ def test_ranges_agree_with_an_independent_ray_cast_over_rough_ground(renderer, r
     assert np.abs(ours / theirs - 1.0).max() < 1e-4
 
 
-def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough) -> None:
+@pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
+def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough, bounded: bool) -> None:
     """Rays that graze rough ground hundreds of samples away, against steps of a thirtieth of a sample."""
     rng = np.random.default_rng(3)
     count, ground = 400, Ground(rough)
     origins = np.column_stack([rng.uniform(0.0, rough.period_m, (count, 2)), np.full(count, ground.highest + 60.0)])
     rays = np.array([direction(a, -np.radians(e)) for a, e in rng.uniform([-np.pi, 2.5], [np.pi, 5.0], (count, 2))])
     expected = ground.cast(origins, rays, 4000.0, 0.05)
-    level, scale = rough.levels[0], 1.0 / rough.spacing_m
+    level, scale, ceiling = rough.levels[0], 1.0 / rough.spacing_m, ceilings(rough, bounded)[0]
+    # by ceilings all of the way is cheap to go
+    begin = 0.0 if bounded else 0.8
     found = np.array(
         [
-            cross_ground(level, scale, *origin, *ray, 0.8 * t, 1.25 * t)
+            cross_ground(level, ceiling, scale, *origin, *ray, begin * t, 1.25 * t)
             for origin, ray, t in zip(origins, rays, expected, strict=True)
         ]
     )
     assert np.median(expected) > 500.0 * rough.spacing_m
     assert np.mean(np.abs(found / expected - 1.0) < 1e-4) > 0.99
+
+
+def test_a_ray_passes_over_the_ground_that_it_is_clear_of(rough) -> None:
+    """To the first block whose ceiling it is not above, in all directions and over the border of the period."""
+    ceiling = rough.ceilings[0]
+    scale, block = 1.0 / rough.spacing_m, CEILING_BLOCK * rough.spacing_m
+    rng = np.random.default_rng(5)
+    for azimuth in [*rng.uniform(-np.pi, np.pi, 60), 0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi]:
+        origin = np.array([*rng.uniform(0.0, rough.period_m, 2), float(ceiling.max()) + 5.0])
+        ray = direction(azimuth, -np.radians(rng.uniform(1.0, 20.0)))
+        start = rng.uniform(0.0, 50.0)
+        clear = pass_over(ceiling, scale, *origin, *ray, start, 5000.0)
+        t = np.arange(start, clear + 3.0 * block, 0.01 * block)
+        places = origin + t[:, None] * ray
+        a, b = (np.floor(places[:, axis] / block).astype(int) % len(ceiling) for axis in (1, 0))
+        below = places[:, 2] <= ceiling[a, b]
+        assert not below[t < clear - 1e-6].any()
+        assert below[(t > clear) & (t < clear + 2.0 * block)].any()
 
 
 def test_the_mesh_only_starts_the_search(renderer, rough, descent_camera) -> None:

@@ -3,6 +3,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from sim.terrain import Surface
+from sim.terrain.kernels import CEILING_BLOCK
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +36,22 @@ def test_gradient_is_the_derivative_of_height(surface, places) -> None:
     along_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
     along_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
     np.testing.assert_allclose(surface.gradient(x, y), np.stack([along_x, along_y], axis=-1), atol=1e-7)
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_ceilings_bound_the_height(surface, level: int) -> None:
+    """Nowhere higher than the control values around a block, and no higher than the highest of these."""
+    ceiling, spacing = surface.ceilings[level], surface.spacing_m * 2.0**level
+    block = CEILING_BLOCK * spacing
+    x, y = np.random.default_rng(7).uniform(-surface.period_m, 2.0 * surface.period_m, (2, 40000))
+    a, b = (np.floor(each / block).astype(int) % len(ceiling) for each in (y, x))
+    assert np.all(surface.height(x, y, level) <= ceiling[a, b])
+    samples = surface.levels[level][..., 0]
+    for row, column in ((0, 0), (3, 5), (len(ceiling) - 1, 2)):
+        around = [
+            np.arange(CEILING_BLOCK * one - 1, CEILING_BLOCK * (one + 1) + 2) % len(samples) for one in (row, column)
+        ]
+        assert ceiling[row, column] == samples[np.ix_(*around)].max()
 
 
 def test_repeats_with_its_period(surface, places) -> None:
