@@ -16,6 +16,8 @@ Bounds = tuple[float, float, float, float]
 #: Shortest step along a ray that looks for the ground, as a share of the distance: a quarter of what a navcam's pixel
 #: takes in at 10 deg, for crests hide what is behind them however little they stand out.
 FINEST_STEP = 0.00125
+#: How often a crest between two places is looked for, ever closer to its top.
+CREST_LOOKS = 4
 
 
 @njit(cache=True, inline="always")
@@ -83,6 +85,45 @@ def pass_over(
 
 
 @njit(cache=True)
+def _crest_over(
+    field: Level,
+    inverse_spacing: float,
+    x0: float,
+    y0: float,
+    z0: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    near: float,
+    above_near: float,
+    rate_near: float,
+    far: float,
+    above_far: float,
+    rate_far: float,
+) -> tuple[float, float]:
+    """A place below a crest between two that are above the ground, and its clearance; 0 where there is none.
+
+    The ray nears the ground at the first and leaves it at the second. A crest between stands no higher than where the
+    tangents of the clearance meet; while that is below the ground, the place is looked at and takes that side's part.
+    """
+    for _ in range(CREST_LOOKS):
+        step = (rate_far * (far - near) - above_far + above_near) / (rate_far - rate_near)
+        if above_near + rate_near * step >= 0.0:
+            break
+        t = near + step
+        height, slope_x, slope_y, _albedo = sample(field, inverse_spacing, x0 + t * dx, y0 + t * dy)
+        clearance = z0 + t * dz - height
+        if clearance < 0.0:
+            return t, clearance
+        rate = dz - slope_x * dx - slope_y * dy
+        if rate < 0.0:
+            near, above_near, rate_near = t, clearance, rate
+        else:
+            far, above_far, rate_far = t, clearance, rate
+    return far, 0.0
+
+
+@njit(cache=True)
 def cross_ground(
     field: Level,
     ceiling: Array32,
@@ -100,9 +141,8 @@ def cross_ground(
 
     The ray is followed by steps of a sample, longer far away; blocks of ground that it is clear of by their ceilings
     are passed over, or, where no ceilings are known (a single one), longer steps are taken high above the ground. Where
-    it nears the ground at the beginning of a step and leaves it at the end, the crest between is looked at if it may
-    reach the ray: it stands no higher than where the tangents meet. The crossing is closed in on by false position
-    (Illinois) to a hundredth of a sample.
+    it nears the ground at the beginning of a step and leaves it at the end, the crest between is looked for. The
+    crossing is closed in on by false position (Illinois) to a hundredth of a sample.
     """
     spacing = 1.0 / inverse_spacing
     bounded = ceiling.shape[0] > 1
@@ -120,14 +160,13 @@ def cross_ground(
             break
         rate = dz - slope_x * dx - slope_y * dy
         if rate_before < 0.0 and rate > 0.0:
-            step = (rate * (t - before) - clearance + above) / (rate - rate_before)
-            if above + rate_before * step < 0.0:
-                crest = before + step
-                height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, x0 + crest * dx, y0 + crest * dy)
-                if z0 + crest * dz < height:
-                    t = crest
-                    clearance = z0 + crest * dz - height
-                    break
+            crest, under = _crest_over(
+                field, inverse_spacing, x0, y0, z0, dx, dy, dz, before, above, rate_before, t, clearance, rate
+            )
+            if under < 0.0:
+                t = crest
+                clearance = under
+                break
         rate_before = rate
         before = t
         above = clearance

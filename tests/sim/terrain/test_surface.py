@@ -47,7 +47,7 @@ def test_ceilings_bound_the_height(surface, level: int) -> None:
     a, b = (np.floor(each / block).astype(int) % len(ceiling) for each in (y, x))
     assert np.all(surface.height(x, y, level) <= ceiling[a, b])
     samples = surface.levels[level][..., 0]
-    for row, column in ((0, 0), (3, 5), (len(ceiling) - 1, 2)):
+    for row, column in ((0, 0), (3, 1), (len(ceiling) - 1, 2)):
         around = [
             np.arange(CEILING_BLOCK * one - 1, CEILING_BLOCK * (one + 1) + 2) % len(samples) for one in (row, column)
         ]
