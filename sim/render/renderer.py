@@ -8,9 +8,8 @@ Distortion is therefore exact and not a resampling of a pinhole picture.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
@@ -18,161 +17,15 @@ from scipy.spatial.transform import RigidTransform
 
 from sim.frames import turn_matrix
 from sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
-from sim.render.clouds import CloudLayer, no_cover
 from sim.render.edges import Sight, edge_pixels, look_within, rays_within
-from sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
 from sim.render.heap import keep_freed_memory, return_freed_memory
-from sim.render.kernels.casters import Casters
-from sim.render.kernels.ground import Bounds, height_range
-from sim.render.kernels.shading import Clouds, Reach, shade
+from sim.render.kernels.shading import shade
 from sim.render.kernels.sight import GRAZING, look
-from sim.render.kernels.sun import Shadow
-from sim.render.mesh import cells_in_hull, graded_offsets, ground_mesh, lines_in_view
-from sim.render.objects import Objects
-from sim.render.photometry import Photometry, Sun, Texture
+from sim.render.mesh import cells_in_hull, ground_mesh, lines_in_view
 from sim.render.pyramid import ceilings, pyramid
 from sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
-from sim.render.reach import EVERYWHERE, Cone, casters_towards, concerned, shade_reach
+from sim.render.scene import Light, Scene
 from sim.render.threads import in_parts
-from sim.terrain import Surface
-
-NO_TEXTURE = Texture()
-NO_CLOUDS = (no_cover(), np.zeros(5))
-
-#: Direction of the sun, the numbers of the law and of the sky, and clouds, as the kernel takes them.
-Light = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "8"], Float64[np.ndarray, "4"], Clouds]
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Ground, things on it, and light.
-
-    Attributes
-    ----------
-    surface
-        The terrain.
-    centre_m
-        World x, y around which the mesh is dense: below a camera near the ground, or the place of a descent.
-    sun, photometry
-        The light, and how the ground scatters it.
-    objects
-        What stands on the ground.
-    ground_texture, object_texture
-        Albedo finer than the terrain's samples.
-    caster_diameter_m
-        Diameter of what casts a shadow from the camera's place: the lander seen against the sun. 0 for none.
-    ground_shadows
-        Whether the ground hides the sun from itself, as softly as the sun's disc is wide; shadows of objects are hard.
-    clouds
-        Clouds that dim the sun as they drift; None for none.
-    mesh_finest_m, mesh_reach_m, mesh_lines
-        Spacing of the mesh at the centre, how far it reaches to each side, and the number of its lines.
-    among_objects
-        Whether pictures are taken from among the objects, whose shadows may then fall nearly anywhere in them. Without
-        it the places where they may fall are found before, which spares all others the search (`sim.render.reach`).
-    edge_rays
-        Rays along each side of a pixel that holds an edge (`sim.render.edges`); 1 draws every pixel by one ray.
-    shown_m
-        Least and greatest x, least and greatest y of what pictures show; None where they may show anything.
-    """
-
-    surface: Surface
-    centre_m: tuple[float, float]
-    sun: Sun
-    photometry: Photometry
-    objects: Objects = field(default_factory=Objects.none)
-    ground_texture: Texture = NO_TEXTURE
-    object_texture: Texture = NO_TEXTURE
-    caster_diameter_m: float = 0.0
-    ground_shadows: bool = True
-    clouds: CloudLayer | None = None
-    mesh_finest_m: float = 12.0
-    mesh_reach_m: float = 20000.0
-    mesh_lines: int = 513
-    among_objects: bool = False
-    edge_rays: int = 2
-    shown_m: Bounds | None = None
-
-    @cached_property
-    def mesh_offsets(self) -> Float64[np.ndarray, "lines"]:
-        """Offsets of the mesh's lines from the centre."""
-        return graded_offsets(self.mesh_reach_m, self.mesh_finest_m, self.mesh_lines)
-
-    def with_objects(self, objects: Objects) -> Scene:
-        """The same ground in the same light with other things on it; what was found of the ground is kept."""
-        return self._knowing(replace(self, objects=objects), "mesh_offsets", "height_range_m", "steepest", "shadow")
-
-    def in_light(self, sun: Sun, photometry: Photometry) -> Scene:
-        """The same ground with the same things on it under another sun."""
-        other = self._knowing(replace(self, sun=sun, photometry=photometry), "mesh_offsets", "height_range_m")
-        # bounds that were not found for this sun may be for the other
-        return self._knowing(other, "steepest") if np.all(np.isfinite(self.steepest)) else other
-
-    def _knowing(self, other: Scene, *found: str) -> Scene:
-        """Another scene, with what was found of this one and holds for it too."""
-        other.__dict__.update({name: getattr(self, name) for name in found})
-        return other
-
-    def within(self, cones: Sequence[Cone]) -> Scene:
-        """The scene with those objects alone that pictures within these cones may show, or show the shadows of.
-
-        The ground's shadow is found only where these pictures may show it.
-        """
-        sun, lowest = np.asarray(self.sun.direction, dtype=np.float64), self.height_range_m[0]
-        kept = np.zeros(len(self.objects), dtype=np.bool_)
-        for cone in cones:
-            kept |= concerned(self.objects.spheres, sun, lowest, cone)
-        less = replace(self, objects=self.objects.only(kept), shown_m=ground_in_cones(cones, lowest))
-        return self._knowing(less, "mesh_offsets", "height_range_m", "steepest")
-
-    @property
-    def bounds_m(self) -> tuple[float, float, float, float]:
-        """Where the mesh ends: least and greatest x, least and greatest y."""
-        (x, y), reach = self.centre_m, self.mesh_reach_m
-        return x - reach, x + reach, y - reach, y + reach
-
-    @cached_property
-    def height_range_m(self) -> tuple[float, float]:
-        """Bounds of the ground's height."""
-        low, high = height_range(self.surface.levels[0])
-        return float(low), float(high)
-
-    @cached_property
-    def steepest(self) -> tuple[float, float]:
-        """Bounds of the ground's slope along x and along y; infinite where it rises as steeply as the sun's rays."""
-        return slope_bounds(self.surface, self.sun)
-
-    @cached_property
-    def shadow(self) -> tuple[Shadow, float, int]:
-        """The ground's shadow on the grid of a level of the surface, the grid's spacing, and the level."""
-        if not self.ground_shadows or self.sun.direction[2] <= 0.0 or sun_over_slopes(self.sun, self.steepest):
-            return NO_SHADOW
-        return ground_shadow(self.surface, self.sun, self.height_range_m, self.shown_m)
-
-    @cached_property
-    def casters(self) -> Casters:
-        """The objects' triangles as shadows look for them."""
-        return casters_towards(self.objects, self.sun)
-
-    @cached_property
-    def reach(self) -> Reach:
-        """Where objects may shade the ground."""
-        if self.among_objects:
-            return EVERYWHERE
-        towards = np.asarray(self.sun.direction, dtype=np.float64)
-        return shade_reach(self.objects.spheres, towards, self.height_range_m[0])
-
-    def light(self, time_s: float) -> Light:
-        """What the kernel takes: direction of the sun, the law's numbers, the sky's, and the clouds at a time."""
-        photometry, drifting = self.photometry, NO_CLOUDS
-        if self.clouds is not None:
-            more = self.clouds.parameters.sky_light(self.sun)
-            photometry = replace(photometry, sky_share=photometry.sky_share + more)
-            drifting = (self.clouds.cover, self.clouds.numbers(self.sun, time_s))
-        # clouds are not drawn: the sky between them is as bright as ever
-        sky = self.photometry.sky_numbers(self.sun)
-        towards = np.asarray(self.sun.direction, dtype=np.float64)
-        return towards, photometry.law(self.sun, self.caster_diameter_m), sky, drifting
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from sim.camera import Cahv, Cahvor
 from sim.frames import rigid
 from sim.render import Photometry, Scene, Sun, process_renderer
 from sim.render.backend import default_backend
-from sim.render.renderer import PixelRays
+from sim.render.rays import PixelRays
 from sim.sensor import ImageMotion, natural_fall_off
 from sim.sensor.kernels import path_kernel
 from sim.sensor.motion import moving_exposure
