@@ -28,6 +28,7 @@ format: setup ## Rewrite the sources in the project's format, mending what can b
 	$(BIN)/ruff format .
 
 bench: setup ## Measure speed and memory
+	$(BIN)/marsyard compile
 	$(BIN)/python -m benchmarks
 	$(BIN)/python -m benchmarks.growth
 
