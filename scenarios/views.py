@@ -347,12 +347,11 @@ def _near_sector(
 
 
 def _in_sector(mesh: RockMesh, eye: Eye) -> Bool[np.ndarray, "triangles"]:
-    """Which triangles lie in the eye's sector or close beside it."""
+    """Which triangles have their first corner in the eye's sector or close beside it."""
     away = mesh.vertices[:, :2] - (eye.east_m, eye.north_m)
     beside = np.arctan2(away[:, 0], away[:, 1]) - eye.azimuth_rad
     turned = np.abs((beside + np.pi) % (2.0 * np.pi) - np.pi)
     close = max(_BESIDE_HEIGHTS * eye.height_m, _BESIDE_M)
-    inside: Bool[np.ndarray, "triangles"] = ((turned <= eye.half_width_rad) | (np.hypot(*away.T) <= close))[
-        mesh.faces[:, 0]
-    ]
+    corners = (turned <= eye.half_width_rad) | (np.hypot(*away.T) <= close)
+    inside: Bool[np.ndarray, "triangles"] = corners[mesh.faces[:, 0]]
     return inside

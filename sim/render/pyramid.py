@@ -10,8 +10,6 @@ from sim.terrain import Surface
 #: Levels that kernels take. They are compiled for a number of arrays: for every other one they would be compiled anew,
 #: which takes a minute. Terrains of 2**15 samples along a side have as many.
 LEVELS = 12
-
-
 #: Bounds of the height of each level.
 Ceilings = tuple[Float32[np.ndarray, "_ _"], ...]
 #: In place of the bounds of a surface's height where they are not worth their time: nothing is known to be clear.

@@ -30,24 +30,32 @@ def _outer(x: float) -> float:
     return square * square * rest / 120.0
 
 
+@njit(cache=True, inline="always")
+def _six(fraction: float) -> tuple[float, float, float, float, float, float]:
+    """The quintic B-spline's values about a point `fraction` beyond its pixel, from two pixels before it on."""
+    return (
+        _outer(fraction + 2.0),
+        _middle(fraction + 1.0),
+        _inner(fraction),
+        _inner(1.0 - fraction),
+        _middle(2.0 - fraction),
+        _outer(3.0 - fraction),
+    )
+
+
 @njit(cache=True)
 def quintic_weights(fraction: float, weights: Array) -> None:
-    """The quintic B-spline's six values about a point `fraction` beyond its pixel, from two pixels before it on."""
-    weights[0], weights[1], weights[2] = _outer(fraction + 2.0), _middle(fraction + 1.0), _inner(fraction)
-    weights[3], weights[4], weights[5] = _inner(1.0 - fraction), _middle(2.0 - fraction), _outer(3.0 - fraction)
+    """The six values of a point."""
+    weights[0], weights[1], weights[2], weights[3], weights[4], weights[5] = _six(fraction)
 
 
 @njit(cache=True, error_model="numpy")
 def _weights_of_all(fractions: Array, weights: Array) -> None:
     """`quintic_weights` of many points, those of a point in a column; without branches, for vector instructions."""
     for k in range(fractions.size):
-        fraction = fractions[k]
-        weights[0, k] = _outer(fraction + 2.0)
-        weights[1, k] = _middle(fraction + 1.0)
-        weights[2, k] = _inner(fraction)
-        weights[3, k] = _inner(1.0 - fraction)
-        weights[4, k] = _middle(2.0 - fraction)
-        weights[5, k] = _outer(3.0 - fraction)
+        first, second, third, fourth, fifth, sixth = _six(fractions[k])
+        weights[0, k], weights[1, k], weights[2, k] = first, second, third
+        weights[3, k], weights[4, k], weights[5, k] = fourth, fifth, sixth
 
 
 @njit(cache=True)

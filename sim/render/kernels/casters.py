@@ -183,7 +183,7 @@ def _listed_bodies(rects: Array) -> Grid:
 
 
 @njit(cache=True)
-def hide_sun(casters: Casters, x: Array, y: Array, z: Array, hidden: NDArray[np.bool_]) -> None:
+def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: NDArray[np.bool_]) -> None:
     """Whether a triangle stands between each of some places and the sun; `hidden` is the output.
 
     All places in one call: handing over so many arrays takes longer than most places do.

@@ -16,7 +16,8 @@ Bounds = tuple[float, float, float, float]
 #: Shortest step along a ray that looks for the ground, as a share of the distance: a quarter of what a navcam's pixel
 #: takes in at 10 deg, for crests hide what is behind them however little they stand out.
 FINEST_STEP = 0.00125
-#: How often a crest between two places is looked for, ever closer to its top.
+#: How often a crest between two places is looked for, ever closer to its top. Of 51,485 flat rays of a rover's pictures
+#: 4 then go through one; with one look, and by steps alone, 25 did (ADR 34).
 CREST_LOOKS = 4
 
 

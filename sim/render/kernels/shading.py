@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.casters import Casters, hide_sun
+from sim.render.kernels.casters import Casters, sun_hidden
 from sim.render.kernels.sight import FLATTEST, Ints
 from sim.render.kernels.sky import sky_brightness
 from sim.render.kernels.strips import ROW, STRIP, Array32, Matrix, Near, fetch_levels, no_cells, numbers, spline, times
@@ -401,7 +401,7 @@ def shade(
                 asked += 1
         if asked > 0:
             x, y, z = work[THING_X : THING_X + asked], work[THING_Y : THING_Y + asked], work[THING_Z : THING_Z + asked]
-            hide_sun(casters, x, y, z, hidden)
+            sun_hidden(casters, x, y, z, hidden)
             for m in range(asked):
                 work[LIT + other[m]] *= 0.0 if hidden[m] else 1.0
         if caster > 0.0 or dimmed:

@@ -1,5 +1,7 @@
 """In which order a step's activities come (Fig. 12): visual odometry within the drive, tracking, navigation."""
 
+import re
+
 import pytest
 from short_run import SHORT
 
@@ -27,9 +29,7 @@ def test_a_step_drives_by_what_was_tracked_and_mapped_before_it(monkeypatch: pyt
     told(loop._Loop, "_track", "track")
     leg = {"motion": "approach", "goal_m": 3.0, "step_share": 0.08, "autonav": True, "visual_odometry": True}
     run = run_case(RoverScenarioParameters.model_validate({**SHORT, "legs": [leg]}), Streams(1, "rover tests", 0))
-    steps = " ".join(word[0] for word in done).replace("d d", "d")
-    while "d d" in steps:
-        steps = steps.replace("d d", "d")
+    steps = re.sub("d( d)+", "d", " ".join(word[0] for word in done))
     # the target is seen first; then each step is mapped, driven in parts that visual odometry joins, and tracked
     assert steps.split(" m d t")[0] == "t"
     assert set(steps.split(" m d t")[1:]) == {""}

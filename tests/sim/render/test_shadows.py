@@ -9,7 +9,7 @@ from sim.camera import Cahv
 from sim.frames import direction, rigid
 from sim.render import Frame, Objects, Photometry, PixelRays, Scene, Sun
 from sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
-from sim.render.kernels.casters import hide_sun
+from sim.render.kernels.casters import sun_hidden
 from sim.render.kernels.ground import height_range
 from sim.render.reach import casters_towards
 from sim.terrain import Surface, TerrainParameters, synthesise
@@ -116,7 +116,7 @@ def test_places_are_hidden_from_the_sun_as_all_triangles_say(elevation: float) -
     places = rng.uniform(-9.0, 9.0, (3000, 3))
     casters = casters_towards(objects, sun)
     found = np.empty(len(places), dtype=np.bool_)
-    hide_sun(casters, *places.T.copy(), found)
+    sun_hidden(casters, *places.T.copy(), found)
     rays = np.broadcast_to(sun.direction, places.shape)
     expected = np.isfinite(meet_triangles(objects, places, rays, nearest=0.0))
     assert 0.1 < np.mean(expected) < 0.9
