@@ -24,6 +24,7 @@ from scenarios.rover.vehicle import Vehicle
 from scenarios.rover.world import RunWorld
 from scenarios.trial import answer_time_s
 from sim.dynamics.driving import Drive
+from sim.frames import composed
 from sim.measurements import DriveCommand, RoverMeasurements
 from sim.streams import Streams
 
@@ -157,7 +158,7 @@ class _Loop:
         stop = run.stops[-1]
         if stop.update.position_rover is None:
             raise ValueError("the target was not seen yet")
-        here = run.vehicle.estimated.inv() * stop.estimated
+        here = composed(run.vehicle.estimated.inv(), stop.estimated)
         position = np.asarray(here.apply(np.array(stop.update.position_rover)))
         return Belief(position, run.rig.range_m(position))
 
@@ -180,7 +181,7 @@ class _Loop:
     def _stop(self, leg: int, aim: MastAim) -> Stop:
         run, world, rig, stance = self.run, self.run.world, self.run.rig, self.run.vehicle.stance
         rig.point(aim.azimuth_rad, aim.elevation_rad)
-        angles, world_from_head = rig.state.readings_rad, stance.world_from_rover * rig.rover_from_head
+        angles, world_from_head = rig.state.readings_rad, composed(stance.world_from_rover, rig.rover_from_head)
         body, mast, point = run.vehicle.rover, rig.calibrated.geometry, run.target.point_world
         shading = (
             world.shading(body, stance, mast, rig.state.true_rad, point, run.time_s) if self.p.rover_shadow else None

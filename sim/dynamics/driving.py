@@ -27,7 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
 from sim.dynamics.rover import Ground, RoverParameters, Stance, settle
-from sim.frames import turn_matrix
+from sim.frames import composed, turn_matrix
 from sim.measurements import DriveCommand
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -114,7 +114,7 @@ class DrivenPart:
     @cached_property
     def motion(self) -> RigidTransform:
         """True motion: the pose after in the axes of the pose before."""
-        return self.before.world_from_rover.inv() * self.after.world_from_rover
+        return composed(self.before.world_from_rover.inv(), self.after.world_from_rover)
 
     @cached_property
     def length_m(self) -> float:

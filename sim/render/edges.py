@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int32, Int64
 
 from sim.render.kernels.edges import look_closely, mark_edges, split_rays
+from sim.render.kernels.ground import Extent
 from sim.render.objects import Objects
 from sim.render.pyramid import Ceilings, pyramid
 from sim.render.rays import PixelRays, RayBundle
@@ -75,7 +76,7 @@ def rays_within(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int)
 def look_within(
     surface: Surface,
     tops: Ceilings,
-    bounds_m: tuple[float, float, float, float],
+    extent_m: Extent,
     objects: Objects,
     rotation: Float64[np.ndarray, "3 3"],
     position: Float64[np.ndarray, "3"],
@@ -88,9 +89,9 @@ def look_within(
 
     Parameters
     ----------
-    surface, tops, bounds_m, objects
-        The ground, bounds of its height (`sim.render.pyramid.ceilings`), where it ends (least and greatest x, least and
-        greatest y), and what stands on it.
+    surface, tops, extent_m, objects
+        The ground, bounds of its height (`sim.render.pyramid.ceilings`), where it ends (`Scene.extent_m`), and what
+        stands on it.
     rotation, position
         Pose of the camera: rotation matrix of the body, world position of its centre of projection.
     columns
@@ -105,7 +106,7 @@ def look_within(
         pyramid(surface)[0],
         tops,
         surface.spacing_m,
-        bounds_m,
+        extent_m,
         objects.hierarchy,
         rotation,
         position,

@@ -9,6 +9,8 @@ from jaxtyping import Float, Int
 from scipy.optimize import brentq
 from scipy.spatial import ConvexHull
 
+from sim.render.kernels.mesh import lay_out, spans_in_hull
+from sim.render.pyramid import pyramid
 from sim.terrain import Surface
 
 if TYPE_CHECKING:
@@ -58,35 +60,10 @@ def ground_mesh(
 
     if spans is None:
         spans = np.tile([0, x.size - 1], (y.size - 1, 1))
-    first, end = spans.T
-    # a line has the corners of the cells to both its sides; where none is drawn it has none
-    left = np.minimum(np.append(first, x.size), np.append(x.size, first))
-    counts = np.maximum(np.maximum(np.append(end, -1), np.append(-1, end)) + 1 - left, 0)
-    starts = np.cumsum(counts) - counts
-    row, column = _ragged(left, counts)
-    level = np.maximum(_levels_of_lines(surface, y)[row], _levels_of_lines(surface, x)[column])
-    across, along = x[column], y[row]
-    z = np.empty_like(across)
-    for one in np.unique(level):
-        chosen = level == one
-        z[chosen] = surface.height(across[chosen], along[chosen], int(one))
-    strip, cell = _ragged(first, end - first)
-    corner, above = (starts - left)[strip] + cell, (starts - left)[strip + 1] + cell
-    faces = np.empty((2, strip.size, 3), dtype=np.uint32)
-    # counter-clockwise seen from above
-    for triangle, corners in enumerate(((corner, corner + 1, above + 1), (corner, above + 1, above))):
-        for place, number in enumerate(corners):
-            faces[triangle, :, place] = number
-    vertices = np.stack([across, along, z], axis=-1)
-    return trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False, validate=False)
-
-
-def _ragged(
-    first: Int[np.ndarray, "rows"], counts: Int[np.ndarray, "rows"]
-) -> tuple[Int[np.ndarray, "items"], Int[np.ndarray, "items"]]:
-    """Row and column of each item of rows of so many items that begin at a column each."""
-    row = np.repeat(np.arange(counts.size), counts)
-    return row, np.arange(row.size) + np.repeat(first - (np.cumsum(counts) - counts), counts)
+    levels, _top = pyramid(surface)
+    on_x, on_y = _levels_of_lines(surface, x), _levels_of_lines(surface, y)
+    vertices, faces = lay_out(levels, surface.spacing_m, x, y, on_x, on_y, spans)
+    return trimesh.Trimesh(vertices, faces, process=False, validate=False)
 
 
 def cells_in_hull(
@@ -96,19 +73,8 @@ def cells_in_hull(
 ) -> Int[np.ndarray, "strips 2"]:
     """The spans of a grid's cells, for `ground_mesh`, that reach into the convex hull of places not all on one line."""
     hull = places[ConvexHull(places).vertices]
-    (x0, y0), (x1, y1) = hull.T, np.roll(hull, -1, axis=0).T
-    low, high = y[:-1, None], y[1:, None]
-    # each side of the hull from where it enters a strip to where it leaves it
-    rise = np.where(y1 == y0, 1.0, y1 - y0)
-    enters, leaves = (x0 + np.clip((level - y0) / rise, 0.0, 1.0) * (x1 - x0) for level in (low, high))
-    flat = y1 == y0
-    enters, leaves = np.where(flat, x0, enters), np.where(flat, x1, leaves)
-    beside = (np.minimum(y0, y1) > high) | (np.maximum(y0, y1) < low)
-    least = np.where(beside, np.inf, np.minimum(enters, leaves)).min(axis=1)
-    greatest = np.where(beside, -np.inf, np.maximum(enters, leaves)).max(axis=1)
-    first = np.clip(np.searchsorted(x, least, side="right") - 1, 0, x.size - 1)
-    end = np.clip(np.searchsorted(x, greatest), first, x.size - 1)
-    return np.column_stack([first, end])
+    spans: Int[np.ndarray, "strips 2"] = spans_in_hull(x, y, hull)
+    return spans
 
 
 def _levels_of_lines(surface: Surface, lines: Float[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
-from sim.render.kernels.bodies import body_spheres, triangles_of
+from sim.render.kernels.bodies import body_spheres, triangles_facing, triangles_of
 from sim.render.kernels.hierarchy import Hierarchy, morton_codes, node_boxes
 
 #: Triangle numbers are drawn as colours of 24 bits, of which 0 is the ground.
@@ -110,9 +110,9 @@ class Objects:
     def in_cone(
         self, apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_angle_rad: float
     ) -> Int64[np.ndarray, "kept"]:
-        """Numbers of the triangles of all bodies whose spheres reach into a cone."""
+        """Numbers of the triangles that face the tip of a cone, of all bodies whose spheres reach into it."""
         kept = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
-        numbers: Int64[np.ndarray, "kept"] = triangles_of(kept, self.first_triangle)
+        numbers: Int64[np.ndarray, "kept"] = triangles_facing(self.triangles, kept, self.first_triangle, *apex)
         return numbers
 
     def only(self, kept: Bool[np.ndarray, "bodies"]) -> Objects:

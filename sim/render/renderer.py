@@ -131,7 +131,7 @@ class Renderer:
                 tops,
                 top_level,
                 scene.surface.spacing_m,
-                scene.bounds_m,
+                scene.extent_m,
                 depth,
                 numbers,
                 rays.focal_px,
@@ -163,7 +163,7 @@ class Renderer:
             pixels = edge_pixels(frame.radiance, frame.range_m, frame.body)
             within = rays_within(rays, pixels, scene.edge_rays)
             seen = look_within(
-                scene.surface, tops, scene.bounds_m, scene.objects, rotation, position, columns, pixels, within, sight
+                scene.surface, tops, scene.extent_m, scene.objects, rotation, position, columns, pixels, within, sight
             )
             finer, _, _ = _shaded(scene, rotation, position, within, seen, light)
             radiance[pixels] = finer.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)

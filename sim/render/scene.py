@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from sim.render.clouds import CloudLayer, no_cover
 from sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
 from sim.render.kernels.casters import Casters
-from sim.render.kernels.ground import Bounds, height_range
+from sim.render.kernels.ground import Bounds, Extent, height_range
 from sim.render.kernels.shading import Clouds, Reach
 from sim.render.kernels.sun import Shadow
 from sim.render.mesh import graded_offsets
@@ -21,6 +21,8 @@ from sim.render.photometry import Photometry, Sun, Texture
 from sim.render.reach import EVERYWHERE, Cone, casters_towards, concerned, shade_reach
 from sim.terrain import Surface
 
+#: By how much a mean of heights may stand above the highest of them, metres: single precision rounds at a few km.
+ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
 NO_CLOUDS = (no_cover(), np.zeros(5))
 
@@ -111,10 +113,11 @@ class Scene:
         return self._knowing(less, "mesh_offsets", "height_range_m", "steepest")
 
     @property
-    def bounds_m(self) -> tuple[float, float, float, float]:
-        """Where the mesh ends: least and greatest x, least and greatest y."""
+    def extent_m(self) -> Extent:
+        """Where the ground ends: least and greatest x, least and greatest y of the mesh, greatest z of the surface."""
         (x, y), reach = self.centre_m, self.mesh_reach_m
-        return x - reach, x + reach, y - reach, y + reach
+        # coarser levels are means of finer ones: none stands higher, but for rounding
+        return x - reach, x + reach, y - reach, y + reach, self.height_range_m[1] + ROUNDING_M
 
     @cached_property
     def height_range_m(self) -> tuple[float, float]:

@@ -153,7 +153,7 @@ def test_the_sun_moves_over_rocks_that_stay() -> None:
     assert np.array_equal(late.sun.direction, alone.sun.direction)
     assert late.photometry == alone.photometry
     assert np.array_equal(late.objects.triangles, alone.objects.triangles)
-    assert late.bounds_m == alone.bounds_m
+    assert late.extent_m == alone.extent_m
 
 
 def test_too_many_triples_are_refused() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, Bounds, cross_ground, way_out, world_ray
+from sim.render.kernels.ground import Array32, Extent, cross_ground, way_in, way_out, world_ray
 from sim.render.kernels.hierarchy import Hierarchy, in_beam, nearest_hit
 from sim.render.kernels.intersection import hit_triangle
 from sim.render.kernels.sight import Ints
@@ -177,10 +177,9 @@ def _nearest_listed(
     dx: float,
     dy: float,
     dz: float,
-    farthest: float,
 ) -> tuple[float, int, float, float]:
     """As `nearest_hit`, among some triangles."""
-    best = farthest
+    best = math.inf
     best_triangle = -1
     best_second = 0.0
     best_third = 0.0
@@ -200,7 +199,7 @@ def look_closely(
     levels: tuple[Level, ...],
     ceilings: tuple[Array32, ...],
     spacing: float,
-    bounds: Bounds,
+    extent: Extent,
     tree: Hierarchy,
     world_from_body: Array,
     position: Array,
@@ -226,7 +225,7 @@ def look_closely(
 
     Parameters
     ----------
-    levels, ceilings, spacing, bounds, world_from_body, position
+    levels, ceilings, spacing, extent, world_from_body, position
         As for `look`.
     tree
         Triangles that stand on the ground, and their hierarchy.
@@ -255,12 +254,12 @@ def look_closely(
         count = 0
         sky = False
         things = False
-        last = 0.0
+        farthest = 0.0
         for i in range(max(row - 1, 0), min(row + 2, rows)):
             for j in range(max(column - 1, 0), min(column + 2, columns)):
                 n = i * columns + j
                 if distance[n] < math.inf:
-                    last = max(last, distance[n])
+                    farthest = max(farthest, distance[n])
                 if distance[n] == math.inf:
                     sky = True
                 elif triangle_of_pixel[n] >= 0:
@@ -293,11 +292,17 @@ def look_closely(
                 dy,
                 dz,
                 BEAM_PX * pixel_angles[a],
-                math.inf if sky else BEYOND * last,
+                math.inf if sky else BEYOND * farthest,
                 listed,
             )
         for n in range(k * share, (k + 1) * share):
             x0, y0, z0, dx, dy, dz = world_ray(world_from_body, position, origins, directions, n)
+            t_thing = math.inf
+            triangle = -1
+            second = 0.0
+            third = 0.0
+            if in_list >= 0:
+                t_thing, triangle, second, third = _nearest_listed(tree, listed, in_list, x0, y0, z0, dx, dy, dz)
             t = math.inf
             level = 0
             end = math.inf
@@ -305,25 +310,25 @@ def look_closely(
             while c < count and t == math.inf:
                 # places met on one level are one stretch; it begins where the stretch before has ended
                 level = found[c]
-                start = min(AHEAD * ranges[c], end)
+                start = max(min(AHEAD * ranges[c], end), way_in(extent, z0, dz))
+                # ground behind a thing is not looked for
+                if start >= t_thing:
+                    break
                 while c + 1 < count and found[c + 1] == level:
                     c += 1
                 end = (TO_HORIZON if sky and c + 1 == count else BEYOND) * ranges[c]
-                end = min(end, way_out(bounds, x0, y0, dx, dy))
+                end = min(end, way_out(extent, x0, y0, dx, dy))
                 smooth = max(level, 0)
                 scale = inverse_spacing / (1 << smooth)
-                t = cross_ground(levels[smooth], ceilings[smooth], scale, x0, y0, z0, dx, dy, dz, start, end)
+                last = min(end, t_thing)
+                t = cross_ground(levels[smooth], ceilings[smooth], scale, x0, y0, z0, dx, dy, dz, start, last)
                 c += 1
-            triangle = -1
-            second = 0.0
-            third = 0.0
-            if things:
-                if in_list < 0:
-                    t_thing, triangle, second, third = nearest_hit(tree, x0, y0, z0, dx, dy, dz, t)
-                else:
-                    t_thing, triangle, second, third = _nearest_listed(tree, listed, in_list, x0, y0, z0, dx, dy, dz, t)
-                if triangle >= 0:
-                    t = t_thing
+            if in_list < 0 and things:
+                t_thing, triangle, second, third = nearest_hit(tree, x0, y0, z0, dx, dy, dz, t)
+            if t_thing < t:
+                t = t_thing
+            else:
+                triangle = -1
             if t == math.inf and count > 0 and not sky:
                 # grazes the ground without dipping below it
                 t = ranges[count - 1]

@@ -19,6 +19,8 @@ Longs = NDArray[np.int64]
 Boxes = NDArray[np.float32]
 #: Triangles, their order along the curve, and the boxes of the tree's nodes: node k has the children 2 k + 1, 2 k + 2.
 Hierarchy = tuple[Array, Longs, Boxes]
+#: A plane: its normal, where it lies along that, and which numbers of a box are of the corner farthest behind it.
+Side = tuple[float, float, float, float, int, int, int]
 #: Triangles of a leaf.
 LEAF = 4
 #: Deep enough for 2**40 triangles.
@@ -162,6 +164,37 @@ def nearest_hit(
     return best, best_triangle, best_second, best_third
 
 
+@njit(cache=True, inline="always")
+def _box_before(boxes: Boxes, node: int, side: Side) -> bool:
+    """Whether a node's box lies wholly before a plane."""
+    nx, ny, nz, offset, ix, iy, iz = side
+    return bool(nx * boxes[node, ix] + ny * boxes[node, iy] + nz * boxes[node, iz] > offset)
+
+
+@njit(cache=True, inline="always")
+def _triangle_before(triangles: Array, n: int, side: Side) -> bool:
+    """Whether a triangle lies wholly before a plane."""
+    nx, ny, nz, offset, _ix, _iy, _iz = side
+    before = True
+    for corner in range(3):
+        before &= nx * triangles[n, corner, 0] + ny * triangles[n, corner, 1] + nz * triangles[n, corner, 2] > offset
+    return before
+
+
+@njit(cache=True, inline="always")
+def _side(x: float, y: float, z: float, nx: float, ny: float, nz: float, beyond: float) -> Side:
+    """The plane across a direction, so far beyond a place along it."""
+    return (
+        nx,
+        ny,
+        nz,
+        nx * x + ny * y + nz * z + beyond,
+        0 if nx > 0.0 else 3,
+        1 if ny > 0.0 else 4,
+        2 if nz > 0.0 else 5,
+    )
+
+
 @njit(cache=True)
 def in_beam(
     tree: Hierarchy,
@@ -179,42 +212,50 @@ def in_beam(
 
     Returns how many there are, -1 where they are more than `found` holds.
     """
-    _triangles, order, boxes = tree
+    triangles, order, boxes = tree
     if order.size == 0:
         return 0
-    ix = 1.0 / (dx if abs(dx) > 1e-12 else 1e-12)
-    iy = 1.0 / (dy if abs(dy) > 1e-12 else 1e-12)
-    iz = 1.0 / (dz if abs(dz) > 1e-12 else 1e-12)
+    # a pyramid around the beam: two directions across it, and its four sides
+    rx, ry, rz = (dy, -dx, 0.0) if abs(dz) < 0.9 else (0.0, dz, -dy)
+    length = math.sqrt(rx * rx + ry * ry + rz * rz)
+    rx, ry, rz = rx / length, ry / length, rz / length
+    ux, uy, uz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
+    widening = math.tan(spread)
+    sx, sy, sz = widening * dx, widening * dy, widening * dz
+    right = _side(x, y, z, rx - sx, ry - sy, rz - sz, 0.0)
+    left = _side(x, y, z, -rx - sx, -ry - sy, -rz - sz, 0.0)
+    above = _side(x, y, z, ux - sx, uy - sy, uz - sz, 0.0)
+    below = _side(x, y, z, -ux - sx, -uy - sy, -uz - sz, 0.0)
+    end = _side(x, y, z, dx, dy, dz, farthest)
     first_leaf = boxes.shape[0] // 2
     count = 0
     node = 0
     while True:
-        # the box, wider by as much as the beam is at its farthest corner
-        wider = max(abs(boxes[node, 0] - x), abs(boxes[node, 3] - x))
-        wider += max(abs(boxes[node, 1] - y), abs(boxes[node, 4] - y))
-        wider += max(abs(boxes[node, 2] - z), abs(boxes[node, 5] - z))
-        wider *= spread
-        a = (boxes[node, 0] - wider - x) * ix
-        b = (boxes[node, 3] + wider - x) * ix
-        near = min(a, b)
-        far = max(a, b)
-        a = (boxes[node, 1] - wider - y) * iy
-        b = (boxes[node, 4] + wider - y) * iy
-        near = max(near, min(a, b))
-        far = min(far, max(a, b))
-        a = (boxes[node, 2] - wider - z) * iz
-        b = (boxes[node, 5] + wider - z) * iz
-        near = max(max(near, min(a, b)), 0.0)
-        far = min(far, max(a, b))
-        if far >= near and near <= farthest:
+        missed = (
+            _box_before(boxes, node, right)
+            or _box_before(boxes, node, left)
+            or _box_before(boxes, node, above)
+            or _box_before(boxes, node, below)
+            or _box_before(boxes, node, end)
+        )
+        if not missed:
             if node < first_leaf:
                 node = 2 * node + 1
                 continue
             start = (node - first_leaf) * LEAF
             for k in range(start, min(start + LEAF, order.size)):
+                n = order[k]
+                beside = (
+                    _triangle_before(triangles, n, right)
+                    or _triangle_before(triangles, n, left)
+                    or _triangle_before(triangles, n, above)
+                    or _triangle_before(triangles, n, below)
+                )
+                if beside:
+                    continue
                 if count == found.size:
                     return -1
-                found[count] = order[k]
+                found[count] = n
                 count += 1
         while node > 0 and node % 2 == 0:
             node = (node - 1) // 2

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Bounds, first_ground
+from sim.render.kernels.ground import CLOSING, Extent, first_ground
 from sim.render.kernels.hierarchy import Hierarchy, nearest_hit
 from sim.render.kernels.intersection import hit_triangle
 from sim.render.kernels.strips import (
@@ -33,8 +33,8 @@ FLATTEST = 0.01
 FINE_UNTIL = 8.0
 #: Sine of the angle below which a ray may pass over crests that the mesh does not hold.
 GRAZING = 0.4
-#: Most steps of Newton's method, the share of the first guess that they may change it by, and the shallowest closing.
-STEPS, FARTHEST, CLOSING = 8, 0.05, -1e-3
+#: Most steps of Newton's method, and the share of the first guess that they may change it by.
+STEPS, FARTHEST = 8, 0.05
 #: Slack of a triangle's edge, as a share: so that no ray slips between two triangles.
 SLACK = 1e-9
 #: Rows of what is kept of a strip of rays: origins and directions in world axes; where in a view's picture they point
@@ -77,11 +77,12 @@ def _meet_object(
     dx: float,
     dy: float,
     dz: float,
+    farthest: float,
 ) -> tuple[float, int, float, float]:
     """The nearest triangle that a ray meets among those that the four samples around it show.
 
     Where the samples show triangles and the ray meets none of them, it passes by an outline, or triangles are smaller
-    than samples: then the hierarchy is asked.
+    than samples: then the hierarchy is asked for one nearer than `farthest`.
     """
     triangles = tree[0]
     best = math.inf
@@ -101,7 +102,7 @@ def _meet_object(
             best_second = second
             best_third = third
     if last > 0 and best_triangle < 0:
-        best, best_triangle, best_second, best_third = nearest_hit(tree, x, y, z, dx, dy, dz, math.inf)
+        best, best_triangle, best_second, best_third = nearest_hit(tree, x, y, z, dx, dy, dz, farthest)
     return best, best_triangle, best_second, best_third
 
 
@@ -234,7 +235,7 @@ def look(
     ceilings: tuple[Array32, ...],
     top_level: int,
     spacing: float,
-    bounds: Bounds,
+    extent: Extent,
     depth: Array32,
     ids: Ints,
     focal: Array,
@@ -255,9 +256,9 @@ def look(
 
     Parameters
     ----------
-    levels, ceilings, top_level, spacing, bounds
+    levels, ceilings, top_level, spacing, extent
         The surface's pyramid and its ceilings (`sim.render.pyramid`), its coarsest level, the spacing of its level 0,
-        and where the mesh ends.
+        and where the ground ends.
     depth, ids, focal, view_from_body
         Pinhole views from `position`: depth along the axis, number of the triangle plus one (0 for ground; empty where
         no triangles were drawn, for none are in view), focal lengths in samples, and rotations from body axes to the
@@ -354,7 +355,7 @@ def look(
                     levels[smooth[k]],
                     ceilings[smooth[k]],
                     inverse_spacing / (1 << smooth[k]),
-                    bounds,
+                    extent,
                     work[X0 + k],
                     work[Y0 + k],
                     work[Z0 + k],
@@ -363,8 +364,10 @@ def look(
                     work[DZ + k],
                     work[GUESS + k],
                 )
-            onto[left] = k
-            left += 1
+            # where a flat ray dips below the ground, it is there already
+            if work[MET + k] == work[GUESS + k]:
+                onto[left] = k
+                left += 1
         _meet_ground(levels, inverse_spacing, smooth, onto, left, width, work, near)
         for k in range(width):
             n = first + k
@@ -385,6 +388,7 @@ def look(
                     work[DX + k],
                     work[DY + k],
                     work[DZ + k],
+                    t,
                 )
                 if triangle >= 0 and t_thing < t:
                     t = t_thing

@@ -11,7 +11,7 @@ from sim.camera import Cahvor
 from sim.frames import direction, rigid
 from sim.render import Objects, Photometry, PixelRays, Scene, Sun
 from sim.render.backend import RenderingError
-from sim.render.kernels.ground import cross_ground, pass_over
+from sim.render.kernels.ground import cross_ground, pass_over, way_in, way_out
 from sim.render.pyramid import ceilings
 from sim.terrain import Surface
 from sim.terrain.kernels import CEILING_BLOCK
@@ -156,6 +156,18 @@ def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough, bounded
     )
     assert np.median(expected) > 500.0 * rough.spacing_m
     assert np.mean(np.abs(found / expected - 1.0) < 1e-4) > 0.99
+    # rays end on the ground, however flat
+    assert np.abs(ground.clearance(origins, rays, found)).max() < 1e-5 * rough.spacing_m
+
+
+def test_a_ray_meets_no_ground_before_it_is_as_low_as_the_highest() -> None:
+    extent = (-10.0, 10.0, -20.0, 20.0, 3.0)
+    assert way_in(extent, 5.0, -0.1) == pytest.approx(20.0)
+    assert way_in(extent, 3.0, -0.1) == 0.0
+    assert way_in(extent, 1.0, 0.1) == 0.0
+    assert way_in(extent, 5.0, 0.1) == np.inf
+    assert way_in(extent, 5.0, 0.0) == np.inf
+    assert way_out(extent, 2.0, -1.0, 0.5, -0.1) == pytest.approx(16.0)
 
 
 def test_a_ray_passes_over_the_ground_that_it_is_clear_of(rough) -> None:

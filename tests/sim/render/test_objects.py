@@ -39,8 +39,15 @@ def test_some_of_the_bodies_are_those_that_were_asked_for() -> None:
     assert len(objects.only(np.zeros(4, dtype=bool))) == 0
 
 
-def test_a_cone_meets_the_bodies_whose_spheres_reach_into_it() -> None:
+def test_a_cone_meets_what_faces_it_of_the_bodies_whose_spheres_reach_into_it() -> None:
+    """A triangle faces a place that lies on the side from which its corners run counter-clockwise."""
     objects = _bodies()
     eye = objects.spheres[2, :3] + np.array([0.0, 0.0, 200.0])
     found = objects.in_cone(eye, np.array([0.0, 0.0, -1.0]), 1e-3)
-    assert set(np.flatnonzero(objects.body_of_triangle == 2)) <= set(found)
+    first, second, third = objects.triangles.transpose(1, 0, 2)
+    facing = np.einsum("ij,ij->i", np.cross(second - first, third - first), eye - first) > 0.0
+    meant = objects.body_of_triangle == 2
+    assert 20 < np.count_nonzero(facing & meant) < 60
+    assert set(np.flatnonzero(facing & meant)) <= set(found)
+    assert facing[found].all()
+    assert (np.diff(found) > 0).all()

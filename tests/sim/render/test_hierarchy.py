@@ -1,0 +1,76 @@
+"""The hierarchy of triangles against all triangles, one by one."""
+
+import numpy as np
+import pytest
+
+from benchmarks.validation.raycast import meet_triangles
+from sim.frames import direction
+from sim.render import Objects
+from sim.render.kernels.hierarchy import in_beam, nearest_hit
+
+EYE = np.array([0.3, -0.2, 1.1])
+
+
+@pytest.fixture(scope="module")
+def thicket() -> Objects:
+    """Triangles of a tenth of a metre to one, all around."""
+    rng = np.random.default_rng(6)
+    middles = rng.uniform(-12.0, 12.0, (1500, 1, 3))
+    corners = (middles + 10.0 ** rng.uniform(-1.5, -0.2, (1500, 1, 1)) * rng.normal(size=(1500, 3, 3))).reshape(-1, 3)
+    faces = np.arange(4500, dtype=np.int32).reshape(-1, 3)
+    return Objects.of_mesh(corners, np.zeros_like(corners), faces, np.zeros(1500, dtype=np.int32), albedo=0.1)
+
+
+def _rays(rng: np.random.Generator, count: int) -> np.ndarray:
+    rays = rng.normal(size=(count, 3))
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def test_the_nearest_triangle_is_that_of_all(thicket: Objects) -> None:
+    rays = _rays(np.random.default_rng(7), 800)
+    expected = meet_triangles(thicket, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
+    found = np.array([nearest_hit(thicket.hierarchy, *EYE, *ray, np.inf)[0] for ray in rays])
+    assert 0.05 < np.mean(np.isfinite(expected)) < 0.9
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("axis", [*_rays(np.random.default_rng(8), 12), *np.eye(3), *-np.eye(3)], ids=str)
+@pytest.mark.parametrize("spread", [1e-3, 0.05, 0.3])
+def test_a_beam_lists_all_triangles_that_its_rays_meet(thicket: Objects, axis: np.ndarray, spread: float) -> None:
+    """Rays at all angles from the axis up to its half angle, up to a distance; few others are listed."""
+    farthest = 9.0
+    rng = np.random.default_rng(9)
+    room = np.empty(1500, dtype=np.int64)
+    listed = set(room[: in_beam(thicket.hierarchy, *EYE, *axis, spread, farthest, room)].tolist())
+    across = np.cross(axis, _rays(rng, 400))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    angles = spread * rng.uniform(0.0, 1.0, (400, 1))
+    met: set[int] = set()
+    for ray in np.cos(angles) * axis + np.sin(angles) * across:
+        met |= _all_met(thicket, ray, farthest)
+    assert met <= listed
+    # what a beam lists lies in a square pyramid about it: beside that only what leans over the pyramid's corners
+    middles = thicket.triangles.mean(axis=1) - EYE
+    size = np.linalg.norm(thicket.triangles - thicket.triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
+    along = middles @ axis
+    beside = np.linalg.norm(middles - along[:, None] * axis, axis=1)
+    near = beside <= np.sqrt(2.0) * (np.tan(spread) * np.maximum(along, 0.0) + 2.0 * size)
+    assert listed <= set(np.flatnonzero(near).tolist())
+
+
+def test_a_beam_tells_where_triangles_are_more_than_it_has_room_for(thicket: Objects) -> None:
+    ahead = direction(1.0, 0.2)
+    room = np.empty(1500, dtype=np.int64)
+    count = in_beam(thicket.hierarchy, *EYE, *ahead, 0.3, 9.0, room)
+    assert count > 5
+    assert in_beam(thicket.hierarchy, *EYE, *ahead, 0.3, 9.0, room[:count].copy()) == count
+    assert in_beam(thicket.hierarchy, *EYE, *ahead, 0.3, 9.0, room[: count - 1].copy()) == -1
+    assert in_beam(Objects.none().hierarchy, *EYE, *ahead, 0.3, 9.0, room) == 0
+
+
+def _all_met(objects: Objects, ray: np.ndarray, farthest: float) -> set[int]:
+    """Numbers of all triangles that a ray from the eye meets up to a distance, by solving for corners' weights."""
+    first, second, third = objects.triangles.transpose(1, 0, 2)
+    columns = np.stack([second - first, third - first, np.broadcast_to(-ray, first.shape)], axis=2)
+    u, v, t = np.linalg.solve(columns, (EYE - first)[:, :, None])[:, :, 0].T
+    return set(np.flatnonzero((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0) & (t < farthest)).tolist())
