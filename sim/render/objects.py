@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
-from sim.render.kernels.bodies import body_spheres, triangles_facing, triangles_of
+from sim.render.kernels.bodies import body_spheres, facing, triangles_of
 from sim.render.kernels.hierarchy import Hierarchy, morton_codes, node_boxes
 
 #: Triangle numbers are drawn as colours of 24 bits, of which 0 is the ground.
@@ -112,7 +112,7 @@ class Objects:
     ) -> Int64[np.ndarray, "kept"]:
         """Numbers of the triangles that face the tip of a cone, of all bodies whose spheres reach into it."""
         kept = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
-        numbers: Int64[np.ndarray, "kept"] = triangles_facing(self.triangles, kept, self.first_triangle, *apex)
+        numbers: Int64[np.ndarray, "kept"] = facing(self.triangles, triangles_of(kept, self.first_triangle), *apex)
         return numbers
 
     def only(self, kept: Bool[np.ndarray, "bodies"]) -> Objects:

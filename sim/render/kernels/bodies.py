@@ -64,22 +64,15 @@ def triangles_of(kept: NDArray[np.bool_], first: Longs) -> Longs:
 
 
 @njit(cache=True)
-def triangles_facing(triangles: Array, kept: NDArray[np.bool_], first: Longs, x: float, y: float, z: float) -> Longs:
-    """Numbers of the triangles of the bodies that are kept, in order, whose outer side a place is on."""
+def facing(triangles: Array, numbers: Longs, x: float, y: float, z: float) -> Longs:
+    """Those of some triangles, by their numbers, whose outer side a place is on."""
+    kept = np.empty(numbers.size, dtype=np.int64)
     count = 0
-    for body in range(kept.size):
-        if kept[body]:
-            count += first[body + 1] - first[body]
-    numbers = np.empty(count, dtype=np.int64)
-    place = 0
-    for body in range(kept.size):
-        if not kept[body]:
-            continue
-        for n in range(first[body], first[body + 1]):
-            ax, ay, az = triangles[n, 0, 0], triangles[n, 0, 1], triangles[n, 0, 2]
-            ux, uy, uz = triangles[n, 1, 0] - ax, triangles[n, 1, 1] - ay, triangles[n, 1, 2] - az
-            vx, vy, vz = triangles[n, 2, 0] - ax, triangles[n, 2, 1] - ay, triangles[n, 2, 2] - az
-            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            numbers[place] = n
-            place += nx * (x - ax) + ny * (y - ay) + nz * (z - az) > 0.0
-    return numbers[:place]
+    for n in numbers:
+        ax, ay, az = triangles[n, 0, 0], triangles[n, 0, 1], triangles[n, 0, 2]
+        ux, uy, uz = triangles[n, 1, 0] - ax, triangles[n, 1, 1] - ay, triangles[n, 1, 2] - az
+        vx, vy, vz = triangles[n, 2, 0] - ax, triangles[n, 2, 1] - ay, triangles[n, 2, 2] - az
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        kept[count] = n
+        count += nx * (x - ax) + ny * (y - ay) + nz * (z - az) > 0.0
+    return kept[:count]
