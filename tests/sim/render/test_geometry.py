@@ -160,6 +160,21 @@ def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough, bounded
     assert np.abs(ground.clearance(origins, rays, found)).max() < 1e-5 * rough.spacing_m
 
 
+@pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
+def test_ground_is_met_up_to_the_very_end_of_the_search_and_none_beyond(rough, bounded: bool) -> None:
+    """Without ceilings steps are longer than what is left: ground before a thing was passed over with the thing."""
+    rng = np.random.default_rng(4)
+    ground = Ground(rough)
+    level, scale, ceiling = rough.levels[0], 1.0 / rough.spacing_m, ceilings(rough, bounded)[0]
+    for azimuth, elevation in rng.uniform([-np.pi, np.radians(20.0)], [np.pi, np.radians(50.0)], (50, 2)):
+        origin = np.array([*rng.uniform(0.0, rough.period_m, 2), ground.highest + 80.0])
+        ray = direction(azimuth, -elevation)
+        t = float(ground.cast(origin[None], ray[None], 2000.0, 0.05)[0])
+        near = t - 4.0 * rough.spacing_m
+        assert cross_ground(level, ceiling, scale, *origin, *ray, near, t + 1e-3) == pytest.approx(t, rel=1e-6)
+        assert cross_ground(level, ceiling, scale, *origin, *ray, near, t - 1e-3) == np.inf
+
+
 def test_a_ray_meets_no_ground_before_it_is_as_low_as_the_highest() -> None:
     extent = (-10.0, 10.0, -20.0, 20.0, 3.0)
     assert way_in(extent, 5.0, -0.1) == pytest.approx(20.0)
