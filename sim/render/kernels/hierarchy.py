@@ -19,8 +19,9 @@ Longs = NDArray[np.int64]
 Boxes = NDArray[np.float32]
 #: Triangles, their order along the curve, and the boxes of the tree's nodes: node k has the children 2 k + 1, 2 k + 2.
 Hierarchy = tuple[Array, Longs, Boxes]
-#: A plane: its normal, where it lies along that, and which numbers of a box are of the corner farthest behind it.
-Side = tuple[float, float, float, float, int, int, int]
+#: A side of a frustum: its outward normal, where it lies along that, and which numbers of a box make its innermost
+#: corner.
+Plane = tuple[float, float, float, float, int, int, int]
 #: Triangles of a leaf.
 LEAF = 4
 #: Deep enough for 2**40 triangles.
@@ -165,24 +166,24 @@ def nearest_hit(
 
 
 @njit(cache=True, inline="always")
-def _box_before(boxes: Boxes, node: int, side: Side) -> bool:
-    """Whether a node's box lies wholly before a plane."""
-    nx, ny, nz, offset, ix, iy, iz = side
+def _box_outside(boxes: Boxes, node: int, plane: Plane) -> bool:
+    """Whether a node's box lies wholly outside a side of a frustum."""
+    nx, ny, nz, offset, ix, iy, iz = plane
     return bool(nx * boxes[node, ix] + ny * boxes[node, iy] + nz * boxes[node, iz] > offset)
 
 
 @njit(cache=True, inline="always")
-def _triangle_before(triangles: Array, n: int, side: Side) -> bool:
-    """Whether a triangle lies wholly before a plane."""
-    nx, ny, nz, offset, _ix, _iy, _iz = side
-    before = True
+def _triangle_outside(triangles: Array, n: int, plane: Plane) -> bool:
+    """Whether a triangle lies wholly outside a side of a frustum."""
+    nx, ny, nz, offset, _ix, _iy, _iz = plane
+    outside = True
     for corner in range(3):
-        before &= nx * triangles[n, corner, 0] + ny * triangles[n, corner, 1] + nz * triangles[n, corner, 2] > offset
-    return before
+        outside &= nx * triangles[n, corner, 0] + ny * triangles[n, corner, 1] + nz * triangles[n, corner, 2] > offset
+    return outside
 
 
 @njit(cache=True, inline="always")
-def _side(x: float, y: float, z: float, nx: float, ny: float, nz: float, beyond: float) -> Side:
+def _plane(x: float, y: float, z: float, nx: float, ny: float, nz: float, beyond: float) -> Plane:
     """The plane across a direction, so far beyond a place along it."""
     return (
         nx,
@@ -215,28 +216,28 @@ def in_beam(
     triangles, order, boxes = tree
     if order.size == 0:
         return 0
-    # a pyramid around the beam: two directions across it, and its four sides
+    # a frustum around the beam: two directions across it, four sides and the far one
     rx, ry, rz = (dy, -dx, 0.0) if abs(dz) < 0.9 else (0.0, dz, -dy)
     length = math.sqrt(rx * rx + ry * ry + rz * rz)
     rx, ry, rz = rx / length, ry / length, rz / length
     ux, uy, uz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
     widening = math.tan(spread)
     sx, sy, sz = widening * dx, widening * dy, widening * dz
-    right = _side(x, y, z, rx - sx, ry - sy, rz - sz, 0.0)
-    left = _side(x, y, z, -rx - sx, -ry - sy, -rz - sz, 0.0)
-    above = _side(x, y, z, ux - sx, uy - sy, uz - sz, 0.0)
-    below = _side(x, y, z, -ux - sx, -uy - sy, -uz - sz, 0.0)
-    end = _side(x, y, z, dx, dy, dz, farthest)
+    right = _plane(x, y, z, rx - sx, ry - sy, rz - sz, 0.0)
+    left = _plane(x, y, z, -rx - sx, -ry - sy, -rz - sz, 0.0)
+    above = _plane(x, y, z, ux - sx, uy - sy, uz - sz, 0.0)
+    below = _plane(x, y, z, -ux - sx, -uy - sy, -uz - sz, 0.0)
+    end = _plane(x, y, z, dx, dy, dz, farthest)
     first_leaf = boxes.shape[0] // 2
     count = 0
     node = 0
     while True:
         missed = (
-            _box_before(boxes, node, right)
-            or _box_before(boxes, node, left)
-            or _box_before(boxes, node, above)
-            or _box_before(boxes, node, below)
-            or _box_before(boxes, node, end)
+            _box_outside(boxes, node, right)
+            or _box_outside(boxes, node, left)
+            or _box_outside(boxes, node, above)
+            or _box_outside(boxes, node, below)
+            or _box_outside(boxes, node, end)
         )
         if not missed:
             if node < first_leaf:
@@ -246,10 +247,10 @@ def in_beam(
             for k in range(start, min(start + LEAF, order.size)):
                 n = order[k]
                 beside = (
-                    _triangle_before(triangles, n, right)
-                    or _triangle_before(triangles, n, left)
-                    or _triangle_before(triangles, n, above)
-                    or _triangle_before(triangles, n, below)
+                    _triangle_outside(triangles, n, right)
+                    or _triangle_outside(triangles, n, left)
+                    or _triangle_outside(triangles, n, above)
+                    or _triangle_outside(triangles, n, below)
                 )
                 if beside:
                     continue
