@@ -319,11 +319,14 @@ def _print_estimate(campaign: Campaign, crew: Crew) -> None:
     least, most = found.case_range_s
     typer.echo(f"{total} cases on {workers} workers: about {_duration(found.time_s)}")
     if found.inputs:
-        typer.echo(f"  {found.inputs} shared inputs to prepare, the first in {found.input_s:.3g} s")
+        typer.echo(f"  {found.inputs} terrains (shared inputs) to build, {found.input_s:.3g} s each")
     typer.echo(f"  {found.case_s:.3g} s a case ({least:.3g} to {most:.3g} s in {found.trials} trial cases)")
     if found.unfinished:
         typer.echo(f"  {found.unfinished} of the trial cases did not come to their end")
     typer.echo(f"disk: {size_text(found.rows_bytes)} of rows, up to {size_text(found.products_bytes)} of products")
+    if found.inputs_bytes:
+        limit = size_text(found.cache_limit_bytes)
+        typer.echo(f"  {size_text(found.inputs_bytes)} of terrains in the cache, which keeps at most {limit}")
 
 
 def _duration(seconds: float) -> str:

@@ -17,15 +17,19 @@ KINDS = {
     "kernels": "compiled code; compiled again in the next minute of running",
 }
 
+#: The kind whose size is limited, by MARSYARD_CACHE_GB.
+LIMITED = "terrain"
+
 
 @dataclass(frozen=True)
 class Kept:
-    """What is kept of one kind: its folder, how many files, and how many bytes on disk they take."""
+    """What is kept of one kind: its folder, how many files, how many bytes on disk they take and may take."""
 
     kind: str
     folder: Path
     files: int
     size_bytes: int
+    limit_bytes: int | None = None
 
 
 @says_what_is_wrong
@@ -48,7 +52,16 @@ def clean(
     found = [kept(kind) for kind in kinds or KINDS]
     freed = sum(_removed(one.folder) for one in found) if yes else 0
     if as_json:
-        told = [{"kind": k.kind, "folder": str(k.folder), "files": k.files, "bytes": k.size_bytes} for k in found]
+        told = [
+            {
+                "kind": k.kind,
+                "folder": str(k.folder),
+                "files": k.files,
+                "bytes": k.size_bytes,
+                "limit_bytes": k.limit_bytes,
+            }
+            for k in found
+        ]
         typer.echo(json.dumps({"kept": told, "removed_bytes": freed}, indent=2))
         return
     _print(found)
@@ -59,8 +72,9 @@ def clean(
 
 
 def kept(kind: str) -> Kept:
-    """What is kept of a kind."""
-    from sim.cache import cache_directory
+    """What is kept of a kind. Raises CampaignError where MARSYARD_CACHE_GB is not a number of gigabytes."""
+    from campaigns.errors import CampaignError
+    from sim.cache import cache_directory, limit_bytes
 
     folder = cache_directory(kind)
     sizes = []
@@ -70,7 +84,12 @@ def kept(kind: str) -> Kept:
                 sizes.append(path.stat().st_size)
         except OSError:  # another process has removed it meanwhile
             continue
-    return Kept(kind, folder, len(sizes), sum(sizes))
+    size = sum(sizes)
+    try:
+        limit = limit_bytes(folder, size) if kind == LIMITED else None
+    except ValueError as error:
+        raise CampaignError(str(error)) from error
+    return Kept(kind, folder, len(sizes), size, limit)
 
 
 def _removed(folder: Path) -> int:
@@ -96,8 +115,10 @@ def _print(found: list[Kept]) -> None:
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("kind", "files", "size", "folder", "what it is"):
-        table.add_column(heading, justify="right" if heading in ("files", "size") else "left", overflow="fold")
+    for heading in ("kind", "files", "size", "limit", "folder", "what it is"):
+        right = heading in ("files", "size", "limit")
+        table.add_column(heading, justify="right" if right else "left", overflow="fold")
     for one in found:
-        table.add_row(one.kind, str(one.files), size_text(one.size_bytes), str(one.folder), KINDS[one.kind])
+        limit = "none" if one.limit_bytes is None else size_text(one.limit_bytes)
+        table.add_row(one.kind, str(one.files), size_text(one.size_bytes), limit, str(one.folder), KINDS[one.kind])
     console().print(table)

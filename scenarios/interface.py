@@ -88,6 +88,19 @@ class Scenario(Protocol):
 
 
 @runtime_checkable
+class SelectsInputs(Protocol):
+    """A scenario that states which shared inputs a case uses: only those of a campaign's own cases are prepared."""
+
+    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
+        """Numbers, out of `shared_inputs`, of the inputs that a case with these drawn parameters uses."""
+        ...
+
+    def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
+        """Bytes on disk that preparing an input would add to the cache; 0 where the input is there."""
+        ...
+
+
+@runtime_checkable
 class TakesAlgorithms(Protocol):
     """A scenario whose algorithms under test a campaign chooses.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -20,6 +21,7 @@ from campaigns.store.products import PackedProducts, pack_products
 from campaigns.store.retention import Keep
 from scenarios.interface import CaseResult, Scalar
 from scenarios.registry import scenario
+from sim.cache import CacheWarning
 
 
 @dataclass(frozen=True)
@@ -84,10 +86,13 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
         return CompletedCase(row, None, f"the products of case {case} could not be kept: {error}")
 
 
-def prepare_input(configuration: str, shared_input: int) -> None:
-    """Builds one input that many cases share."""
+def prepare_input(configuration: str, shared_input: int) -> str:
+    """Builds one input that many cases share, or verifies it; returns what the cache warned of, empty if nothing."""
     campaign = _campaign(configuration)
-    campaign.scenario.prepare(campaign.base_parameters(), shared_input)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CacheWarning)
+        campaign.scenario.prepare(campaign.base_parameters(), shared_input)
+    return "; ".join(str(one.message) for one in caught if issubclass(one.category, CacheWarning))
 
 
 def run_cases(

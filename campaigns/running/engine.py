@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +20,7 @@ from campaigns.execution.cases import CompletedCase, configuration_text, prepare
 from campaigns.execution.crew import Crew, hire
 from campaigns.execution.work import Work, Workers
 from campaigns.outcomes import RETRYABLE, UNFINISHED
+from campaigns.running.inputs import plan_inputs
 from campaigns.running.replay import replay_with
 from campaigns.store import record
 from campaigns.store.columns import Row
@@ -234,7 +235,7 @@ def _run(work: _Work, again: Sequence[int]) -> None:
     with _recorded(work), hire(work.crew) as workers:
         missing = work.store.missing(work.configuration.total_cases)
         if missing or again:
-            _prepare(work, workers)
+            _prepare(work, workers, itertools.chain(*missing, again))
             _run_cases(work, workers, [*missing, again])
         measures = [asked.metric for asked in work.configuration.requirements if asked.bound is not None]
         write_table(work.directory / TABLE_FILE, work.store, measures)
@@ -298,10 +299,16 @@ def _keep_products(products: ProductStore, completed: CompletedCase, watch: Watc
         watch.note(f"the budget for kept products (retain.budget_gb) is used up: none is kept from case {case} on")
 
 
-def _prepare(work: _Work, workers: Workers) -> None:
-    """Builds what cases share; where that fails the cases that need it will say so in their rows."""
+def _prepare(work: _Work, workers: Workers, cases: Iterable[int]) -> None:
+    """Builds what these cases share; where that fails the cases that need it will say so in their rows."""
     configuration, watch = work.configuration, work.watch
-    inputs = work.campaign.scenario.shared_inputs(work.campaign.base_parameters())
+    plan = plan_inputs(work.campaign, cases)
+    inputs = plan.to_prepare
+    if plan.build_bytes > plan.limit_bytes:
+        watch.note(
+            f"the terrains to be built take {plan.build_bytes / 1e9:.1f} GB, more than the cache may "
+            f"({plan.limit_bytes / 1e9:.1f} GB): some are built more than once; MARSYARD_CACHE_GB sets the limit"
+        )
     if not inputs:
         return
     watch.begin("preparing", len(inputs))
@@ -311,6 +318,8 @@ def _prepare(work: _Work, workers: Workers) -> None:
             if done.error is not None:
                 said = f"{type(done.error).__name__}: {done.error}"
                 watch.note(f"shared input {done.item} could not be prepared: {said}")
+            elif done.result:
+                watch.note(done.result)
             watch.step()
 
 

@@ -14,7 +14,9 @@ from campaigns.execution.cases import CompletedCase, configuration_text, prepare
 from campaigns.execution.crew import Crew, hire
 from campaigns.execution.work import Work, Workers
 from campaigns.outcomes import UNFINISHED
+from campaigns.running.inputs import plan_inputs
 from campaigns.store.retention import KEEP_ALL
+from scenarios.interface import SelectsInputs
 
 #: Cases run on trial, at most; the first is left out of the mean as it loads what the others find.
 TRIAL_CASES = 9
@@ -36,8 +38,11 @@ class Estimate:
         Cases run on trial, and those of them that did not come to their end.
     case_s, case_range_s
         Mean wall-clock time of a trial case on one worker, and the shortest and the longest.
-    inputs, input_s
-        Shared inputs to be prepared, and the time that the first took (little where it was there already).
+    inputs, input_s, inputs_bytes
+        Shared inputs (terrains) of the cases that are not built yet, the mean time that building one took, and what
+        they take on disk together (0 where the scenario does not state it).
+    cache_limit_bytes
+        Size limit of the cache that keeps them.
     time_s
         Of the whole campaign with the crew that was asked for, as long as it has a core for each worker.
     rows_bytes, products_bytes
@@ -50,25 +55,24 @@ class Estimate:
     case_range_s: tuple[float, float]
     inputs: int
     input_s: float
+    inputs_bytes: float
+    cache_limit_bytes: float
     time_s: float
     rows_bytes: float
     products_bytes: float
 
 
 def estimate(campaign: Campaign, jobs: int) -> Estimate:
-    """Runs the first shared input and some cases on trial, in one worker, and keeps nothing of them.
+    """Runs some cases on trial, in one worker, and keeps nothing of them but the shared inputs built for them.
 
     The cases are spread evenly over the campaign.
     """
     configuration = campaign.configuration
-    inputs = campaign.scenario.shared_inputs(campaign.base_parameters())
+    plan = plan_inputs(campaign, range(configuration.total_cases))
+    inputs = len(plan.to_build)
     with hire(Crew()) as workers:
-        began = time.monotonic()
-        if inputs:
-            task = partial(prepare_input, configuration_text(configuration))
-            list(workers.run(Work(task, inputs[:1], prepare_limits(configuration.limits))))
-        input_s = time.monotonic() - began
-        trials = _trials(configuration, workers)
+        trials, built = _trials(campaign, workers)
+    input_s = statistics.fmean(built) if built else 0.0
     times = [seconds for _, seconds in (trials[1:] or trials)]
     case_s = statistics.fmean(times)
     size = statistics.fmean(len(json.dumps(list(one.row.values()))) for one, _ in trials)
@@ -80,17 +84,21 @@ def estimate(campaign: Campaign, jobs: int) -> Estimate:
         unfinished=sum(one.row["outcome"] in UNFINISHED for one, _ in trials),
         case_s=case_s,
         case_range_s=(min(times), max(times)),
-        inputs=len(inputs),
+        inputs=inputs,
         input_s=input_s,
-        time_s=(rows * case_s + len(inputs) * input_s) / jobs,
+        inputs_bytes=plan.build_bytes,
+        cache_limit_bytes=plan.limit_bytes,
+        time_s=(rows * case_s + inputs * input_s) / jobs,
         rows_bytes=rows * size * _ROW_OVERHEAD,
         products_bytes=min(kept, configuration.retain.budget_gb * 1e9),
     )
 
 
-def _trials(configuration: CampaignConfiguration, workers: Workers) -> list[tuple[CompletedCase, float]]:
-    """Cases run on trial, and the time that each took."""
+def _trials(campaign: Campaign, workers: Workers) -> tuple[list[tuple[CompletedCase, float]], list[float]]:
+    """Cases run on trial with the time that each took, and the times of the shared inputs built for them."""
     ran: list[tuple[CompletedCase, float]] = []
+    built: list[float] = []
+    configuration = campaign.configuration
     total = configuration.total_cases
     number = min(TRIAL_CASES, total)
     began = time.monotonic()
@@ -98,9 +106,30 @@ def _trials(configuration: CampaignConfiguration, workers: Workers) -> list[tupl
         start = time.monotonic()
         if ran and start - began > TRIAL_S:
             break
-        ((completed,),) = run_cases(workers, configuration, [place * total // number], keep=KEEP_ALL)
+        case = place * total // number
+        built += _build_inputs(campaign, workers, case)
+        start = time.monotonic()
+        ((completed,),) = run_cases(workers, configuration, [case], keep=KEEP_ALL)
         ran.append((completed, time.monotonic() - start))
-    return ran
+    return ran, built
+
+
+def _build_inputs(campaign: Campaign, workers: Workers, case: int) -> list[float]:
+    """Builds what a case shares with others and what is not there; returns the time that each input took.
+
+    Of a scenario that does not state what a case uses, the first input stands for all, and is built for case 0.
+    """
+    missing = list(plan_inputs(campaign, [case]).to_build)
+    if not isinstance(campaign.scenario, SelectsInputs):
+        missing = missing[:1] if case == 0 else []
+    limits = prepare_limits(campaign.configuration.limits)
+    task = partial(prepare_input, configuration_text(campaign.configuration))
+    times = []
+    for number in missing:
+        began = time.monotonic()
+        list(workers.run(Work(task, [number], limits)))
+        times.append(time.monotonic() - began)
+    return times
 
 
 def _kept_share(configuration: CampaignConfiguration) -> float:

@@ -8,7 +8,7 @@ from functools import partial
 from pydantic import BaseModel
 
 from scenarios.descent.exposure import expose
-from scenarios.descent.faults import faulty_detector
+from scenarios.descent.faults import faulty_detector, faulty_terrain
 from scenarios.descent.flight import flown_descent, picture_states, true_velocity
 from scenarios.descent.landing import touchdown
 from scenarios.descent.measurement import Instruments, measure
@@ -68,8 +68,16 @@ class DescentScenario:
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Builds one terrain of the bank."""
+        _bank(parameters).terrain(shared_input)
+
+    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
+        """The terrain below the descent; none where a fault puts dunes on it, which is no terrain of the bank."""
         p = _checked(parameters)
-        TerrainBank(p.terrain, p.place.bank_seed).terrain(shared_input)
+        return (p.place.terrain,) if faulty_terrain(p.faults, p.terrain) == p.terrain else ()
+
+    def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
+        """Bytes of a terrain that is not on disk."""
+        return _bank(parameters).missing_bytes(shared_input)
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """The pictures of a case with the truth of their pixels."""
@@ -152,6 +160,11 @@ class DescentScenario:
             )
 
         return case_result(p.algorithms, judge, conditions_row)
+
+
+def _bank(parameters: BaseModel) -> TerrainBank:
+    p = _checked(parameters)
+    return TerrainBank(p.terrain, p.place.bank_seed)
 
 
 def _checked(parameters: BaseModel) -> DescentScenarioParameters:

@@ -56,8 +56,17 @@ class FieldTestScenario:
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Builds the terrain of one site."""
+        _bank(parameters, shared_input).terrain(0)
+
+    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
+        """The site of the case's run. Raises ValueError where the runs have no triple of this number."""
         p = _checked(parameters)
-        TerrainBank(p.terrain(p.site_names[shared_input]), p.bank_seed).terrain(0)
+        number, _ = case_order(p)[_place(p, case)]
+        return (p.site_names.index(p.runs[number].site),)
+
+    def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
+        """Bytes of a site's terrain that is not on disk."""
+        return _bank(parameters, shared_input).missing_bytes(0)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One triple."""
@@ -103,6 +112,11 @@ class FieldTestScenario:
             )
 
         return case_result(p.algorithms, judge, known)
+
+
+def _bank(parameters: BaseModel, site_number: int) -> TerrainBank:
+    p = _checked(parameters)
+    return TerrainBank(p.terrain(p.site_names[site_number]), p.bank_seed)
 
 
 def _checked(parameters: BaseModel) -> FieldTestParameters:

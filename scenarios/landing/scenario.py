@@ -48,8 +48,15 @@ class LandingScenario:
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Builds one terrain of the bank."""
-        p = _checked(parameters)
-        TerrainBank(p.terrain, p.place.bank_seed).terrain(shared_input)
+        _bank(parameters).terrain(shared_input)
+
+    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
+        """The terrain below the flight."""
+        return (_checked(parameters).place.terrain,)
+
+    def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
+        """Bytes of a terrain that is not on disk."""
+        return _bank(parameters).missing_bytes(shared_input)
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """The two pictures of a case with the truth of their pixels."""
@@ -99,6 +106,11 @@ class LandingScenario:
             )
 
         return case_result(p.algorithms, judge, known)
+
+
+def _bank(parameters: BaseModel) -> TerrainBank:
+    p = _checked(parameters)
+    return TerrainBank(p.terrain, p.place.bank_seed)
 
 
 def _checked(parameters: BaseModel) -> LandingScenarioParameters:

@@ -41,8 +41,15 @@ class RoverScenario:
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Builds one terrain of the bank."""
-        w = _checked(parameters).world
-        TerrainBank(terrain_parameters(w), w.bank_seed).terrain(shared_input)
+        _bank(parameters).terrain(shared_input)
+
+    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
+        """The terrain that the rover drives on."""
+        return (_checked(parameters).world.terrain,)
+
+    def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
+        """Bytes of a terrain that is not on disk."""
+        return _bank(parameters).missing_bytes(shared_input)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One run; each algorithm that is compared makes one of its own, with the same draws."""
@@ -78,6 +85,11 @@ def _tracked(p: RoverScenarioParameters, streams: Streams) -> tuple[Run, dict[st
 
 def _judged(run: Run, row: Mapping[str, Scalar], kept: Mapping[str, object] | None = None) -> Judged:
     return Judged(run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, kept or {})
+
+
+def _bank(parameters: BaseModel) -> TerrainBank:
+    w = _checked(parameters).world
+    return TerrainBank(terrain_parameters(w), w.bank_seed)
 
 
 def _checked(parameters: BaseModel) -> RoverScenarioParameters:

@@ -336,8 +336,16 @@ class SharedDriveScenario:
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Builds one terrain of the bank."""
-        w = _checked(parameters).drive.world
-        TerrainBank(terrain_parameters(w), w.bank_seed).terrain(shared_input)
+        _bank(parameters).terrain(shared_input)
+
+    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
+        """The terrain of the case's run."""
+        p = _checked(parameters)
+        return (p.variants[p.run].terrain,)
+
+    def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
+        """Bytes of a terrain that is not on disk."""
+        return _bank(parameters).missing_bytes(shared_input)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One target of one run, tracked with one step; all algorithms see the same pictures."""
@@ -387,6 +395,11 @@ def _known(p: SharedDriveParameters) -> dict[str, Scalar]:
         "pure_ncc": p.drive.algorithm == "pure-ncc",
         **bands,
     }
+
+
+def _bank(parameters: BaseModel) -> TerrainBank:
+    w = _checked(parameters).drive.world
+    return TerrainBank(terrain_parameters(w), w.bank_seed)
 
 
 def _checked(parameters: BaseModel) -> SharedDriveParameters:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import tempfile
+import warnings
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from jaxtyping import Float32
 
-from sim.cache import UNFINISHED, cache_directory, make_room, touch
+from sim.cache import CacheWarning, cache_directory, load_array, make_room, save_array, touch
 from sim.terrain.embedding import RealExtent, embed
 from sim.terrain.parameters import TerrainParameters
 from sim.terrain.rocks.field import RockField
@@ -59,6 +59,10 @@ class TerrainBank:
         _IN_USE[path] = flat
         return self._surface(flat)
 
+    def missing_bytes(self, number: int) -> int:
+        """Bytes that a terrain would take on disk, but for some hundred; 0 where it is there."""
+        return 0 if self._path(number).exists() else 4 * self._size()
+
     def rocks(self, number: int) -> RockField | None:
         """The rocks of terrain `number`, built anew each time; None where the parameters ask for none."""
         if self.parameters.rocks is None:
@@ -88,27 +92,20 @@ class TerrainBank:
 
     def _kept(self, path: Path) -> Float32[np.ndarray, "samples"] | None:
         """Samples of all levels, memory-mapped; None where the file is missing or damaged."""
-        try:
-            flat: Float32[np.ndarray, "samples"] = np.load(path, mmap_mode="r").view(np.ndarray)
-        except (FileNotFoundError, ValueError, EOFError):
-            return None
-        return flat if flat.size == self._size() else None
+        flat = load_array(path)
+        return flat if flat is not None and flat.size == self._size() else None
 
     def _build(self, number: int, path: Path) -> Float32[np.ndarray, "samples"]:
-        make_room(path.parent, 4 * self._size(), set(_IN_USE))
+        """Builds a terrain and keeps it on disk; where that cannot be written, in memory only."""
         built = synthesise(self.parameters, self._rng(number))
-        # Written aside and moved into place, so that neither an interruption nor a second builder leaves half a file;
-        # mapped before, so that another process may remove it again at once.
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=UNFINISHED, delete=False) as part:
-            try:
-                np.save(part, np.concatenate([level.reshape(-1) for level in built.levels]))
-                part.close()
-                flat: Float32[np.ndarray, "samples"] = np.load(part.name, mmap_mode="r").view(np.ndarray)
-                Path(part.name).replace(path)
-            except BaseException:
-                Path(part.name).unlink(missing_ok=True)
-                raise
-        return flat
+        flat = np.concatenate([level.reshape(-1) for level in built.levels])
+        try:
+            make_room(path.parent, 4 * self._size(), set(_IN_USE))
+            return save_array(path, flat)
+        except OSError as error:
+            warnings.warn(f"terrain {number} is not kept: {path}: {error.strerror}", CacheWarning, stacklevel=2)
+            flat.flags.writeable = False
+            return flat
 
     def _sides(self) -> list[int]:
         sides = [self.parameters.samples]

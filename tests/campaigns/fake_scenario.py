@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import re
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from scenarios.interface import CaseResult
+from sim.cache import CacheWarning
 from sim.streams import Streams
 
 
@@ -102,3 +104,17 @@ class FakeScenario:
         products = {"picture": np.arange(6, dtype=np.uint16).reshape(2, 3), "title": "a", "nested": [{"x": np.eye(2)}]}
         kept = {"thing": object()} if parameters.products == "bad" else products
         return CaseResult("VALID" if answered else "SILENT", answered, row, kept)
+
+
+class SelectingScenario(FakeScenario):
+    """A scenario that states which shared input a case uses: the one of its terrain's number."""
+
+    def prepare(self, parameters: FakeParameters, shared_input: int) -> None:
+        super().prepare(parameters, shared_input)
+        warnings.warn(f"input {shared_input} was damaged", CacheWarning, stacklevel=2)
+
+    def case_inputs(self, parameters: FakeParameters, case: int) -> tuple[int, ...]:
+        return (parameters.terrain,)
+
+    def missing_bytes(self, parameters: FakeParameters, shared_input: int) -> int:
+        return 0 if Path(parameters.cache, f"shared-{shared_input}").exists() else 1_000_000

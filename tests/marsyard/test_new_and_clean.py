@@ -88,6 +88,7 @@ def test_files_that_are_there_stay(here: Path) -> None:
 
 def test_clean_shows_and_then_removes(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(here / "cache"))
+    monkeypatch.setenv("MARSYARD_CACHE_GB", "2")
     folder = here / "cache" / "terrain"
     folder.mkdir(parents=True)
     (folder / "one.npy").write_bytes(b"\0" * 3000)
@@ -95,6 +96,7 @@ def test_clean_shows_and_then_removes(here: Path, monkeypatch: pytest.MonkeyPatc
     status, output = told("clean")
     assert status == 0
     assert "3.5 kB" in output
+    assert "2 GB" in output, "the limit of the cache"
     assert "nothing was removed" in output
     assert (folder / "one.npy").exists()
     status, output = told("clean", "terrain", "--yes", "--json")

@@ -61,9 +61,9 @@ def test_the_limit_is_a_share_of_what_the_disk_could_give(tmp_path: Path, monkey
     monkeypatch.setattr("sim.cache.shutil.disk_usage", lambda _: SimpleNamespace(free=free))
     assert limit_bytes(tmp_path, 0) == 8 * GIGA
     # what is kept already does not shrink the limit
-    assert limit_bytes(tmp_path, 10 * GIGA) == 12 * GIGA
+    assert limit_bytes(tmp_path, 3 * GIGA) == 9.2 * GIGA
     free = 900 * GIGA
-    assert limit_bytes(tmp_path, 0) == 30 * GIGA
+    assert limit_bytes(tmp_path, 0) == 10 * GIGA
 
 
 @pytest.mark.parametrize("wrong", ["plenty", "0", "-3", "nan", "inf"])

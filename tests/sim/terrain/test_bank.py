@@ -1,11 +1,15 @@
+import errno
 import hashlib
 import multiprocessing
+import os
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import sim.cache as cache_module
+from sim.cache import CacheWarning
 from sim.terrain import TerrainBank, TerrainParameters
 
 SMALL = TerrainParameters(samples=64)
@@ -46,7 +50,67 @@ def test_a_damaged_file_is_built_anew(cache: Path, damage: bytes | None) -> None
     built = _bytes(bank, 3)
     path = next(cache.iterdir())
     path.write_bytes(path.read_bytes()[:1000] if damage is None else damage)
+    with pytest.warns(CacheWarning, match="damaged and built again"):
+        assert _bytes(bank, 3) == built
     assert _bytes(bank, 3) == built
+
+
+def test_zeros_in_a_cached_file_are_noticed_and_the_terrain_is_built_again(cache: Path) -> None:
+    """Also by a process that has verified the file before, and although the time of use was set meanwhile."""
+    bank = TerrainBank(SMALL, seed=1)
+    built = _bytes(bank, 0)
+    assert _bytes(bank, 0) == built
+    with next(cache.iterdir()).open("r+b") as file:
+        file.seek(5000)
+        file.write(bytes(20_000))
+    with pytest.warns(CacheWarning, match="checksum"):
+        assert _bytes(bank, 0) == built
+    assert _bytes(bank, 0) == built
+
+
+def test_a_file_is_verified_once_by_a_process(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bank = TerrainBank(SMALL, seed=1)
+    built = _bytes(bank, 0)
+    monkeypatch.setattr("sim.cache._VERIFIED", {})
+    summed: list[int] = []
+    checksum = cache_module._checksum
+    monkeypatch.setattr("sim.cache._checksum", lambda array: summed.append(array.size) or checksum(array))
+    assert [_bytes(bank, 0), _bytes(bank, 0)] == [built, built]
+    assert len(summed) == 1
+
+
+def test_a_terrain_is_synced_before_it_gets_its_name(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[str] = []
+    replace, sync = Path.replace, os.fsync
+    monkeypatch.setattr(
+        "os.fsync", lambda file: steps.append(str(Path(f"/proc/self/fd/{file}").readlink())) or sync(file)
+    )
+    monkeypatch.setattr(Path, "replace", lambda self, path: steps.append("named") or replace(self, path))
+    TerrainBank(SMALL, seed=1).terrain(0)
+    assert [Path(step).suffix or Path(step).name for step in steps] == [".part", "named", "terrain"]
+
+
+def test_a_cache_that_cannot_be_written_costs_time_only(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bank = TerrainBank(SMALL, seed=1)
+    built = _bytes(bank, 0)
+    next(cache.iterdir()).unlink()
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.warns(CacheWarning, match="No space left"):
+        assert _bytes(bank, 0) == built
+    assert not list(cache.iterdir())
+
+
+def test_a_terrain_larger_than_the_limit_is_built_and_used(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MARSYARD_CACHE_GB", "0.00001")
+    bank = TerrainBank(SMALL, seed=1)
+    held = bank.terrain(0)
+    other = bank.terrain(1)
+    assert held.levels[0].tobytes() == TerrainBank(SMALL, seed=1).terrain(0).levels[0].tobytes()
+    assert np.isfinite(other.levels[0]).all()
 
 
 def test_terrains_are_read_only(cache: Path) -> None:
