@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from algorithms.exchange import ProgramDetails
-from algorithms.faults import AlgorithmError, Fault
+from algorithms.faults import AlgorithmError, Fault, describe_error
 from scenarios.estimators import labels
 from scenarios.interface import CaseResult, Failure, Scalar
 
@@ -60,10 +60,10 @@ def attempted(ask: Callable[[], object], check: Callable[[object], Answer]) -> A
         said = {STDERR: error.stderr} if error.stderr else {}
         return Attempt(None, Failure(error.fault.name, str(error), ""), {**_time(started), **said})
     except MemoryError as error:
-        failure = Failure(Fault.OUT_OF_MEMORY.name, f"MemoryError: {error}", traceback.format_exc())
+        failure = Failure(Fault.OUT_OF_MEMORY.name, describe_error(error), traceback.format_exc())
         return Attempt(None, failure, _time(started))
     except Exception as error:
-        failure = Failure(Fault.CRASHED.name, f"{type(error).__name__}: {error}", traceback.format_exc())
+        failure = Failure(Fault.CRASHED.name, describe_error(error), traceback.format_exc())
         return Attempt(None, failure, _time(started))
     row: dict[str, Scalar] = {"estimation_time_s": answer_time_s(answer, taken)}
     details = getattr(answer, "details", None)
