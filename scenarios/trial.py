@@ -16,7 +16,8 @@ from typing import Any, Generic, TypeVar
 from algorithms.exchange import ProgramDetails
 from algorithms.faults import AlgorithmError, Fault, describe_error
 from scenarios.estimators import labels
-from scenarios.interface import CaseResult, Failure, Scalar
+from scenarios.handover import Given, Handover
+from scenarios.interface import CaseResult, Failure, Scalar, record_conditions
 
 Answer = TypeVar("Answer")
 
@@ -72,6 +73,19 @@ def attempted(ask: Callable[[], object], check: Callable[[object], Answer]) -> A
     return Attempt(answer, None, row)
 
 
+def attempted_with(
+    ask: Callable[[Given], object], check: Callable[[object], Answer], measurements: Given
+) -> Attempt[Answer]:
+    """As `attempted`, of an algorithm that is given its own copy of measurements, and is not to change it."""
+    handover = Handover(measurements)
+
+    def check_both(answer: object) -> Answer:
+        handover.check()
+        return check(answer)
+
+    return attempted(lambda: ask(handover.given), check_both)
+
+
 def answer_time_s(answer: object, taken_s: float) -> float:
     """The time that an answer took: processor time, measured around it; of a program, the wall-clock time it tells."""
     details = getattr(answer, "details", None)
@@ -96,7 +110,7 @@ class Judged:
 def case_result(
     algorithms: Sequence[str], judge: Callable[[str], Judged], conditions: Mapping[str, Scalar]
 ) -> CaseResult:
-    """A case's result with every algorithm judged in it.
+    """A case's result with every algorithm judged in it; its conditions are recorded before any is asked.
 
     Parameters
     ----------
@@ -107,6 +121,7 @@ def case_result(
     conditions
         What the case was like: columns that do not depend on any algorithm.
     """
+    record_conditions(conditions)
     names = labels(algorithms)
     first, *others = [judge(spec) for spec in algorithms]
     row: dict[str, Scalar] = {ALGORITHM: names[0], **first.row, **conditions}
