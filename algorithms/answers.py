@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from algorithms.faults import AlgorithmError, Fault
 from algorithms.interface import (
@@ -29,7 +30,7 @@ _ROUNDING = 1e-9
 
 
 def checked_velocity(answer: object, tags_s: Sequence[float] | None = None) -> VelocityEstimate:
-    """The answer, if it is a valid `VelocityEstimate`.
+    """The answer in plain float64 arrays and Python numbers of its own, if it is a valid `VelocityEstimate`.
 
     Parameters
     ----------
@@ -50,22 +51,21 @@ def checked_velocity(answer: object, tags_s: Sequence[float] | None = None) -> V
     if (answer.outcome is Outcome.VALID) != (answer.velocity_m_s is not None):
         given = "none is given" if answer.velocity_m_s is None else "one is given"
         raise _bad(f"outcome is {answer.outcome.name}, but of velocity_m_s {given}; allowed: one with VALID alone")
-    if answer.velocity_m_s is not None:
-        _check_numbers("velocity_m_s", answer.velocity_m_s, (2,))
+    velocity = None if answer.velocity_m_s is None else _numbers("velocity_m_s", answer.velocity_m_s, (2,))
+    covariance = None
     if answer.covariance_m2_s2 is not None:
-        if answer.velocity_m_s is None:
+        if velocity is None:
             raise _bad("covariance_m2_s2 is given without a velocity")
-        _check_numbers("covariance_m2_s2", answer.covariance_m2_s2, (2, 2))
-        _check_covariance(answer.covariance_m2_s2)
-    if answer.span_s is not None:
-        _check_span(answer.span_s, tags_s)
-    elif tags_s is not None and len(tags_s) < 2 and answer.velocity_m_s is not None:
+        covariance = _numbers("covariance_m2_s2", answer.covariance_m2_s2, (2, 2))
+        _check_covariance(covariance)
+    span = None if answer.span_s is None else _span(answer.span_s, tags_s)
+    if span is None and tags_s is not None and len(tags_s) < 2 and velocity is not None:
         raise _bad("of one picture there is no last interval; allowed: a velocity with a span_s, or a failure")
-    return answer
+    return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_pictures)
 
 
 def checked_site(answer: object) -> SiteEstimate:
-    """The answer, if it is a valid `SiteEstimate`; raises as `checked_velocity`."""
+    """The answer in plain arrays, if it is a valid `SiteEstimate`; raises as `checked_velocity`."""
     if not isinstance(answer, SiteEstimate):
         raise _bad(f"the answer is a {_kind(answer)}; allowed: a SiteEstimate")
     if not isinstance(answer.outcome, SiteOutcome):
@@ -73,22 +73,20 @@ def checked_site(answer: object) -> SiteEstimate:
     if (answer.outcome is SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
         given = "none is given" if answer.site_world is None else "one is given"
         raise _bad(f"outcome is {answer.outcome.name}, but site_world: {given}; allowed: none with NO_SAFE_SITE only")
-    if answer.site_world is not None:
-        _check_numbers("site_world", answer.site_world, (3,))
-    return answer
+    site = None if answer.site_world is None else _numbers("site_world", answer.site_world, (3,))
+    return SiteEstimate(answer.outcome, site, answer.details)
 
 
 def checked_update(answer: object) -> TargetUpdate:
-    """The answer, if it is a valid `TargetUpdate`; raises as `checked_velocity`."""
+    """The answer in plain arrays, if it is a valid `TargetUpdate`; raises as `checked_velocity`."""
     if not isinstance(answer, TargetUpdate):
         raise _bad(f"the answer is a {_kind(answer)}; allowed: a TargetUpdate")
     if not isinstance(answer.state, TrackingState):
         raise _bad(f"state is a {_kind(answer.state)}; allowed: a TrackingState")
-    if answer.found and answer.position_rover is None:
+    position = None if answer.position_rover is None else _numbers("position_rover", answer.position_rover, (3,))
+    if answer.state is TrackingState.NORMAL and position is None:
         raise _bad("state is NORMAL, but position_rover is None")
-    if answer.position_rover is not None:
-        _check_numbers("position_rover", answer.position_rover, (3,))
-    return answer
+    return TargetUpdate(answer.state, answer.losses, position, answer.details)
 
 
 def checked_aim(answer: object, mast: MastCalibration) -> MastAim | None:
@@ -107,7 +105,7 @@ def checked_aim(answer: object, mast: MastCalibration) -> MastAim | None:
             raise _bad(f"{name} is {angle!r}; allowed: {least:g} to {most:g}")
     for name, camera in (("left", mast.left), ("right", mast.right)):
         _check_box(name, getattr(answer, name), camera.size)
-    return answer
+    return MastAim(float(answer.azimuth_rad), float(answer.elevation_rad), answer.left, answer.right)
 
 
 def _check_box(name: str, box: Any, size: tuple[int, int]) -> None:
@@ -120,23 +118,28 @@ def _check_box(name: str, box: Any, size: tuple[int, int]) -> None:
             raise _bad(f"{name} is {box.corner} and {box.size}; allowed: a part of the frame of {size} pixels")
 
 
-def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> None:
+def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
+    """A plain copy of an array of finite floats of this shape: no subclass whose operators could do anything."""
     if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
         kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {_kind(value)}"
         raise _bad(f"{name} is {kind}; allowed: a NumPy array of floats, shape {shape}")
-    if value.shape != shape:
-        raise _bad(f"{name} has the shape {value.shape}; allowed: {shape}")
-    if not np.all(np.isfinite(value)):
-        raise _bad(f"{name} is not finite: {value.tolist()}")
+    plain = np.array(value, dtype=np.float64, subok=False)
+    if plain.shape != shape:
+        raise _bad(f"{name} has the shape {plain.shape}; allowed: {shape}")
+    if not np.all(np.isfinite(plain)):
+        raise _bad(f"{name} is not finite: {plain.tolist()}")
+    return plain
 
 
-def _check_span(span: Any, tags_s: Sequence[float] | None) -> None:
-    if not isinstance(span, tuple) or len(span) != 2 or not all(isinstance(one, float | int) for one in span):
-        raise _bad(f"span_s is {span!r}; allowed: a tuple of two time tags, or None")
+def _span(given: Any, tags_s: Sequence[float] | None) -> tuple[float, float]:
+    if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(one, float | int) for one in given):
+        raise _bad(f"span_s is {given!r}; allowed: a tuple of two time tags, or None")
+    span = (float(given[0]), float(given[1]))
     if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
         raise _bad(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
     if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
         raise _bad(f"span_s is {span}; allowed: within the pictures' tags, {tags_s[0]} to {tags_s[-1]} s")
+    return span
 
 
 def _check_covariance(matrix: np.ndarray) -> None:

@@ -15,6 +15,14 @@ class Fault(Enum):
     BAD_ANSWER = "its answer is not of the form that the interface states"
 
 
+def describe_error(error: BaseException | None) -> str:
+    """Type and message of an error; the type alone where its message cannot be had."""
+    try:
+        return f"{type(error).__name__}: {error}"
+    except Exception:
+        return f"{type(error).__name__}, whose message cannot be had"
+
+
 class AlgorithmError(Exception):
     """An algorithm under test that failed to answer.
 

@@ -43,12 +43,15 @@ class CaseEndedError(Exception):
         The same words each time that the task ends so.
     trace
         Where in Python the process stood, and the last that it wrote, as far as that is known.
+    note
+        What the task had left by `worker_process.leave_note`.
     """
 
-    def __init__(self, outcome: str, reason: str, trace: str) -> None:
+    def __init__(self, outcome: str, reason: str, trace: str, note: str = "") -> None:
         super().__init__(reason)
         self.outcome = outcome
         self.trace = trace
+        self.note = note
 
-    def __reduce__(self) -> tuple[type[CaseEndedError], tuple[str, str, str]]:
-        return type(self), (self.outcome, str(self), self.trace)
+    def __reduce__(self) -> tuple[type[CaseEndedError], tuple[str, str, str, str]]:
+        return type(self), (self.outcome, str(self), self.trace, self.note)

@@ -57,7 +57,8 @@ class Verdict:
         PASS where the lower bound reaches the probability, FAIL where the upper bound is below it, else INSUFFICIENT;
         where the estimate decides, PASS if it reaches the probability, else FAIL.
     n, failures
-        Cases of the population, and those that did not succeed (a metric that is missing or NaN is a failure).
+        Cases of the population, and those that did not succeed: a metric that is missing or NaN is a failure, and so is
+        a case that the engine could not finish, or whose membership is unknown.
     estimate, lower, upper
         Success rate and the one-sided bounds that decide, each at `bounds_confidence`; NaN for an empty population,
         bounds also where the cases are not independent random draws.
@@ -65,7 +66,7 @@ class Verdict:
         Cases still needed if no more fail, each on a terrain of its own where whole terrains are counted; None for PASS
         and FAIL, and where it cannot be said.
     reason
-        Why nothing could be judged; empty where it could.
+        Why nothing could be judged, or why the verdict is withheld; empty otherwise.
     terrains
         Distinct terrains behind the population; None where the rows do not say.
     clustered
@@ -193,38 +194,45 @@ def crashed_cases(frame: pd.DataFrame) -> int:
 
 def succeeded(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
     """Whether |scale * metric| <= bound, or the metric is true where the bound is NaN, case by case; False where
-    missing. A metric may be a sum of columns, joined by " + ".
+    missing, and of every case that the engine could not finish. A metric may be a sum of columns, joined by " + ".
     """
+    finished = ~_engine_failed(frame)
     if math.isnan(bound):
-        return _true(frame, metric)
+        return _true(frame, metric) & finished
     values = sum((numbers(frame, part) for part in metric.split(" + ")), np.zeros(len(frame)))
-    return np.asarray(np.abs(scale * values) <= bound, dtype=np.bool_)
+    return np.asarray((np.abs(scale * values) <= bound) & finished, dtype=np.bool_)
 
 
 def members(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
     """Which cases belong to a population: `all`, `completed`, `valid`, a column of true and false, or several of these
     joined by " and ".
 
+    A case whose membership is unknown, as that of a crashed case without the column, is a member.
+
     Raises
     ------
     ValueError
-        Where the rows do not tell who belongs to it.
+        Where no row has the column.
     """
-    chosen = np.ones(len(frame), dtype=np.bool_)
-    for part in population.split(" and "):
-        chosen &= _members_of(frame, part)
-    return chosen
+    return _members_of(frame, population.split(" and "))[0]
 
 
-def _members_of(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    if population == "all":
-        return np.ones(len(frame), dtype=np.bool_)
-    if population == "completed":
-        return ~_engine_failed(frame)
-    column = "answered" if population == "valid" else population
-    if not is_flag(frame, column):
-        raise ValueError(f"the rows have no column '{column}' of true and false, by which a population is known")
-    return _true(frame, column)
+def _members_of(
+    frame: pd.DataFrame, parts: Sequence[str]
+) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Members of the intersection of populations, and those of them whose membership is unknown."""
+    chosen, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
+    for part in parts:
+        if part == "completed":
+            chosen &= ~_engine_failed(frame)
+        elif part != "all":
+            column = "answered" if part == "valid" else part
+            if not is_flag(frame, column):
+                raise ValueError(f"the rows have no column '{column}' of true and false, by which a population is known")
+            missing = frame[column].isna().to_numpy(dtype=np.bool_)
+            chosen &= _true(frame, column) | missing
+            unknown |= missing
+    return chosen, chosen & unknown
 
 
 def is_flag(frame: pd.DataFrame, column: str) -> bool:
@@ -249,6 +257,7 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
         return replace(open_verdict, reason=fault)
     try:
         chosen = frame[members(frame, open_verdict.population)]
+        suspected = frame[_members_if_answered(frame, open_verdict.population)]
     except ValueError as error:
         return replace(open_verdict, reason=_sentence(str(error)))
     if chosen.empty:
@@ -256,14 +265,46 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
         further = further_cases_needed(0, 0, *asked) if how.independent else None
         reason = f"No case belongs to the population '{open_verdict.population}'."
         return replace(open_verdict, reason=reason, further_cases=further)
+    return _withhold(*(_decide(open_verdict, cases, how, len(frame)) for cases in (chosen, suspected)))
+
+
+def _members_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
+    """The members of a population, and the cases that would be if the engine had finished them with an answer."""
+    others = [part for part in population.split(" and ") if part not in ("valid", "completed")]
+    return members(frame, population) | (_members_of(frame, others)[0] & _engine_failed(frame))
+
+
+def _withhold(verdict: Verdict, suspected: Verdict) -> Verdict:
+    """The verdict; withheld if it is good and unfinished cases, counted as failures, would change it.
+
+    `valid` and `completed` leave unfinished cases out, so that a crash instead of a wrong answer could earn a PASS.
+    """
+    if verdict.status in (Status.FAIL, Status.INSUFFICIENT, suspected.status):
+        return verdict
+    lost = suspected.n - verdict.n
+    reason = (
+        f"{count(lost, 'case')} did not come to an end and so {'belongs' if lost == 1 else 'belong'} to no population "
+        f"of answers; counted as failures they change the verdict {verdict.status}, which is withheld."
+    )
+    return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
+
+
+def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, cases: int) -> Verdict:
+    """The verdict by the members of its population, of which there is at least one, among so many cases."""
     if not how.independent:
-        return _described(open_verdict, chosen, how)
-    return _weighed(open_verdict, chosen, how.risk_share(len(frame)))
+        return _described(verdict, chosen, how)
+    return _weighed(verdict, chosen, how.risk_share(cases))
+
+
+def _successes(verdict: Verdict, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"]:
+    """Which members succeed: none of those whose membership is unknown."""
+    _, unknown = _members_of(chosen, verdict.population.split(" and "))
+    return succeeded(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown
 
 
 def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
     """The verdict by cases that carry no probability: the rate seen, which decides where the estimate is to."""
-    success = succeeded(chosen, verdict.metric, verdict.bound, verdict.scale)
+    success = _successes(verdict, chosen)
     groups = terrain_groups(chosen)
     rate = float(success.mean())
     decided = verdict.decide_by == ESTIMATE
@@ -280,7 +321,7 @@ def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
 
 def _weighed(verdict: Verdict, chosen: pd.DataFrame, share: float) -> Verdict:
     """The verdict by the cases of its population, of which there is at least one; `share` of the risk may be spent."""
-    success = succeeded(chosen, verdict.metric, verdict.bound, verdict.scale)
+    success = _successes(verdict, chosen)
     n, failures = success.size, int((~success).sum())
     confidence = confidence_at(verdict.confidence, share)
     plain = proportion_lower(n - failures, n, confidence), proportion_upper(n - failures, n, confidence)

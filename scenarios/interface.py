@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -16,6 +18,35 @@ if TYPE_CHECKING:
 
 #: A value that can stand in a column of the results.
 Scalar = float | int | str | bool
+
+
+_recorder: ContextVar[Callable[[Mapping[str, Scalar]], None] | None] = ContextVar("_recorder", default=None)
+
+
+def record_conditions(columns: Mapping[str, Scalar]) -> None:
+    """Records columns of the running case that depend on no algorithm; to be called before an algorithm runs.
+
+    The engine stores them also where the case then raises or its process is killed, so that it is known to which
+    populations the case belongs. A case may call this several times. Outside of a campaign it does nothing.
+
+    Parameters
+    ----------
+    columns
+        As in `CaseResult.row`, which must hold them again.
+    """
+    recorder = _recorder.get()
+    if recorder is not None:
+        recorder(columns)
+
+
+@contextmanager
+def conditions_recorded_by(recorder: Callable[[Mapping[str, Scalar]], None]) -> Iterator[None]:
+    """Gives the columns of `record_conditions` to a recorder."""
+    token = _recorder.set(recorder)
+    try:
+        yield
+    finally:
+        _recorder.reset(token)
 
 
 @dataclass(frozen=True)
@@ -83,7 +114,10 @@ class Scenario(Protocol):
         ...
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """Runs one case with its parameters (dispersions already drawn into them) and its random streams."""
+        """Runs one case with its parameters (dispersions already drawn into them) and its random streams.
+
+        Columns that depend on no algorithm should be recorded first (`record_conditions`).
+        """
         ...
 
 

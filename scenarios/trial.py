@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from algorithms.exchange import ProgramDetails
-from algorithms.faults import AlgorithmError, Fault
+from algorithms.faults import AlgorithmError, Fault, describe_error
 from scenarios.estimators import labels
-from scenarios.interface import CaseResult, Failure, Scalar
+from scenarios.handover import Given, Handover
+from scenarios.interface import CaseResult, Failure, Scalar, record_conditions
 
 Answer = TypeVar("Answer")
 
@@ -60,16 +61,29 @@ def attempted(ask: Callable[[], object], check: Callable[[object], Answer]) -> A
         said = {STDERR: error.stderr} if error.stderr else {}
         return Attempt(None, Failure(error.fault.name, str(error), ""), {**_time(started), **said})
     except MemoryError as error:
-        failure = Failure(Fault.OUT_OF_MEMORY.name, f"MemoryError: {error}", traceback.format_exc())
+        failure = Failure(Fault.OUT_OF_MEMORY.name, describe_error(error), traceback.format_exc())
         return Attempt(None, failure, _time(started))
     except Exception as error:
-        failure = Failure(Fault.CRASHED.name, f"{type(error).__name__}: {error}", traceback.format_exc())
+        failure = Failure(Fault.CRASHED.name, describe_error(error), traceback.format_exc())
         return Attempt(None, failure, _time(started))
     row: dict[str, Scalar] = {"estimation_time_s": answer_time_s(answer, taken)}
     details = getattr(answer, "details", None)
     if isinstance(details, ProgramDetails):
         row[STDERR] = details.stderr
     return Attempt(answer, None, row)
+
+
+def attempted_with(
+    ask: Callable[[Given], object], check: Callable[[object], Answer], measurements: Given
+) -> Attempt[Answer]:
+    """As `attempted`, of an algorithm that is given its own copy of measurements, and is not to change it."""
+    handover = Handover(measurements)
+
+    def check_both(answer: object) -> Answer:
+        handover.check()
+        return check(answer)
+
+    return attempted(lambda: ask(handover.given), check_both)
 
 
 def answer_time_s(answer: object, taken_s: float) -> float:
@@ -96,7 +110,7 @@ class Judged:
 def case_result(
     algorithms: Sequence[str], judge: Callable[[str], Judged], conditions: Mapping[str, Scalar]
 ) -> CaseResult:
-    """A case's result with every algorithm judged in it.
+    """A case's result with every algorithm judged in it; its conditions are recorded before any is asked.
 
     Parameters
     ----------
@@ -107,6 +121,7 @@ def case_result(
     conditions
         What the case was like: columns that do not depend on any algorithm.
     """
+    record_conditions(conditions)
     names = labels(algorithms)
     first, *others = [judge(spec) for spec in algorithms]
     row: dict[str, Scalar] = {ALGORITHM: names[0], **first.row, **conditions}

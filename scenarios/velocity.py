@@ -11,6 +11,7 @@ from algorithms.dimes import DimesDetails, dimes_products
 from algorithms.faults import AlgorithmError, Fault
 from algorithms.interface import VelocityEstimate, VelocityEstimator
 from algorithms.streams import StreamedEstimator, spanned
+from scenarios.handover import Handover
 from scenarios.interface import Scalar
 from scenarios.offline import Answered, Recorder
 from scenarios.trial import Attempt, attempted
@@ -33,16 +34,23 @@ def asked(
     A stream is given all pictures, as is what writes them down for others; an estimator of three pictures these three,
     and where there are none it fails.
     """
-    given = measurements
+    handover = Handover(measurements)
+    tags = measurements.tags_s
 
     def answer() -> object:
-        nonlocal given
+        nonlocal tags
         estimator = make()
-        if not isinstance(estimator, StreamedEstimator | Recorder | Answered):
-            given = _three_of(measurements, triple)
-        return estimator.estimate(given)
+        if isinstance(estimator, StreamedEstimator | Recorder | Answered):
+            return estimator.estimate(handover.given)
+        three = _three_of(handover.given, triple)
+        tags = three.tags_s
+        return estimator.estimate(three)
 
-    return attempted(answer, lambda answer: spanned(answer, given.tags_s))
+    def check(answer: object) -> VelocityEstimate:
+        handover.check()
+        return spanned(answer, tags)
+
+    return attempted(answer, check)
 
 
 def _three_of(measurements: DescentMeasurements, triple: Triple | None) -> DescentMeasurements:

@@ -15,7 +15,7 @@ from campaigns.definition.loading import load_campaign
 from scenarios.interface import Scalar
 from scenarios.rover import RoverScenarioParameters
 from scenarios.rover.run import Run, run_case
-from scenarios.rover.score import conditions, score
+from scenarios.rover.score import fixed_conditions, run_conditions, score
 from sim.sensor.odometry import EXACT
 from sim.streams import Streams
 
@@ -51,7 +51,7 @@ def driven(number: int, camera: str) -> dict[str, Scalar]:
     """Its row."""
     p = exact(number, camera)
     run = run_case(p, Streams(SEED, "validation tracking", number))
-    return {**score(p, run), **conditions(p, run)}
+    return {**score(p, run), **fixed_conditions(p, run), **run_conditions(p, run)}
 
 
 def drift(quick: bool) -> Iterator[Measure]:
@@ -103,7 +103,7 @@ def _designated(number: int, camera: str) -> tuple[float, float] | None:
     drawn = campaign.with_values(campaign.draws(number) | rock)
     p = RoverScenarioParameters.model_validate(drawn.model_dump() | {"legs": [{"motion": "stay", "steps": 1}]})
     run = run_case(p, Streams(SEED, "validation stereo", number))
-    row = conditions(p, run)
+    row = fixed_conditions(p, run)
     if not row["selectable"] or not run.stops[0].update.found:
         return None
     return _range_error_m(run), _expected_m(run, float(row["disparity_error_start_px"]))

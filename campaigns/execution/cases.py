@@ -2,26 +2,41 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
+from algorithms.faults import describe_error
 from campaigns.definition.campaign import Campaign
-from campaigns.definition.configuration import CampaignConfiguration, Limits
+from campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
 from campaigns.execution.work import Work, Workers, WorkLimits
-from campaigns.execution.worker_process import LOADING_S, Done, limit_threads, settle, start_clock
+from campaigns.execution.worker_process import (
+    LOADING_S,
+    Done,
+    leave_note,
+    limit_threads,
+    lost_descriptors,
+    settle,
+    start_clock,
+)
 from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
 from campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from campaigns.store.products import PackedProducts, pack_products
 from campaigns.store.retention import Keep
-from scenarios.interface import CaseResult, Scalar
+from scenarios.interface import CaseResult, Scalar, conditions_recorded_by
 from scenarios.registry import scenario
 from sim.cache import CacheWarning
+
+
+#: Bits of the largest integers that are stored: all of these have a float64, whose maximum is below 2 ** 1024.
+_MAX_INT_BITS = 1023
 
 
 @dataclass(frozen=True)
@@ -67,15 +82,23 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
     """
     wall, cpu = time.perf_counter(), time.process_time()
     products: Mapping[str, Any] = {}
+    conditions: dict[str, Scalar] = {}
+
+    def record(columns: Mapping[str, Scalar]) -> None:
+        conditions.update(_scenario_columns(columns))
+        leave_note(json.dumps({"case": case, "conditions": conditions}))
+
     try:
         campaign = _campaign(configuration)
         wall, cpu = time.perf_counter(), time.process_time()
-        result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
-        row = _scored(case, result)
+        with conditions_recorded_by(record):
+            result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
+        row = _scored(case, result, campaign.configuration.requirements)
         products = result.products
     except BaseException as error:
         outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
-        row = unfinished_row(case, outcome, f"{type(error).__name__}: {error}", traceback.format_exc())
+        row = unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), conditions)
+    _end_damaged_worker(case, conditions)
     times = {"wall_time_s": time.perf_counter() - wall, "cpu_time_s": time.process_time() - cpu}
     row = {**row, **times}
     if not products or not keep.wants(row):
@@ -84,6 +107,15 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
         return CompletedCase(row, pack_products(products))
     except TypeError as error:
         return CompletedCase(row, None, f"the products of case {case} could not be kept: {error}")
+
+
+def _end_damaged_worker(case: int, conditions: Mapping[str, Scalar]) -> None:
+    """Ends a worker process in which a case closed or replaced the files that the worker itself needs."""
+    lost = lost_descriptors()
+    if lost:
+        reason = f"the case closed or replaced the worker's file descriptors: {', '.join(map(str, lost))}"
+        leave_note(json.dumps({"case": case, "conditions": conditions, "reason": reason}))
+        os._exit(1)
 
 
 def prepare_input(configuration: str, shared_input: int) -> str:
@@ -127,16 +159,34 @@ def _completed(done: Done[CompletedCase]) -> CompletedCase:
     error = done.error
     times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
     if isinstance(error, CaseEndedError):
-        return CompletedCase({**unfinished_row(done.item, error.outcome, str(error), _above(error.trace)), **times})
-    return CompletedCase({**unfinished_row(done.item, CRASHED, f"{type(error).__name__}: {error}", ""), **times})
+        conditions, reason = _read_note(done.item, error.note)
+        row = unfinished_row(done.item, error.outcome, reason or str(error), _above(error.trace), conditions)
+    else:
+        row = unfinished_row(done.item, CRASHED, describe_error(error), "")
+    return CompletedCase({**row, **times})
 
 
-def unfinished_row(case: int, outcome: str, error: str, trace: str) -> Row:
-    """The row of a case that did not come to an end."""
+def _read_note(case: int, note: str) -> tuple[Mapping[str, Scalar], str]:
+    """The columns that a case recorded before its process ended, and why it ended, where it left that."""
+    try:
+        left = json.loads(note)
+        if left["case"] != case:
+            return {}, ""
+        return _scenario_columns(left["conditions"]), str(left.get("reason", ""))
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        # the process ended while it wrote, or something else wrote there
+        return {}, ""
+
+
+def unfinished_row(
+    case: int, outcome: str, error: str, trace: str, conditions: Mapping[str, Scalar] | None = None
+) -> Row:
+    """The row of a case that did not come to an end, with what it had recorded of its conditions."""
     return {
         "case": case,
         "outcome": outcome,
         "answered": False,
+        **(conditions or {}),
         "error": _plain_text(error),
         "traceback": _plain_text(trace),
     }
@@ -155,29 +205,63 @@ def _above(trace: str) -> str:
 def _plain_text(text: str) -> str:
     """Text that any file takes, without the addresses of objects, which change from run to run."""
     text = re.sub(r"\b0x[0-9a-fA-F]{4,}\b", "0x...", text)
-    return text.encode("utf-8", errors="replace").decode("utf-8")
+    return _utf8(text)
 
 
-def _scored(case: int, result: CaseResult) -> Row:
-    """The row of a case that came to an end, in plain Python values."""
+def _scored(case: int, result: CaseResult, requirements: Sequence[Requirement]) -> Row:
+    """The row of a case that came to an end, in plain Python values.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Where a column holds what cannot be stored, or what a requirement cannot be judged by.
+    """
     failure = result.failure
     if (result.outcome in UNFINISHED) != (failure is not None):
         raise ValueError(f"the outcome {result.outcome} is kept for cases that do not come to an end")
-    clashes = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(result.row))
-    if clashes:
-        raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(clashes)}")
-    columns = {str(name): _plain(str(name), value) for name, value in result.row.items()}
-    head: Row = {"case": case, "outcome": str(result.outcome), "answered": bool(result.answered)}
+    columns = _scenario_columns(result.row)
+    _check_requirements(columns, requirements)
+    head: Row = {"case": case, "outcome": _utf8(str(result.outcome)), "answered": bool(result.answered)}
     if failure is None:
         return {**head, **columns, "error": "", "traceback": ""}
     return {**head, **columns, "error": _plain_text(failure.error), "traceback": _plain_text(failure.trace)}
 
 
+def _scenario_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
+    """Columns of a scenario in plain Python values; raises ValueError or TypeError where they cannot be stored."""
+    clashes = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(row))
+    if clashes:
+        raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(clashes)}")
+    return {_utf8(str(name)): _plain(str(name), value) for name, value in row.items()}
+
+
+def _check_requirements(columns: Mapping[str, Scalar], requirements: Sequence[Requirement]) -> None:
+    """Raises TypeError where a requirement's metric or population is a column of another kind in this case.
+
+    One such value would make the stored column one of texts, and the requirement undecidable for all cases.
+    """
+    for asked in requirements:
+        flags = (*asked.population_columns, *(asked.metric_columns if asked.bound is None else ()))
+        for name in flags:
+            if name in columns and type(columns[name]) is not bool:
+                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {asked.id} needs true or false")
+        for name in () if asked.bound is None else asked.metric_columns:
+            if type(columns.get(name, 0.0)) is str:
+                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {asked.id} needs a number")
+
+
+def _utf8(text: str) -> str:
+    """Text without lone surrogates."""
+    return text.encode("utf-8", errors="replace").decode("utf-8")
+
+
 def _plain(column: str, value: Any) -> Scalar:
     """A value as one of Python's own; NumPy's scalars are unwrapped."""
     plain = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
+    if type(plain) is int and plain.bit_length() > _MAX_INT_BITS:
+        raise ValueError(f"column {column} holds an integer of {plain.bit_length()} bits, beyond what a float can hold")
     if type(plain) in (float, int, bool):
         return plain  # type: ignore[no-any-return]
     if type(plain) is str:
-        return plain.encode("utf-8", errors="replace").decode("utf-8")
+        return _utf8(plain)
     raise TypeError(f"column {column} holds a {type(value).__name__}; allowed: float, int, str, bool")

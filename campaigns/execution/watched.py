@@ -49,6 +49,9 @@ LOOK_S = 0.05
 #: Characters kept of what a process wrote before it died.
 _KEPT_OUTPUT = 2000
 
+#: Bytes read of the note that a task left.
+_MAX_NOTE = 1_000_000
+
 #: Seconds that a worker gets to write down where it stands.
 _DUMP_S = 0.3
 
@@ -131,8 +134,14 @@ class WatchedWorker:
         else:
             item, found = died
         self._kill()
+        found.note = self._note()
         self.replace()
         return item, found
+
+    def _note(self) -> str:
+        """The note that the task left; empty where there is none."""
+        note = self._folder / "note"
+        return note.read_bytes()[:_MAX_NOTE].decode(errors="replace") if note.exists() else ""
 
     def _last_words(self, *, with_output: bool) -> str:
         """What the process wrote of where it stood: the reason, the thread in which it happened, and its output."""
@@ -154,8 +163,8 @@ class WatchedWorker:
         self._ended = None
         self._board.close()
         self._board = Board.create(self._folder / "board")
-        (self._folder / "words").unlink(missing_ok=True)
-        (self._folder / "output").unlink(missing_ok=True)
+        for name in ("words", "output", "note"):
+            (self._folder / name).unlink(missing_ok=True)
         self._executor = self._start()
 
     def stop(self, *, kill: bool) -> None:

@@ -12,7 +12,8 @@ import signal
 import struct
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -90,6 +91,8 @@ class _Place:
 
     board: Board
     output: int
+    note: Path
+    descriptors: Mapping[int, tuple[int, int]]
     item: int | None = None
 
 
@@ -118,7 +121,7 @@ def begin(parent: int, folder: str) -> None:
     for stream in (1, 2):
         os.dup2(output, stream)
     _leave_memory_to_the_watcher()
-    _place = _Place(Board(Path(folder, "board")), output)
+    _place = _Place(Board(Path(folder, "board")), output, Path(folder, "note"), _open_descriptors())
     _place.board.write(Standing(os.getpid(), None, math.inf))
 
 
@@ -163,6 +166,30 @@ def start_clock(grace_s: float = 0.0) -> None:
     """Lets the time limit of the item that is being worked on count from now, or from later."""
     if _place is not None:
         _place.board.write(Standing(os.getpid(), _place.item, time.monotonic() + grace_s))
+
+
+def leave_note(text: str) -> None:
+    """Leaves a text that the watcher finds where the task ends with its process; it replaces the one before."""
+    if _place is not None:
+        _place.note.write_text(text)
+
+
+def lost_descriptors() -> list[int]:
+    """The file descriptors of the worker's own that were closed or replaced since it was set up."""
+    if _place is None:
+        return []
+    found = _open_descriptors()
+    return sorted(number for number, file in _place.descriptors.items() if found.get(number) != file)
+
+
+def _open_descriptors() -> dict[int, tuple[int, int]]:
+    """Device and inode of each open file descriptor; none where the system does not list them."""
+    found = {}
+    for name in os.listdir("/proc/self/fd") if sys.platform == "linux" else ():
+        with suppress(OSError):  # that of the listing itself is closed by now
+            status = os.fstat(int(name))
+            found[int(name)] = (status.st_dev, status.st_ino)
+    return found
 
 
 def settle() -> None:

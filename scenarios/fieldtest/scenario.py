@@ -20,7 +20,7 @@ from scenarios.interface import CaseResult, Scalar
 from scenarios.parts.named import SCORE, Kind
 from scenarios.parts.scores import ScoredFlight, scored
 from scenarios.provenance import rendered
-from scenarios.trial import Judged, attempted, case_result
+from scenarios.trial import Judged, attempted_with, case_result
 from scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
 from sim.dynamics import State
 from sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
@@ -88,8 +88,10 @@ class FieldTestScenario:
 
         def judge(algorithm: str) -> Judged:
             estimator = partial(VELOCITY.make, algorithm, DimesOptions(), p.executable, streams.case)
-            attempt = attempted(
-                lambda: estimator().estimate(measurements), lambda answer: checked_last_interval(answer, measurements)
+            attempt = attempted_with(
+                lambda given: estimator().estimate(given),
+                lambda answer: checked_last_interval(answer, measurements),
+                measurements,
             )
             estimate = attempt.answer
             velocity = None if estimate is None else estimate.velocity_m_s

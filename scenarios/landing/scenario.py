@@ -16,14 +16,14 @@ from scenarios.landing.measurement import measure
 from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.landing.pictures import take_pictures
 from scenarios.landing.samples import landing_samples
-from scenarios.landing.score import conditions, map_row, motion_row, products, site_row, times_row
+from scenarios.landing.score import conditions, map_row, motion_row, outcome_row, products, site_row, times_row
 from scenarios.landing.truth import GroundTruth
 from scenarios.landing.world import KEPT_GROUNDS, World, camera_optics
 from scenarios.parts.named import SCORE, Kind
 from scenarios.parts.scores import ScoredLanding, scored
 from scenarios.provenance import rendered
 from scenarios.samples import Sample
-from scenarios.trial import Judged, attempted, case_result
+from scenarios.trial import Judged, attempted_with, case_result
 from sim.frames import rigid
 from sim.streams import Streams
 from sim.terrain import TerrainBank
@@ -75,11 +75,14 @@ class LandingScenario:
         nothing = SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
 
         def judge(algorithm: str) -> Judged:
-            attempt = attempted(
-                lambda: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(measurements), checked_site
+            attempt = attempted_with(
+                lambda given: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(given),
+                checked_site,
+                measurements,
             )
             estimate = nothing if attempt.answer is None else attempt.answer
             row = {
+                **({} if attempt.answer is None else outcome_row(attempt.answer)),
                 **site_row(estimate, flight, truth),
                 **landing_row(p, estimate, flight, truth, streams),
                 **motion_row(estimate.details, flight, pair),

@@ -30,6 +30,18 @@ WELL = 0.9
 MOST_ROLL_DEG, MOST_TILT_DEG, MOST_CLIMB = 10.0, 20.0, 0.2
 
 
+def outcome_row(estimate: SiteEstimate) -> dict[str, Scalar]:
+    """What was answered, as populations of requirements; not to be stored of an algorithm that crashed.
+
+    Its case belongs to each of them then, and fails.
+    """
+    return {
+        "converged": estimate.outcome.converged,
+        "site_reported": estimate.outcome is SiteOutcome.SAFE_SITE,
+        "no_site_reported": estimate.outcome is SiteOutcome.NO_SAFE_SITE,
+    }
+
+
 def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict[str, Scalar]:
     """The answer against the truth.
 
@@ -37,19 +49,8 @@ def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict
     first picture. Nothing but SAFE_SITE reports a safe site: where the algorithm did not converge the a-priori site is
     scored.
     """
-    places = {"site": estimate.site_world}
-    row: dict[str, Scalar] = {
-        "converged": estimate.outcome.converged,
-        "site_reported": estimate.outcome is SiteOutcome.SAFE_SITE,
-        "no_site_reported": estimate.outcome is SiteOutcome.NO_SAFE_SITE,
-        "safe_exists": bool(np.any(truth.safe)),
-        "none_exists": not np.any(truth.safe),
-        "roomy_exists": bool(np.any(truth.roomy)),
-        "truly_safe_share": float(truth.safe.sum() / max(int(truth.covered.sum()), 1)),
-    }
-    for name, place in places.items():
-        row |= place_row(name, None if place is None else (place - flight.position_error_m)[:2], truth)
-    return row
+    site = estimate.site_world
+    return place_row("site", None if site is None else (site - flight.position_error_m)[:2], truth)
 
 
 def place_row(name: str, place: np.ndarray | None, truth: GroundTruth) -> dict[str, Scalar]:
@@ -90,7 +91,6 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
     )  # fmt: skip
     row: dict[str, Scalar] = dict.fromkeys(names, NAN)
     row["tracked_well"] = False
-    row["within_limits"] = _within_limits(true_motion(flight, pair), flight, pair.axis_range_m)
     if not isinstance(details, HdaDetails):
         return row
     if details.tracks is not None:
@@ -204,6 +204,11 @@ def conditions(
         "pose_azimuth_error_deg": float(np.degrees(errors[0][2])),
         "pose_turn_error_deg": float(np.degrees(np.linalg.norm(errors[1] - errors[0]))),
         "covered_m2": float(covered.sum() * truth.step_m**2),
+        "safe_exists": bool(np.any(truth.safe)),
+        "none_exists": not np.any(truth.safe),
+        "roomy_exists": bool(np.any(truth.roomy)),
+        "truly_safe_share": float(truth.safe.sum() / max(int(covered.sum()), 1)),
+        "within_limits": _within_limits(true_motion(flight, pair), flight, pair.axis_range_m),
         "true_slope_median_deg": _median_deg(truth, covered),
         "texture": p.texture,
         "grid_px": p.hda.grid_px,

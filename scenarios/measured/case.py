@@ -17,7 +17,7 @@ from scenarios.chosen import ChosenAlgorithms
 from scenarios.interface import Scalar
 from scenarios.measured.parameters import MeasuredParameters
 from scenarios.measured.store import StoredPicture, pose_of
-from scenarios.trial import Attempt, attempted
+from scenarios.trial import Attempt, attempted_with
 from sim.measurements import DetectorImage
 
 Answer = TypeVar("Answer")
@@ -50,7 +50,9 @@ def tried(
     """What came of asking each of the algorithms."""
 
     def ask(spec: str) -> Attempt[Answer]:
-        return attempted(lambda: p.task.make(spec, options, p.executable, case).estimate(measurements), check)
+        return attempted_with(
+            lambda given: p.task.make(spec, options, p.executable, case).estimate(given), check, measurements
+        )
 
     return {spec: ask(spec) for spec in p.algorithms}
 

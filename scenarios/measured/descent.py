@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from algorithms.dimes import DimesDetails
 from algorithms.interface import VelocityEstimate
 from scenarios.estimators import VELOCITY
-from scenarios.interface import CaseResult, Scalar
+from scenarios.interface import CaseResult, Scalar, record_conditions
 from scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, tried
 from scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
 from scenarios.measured.parameters import MeasuredVelocityParameters
@@ -41,11 +41,11 @@ class MeasuredVelocityScenario(MeasuredScenario):
         images = images_of(p.cases, p.case)
         measurements = descent_measurements(p.case, images)
         matches = matched(images)
+        known = {**about(p, images), **_conditions(p.case, measurements)}
+        record_conditions(known)
         attempts = tried(
             p, p.dimes, measurements, lambda answer: checked_last_interval(answer, measurements), streams.case
         )
-
-        known = {**about(p, images), **_conditions(p.case, measurements)}
 
         def judge(algorithm: str) -> Judged:
             attempt = attempts[algorithm]

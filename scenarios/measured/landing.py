@@ -14,7 +14,7 @@ from algorithms.hda import HdaDetails, hda_products
 from algorithms.hda.view import camera_pose
 from algorithms.interface import SiteEstimate, SiteOutcome
 from scenarios.estimators import LANDING
-from scenarios.interface import CaseResult, Scalar
+from scenarios.interface import CaseResult, Scalar, record_conditions
 from scenarios.landing.motion import motion_errors, solved_row
 from scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, pose, tried
 from scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
@@ -42,9 +42,10 @@ class MeasuredLandingScenario(MeasuredScenario):
         images = images_of(p.cases, p.case)
         measurements = landing_measurements(p.case, images)
         pairs = agreements(images, matched(images), [pose(picture) for picture in p.case.pictures])
-        attempts = tried(p, p.hda, measurements, checked_site, streams.case)
         shown = agreement_products(images, pairs)
         known = {**about(p, images), **_conditions(p.case), **agreement_row(pairs)}
+        record_conditions(known)
+        attempts = tried(p, p.hda, measurements, checked_site, streams.case)
 
         def judge(algorithm: str) -> Judged:
             attempt = attempts[algorithm]

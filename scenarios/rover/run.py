@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from algorithms.answers import checked_aim, checked_update
-from algorithms.interface import MastAim, TargetTracker, TrackingState
+from algorithms.interface import MastAim, TrackingState
 from algorithms.navigation import NavigationOutcome
 from algorithms.vtt import GoalReached, HandOffOutcome, hand_off
 from scenarios.estimators import TRACKING
+from scenarios.rover.guarded import GuardedTracker
 from scenarios.rover.mapping import Mapper
 from scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from scenarios.rover.pictures import Detectors, Photographer
@@ -22,10 +21,9 @@ from scenarios.rover.stops import RunOutcome, Stop
 from scenarios.rover.target import ChosenTarget, choose_target
 from scenarios.rover.vehicle import Vehicle
 from scenarios.rover.world import RunWorld
-from scenarios.trial import answer_time_s
 from sim.dynamics.driving import Drive
 from sim.frames import composed
-from sim.measurements import DriveCommand, RoverMeasurements
+from sim.measurements import DriveCommand
 from sim.streams import Streams
 
 
@@ -71,28 +69,36 @@ class Run:
 
 def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
     """A run, from the designation of the target to its end."""
+    run = prepare_run(p, streams)
+    track_target(p, run, streams)
+    return run
+
+
+def prepare_run(p: RoverScenarioParameters, streams: Streams) -> Run:
+    """A run before a tracker has been asked: everything in its place, the target chosen."""
     rig = Rig.of(p, streams)
     world = RunWorld.of(p, rig.pixel_rad, streams)
     vehicle = Vehicle.placed(p, world, rig, streams)
-    target = choose_target(p, world, rig, vehicle.stance)
+    return Run(world, rig, vehicle, choose_target(p, world, rig, vehicle.stance))
+
+
+def track_target(p: RoverScenarioParameters, run: Run, streams: Streams) -> None:
+    """Drives a prepared run to its end by what the tracker of the parameters answers."""
     photographer = Photographer(
         p.backend,
         Detectors.drawn(p.camera, streams.generator("detector response")),
         p.exposure,
         streams.generator("detector noise"),
     )
-    tracker = TRACKING.make(p.algorithm, p.vtt, p.executable)
-    tracker.designate(target.designation, vehicle.estimated)
-    run = Run(world, rig, vehicle, target)
-    loop = _Loop(p, run, tracker, photographer)
-    run.outcome = loop.outcome()
+    tracker = GuardedTracker(TRACKING.make(p.algorithm, p.vtt, p.executable), run.rig.calibrated)
+    tracker.designate(run.target.designation, run.vehicle.estimated)
+    run.outcome = _Loop(p, run, tracker, photographer).outcome()
     if run.outcome is RunOutcome.COMPLETED:
         last = p.legs[-1]
         if last.motion == "approach":
             reached = GoalReached(last.goal_m, 2.0 * GOAL_TOLERANCE_M)
-            handed = hand_off(run.stops[-1].update, reached, rig.calibrated)
+            handed = hand_off(run.stops[-1].update, reached, run.rig.calibrated)
             run.handed_over = handed.outcome is HandOffOutcome.HANDED_OVER
-    return run
 
 
 @dataclass
@@ -101,7 +107,7 @@ class _Loop:
 
     p: RoverScenarioParameters
     run: Run
-    tracker: TargetTracker
+    tracker: GuardedTracker
     photographer: Photographer
 
     def outcome(self) -> RunOutcome:
@@ -166,7 +172,7 @@ class _Loop:
         """Points, takes pictures, updates. Why the run is over, or None."""
         run = self.run
         run.time_s += self.p.timing.track_s
-        aim = checked_aim(self.tracker.aim(run.vehicle.estimated, run.rig.calibrated), run.rig.calibrated)
+        aim = self.tracker.aim(run.vehicle.estimated)
         if aim is None:
             return RunOutcome.OUT_OF_REACH
         stop = self._stop(leg, aim)
@@ -191,10 +197,7 @@ class _Loop:
         pictures = self.photographer.take(
             scene, shading, world_from_head, (rig.left, rig.right), (aim.left, aim.right), brightness, run.time_s
         )
-        measurements = RoverMeasurements(pictures.left, pictures.right, rig.calibrated, *angles, run.vehicle.estimated)
-        started = time.process_time()
-        update = checked_update(self.tracker.update(measurements))
-        taken = answer_time_s(update, time.process_time() - started)
+        update, taken = self.tracker.update(pictures, angles, run.vehicle.estimated)
         in_head = np.asarray(world_from_head.inv().apply(run.target.point_world.copy()))
         return Stop(
             leg=leg,

@@ -13,8 +13,18 @@ from scenarios.interface import CaseResult, Scalar
 from scenarios.parts.named import SCORE, Kind
 from scenarios.parts.scores import scored
 from scenarios.rover.parameters import RoverScenarioParameters
-from scenarios.rover.run import Run, run_case
-from scenarios.rover.score import conditions, products, provenance, score, scored_run, sighted, stored_updates, tracking
+from scenarios.rover.run import Run, prepare_run, track_target
+from scenarios.rover.score import (
+    fixed_conditions,
+    products,
+    provenance,
+    run_conditions,
+    score,
+    scored_run,
+    sighted,
+    stored_updates,
+    tracking,
+)
 from scenarios.rover.stops import RunOutcome
 from scenarios.rover.world import terrain_parameters
 from scenarios.trial import Judged, attempted, case_result
@@ -55,32 +65,35 @@ class RoverScenario:
         """One run; each algorithm that is compared makes one of its own, with the same draws."""
         p = _checked(parameters)
 
+        started = time.process_time()
+        first = prepare_run(p, streams)
+        known = fixed_conditions(p, first)
+
         def judge(algorithm: str) -> Judged:
-            mine = p.model_copy(update={"algorithm": algorithm})
-            attempt = attempted(lambda: _tracked(mine, streams), lambda made: cast(tuple[Run, dict[str, Scalar]], made))
-            if attempt.answer is None:
-                return Judged(attempt.outcome(lambda made: made[0].outcome.name), False, {}, failure=attempt.failure)
-            run, row = attempt.answer
             judged = algorithm == p.algorithm
+            mine = p.model_copy(update={"algorithm": algorithm})
+            began, run = (started, first) if judged else (time.process_time(), prepare_run(mine, streams))
+            attempt = attempted(lambda: _tracked(mine, run, streams), lambda row: cast(dict[str, Scalar], row))
+            if attempt.answer is None:
+                return Judged(attempt.outcome(lambda _: run.outcome.name), False, {}, failure=attempt.failure)
+            row = {**attempt.answer, "run_time_s": time.process_time() - began}
             if judged:
                 row |= {
                     **stored_updates(run, p.score.stored_updates),
-                    **conditions(p, run),
+                    **run_conditions(p, run),
                     **sighted(p, run),
                     **provenance(p, run),
                 }
-            row |= scored(p.scores, scored_run(run), row)
+            row |= scored(p.scores, scored_run(run), {*row, *known})
             return _judged(run, row, products(p, run) if judged else None)
 
-        return case_result(p.algorithms, judge, {})
+        return case_result(p.algorithms, judge, known)
 
 
-def _tracked(p: RoverScenarioParameters, streams: Streams) -> tuple[Run, dict[str, Scalar]]:
-    """One run of the closed loop, and its score."""
-    started = time.process_time()
-    run = run_case(p, streams)
-    taken = time.process_time() - started
-    return run, {**score(p, run), **tracking(run), "run_time_s": taken}
+def _tracked(p: RoverScenarioParameters, run: Run, streams: Streams) -> dict[str, Scalar]:
+    """A prepared run of the closed loop driven to its end, and its score."""
+    track_target(p, run, streams)
+    return {**score(p, run), **tracking(run)}
 
 
 def _judged(run: Run, row: Mapping[str, Scalar], kept: Mapping[str, object] | None = None) -> Judged:

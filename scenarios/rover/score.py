@@ -172,23 +172,9 @@ def stored_updates(run: Run, count: int) -> dict[str, Scalar]:
     return row
 
 
-def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """What the run was like, read from the simulated objects."""
-    stops, world, chosen = run.stops, run.world, run.target
-    first, last = stops[0] if stops else None, stops[-1] if stops else None
-    tilts = np.array([one.stance.tilt_rad for one in stops])
-    drives = [drive for one in stops for drive in one.drives]
-    lengths = np.array([drive.command.length_m for drive in drives])
-    slips = np.array([drive.slip for drive in drives])
-    moving = lengths > 0.0
-    driven = float(lengths.sum())
-    pose_error = (
-        float("nan")
-        if last is None
-        else float(np.linalg.norm(last.estimated.translation - last.stance.world_from_rover.translation))
-    )
-    sun = [world.sun.direction(0.0 if one is None else one.time_s) for one in (first, last)]
-    rock, shadowed = chosen.rock, _own_shadow(p, run)
+def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
+    """What is known of a run before its tracker is asked, read from the simulated objects."""
+    chosen, rock = run.target, run.target.rock
     return {
         "site": p.world.site,
         "terrain": p.world.terrain,
@@ -205,10 +191,39 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "point_on_edge": chosen.on_edge,
         "point_lit": chosen.lit,
         "selectable": chosen.lit and not chosen.on_edge,
-        "own_shadow": shadowed,
-        "no_own_shadow": not shadowed,
         "incline": p.world.incline.name,
         "slope_deg": p.world.incline.slope_deg,
+        "bearing_deg": float(np.degrees(p.bearing_rad)) % _FULL_TURN_DEG,
+        "visual_odometry": any(leg.visual_odometry for leg in p.legs),
+        "autonav": any(leg.autonav for leg in p.legs),
+        "map_by": next((leg.map_by for leg in p.legs if leg.autonav), "none"),
+        "roll_compensated": p.vtt.roll and p.algorithm != "pure-ncc",
+        "roll_ignored": not p.vtt.roll or p.algorithm == "pure-ncc",
+        "clear_sky": p.clouds is None or p.clouds.cover == 0.0,
+        **run.rig.applied(),
+    }
+
+
+def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
+    """What the run was like where its tracker led it, read from the simulated objects."""
+    stops, world = run.stops, run.world
+    first, last = stops[0] if stops else None, stops[-1] if stops else None
+    tilts = np.array([one.stance.tilt_rad for one in stops])
+    drives = [drive for one in stops for drive in one.drives]
+    lengths = np.array([drive.command.length_m for drive in drives])
+    slips = np.array([drive.slip for drive in drives])
+    moving = lengths > 0.0
+    driven = float(lengths.sum())
+    pose_error = (
+        float("nan")
+        if last is None
+        else float(np.linalg.norm(last.estimated.translation - last.stance.world_from_rover.translation))
+    )
+    sun = [world.sun.direction(0.0 if one is None else one.time_s) for one in (first, last)]
+    shadowed = _own_shadow(p, run)
+    return {
+        "own_shadow": shadowed,
+        "no_own_shadow": not shadowed,
         "range_start_m": float("nan") if first is None else first.range_m,
         "range_end_m": float("nan") if last is None else last.range_m,
         "tilt_max_deg": float(np.degrees(_most(tilts))),
@@ -218,19 +233,11 @@ def conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "pose_error_m": pose_error,
         "pose_error_share": pose_error / driven if driven > 0.0 else float("nan"),
         "duration_min": 0.0 if last is None else last.time_s / 60.0,
-        "bearing_deg": float(np.degrees(p.bearing_rad)) % _FULL_TURN_DEG,
-        "visual_odometry": any(leg.visual_odometry for leg in p.legs),
-        "autonav": any(leg.autonav for leg in p.legs),
-        "map_by": next((leg.map_by for leg in p.legs if leg.autonav), "none"),
-        "roll_compensated": p.vtt.roll and p.algorithm != "pure-ncc",
-        "roll_ignored": not p.vtt.roll or p.algorithm == "pure-ncc",
-        "clear_sky": p.clouds is None or p.clouds.cover == 0.0,
         "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0][0], sun[0][1])) % _FULL_TURN_DEG),
         "sun_elevation_deg": float(np.degrees(np.arcsin(sun[0][2]))),
         "sun_moved_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
         "exposure_min_s": _least(np.array([one.pictures.exposure_s for one in stops], dtype=np.float64)),
         "exposure_max_s": _most(np.array([one.pictures.exposure_s for one in stops], dtype=np.float64)),
-        **run.rig.applied(),
     }
 
 

@@ -10,7 +10,6 @@ A drive is a function of the parameters, the campaign's seed and the run's numbe
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -21,7 +20,6 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.answers import checked_update
 from algorithms.interface import PixelBox, TrackingState
 from algorithms.vtt import VttOptions
 from algorithms.vtt.pointing import box_around, mast_angles
@@ -29,20 +27,29 @@ from scenarios.estimators import TRACKING
 from scenarios.interface import CaseResult, Scalar
 from scenarios.parts.named import SCORE, Kind
 from scenarios.parts.scores import scored
+from scenarios.rover.guarded import GuardedTracker
 from scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from scenarios.rover.pictures import Detectors, Photographer, StereoPictures
 from scenarios.rover.rig import Rig
 from scenarios.rover.route import Belief, commands, finished
 from scenarios.rover.run import Run
-from scenarios.rover.score import conditions, products, provenance, score, scored_run, stored_updates, tracking
+from scenarios.rover.score import (
+    fixed_conditions,
+    products,
+    provenance,
+    run_conditions,
+    score,
+    scored_run,
+    stored_updates,
+    tracking,
+)
 from scenarios.rover.stops import RunOutcome, Stop
 from scenarios.rover.target import Sightings, point_on, rock_of, sightings, told_by_pixel
 from scenarios.rover.vehicle import Vehicle
 from scenarios.rover.world import RunWorld, terrain_parameters
-from scenarios.trial import Judged, answer_time_s, attempted, case_result
+from scenarios.trial import Judged, attempted, case_result
 from sim.camera import CameraModel
 from sim.dynamics import Stance
-from sim.measurements import RoverMeasurements
 from sim.streams import Streams
 from sim.terrain import TerrainBank
 
@@ -255,24 +262,26 @@ def _box(camera: CameraModel, points: Float64[np.ndarray, "points 3"], margin_px
     return box
 
 
-def tracked(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> Run:
-    """A tracker run over the drive's pictures for one of the targets; the one that is judged if none is named."""
+def _prepare_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
+    """A run over the drive's pictures before a tracker has been asked, its target chosen."""
     first = drive.views[0]
     eyes = drive.rig.eyes(first.world_from_head)
     chosen, seen = p.targets[p.target], _picked_from(p.drive, drive.world, eyes[0])
     point, on_edge, lit = point_on(drive.world, eyes, chosen.across, chosen.up, drive.rig.pixel_rad, p.drive.vtt, seen)
     told = told_by_pixel(drive.rig.left, first.world_from_head, point, first.angles_rad)
-    run = Run(drive.world, drive.rig, drive.vehicle, rock_of(drive.world, point, told, on_edge, lit))
-    tracker = TRACKING.make(algorithm or p.drive.algorithm, p.drive.vtt, p.drive.executable)
-    tracker.designate(told, first.estimated)
+    return Run(drive.world, drive.rig, drive.vehicle, rock_of(drive.world, point, told, on_edge, lit))
+
+
+def tracked(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> Run:
+    """A tracker run over the drive's pictures for one of the targets; the one that is judged if none is named."""
+    run = _prepare_run(p, drive)
+    point = run.target.point_world
+    made = TRACKING.make(algorithm or p.drive.algorithm, p.drive.vtt, p.drive.executable)
+    tracker = GuardedTracker(made, drive.rig.calibrated)
+    tracker.designate(run.target.designation, drive.views[0].estimated)
     for view in drive.views[:: p.skip + 1]:
         pictures = view.pictures
-        measurements = RoverMeasurements(
-            pictures.left, pictures.right, drive.rig.calibrated, *view.angles_rad, view.estimated
-        )
-        started = time.process_time()
-        update = checked_update(tracker.update(measurements))
-        taken = answer_time_s(update, time.process_time() - started)
+        update, taken = tracker.update(pictures, view.angles_rad, view.estimated)
         in_head = np.asarray(view.world_from_head.inv().apply(point.copy()))
         run.stops.append(
             Stop(
@@ -357,7 +366,8 @@ class SharedDriveScenario:
 
         seen = seen_along(*shared, p.targets[p.target], p.drive.vtt)
         on_face = seen.in_view and (p.face_deg is None or seen.obliquity_max_deg <= p.face_deg)
-        known = {**_known(p), **asdict(seen), "on_face": on_face}
+        chosen = fixed_conditions(case, _prepare_run(p, drive))
+        known = {**chosen, **_known(p), **asdict(seen), "on_face": on_face}
 
         def judge(algorithm: str) -> Judged:
             attempt = attempted(lambda: tracked(p, drive, algorithm), lambda made: cast(Run, made))
@@ -369,7 +379,7 @@ class SharedDriveScenario:
             judged = algorithm == p.drive.algorithm
             if judged:
                 row |= {
-                    **conditions(case, run),
+                    **run_conditions(case, run),
                     **stored_updates(run, p.drive.score.stored_updates),
                     **provenance(case, run),
                 }

@@ -205,7 +205,7 @@ def test_programs_that_are_not_there(spec: str, message: str) -> None:
 def test_answers_in_python_are_held_against_the_interface() -> None:
     velocity = np.array([1.0, 2.0])
     good = VelocityEstimate(VelocityOutcome.VALID, velocity)
-    assert checked_velocity(good) is good
+    assert checked_velocity(good).velocity_m_s is not velocity
     for wrong in (
         None,
         dataclasses.replace(good, velocity_m_s=None),

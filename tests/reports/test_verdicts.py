@@ -151,11 +151,54 @@ def test_populations_of_columns_and_of_several() -> None:
     asked = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
     both = _judge(frame, asked, population="valid and room")
     assert (both.n, both.failures) == (40, 10)
-    # A case that does not say whether it belongs (a crashed one) does not.
-    unknown = frame.astype({"room": object})
-    unknown.loc[49, "room"] = None
-    assert _judge(unknown, asked, population="room").n == 49
     assert "room" in _judge(frame.assign(room=np.arange(100.0)), asked, population="room").note
+
+
+@pytest.mark.parametrize("outcome", ["VALID", "CRASHED", "BAD_ANSWER", "TIMED_OUT"])
+def test_a_case_of_unknown_membership_is_a_member_and_a_failure(outcome: str) -> None:
+    frame = _rows(100, 0).assign(room=np.arange(100) < 50).astype({"room": object})
+    frame.loc[90:93, "outcome"] = outcome
+    frame.loc[90:93, "room"] = None
+    asked = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
+    found = _judge(frame, asked, population="room")
+    assert (found.n, found.failures) == (54, 4)
+    # the other part of the population is known, and false
+    frame["near"] = np.arange(100) < 92
+    found = _judge(frame, asked, population="room and near")
+    assert (found.n, found.failures) == (52, 2)
+
+
+def test_crashes_do_not_meet_an_availability() -> None:
+    """4 of 20 cases crash before anything is known of them; by the others alone the rate is 100 %."""
+    frame = _rows(20, 0).assign(room=True).astype({"room": object})
+    frame.loc[:3, ["outcome", "answered", "room"]] = ["CRASHED", False, None]
+    asked = {"id": "AVAIL", "metric": "answered", "probability": 0.95, "confidence": 0.9, "population": "room"}
+    found = _judge(frame, asked, decide_by="estimate")
+    assert (found.status, found.n, found.failures) == (Status.FAIL, 20, 4)
+
+
+def test_a_crashed_case_that_was_scored_fails_nevertheless() -> None:
+    frame = _rows(20, 0).assign(outcome=["CRASHED"] * 2 + ["VALID"] * 18)
+    asked = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.95, "confidence": 0.9}
+    assert _judge(frame, asked, population="all", decide_by="estimate").failures == 2
+
+
+@pytest.mark.parametrize("population", ["valid", "completed", "valid and near"])
+def test_crashes_withhold_a_verdict_on_answers_that_they_might_have_failed(population: str) -> None:
+    """A crash is no answer; but where crashes instead of wrong answers would earn a PASS, there is none."""
+    asked = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
+    frame = _rows(50, 0).assign(near=True)
+    frame.loc[:9, ["outcome", "answered"]] = ["CRASHED", False]
+    for how in ("confidence", "estimate"):
+        found = _judge(frame, asked, population=population, decide_by=how)
+        assert (found.status, found.n, found.failures) == (Status.INSUFFICIENT, 40, 0)
+        assert "10 cases did not come to an end" in found.note
+    # crashes that are too few to matter, or that belong elsewhere, withhold nothing
+    few = _rows(200, 0).assign(near=True)
+    few.loc[:1, ["outcome", "answered"]] = ["CRASHED", False]
+    assert _judge(few, asked, population=population).status is Status.PASS
+    elsewhere = frame.assign(near=frame["answered"])
+    assert _judge(elsewhere, asked, population="valid and near").status is Status.PASS
 
 
 def test_the_estimate_decides_among_shared_terrains_too(velocity: dict[str, Any]) -> None:
