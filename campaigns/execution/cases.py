@@ -6,14 +6,22 @@ import re
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
 from campaigns.definition.campaign import Campaign
 from campaigns.definition.configuration import CampaignConfiguration, Limits
+from campaigns.execution.state_notes import StateNotes
 from campaigns.execution.work import Work, Workers, WorkLimits
-from campaigns.execution.worker_process import LOADING_S, Done, limit_threads, settle, start_clock
+from campaigns.execution.worker_process import (
+    LOADING_S,
+    Done,
+    limit_threads,
+    request_fresh_worker,
+    settle,
+    start_clock,
+)
 from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
 from campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from campaigns.store.products import PackedProducts, pack_products
@@ -21,12 +29,15 @@ from campaigns.store.retention import Keep
 from scenarios.interface import CaseResult, Scalar
 from scenarios.registry import scenario
 
+#: Characters of an error's text, or of a traceback, that a row keeps: its beginning and its end.
+_TEXT_LENGTH = 8000
+
 
 @dataclass(frozen=True)
 class CompletedCase:
     """A case's row and, where they are kept, the products of the scenario.
 
-    `note` is why products that were to be kept could not be.
+    `note` is why products that were to be kept could not be, and what the case changed in its worker process.
     """
 
     row: Row
@@ -76,6 +87,8 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
         row = unfinished_row(case, outcome, f"{type(error).__name__}: {error}", traceback.format_exc())
     times = {"wall_time_s": time.perf_counter() - wall, "cpu_time_s": time.process_time() - cpu}
     row = {**row, **times}
+    if row["outcome"] in (CRASHED, OUT_OF_MEMORY):
+        request_fresh_worker()
     if not products or not keep.wants(row):
         return CompletedCase(row)
     try:
@@ -100,8 +113,13 @@ def run_cases(
 ) -> Iterator[list[CompletedCase]]:
     """Runs cases, and yields them as they end; one that takes its worker down, or must be ended, has a row as well."""
     task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), keep)
+    state_notes = StateNotes()
     for ended in workers.run(Work(task, cases, case_limits(configuration.limits), total)):
-        yield [_completed(done) for done in ended]
+        yield [_with_note(_completed(done), state_notes.of(done)) for done in ended]
+
+
+def _with_note(completed: CompletedCase, note: str) -> CompletedCase:
+    return replace(completed, note="; ".join(filter(None, (completed.note, note)))) if note else completed
 
 
 def case_limits(limits: Limits) -> WorkLimits:
@@ -148,7 +166,10 @@ def _above(trace: str) -> str:
 
 
 def _plain_text(text: str) -> str:
-    """Text that any file takes, without the addresses of objects, which change from run to run."""
+    """Text that any file takes, cut where it is long, without addresses of objects: they change from run to run."""
+    if len(text) > _TEXT_LENGTH:
+        half = _TEXT_LENGTH // 2
+        text = f"{text[:half]}\n... {len(text) - 2 * half} characters left out ...\n{text[-half:]}"
     text = re.sub(r"\b0x[0-9a-fA-F]{4,}\b", "0x...", text)
     return text.encode("utf-8", errors="replace").decode("utf-8")
 
