@@ -294,12 +294,17 @@ def shown_progress(directory: Path, to_go_on: str) -> Iterator[Watch]:
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Has the first Ctrl-C or SIGTERM stop the work; those after it do not disturb the end."""
+    """Has the first Ctrl-C or SIGTERM stop the work in good order, and the second end the program at once."""
 
     def stop(number: int, _frame: object) -> None:
         for kind in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(kind, signal.SIG_IGN)
+            signal.signal(kind, end_at_once)
         raise KeyboardInterrupt(signal.Signals(number).name)
+
+    def end_at_once(_number: int, _frame: object) -> None:
+        # the supervisors of the workers see this process end, kill what is below them and remove the temporary files
+        os.write(2, b"\x1b[?25hkilled\n" if os.isatty(2) else b"killed\n")
+        os._exit(Exit.INTERRUPTED)
 
     before = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
     try:

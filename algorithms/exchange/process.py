@@ -104,6 +104,11 @@ class Child:
             raise AlgorithmError(Fault.CRASHED, message) from error
         self._begin()
 
+    @property
+    def process(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
     def answer(self) -> Said:
         """All that the program writes until it ends by itself, with status 0."""
         started = time.perf_counter()

@@ -29,6 +29,11 @@ def given_back(command: Command, limits: ExecutableLimits, child: Child) -> None
         child.leave()
 
 
+def waiting_processes() -> set[int]:
+    """Process ids of the persistent programs that wait for a case."""
+    return {child.process for child in _waiting.values()}
+
+
 @atexit.register
 def end_persistent() -> None:
     """Ends the persistent programs of this process."""

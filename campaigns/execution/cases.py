@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
 from algorithms.faults import describe_error
 from campaigns.definition.campaign import Campaign
 from campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
+from campaigns.execution.state_notes import StateNotes
 from campaigns.execution.work import Work, Workers, WorkLimits
 from campaigns.execution.worker_process import (
     LOADING_S,
     Done,
     leave_note,
     limit_threads,
-    lost_descriptors,
+    request_fresh_worker,
     settle,
     start_clock,
 )
@@ -34,16 +34,18 @@ from scenarios.interface import CaseResult, Scalar, conditions_recorded_by
 from scenarios.registry import scenario
 from sim.cache import CacheWarning
 
-
 #: Bits of the largest integers that are stored: all of these have a float64, whose maximum is below 2 ** 1024.
 _MAX_INT_BITS = 1023
+
+#: Characters of an error's text, or of a traceback, that a row keeps: its beginning and its end.
+_TEXT_LENGTH = 8000
 
 
 @dataclass(frozen=True)
 class CompletedCase:
     """A case's row and, where they are kept, the products of the scenario.
 
-    `note` is why products that were to be kept could not be.
+    `note` is why products that were to be kept could not be, and what the case changed in its worker process.
     """
 
     row: Row
@@ -98,24 +100,16 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
     except BaseException as error:
         outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
         row = unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), conditions)
-    _end_damaged_worker(case, conditions)
     times = {"wall_time_s": time.perf_counter() - wall, "cpu_time_s": time.process_time() - cpu}
     row = {**row, **times}
+    if row["outcome"] in (CRASHED, OUT_OF_MEMORY):
+        request_fresh_worker()
     if not products or not keep.wants(row):
         return CompletedCase(row)
     try:
         return CompletedCase(row, pack_products(products))
     except TypeError as error:
         return CompletedCase(row, None, f"the products of case {case} could not be kept: {error}")
-
-
-def _end_damaged_worker(case: int, conditions: Mapping[str, Scalar]) -> None:
-    """Ends a worker process in which a case closed or replaced the files that the worker itself needs."""
-    lost = lost_descriptors()
-    if lost:
-        reason = f"the case closed or replaced the worker's file descriptors: {', '.join(map(str, lost))}"
-        leave_note(json.dumps({"case": case, "conditions": conditions, "reason": reason}))
-        os._exit(1)
 
 
 def prepare_input(configuration: str, shared_input: int) -> str:
@@ -137,8 +131,13 @@ def run_cases(
 ) -> Iterator[list[CompletedCase]]:
     """Runs cases, and yields them as they end; one that takes its worker down, or must be ended, has a row as well."""
     task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), keep)
+    state_notes = StateNotes()
     for ended in workers.run(Work(task, cases, case_limits(configuration.limits), total)):
-        yield [_completed(done) for done in ended]
+        yield [_with_note(_completed(done), state_notes.of(done)) for done in ended]
+
+
+def _with_note(completed: CompletedCase, note: str) -> CompletedCase:
+    return replace(completed, note="; ".join(filter(None, (completed.note, note)))) if note else completed
 
 
 def case_limits(limits: Limits) -> WorkLimits:
@@ -159,23 +158,21 @@ def _completed(done: Done[CompletedCase]) -> CompletedCase:
     error = done.error
     times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
     if isinstance(error, CaseEndedError):
-        conditions, reason = _read_note(done.item, error.note)
-        row = unfinished_row(done.item, error.outcome, reason or str(error), _above(error.trace), conditions)
+        conditions = _recorded_conditions(done.item, error.note)
+        row = unfinished_row(done.item, error.outcome, str(error), _above(error.trace), conditions)
     else:
         row = unfinished_row(done.item, CRASHED, describe_error(error), "")
     return CompletedCase({**row, **times})
 
 
-def _read_note(case: int, note: str) -> tuple[Mapping[str, Scalar], str]:
-    """The columns that a case recorded before its process ended, and why it ended, where it left that."""
+def _recorded_conditions(case: int, note: str) -> Mapping[str, Scalar]:
+    """The columns that a case recorded before its process ended."""
     try:
         left = json.loads(note)
-        if left["case"] != case:
-            return {}, ""
-        return _scenario_columns(left["conditions"]), str(left.get("reason", ""))
+        return _scenario_columns(left["conditions"]) if left["case"] == case else {}
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
         # the process ended while it wrote, or something else wrote there
-        return {}, ""
+        return {}
 
 
 def unfinished_row(
@@ -203,7 +200,10 @@ def _above(trace: str) -> str:
 
 
 def _plain_text(text: str) -> str:
-    """Text that any file takes, without the addresses of objects, which change from run to run."""
+    """Text that any file takes, cut where it is long, without addresses of objects: they change from run to run."""
+    if len(text) > _TEXT_LENGTH:
+        half = _TEXT_LENGTH // 2
+        text = f"{text[:half]}\n... {len(text) - 2 * half} characters left out ...\n{text[-half:]}"
     text = re.sub(r"\b0x[0-9a-fA-F]{4,}\b", "0x...", text)
     return _utf8(text)
 

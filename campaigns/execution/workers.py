@@ -13,6 +13,7 @@ import re
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -24,7 +25,7 @@ from campaigns.errors import CampaignError
 from campaigns.execution.batches import Batches
 from campaigns.execution.watched import LOOK_S, WatchedWorker
 from campaigns.execution.work import Work
-from campaigns.execution.worker_process import Done
+from campaigns.execution.worker_process import BatchEnd, Done
 from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, CaseEndedError
 
 Result = TypeVar("Result")
@@ -90,6 +91,7 @@ class _Run:
         self._idle = deque(workers)
         self._again: deque[list[int]] = deque()
         self._attempts: dict[int, int] = {}
+        self._spoilers: dict[int, int | None] = {}
         self._running: dict[Future[Any], tuple[WatchedWorker, Sequence[int]]] = {}
         self._deaths_at_start = 0
 
@@ -125,17 +127,38 @@ class _Run:
         error = future.exception()
         if isinstance(error, BrokenProcessPool):
             return self._bereaved(worker, batch, error)
-        self._idle.append(worker)
         if error is None:
             self._deaths_at_start = 0
-            seconds, done = future.result()
-            self._batches.took(len(batch), seconds)
-            return list(done)
+            return self._ended(worker, future.result())
+        self._idle.append(worker)
         if len(batch) > 1:
             # something in it cannot be sent
             self._again.extend([item] for item in batch)
             return []
         return [Done(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
+
+    def _ended(self, worker: WatchedWorker, end: BatchEnd[Any]) -> list[Done[Any]]:
+        """What a batch that its worker delivered came to; a worker that is spent is replaced."""
+        self._again.extend([item] for item in end.alone)
+        if end.rest:
+            self._again.append(list(end.rest))
+        if end.done:
+            self._batches.took(len(end.done), end.seconds)
+        if end.spent:
+            worker.replace()
+        suspects = [one for one in end.done if one.crashed and one.before is not None]
+        for one in suspects:
+            # at most one, the last of the batch; in the process that is now fresh
+            self._spoilers[one.item] = one.before
+            self._submit(worker, [one.item])
+        if not suspects:
+            self._idle.append(worker)
+        return [self._judged(one) for one in end.done if one not in suspects]
+
+    def _judged(self, done: Done[Any]) -> Done[Any]:
+        """A task as it ended; says so where it crashed in a used process, and in a fresh one does not."""
+        spoiler = self._spoilers.pop(done.item, None)
+        return done if done.crashed else replace(done, spoiled_by=spoiler)
 
     def _bereaved(self, worker: WatchedWorker, batch: Sequence[int], error: BaseException) -> list[Done[Any]]:
         """What becomes of a batch whose worker died: one task is at fault, the others are run again."""

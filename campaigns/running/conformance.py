@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 from campaigns.errors import CampaignError
@@ -66,7 +67,7 @@ def _check(subject: Subject, number: int) -> Finding:
 
 def _finding(done: Done[Finding], name: str, asked: str) -> Finding:
     if done.result is not None:
-        return done.result
+        return _with_state(done.result, done.changed)
     error = done.error
     if isinstance(error, CaseEndedError):
         where = [line.strip() for line in error.trace.splitlines() if line.strip().startswith("File ")][:1]
@@ -74,4 +75,15 @@ def _finding(done: Done[Finding], name: str, asked: str) -> Finding:
         return Finding(name, asked, problem, "no picture may make it hang, end its process or take all memory")
     return Finding(
         name, asked, f"{type(error).__name__}: {error}", "this is a defect of the suite or of the answer's types"
+    )
+
+
+def _with_state(finding: Finding, changed: tuple[str, ...]) -> Finding:
+    """A finding, failed where the check passed but changed what later cases of the same process would meet."""
+    if not changed or not finding.passed:
+        return finding
+    return replace(
+        finding,
+        problem=f"it changed the state of its process: {'; '.join(changed)}",
+        next_step="set it back before returning, and end every thread and child process: a case must leave no trace",
     )

@@ -20,7 +20,7 @@ import pytest
 
 from campaigns.errors import CampaignError
 from campaigns.execution.batches import MOST_CASES, Batches
-from campaigns.execution.watched import used_memory
+from campaigns.execution.process_tree import used_memory
 from campaigns.execution.work import UNLIMITED, Work, WorkLimits
 from campaigns.execution.worker_process import Board, Done, Standing
 from campaigns.execution.workers import LocalWorkers
@@ -213,16 +213,16 @@ def test_memory_counts_what_is_the_processs_own(tmp_path: Path) -> None:
     size = 40_000_000
     # what earlier tests have left in this process may be released meanwhile
     gc.collect()
-    before = used_memory(os.getpid())
+    before = used_memory([os.getpid()])
     mapped = np.memmap(tmp_path / "terrain", dtype=np.uint8, mode="w+", shape=size)
     mapped[:] = 1
-    with_map = used_memory(os.getpid())
+    with_map = used_memory([os.getpid()])
     assert with_map - before < 0.5 * size
     # not an array: NumPy would take its memory from what earlier tests have left, which counts already
     own = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
     np.frombuffer(own, np.uint8)[:] = 1
-    assert used_memory(os.getpid()) - with_map > 0.5 * size
-    assert used_memory(2**22 + 1) == 0.0
+    assert used_memory([os.getpid()]) - with_map > 0.5 * size
+    assert used_memory([2**22 + 1]) == 0.0
 
 
 def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
@@ -251,6 +251,6 @@ def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
 def test_the_board_shows_where_a_worker_stands(tmp_path: Path) -> None:
     board = Board.create(tmp_path / "board")
     assert board.read().item is None
-    Board(tmp_path / "board").write(Standing(7, 2**40, 1.5))
-    assert board.read() == Standing(7, 2**40, 1.5)
+    Board(tmp_path / "board").write(Standing(2**40, 1.5))
+    assert board.read() == Standing(2**40, 1.5)
     board.close()
