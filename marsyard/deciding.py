@@ -32,7 +32,8 @@ def run_until_decided(campaign: Campaign, directory: Path, crew: Crew, watch: Wa
         raise CampaignError("--until-decided: the campaign has no requirement that is decided at a confidence")
     most = configuration.total_cases
     first = configuration.model_copy(update={"cases": looks_of(most)[0].cases, "appended": (), "most_cases": most})
-    run_campaign(Campaign(first, campaign.scenario), directory, crew, watch)
+    command = (*campaign.command, "--until-decided")
+    run_campaign(Campaign(first, campaign.scenario, command), directory, crew, watch)
     go_on_until_decided(directory, crew, watch)
 
 

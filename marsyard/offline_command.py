@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -45,6 +46,11 @@ def export(
     exported = Exported(out, truth if truth is not None else truth_folder(out))
     kept = ["retain.products=none", "retain.showcase=none"]
     loaded = load_campaign(campaign, [*(override or []), *kept], cases, seed, [f"{EXPORT}{out.resolve()}"])
+    words = ["marsyard", "export", campaign, "--out", str(out), "--truth", str(exported.truth)]
+    words += [] if cases is None else ["-n", str(cases)]
+    words += [] if seed is None else ["--seed", str(seed)]
+    words += [word for value in override or [] for word in ("--set", value)]
+    loaded = replace(loaded, command=tuple(words))
     with shown_progress(exported.truth, f"the same command again ({out})") as watch:
         export_campaign(loaded, exported, make_crew(jobs, cluster), watch)
     crashed = int(record.read(exported.truth)["cases_crashed"])
@@ -73,7 +79,8 @@ def score(
     from campaigns.running.offline import Exported, other_pictures, scored_campaign, truth_folder
 
     exported = Exported(directory, truth if truth is not None else truth_folder(directory))
-    campaign = scored_campaign(exported, answers)
+    words = ("marsyard", "score", str(directory), str(answers), "--truth", str(exported.truth))
+    campaign = replace(scored_campaign(exported, answers), command=words)
     target = out if out is not None else default_directory(campaign.configuration.name)
 
     def run(watch: Watch) -> None:
