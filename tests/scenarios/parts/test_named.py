@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from campaigns.definition.configuration import CampaignConfiguration, problems_of
-from campaigns.definition.identity import foreign_sources, chosen_parts
+from campaigns.definition.identity import chosen_parts, foreign_sources
 from scenarios.descent import DescentScenarioParameters
 from scenarios.parts import named
 from scenarios.parts.motions import OwnMotion
