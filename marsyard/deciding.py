@@ -14,6 +14,7 @@ from reports.deciding import next_look
 from reports.sampled import sampled
 from reports.statistics.sequential import looks_of
 from reports.verdicts import ESTIMATE, judge_campaign
+from reports.wording import count
 
 
 def run_until_decided(campaign: Campaign, directory: Path, crew: Crew, watch: Watch) -> None:
@@ -47,6 +48,6 @@ def go_on_until_decided(directory: Path, crew: Crew, watch: Watch) -> None:
         how, cases = sampled(plain), configuration.total_cases
         look = next_look(judge_campaign(read_frame(directory), plain["requirements"], how), how, cases)
         if look is None:
-            watch.note(f"stopped after {cases} of at most {configuration.most_cases} cases")
+            watch.note(f"stopped after {cases} of at most {count(configuration.most_cases, 'case')}")
             return
         append_cases(directory, look - cases, crew, watch)

@@ -41,6 +41,7 @@ def export(
     from campaigns.definition.loading import load_campaign
     from campaigns.running.offline import Exported, export_campaign, truth_folder
     from campaigns.store import record
+    from reports.wording import count
     from scenarios.offline import EXPORT
 
     exported = Exported(out, truth if truth is not None else truth_folder(out))
@@ -55,11 +56,11 @@ def export(
         export_campaign(loaded, exported, make_crew(jobs, cluster), watch)
     crashed = int(record.read(exported.truth)["cases_crashed"])
     total = loaded.configuration.total_cases
-    typer.echo(f"{total - crashed} of {total} cases: {out}")
+    typer.echo(f"{total - crashed} of {count(total, 'case')}: {out}")
     typer.echo(f"their truth, not to be handed away: {exported.truth}")
     typer.echo(f"once they are answered: marsyard score {out} ANSWERS.csv")
     if crashed:
-        typer.echo(f"{crashed} cases could not be written; why: marsyard report {exported.truth}", err=True)
+        typer.echo(f"{count(crashed, 'case')} could not be written; why: marsyard report {exported.truth}", err=True)
         raise typer.Exit(Exit.FAILED)
 
 
@@ -77,6 +78,7 @@ def score(
     """Score answers that were made elsewhere: the scoring, the verdicts and the report of a run."""
     from campaigns.running.engine import Watch, run_campaign
     from campaigns.running.offline import Exported, other_pictures, scored_campaign, truth_folder
+    from reports.wording import count
 
     exported = Exported(directory, truth if truth is not None else truth_folder(directory))
     words = ("marsyard", "score", str(directory), str(answers), "--truth", str(exported.truth))
@@ -87,6 +89,8 @@ def score(
         run_campaign(campaign, target, make_crew(jobs, cluster), watch)
         other = other_pictures(exported.truth, target)
         if other:
-            watch.note(f"{len(other)} cases show other pictures here than were exported, the first case {other[0]}")
+            watch.note(
+                f"other pictures here than were exported: {count(len(other), 'case')}, the first case {other[0]}"
+            )
 
     carry_out(target, run)

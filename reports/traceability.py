@@ -13,6 +13,7 @@ from xml.etree import ElementTree as Xml
 from reports.algorithms import Algorithm, judged_text
 from reports.overall import Overall
 from reports.verdicts import Status, Verdict
+from reports.wording import count
 
 #: Columns of the matrix; one row for each requirement and campaign.
 COLUMNS = (
@@ -143,7 +144,7 @@ def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall, algori
         Xml.SubElement(case, "system-out").text = _text(f"{subject}{one.statement} {said}")
     ended = Xml.SubElement(suite, "testcase", classname=_text(campaign), name="all cases end")
     if whole.crashed:
-        Xml.SubElement(ended, "failure", message=f"{whole.crashed} cases crashed", type="CRASHED")
+        Xml.SubElement(ended, "failure", message=f"{count(whole.crashed, 'case')} crashed", type="CRASHED")
     Xml.indent(suite)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{Xml.tostring(suite, encoding="unicode")}\n'
 
