@@ -317,15 +317,16 @@ def stopped_by_signals() -> Iterator[None]:
 def _print_estimate(campaign: Campaign, crew: Crew) -> None:
     """Prints what a campaign would take."""
     from campaigns.running.estimate import estimate
+    from reports.wording import count
 
     workers = crew.jobs if crew.cluster is None else os.cpu_count() or 1
     found = estimate(campaign, workers)
     total = campaign.configuration.total_cases
     least, most = found.case_range_s
-    typer.echo(f"{total} cases on {workers} workers: about {_duration(found.time_s)}")
+    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {_duration(found.time_s)}")
     if found.inputs:
-        typer.echo(f"  {found.inputs} terrains (shared inputs) to build, {found.input_s:.3g} s each")
-    typer.echo(f"  {found.case_s:.3g} s a case ({least:.3g} to {most:.3g} s in {found.trials} trial cases)")
+        typer.echo(f"  {count(found.inputs, 'terrain')} (shared inputs) to build, {found.input_s:.3g} s each")
+    typer.echo(f"  {found.case_s:.3g} s a case ({least:.3g} to {most:.3g} s in {count(found.trials, 'trial case')})")
     if found.unfinished:
         typer.echo(f"  {found.unfinished} of the trial cases did not come to their end")
     typer.echo(f"disk: {size_text(found.rows_bytes)} of rows, up to {size_text(found.products_bytes)} of products")

@@ -14,6 +14,7 @@ from reports.deciding import next_look
 from reports.sampled import sampled
 from reports.statistics.sequential import looks_of
 from reports.verdicts import ESTIMATE, judge_campaign
+from reports.wording import count
 
 
 def run_until_decided(campaign: Campaign, directory: Path, crew: Crew, watch: Watch) -> None:
@@ -32,7 +33,8 @@ def run_until_decided(campaign: Campaign, directory: Path, crew: Crew, watch: Wa
         raise CampaignError("--until-decided: the campaign has no requirement that is decided at a confidence")
     most = configuration.total_cases
     first = configuration.model_copy(update={"cases": looks_of(most)[0].cases, "appended": (), "most_cases": most})
-    run_campaign(Campaign(first, campaign.scenario), directory, crew, watch)
+    command = (*campaign.command, "--until-decided")
+    run_campaign(Campaign(first, campaign.scenario, command), directory, crew, watch)
     go_on_until_decided(directory, crew, watch)
 
 
@@ -46,6 +48,6 @@ def go_on_until_decided(directory: Path, crew: Crew, watch: Watch) -> None:
         how, cases = sampled(plain), configuration.total_cases
         look = next_look(judge_campaign(read_frame(directory), plain["requirements"], how), how, cases)
         if look is None:
-            watch.note(f"stopped after {cases} of at most {configuration.most_cases} cases")
+            watch.note(f"stopped after {cases} of at most {count(configuration.most_cases, 'case')}")
             return
         append_cases(directory, look - cases, crew, watch)

@@ -47,6 +47,7 @@ def ingest(
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     from campaigns.definition.loading import load_campaign
+    from reports.wording import count
 
     try:
         load_campaign(str(out / CAMPAIGN_FILE))
@@ -55,7 +56,7 @@ def ingest(
         shutil.rmtree(out)
         raise
     pictures = sum(len(case.pictures) for case in stored.cases)
-    typer.echo(f"{len(stored.cases)} cases of {pictures} pictures: {out}")
+    typer.echo(f"{count(len(stored.cases), 'case')} of {count(pictures, 'picture')}: {out}")
     typer.echo(f"run them with: marsyard run {out / CAMPAIGN_FILE}")
 
 

@@ -54,7 +54,7 @@ def campaign_text(choices: Choices) -> str:
 
 _SCENARIOS = {"velocity": "descent", "landing": "landing", "tracking": "rover"}
 _ABOUT = {
-    "velocity": "DIMES' horizontal velocity in a parachute descent.",
+    "velocity": "Horizontal velocity in a parachute descent.",
     "landing": "Safe landing sites found from two pictures of a moving camera.",
     "tracking": "A rover drives at a target and tracks it.",
 }

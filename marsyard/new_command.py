@@ -57,6 +57,7 @@ def new(
     from campaigns.definition.loading import load_campaign
     from campaigns.errors import CampaignError
     from marsyard.new_campaign import Choices, campaign_text
+    from reports.wording import count
 
     path = Path(f"{name}.toml") if out is None else out
     if path.exists() and not overwrite:
@@ -83,7 +84,9 @@ def new(
         # what was asked for cannot be run: nothing of it stays
         path.unlink() if before is None else path.write_text(before, encoding="utf-8")
         raise
-    typer.echo(f"{path}: {chosen.value} over {site}, {cases} cases. See it with `marsyard show {path}`, run it with")
+    typer.echo(
+        f"{path}: {chosen.value} over {site}, {count(cases, 'case')}. See it with `marsyard show {path}`, run it with"
+    )
     typer.echo(f"  marsyard run {path}")
 
 

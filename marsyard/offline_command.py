@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -40,20 +41,26 @@ def export(
     from campaigns.definition.loading import load_campaign
     from campaigns.running.offline import Exported, export_campaign, truth_folder
     from campaigns.store import record
+    from reports.wording import count
     from scenarios.offline import EXPORT
 
     exported = Exported(out, truth if truth is not None else truth_folder(out))
     kept = ["retain.products=none", "retain.showcase=none"]
     loaded = load_campaign(campaign, [*(override or []), *kept], cases, seed, [f"{EXPORT}{out.resolve()}"])
+    words = ["marsyard", "export", campaign, "--out", str(out), "--truth", str(exported.truth)]
+    words += [] if cases is None else ["-n", str(cases)]
+    words += [] if seed is None else ["--seed", str(seed)]
+    words += [word for value in override or [] for word in ("--set", value)]
+    loaded = replace(loaded, command=tuple(words))
     with shown_progress(exported.truth, f"the same command again ({out})") as watch:
         export_campaign(loaded, exported, make_crew(jobs, cluster), watch)
     crashed = int(record.read(exported.truth)["cases_crashed"])
     total = loaded.configuration.total_cases
-    typer.echo(f"{total - crashed} of {total} cases: {out}")
+    typer.echo(f"{total - crashed} of {count(total, 'case')}: {out}")
     typer.echo(f"their truth, not to be handed away: {exported.truth}")
     typer.echo(f"once they are answered: marsyard score {out} ANSWERS.csv")
     if crashed:
-        typer.echo(f"{crashed} cases could not be written; why: marsyard report {exported.truth}", err=True)
+        typer.echo(f"{count(crashed, 'case')} could not be written; why: marsyard report {exported.truth}", err=True)
         raise typer.Exit(Exit.FAILED)
 
 
@@ -71,15 +78,19 @@ def score(
     """Score answers that were made elsewhere: the scoring, the verdicts and the report of a run."""
     from campaigns.running.engine import Watch, run_campaign
     from campaigns.running.offline import Exported, other_pictures, scored_campaign, truth_folder
+    from reports.wording import count
 
     exported = Exported(directory, truth if truth is not None else truth_folder(directory))
-    campaign = scored_campaign(exported, answers)
+    words = ("marsyard", "score", str(directory), str(answers), "--truth", str(exported.truth))
+    campaign = replace(scored_campaign(exported, answers), command=words)
     target = out if out is not None else default_directory(campaign.configuration.name)
 
     def run(watch: Watch) -> None:
         run_campaign(campaign, target, make_crew(jobs, cluster), watch)
         other = other_pictures(exported.truth, target)
         if other:
-            watch.note(f"{len(other)} cases show other pictures here than were exported, the first case {other[0]}")
+            watch.note(
+                f"other pictures here than were exported: {count(len(other), 'case')}, the first case {other[0]}"
+            )
 
     carry_out(target, run)

@@ -34,6 +34,7 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
         Where the folder holds no campaign with rows, or the report cannot be written.
     """
     from reports.tables import verdict_table
+    from reports.wording import count
 
     stored = record.read(directory)
     finished = stored["state"] == "finished"
@@ -45,7 +46,7 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
         console.print(table)
     lines = [f"verdict: {found.whole.word}", found.whole.sentence, f"report: {page}"]
     if not finished:
-        come = f"{len(found.run.whole)} of {stored['cases']} cases"
+        come = f"{len(found.run.whole)} of {count(stored['cases'], 'case')}"
         lines.insert(0, f"INCOMPLETE: {come}; {_how_it_stands(directory, stored['state'])}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

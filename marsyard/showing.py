@@ -118,7 +118,7 @@ def drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
 def _print_head(configuration: CampaignConfiguration, console: Console) -> None:
     for line in (
         f"{configuration.name}: {configuration.description}",
-        f"scenario {configuration.scenario}, {configuration.total_cases} cases, seed {configuration.seed}",
+        f"scenario {configuration.scenario}, {count(configuration.total_cases, 'case')}, seed {configuration.seed}",
         f"sampling: {_said(configuration)}",
     ):
         console.print(line, markup=False, highlight=False, soft_wrap=True)

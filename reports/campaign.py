@@ -15,6 +15,7 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from reports import gallery, sections
+from reports.algorithms import algorithms_of
 from reports.answers import answers_section
 from reports.columns import label, numbers, primary_metric
 from reports.comparison import comparison_section
@@ -118,9 +119,10 @@ def write_judged(found: Judged) -> Path:
     subject = Subject(drawn, metric, bound)
     further = [section for make in FURTHER_SECTIONS if (section := make(subject)) is not None]
     twin = summary(found, subject, further)
+    algorithms = algorithms_of(run.record)
     write_whole(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
-    write_whole(directory / VERIFICATION_FILE, verification_csv(evidence_of(run.name, verdicts)))
-    write_whole(directory / JUNIT_FILE, junit_xml(run.name, verdicts, whole))
+    write_whole(directory / VERIFICATION_FILE, verification_csv(evidence_of(run.name, verdicts, algorithms)))
+    write_whole(directory / JUNIT_FILE, junit_xml(run.name, verdicts, whole, algorithms))
     page = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, whole, further)
     write_whole(page, page_environment().get_template("report.html.j2").render(context))
@@ -150,7 +152,9 @@ def page_context(
         "provenance": sections.provenance(run),
         "versions": sections.versions(run),
         "configuration": sections.configuration_text(run),
-        "rerun": sections.rerun_command(run),
+        "algorithms": algorithms_of(run.record),
+        "rerun": sections.rerun_commands(run),
+        "rerun_is_stored": run.command is not None,
         "replay": sections.replay_command(run, "CASE"),
         "gallery": shlex.join(["marsyard", "report", str(run.directory), "--gallery"]),
     }
@@ -207,6 +211,7 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
         "crashed": whole.crashed,
         "sites": _kinds(run.frame, "site"),
         "algorithms": _kinds(run.frame, "algorithm"),
+        "algorithm_details": [asdict(one) for one in algorithms_of(run.record)],
         "sampling": {**asdict(how), "independent": how.independent, "text": how.text},
         "verdict": whole.word,
         "sentence": whole.sentence,

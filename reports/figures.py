@@ -29,12 +29,15 @@ from reports.svg import (
 )
 from reports.tables import answered_outcomes, outcome_counts
 from reports.verdicts import ENGINE_FAILURES
+from reports.wording import count as counted
 from reports.wording import stated
 
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95
-#: Errors beyond this many times the bound are drawn at the edge, or one of them would hide all others.
+#: Errors beyond this many times the bound are counted beyond the axis, or one of them would hide all others.
 _FARTHEST = 3.0
+#: Where a larger fraction of the errors would lie beyond the axis, it follows the errors: to this quantile of them.
+_MAX_BEYOND, _FOLLOWED = 0.25, 0.95
 #: Cases behind a point of a conditional curve, and how many points it has at least and at most.
 _CASES_PER_POINT, _FEWEST_POINTS, _MOST_POINTS = 25, 4, 16
 
@@ -94,9 +97,14 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
     if close and ellipse is not None:
         reach = max(reach, ellipse.reach)
     figure, axes = new_axes(5.0, 4.9)
+    inside = (np.abs(points) <= reach).all(axis=1)
     for kind in categories(frame, metric, bound):
-        x, y = np.clip(points[kind.chosen & known], -reach, reach).T
+        x, y = points[kind.chosen & known & inside].T
         _draw_points(axes, x, y, kind)
+        x, y = np.clip(points[kind.chosen & known & ~inside], -reach, reach).T
+        _draw_points(axes, x, y, kind, hollow=True)
+    if (known & ~inside).any():
+        axes.plot([], [], "o", markerfacecolor="none", color=INK, label=f"{(known & ~inside).sum():,} beyond the axes")
     if bound is not None:
         axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
         if bound <= reach * math.sqrt(2.0):  # else the circle lies outside of all four corners
@@ -113,11 +121,20 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
     return figure
 
 
-def off_scale(frame: pd.DataFrame, metric: str, bound: float | None) -> int:
-    """How many errors are too large for the scatter's axes and are drawn at its edge."""
-    if bound is None or bound <= 0:
-        return 0
-    return int((np.abs(numbers(frame, metric)) > _FARTHEST * bound).sum())
+def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
+    """End of an axis that shows magnitudes next to their bound.
+
+    Without a bound, the largest magnitude. With one, at least 1.1 and at most 3 times the bound, so that a few gross
+    errors do not hide the others; where more than a quarter of the magnitudes lie beyond that, their 95 % quantile.
+    """
+    if magnitudes.size == 0:
+        return bound or 1.0
+    largest = float(magnitudes.max())
+    if bound is None or bound <= 0.0:
+        return largest or 1.0
+    if float(np.mean(magnitudes > _FARTHEST * bound)) > _MAX_BEYOND:
+        return float(np.quantile(magnitudes, _FOLLOWED, method="higher"))
+    return min(max(largest, 1.1 * bound), _FARTHEST * bound)
 
 
 def worth_a_closer_look(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
@@ -129,23 +146,49 @@ def worth_a_closer_look(frame: pd.DataFrame, metric: str, bound: float | None) -
 
 @in_page_style
 def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Figure | None:
-    """How often each magnitude of error occurred; None where no case has one."""
+    """How often each magnitude of error occurred; a bar of its own counts those beyond the axis. None where no case
+    has one.
+    """
     magnitude, edge = _magnitudes(frame, metric, bound)
     if magnitude.size == 0:
         return None
     figure, axes = new_axes(5.0, 2.7)
-    drawn = np.minimum(magnitude, edge)
-    bins = np.linspace(0.0, float(drawn.max()) or 1.0, 1 + int(np.clip(2 * math.sqrt(drawn.size), 6, 60)))
+    drawn = magnitude[magnitude <= edge]
+    largest = float(drawn.max()) if drawn.size else edge
+    bins = np.linspace(0.0, largest or 1.0, 1 + int(np.clip(2 * math.sqrt(magnitude.size), 6, 60)))
     axes.hist(drawn, bins=list(bins), color=SERIES[0], alpha=0.85)
-    _bound_line(axes, metric, bound, 0.98)
+    beyond = magnitude.size - drawn.size
     axes.set(xlabel=magnitude_label(metric), ylabel="cases", xlim=(0.0, edge * 1.02))
+    if beyond:
+        _overflow_bar(axes, beyond, edge)
+    _bound_line(axes, metric, bound, 0.98)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
 
 
+def _overflow_bar(axes: Axes, beyond: int, edge: float) -> None:
+    """The magnitudes beyond a histogram's axis: a hatched bar to its right, with their number."""
+    centre = 1.11 * edge
+    axes.bar(centre, beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
+    axes.axvline(1.04 * edge, color=MUTED, linewidth=0.8)
+    axes.annotate(
+        f"{beyond:,}\n> {edge:.3g}",
+        (centre, beyond),
+        xytext=(0, 2),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        color=INK,
+        fontsize=8,
+    )
+    axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= edge])
+    axes.set_xlim(0.0, 1.18 * edge)
+    axes.margins(y=0.25)
+
+
 @in_page_style
 def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) -> Figure | None:
-    """Fraction of cases with an error up to each magnitude; None where no case has one."""
+    """Fraction of cases with an error up to each magnitude, and how many lie beyond; None where no case has one."""
     magnitude, edge = _magnitudes(frame, metric, bound)
     if magnitude.size == 0:
         return None
@@ -156,33 +199,42 @@ def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) ->
     share = np.arange(1, ordered.size + 1) / ordered.size
     steps = np.concatenate([[0.0], ordered, [max(edge, float(ordered[-1]))]])
     axes.plot(steps, np.concatenate([[0.0], share, [1.0]]), drawstyle="steps-post", color=SERIES[0], linewidth=1.8)
-    _bound_line(axes, metric, bound, 0.1)
     axes.set(xlabel=magnitude_label(metric), ylabel="fraction of cases with an error", xlim=(0.0, edge * 1.02))
+    _bound_line(axes, metric, bound, 0.2)
     axes.set_ylim(0.0, 1.03)
+    note_beyond(axes, int((magnitude > edge).sum()))
     return figure
+
+
+def note_beyond(axes: Axes, beyond: int) -> None:
+    """Write at the right edge of a cumulative curve how many cases lie beyond its axis; nothing where none does."""
+    if beyond:
+        text = f"{counted(beyond, 'case')} beyond →"
+        axes.annotate(text, (0.985, 0.04), xycoords="axes fraction", ha="right", va="bottom", color=INK, fontsize=9)
 
 
 @in_page_style
 def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> Figure | None:
-    """Errors against what may drive them; cases without an error are ticks on the upper edge. None without numbers."""
+    """Errors against what may drive them; cases without an error are ticks on the upper edge, those beyond the axis
+    hollow marks below it. None without numbers.
+    """
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
     known = np.isfinite(x) & np.isfinite(magnitude)
     silent = np.isfinite(x) & ~np.isfinite(magnitude)
     if not (known | silent).any():
         return None
     figure, axes = new_axes(4.2, 3.2)
-    top = 1.12 * (float(magnitude[known].max()) if known.any() else 1.0)
-    top = max(top, 1.12 * bound) if bound is not None and top > 0.6 * bound else top
-    top = min(top, _FARTHEST * bound) if bound else top
-    top = top or 1.0
+    edge = _driven_edge(magnitude[known], bound)
+    top = 1.12 * edge
     kinds = categories(frame, metric, bound)
     for kind in kinds:
-        chosen = kind.chosen & known
-        _draw_points(axes, x[chosen], np.minimum(magnitude[chosen], top), kind)
+        inside, beyond = (kind.chosen & known & which for which in (magnitude <= edge, magnitude > edge))
+        _draw_points(axes, x[inside], magnitude[inside], kind)
+        _draw_points(axes, x[beyond], np.full(beyond.sum(), 1.06 * edge), kind, hollow=True)
     if len(kinds) > 1 and not axis_columns(metric, [str(name) for name in frame.columns]):
         # no scatter on the page tells them apart
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, handletextpad=0.2)
-    _conditional_curves(axes, x[known], np.minimum(magnitude[known], top))
+    _conditional_curves(axes, x[known], np.minimum(magnitude[known], 1.06 * edge))
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
     raster = bool(silent.sum() > LARGEST_VECTOR_SAMPLE)
@@ -190,6 +242,21 @@ def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | 
     axes.set(xlabel=label(driver), ylabel=magnitude_label(metric), ylim=(0.0, top))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     return figure
+
+
+def _driven_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
+    """The largest magnitude drawn to scale; the bound is within the axis where it is near."""
+    edge = axis_edge(magnitudes, bound)
+    largest = float(magnitudes.max()) if magnitudes.size else 0.0
+    near = bound is not None and 1.12 * largest > 0.6 * bound
+    return edge if near or largest == 0.0 else largest
+
+
+def beyond_the_axis(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> int:
+    """How many cases `error_against` draws at its upper edge, hollow."""
+    x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
+    known = magnitude[np.isfinite(x) & np.isfinite(magnitude)]
+    return int((known > _driven_edge(known, bound)).sum())
 
 
 def _conditional_curves(axes: Axes, x: Float[np.ndarray, " n"], magnitude: Float[np.ndarray, " n"]) -> None:
@@ -234,22 +301,22 @@ def outcome_bars(frame: pd.DataFrame) -> Figure | None:
 def _reach(points: Float[np.ndarray, "n 2"], bound: float | None, close: bool) -> float:
     """Half the width of the scatter's axes."""
     extent = 1.08 * float(np.abs(points).max()) or 1.0
-    if bound is None or bound <= 0.0:
+    if close or bound is None or bound <= 0.0:
         return extent
-    return extent if close else min(max(extent, 1.15 * bound), _FARTHEST * bound)
+    return min(extent, 1.05 * axis_edge(np.abs(points).max(axis=1), bound)) if extent > 1.15 * bound else 1.15 * bound
 
 
 def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[Float[np.ndarray, " known"], float]:
     """Magnitudes of the errors that are known, and the right edge of an axis that shows them beside the bound."""
     magnitude = np.abs(numbers(frame, metric))
     known = magnitude[np.isfinite(magnitude)]
-    edge = float(known.max()) if known.size else 0.0
-    if bound is not None and bound > 0.0:
-        edge = min(max(edge, 1.1 * bound), _FARTHEST * bound)
-    return known, edge or 1.0
+    return known, axis_edge(known, bound)
 
 
-def _draw_points(axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], kind: Category) -> None:
+def _draw_points(
+    axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], kind: Category, *, hollow: bool = False
+) -> None:
+    """Points of a kind; hollow where they lie beyond the axes and are drawn at their edge."""
     many = x.size > LARGEST_VECTOR_SAMPLE
     axes.plot(
         x,
@@ -258,9 +325,10 @@ def _draw_points(axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " 
         marker=kind.marker,
         markersize=3.0 if many else 5.5,
         alpha=0.55 if many else 0.85,
-        markeredgewidth=0.0,
+        markeredgewidth=1.0 if hollow else 0.0,
+        markerfacecolor="none" if hollow else kind.colour,
         color=kind.colour,
-        label=kind.name,
+        label="_beyond" if hollow else kind.name,
         rasterized=many,
         zorder=2,
     )
@@ -271,13 +339,15 @@ def _bound_line(axes: Axes, metric: str, bound: float | None, height: float) -> 
     if bound is None:
         return
     axes.axvline(bound, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3)
+    # to the left of the line, unless it stands too near to the axis for the text
+    left = bound > 0.3 * axes.get_xlim()[1]
     axes.annotate(
         f"requirement {bound:g} {split_unit(metric)[1]}",
         (bound, height),
         xycoords=("data", "axes fraction"),
-        xytext=(-5, 0),
+        xytext=(-5 if left else 5, 0),
         textcoords="offset points",
-        ha="right",
+        ha="right" if left else "left",
         va="top",
         color=INK,
         fontsize=9,

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from reports.algorithms import algorithms_of
 from reports.columns import axis_columns, driver_columns, label, numbers
 from reports.overall import Overall
 from reports.sampled import sampled
@@ -170,6 +171,7 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
     facts = [
         ("Campaign", run.name),
         ("Scenario", run.said("scenario")),
+        *_algorithm_facts(run),
         ("State", run.said("state")),
         ("Root seed", run.said("seed")),
         ("Sampling", sampled(run.configuration).text),
@@ -188,6 +190,24 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
     return [(name, _plain(value)) for name, value in facts if value not in (None, "")]
 
 
+def _algorithm_facts(run: StoredRun) -> list[tuple[str, Any]]:
+    """What was judged, and what was compared with it."""
+    facts: list[tuple[str, Any]] = []
+    for one in algorithms_of(run.record):
+        head = "Algorithm judged" if one.judged else "Algorithm compared"
+        facts.append((head, one.name))
+        facts += [
+            (f"{head}: {name}", value)
+            for name, value in (
+                ("class or file", one.path),
+                ("version", one.version),
+                ("sources", one.source_hash),
+                ("options", one.options_text),
+            )
+        ]
+    return facts
+
+
 def versions(run: StoredRun) -> list[tuple[str, str]]:
     """Packages and their versions."""
     return [(str(name), _plain(version)) for name, version in table(run.said("versions")).items()]
@@ -203,13 +223,27 @@ def replay_command(run: StoredRun, case: str) -> str:
     return shlex.join(["marsyard", "replay", str(run.directory), case])
 
 
-def rerun_command(run: StoredRun) -> str:
-    """The command that runs the campaign again, into a folder of its own."""
-    words = ["marsyard", "run", run.name]
-    for option, key in (("-n", "cases"), ("--seed", "seed")):
-        if run.said(key) is not None:
-            words += [option, str(run.said(key))]
-    return shlex.join(words)
+def rerun_commands(run: StoredRun) -> list[str]:
+    """The commands that run the campaign again, into a folder of its own, quoted for a shell.
+
+    Where the record holds the command that was given it is that one, from the same folder, and one that adds each block
+    of cases that was appended. Records of earlier versions have the campaign's name, cases and seed alone.
+    """
+    if run.command is None:
+        words = ["marsyard", "run", run.name]
+        for option, key in (("-n", "cases"), ("--seed", "seed")):
+            if run.said(key) is not None:
+                words += [option, str(run.said(key))]
+        return [shlex.join(words)]
+    folder, words = run.command[0], list(run.command[1])
+    blocks = run.configuration.get("appended")
+    # a campaign that stops itself appends its blocks itself
+    added = [] if run.said("most_cases") or not isinstance(blocks, list | tuple) else blocks
+    target = f"runs/{run.name}-again"
+    if added:
+        words += ["--out", target]
+    appends = [shlex.join(["marsyard", "append", target, str(cases)]) for cases in added]
+    return [*([shlex.join(["cd", folder])] if folder else []), shlex.join(words), *appends]
 
 
 def _case_table(

@@ -66,6 +66,15 @@ class StoredRun:
         asked = self.said("requirements")
         return [item for item in asked if isinstance(item, Mapping)] if isinstance(asked, list | tuple) else []
 
+    @property
+    def command(self) -> tuple[str, tuple[str, ...]] | None:
+        """The folder and the words of the command that ran the campaign; None where the record does not say."""
+        stored = table(self.record.get("command"))
+        words = stored.get("words")
+        if not isinstance(words, list) or not words:
+            return None
+        return str(stored.get("folder") or ""), tuple(str(word) for word in words)
+
     def said(self, key: str) -> Any:
         """What the record says under a key, or its configuration; None where neither does."""
         found = self.record.get(key)

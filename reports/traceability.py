@@ -10,8 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree as Xml
 
+from reports.algorithms import Algorithm, judged_text
 from reports.overall import Overall
 from reports.verdicts import Status, Verdict
+from reports.wording import count
 
 #: Columns of the matrix; one row for each requirement and campaign.
 COLUMNS = (
@@ -20,6 +22,10 @@ COLUMNS = (
     "kind",
     "source",
     "campaign",
+    "algorithm",
+    "algorithm_version",
+    "algorithm_options",
+    "algorithm_source",
     "verdict",
     "metric",
     "bound",
@@ -42,8 +48,22 @@ COLUMNS = (
 _UNPRINTABLE = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-def evidence_of(campaign: str, verdicts: Iterable[Verdict]) -> list[dict[str, Any]]:
-    """Rows of the matrix: what a campaign shows of each requirement."""
+def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
+    """The matrix' columns that name the algorithms that are judged; several are joined by "; "."""
+    judged = [one for one in algorithms if one.judged]
+    cells = {
+        "algorithm": [one.name for one in judged],
+        "algorithm_version": [one.version for one in judged],
+        "algorithm_options": [one.options_text for one in judged],
+        "algorithm_source": [one.source_hash for one in judged],
+    }
+    return {column: "; ".join(value for value in values if value) for column, values in cells.items()}
+
+
+def evidence_of(
+    campaign: str, verdicts: Iterable[Verdict], algorithms: Sequence[Algorithm] = ()
+) -> list[dict[str, Any]]:
+    """Rows of the matrix: what a campaign shows of each requirement, and of which algorithm."""
     return [
         {
             "requirement": one.requirement_id,
@@ -51,6 +71,7 @@ def evidence_of(campaign: str, verdicts: Iterable[Verdict]) -> list[dict[str, An
             "kind": one.kind,
             "source": one.source,
             "campaign": campaign,
+            **algorithm_cells(algorithms),
             "verdict": str(one.status),
             "metric": one.metric if one.scale == 1.0 else f"{one.scale:g} * ({one.metric})",
             "bound": one.bound,
@@ -90,9 +111,10 @@ def _cell(value: Any) -> str:
     return f"'{text}" if isinstance(value, str) and text[:1] in "=+-@\t\r" and text else text
 
 
-def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall) -> str:
+def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall, algorithms: Sequence[Algorithm] = ()) -> str:
     """A test case for each requirement, and one that says whether all cases came to an end.
 
+    Properties of the suite name the algorithms that are judged.
     FAIL is a failure, INSUFFICIENT is skipped: a server of tests then shows it, and neither as passed nor as failed.
     """
     statuses = [one.status for one in verdicts]
@@ -103,6 +125,13 @@ def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall) -> str
         failures=str(statuses.count(Status.FAIL) + bool(whole.crashed)),
         skipped=str(statuses.count(Status.INSUFFICIENT)),
     )
+    cells = {name: value for name, value in algorithm_cells(algorithms).items() if value}
+    if cells:
+        properties = Xml.SubElement(suite, "properties")
+        for name, value in cells.items():
+            Xml.SubElement(properties, "property", name=name, value=_text(value))
+    judged = judged_text(algorithms)
+    subject = f"Judged: {judged}. " if judged else ""
     for one in verdicts:
         case = Xml.SubElement(suite, "testcase", classname=_text(campaign), name=_text(one.requirement_id))
         said = _text(
@@ -112,10 +141,10 @@ def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall) -> str
             Xml.SubElement(case, "failure", message=said, type=str(one.status))
         elif one.status is Status.INSUFFICIENT:
             Xml.SubElement(case, "skipped", message=f"{one.status}: {said}")
-        Xml.SubElement(case, "system-out").text = _text(f"{one.statement} {said}")
+        Xml.SubElement(case, "system-out").text = _text(f"{subject}{one.statement} {said}")
     ended = Xml.SubElement(suite, "testcase", classname=_text(campaign), name="all cases end")
     if whole.crashed:
-        Xml.SubElement(ended, "failure", message=f"{whole.crashed} cases crashed", type="CRASHED")
+        Xml.SubElement(ended, "failure", message=f"{count(whole.crashed, 'case')} crashed", type="CRASHED")
     Xml.indent(suite)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{Xml.tostring(suite, encoding="unicode")}\n'
 

@@ -108,6 +108,17 @@ class TwinSampling(_Part):
     text: str
 
 
+class TwinAlgorithm(_Part):
+    """An algorithm under test; what the campaign's record does not say is empty."""
+
+    name: str = Field(description="as the campaign names it")
+    judged: bool = Field(description="false where it is only compared")
+    path: str = Field(description="class as module:name, or file")
+    version: str
+    options: dict[str, Any]
+    source_hash: str
+
+
 class Twin(_Part):
     """A campaign's report in numbers."""
 
@@ -122,6 +133,9 @@ class Twin(_Part):
     crashed: int
     sites: list[str] = Field(description="as the rows name them, at most 24, as are the algorithms")
     algorithms: list[str]
+    algorithm_details: list[TwinAlgorithm] = Field(
+        default=[], description="as the campaign's record names them, the judged one first"
+    )
     sampling: TwinSampling
     verdict: Word | Literal["NO REQUIREMENT"]
     sentence: str

@@ -8,6 +8,9 @@ from typing import Protocol, runtime_checkable
 #: Stands where there is nothing to say.
 NOTHING = "–"
 
+#: Magnitudes below this are rounding errors of double precision in any unit that rows have (metres, degrees, pixels).
+_ROUNDING = 1e-9
+
 #: Populations in words where their names alone would not read well; others are columns of true and false.
 _POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "valid answers"}
 
@@ -60,14 +63,14 @@ def population_text(population: str) -> str:
 
 
 def number(value: float) -> str:
-    """A number with about three significant digits; a dash where there is none.
+    """A number with about three significant digits; a dash where there is none, 0 for what rounding errors left.
 
-    >>> number(1.23456), number(123.456), number(0.0123456), number(0.0)
+    >>> number(1.23456), number(123.456), number(0.0123456), number(9.09e-13)
     ('1.235', '123.5', '0.0123', '0.000')
     """
     if math.isnan(value):
         return NOTHING
-    return _digits(value).replace("-", "−")
+    return _digits(0.0 if abs(value) < _ROUNDING else value).replace("-", "−")
 
 
 def coefficient(value: float) -> str:

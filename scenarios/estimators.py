@@ -65,6 +65,8 @@ class Task(Generic[Algorithm, Options]):
         How each algorithm that ships is made from the options of the paper's own.
     executable
         How a program becomes one.
+    options
+        The options of the paper's algorithm.
     offline
         How its answers stand in a table; None where each answer decides what is seen next.
     streamed
@@ -76,6 +78,7 @@ class Task(Generic[Algorithm, Options]):
     methods: tuple[str, ...]
     shipped: Mapping[str, Callable[[Options], Algorithm]]
     executable: Callable[[Command, ExecutableLimits], Algorithm]
+    options: type[Options]
     offline: OfflineForm[Any] | None = None
     streamed: Callable[[Any], Algorithm] | None = None
 
@@ -185,6 +188,7 @@ VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
         "homography": lambda _: HomographyEstimator(),
     },
     executable=_executable_velocity,
+    options=DimesOptions,
     offline=VELOCITY_FORM,
     streamed=StreamedEstimator,
 )
@@ -195,6 +199,7 @@ TRACKING: Task[TargetTracker, VttOptions] = Task(
     methods=("designate", "aim", "update", "clear", "state"),
     shipped={"vtt": VisualTargetTracker, "pure-ncc": _pure_ncc, "lucas-kanade": lucas_kanade_tracker},
     executable=ExecutableTargetTracker,
+    options=VttOptions,
 )
 
 LANDING: Task[SiteEstimator, HdaOptions] = Task(
@@ -203,6 +208,7 @@ LANDING: Task[SiteEstimator, HdaOptions] = Task(
     methods=("estimate",),
     shipped={"hda": HdaEstimator, "essential-matrix": EssentialMatrixEstimator, "semi-global": SemiGlobalEstimator},
     executable=ExecutableSiteEstimator,
+    options=HdaOptions,
     offline=SITE_FORM,
 )
 

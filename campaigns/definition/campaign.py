@@ -22,10 +22,21 @@ from sim.streams import Streams
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign ready to run: its configuration, its parameters complete, and the scenario it is made of."""
+    """A campaign ready to run.
+
+    Attributes
+    ----------
+    configuration
+        What its file and the options of the command line state, its parameters complete.
+    scenario
+        What its cases are made of.
+    command
+        The words of the command that runs it again; empty where it comes from no command.
+    """
 
     configuration: CampaignConfiguration
     scenario: Scenario
+    command: tuple[str, ...] = ()
 
     def streams(self, case: int) -> Streams:
         """The random streams of a case."""

@@ -135,7 +135,7 @@ def configuration_hash(configuration: CampaignConfiguration) -> str:
 def code_hash(named: tuple[str, ...]) -> str:
     """A hash of the sources that rows depend on, names and contents; `named` are scenario, algorithms and parts."""
     digest = hashlib.sha256()
-    foreign = [source for one in named for source in _foreign_sources(one)]
+    foreign = [source for one in named for source in foreign_sources(one)]
     for name, path in (*_own_sources(), *foreign):
         contents = path.read_bytes()
         digest.update(f"{name}\0{len(contents)}\0".encode())
@@ -150,7 +150,7 @@ def _own_sources() -> Iterator[tuple[str, Path]]:
         yield from relative_to(_HOME, sorted((_HOME / folder).rglob("*.json")))
 
 
-def _foreign_sources(named: str) -> Iterator[tuple[str, Path]]:
+def foreign_sources(named: str) -> Iterator[tuple[str, Path]]:
     """The package or module of what is given as `module:Class` or by an entry point; a program's or a table's file."""
     table = answers_file(named)
     if table is not None:

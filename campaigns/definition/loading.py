@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -103,7 +103,22 @@ def load_campaign(
         if value is not None:
             tables[key] = value
             overridden[(key,)] = f"{option} {value}"
-    return _checked(_Document(str(path), tables, overridden))
+    return replace(
+        _checked(_Document(str(path), tables, overridden)),
+        command=_command(name_or_path, overrides, cases, seed, algorithms),
+    )
+
+
+def _command(
+    name_or_path: str, overrides: Sequence[str], cases: int | None, seed: int | None, algorithms: Sequence[str]
+) -> tuple[str, ...]:
+    """The words of the command that loads the same campaign and runs it."""
+    words = ["marsyard", "run", name_or_path]
+    words += [] if cases is None else ["-n", str(cases)]
+    words += [] if seed is None else ["--seed", str(seed)]
+    for option, values in (("--algorithm", algorithms), ("--set", overrides)):
+        words += [word for value in values for word in (option, value)]
+    return tuple(words)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 from pydantic import ValidationError
 
+from campaigns.definition.algorithms import describe_algorithms
 from campaigns.definition.campaign import Campaign
 from campaigns.definition.configuration import POPULATIONS, CampaignConfiguration, Limits
 from campaigns.definition.identity import Identity, identity_of
@@ -84,7 +85,14 @@ def run_campaign(campaign: Campaign, directory: Path, crew: Crew, watch: Watch) 
         record.claim(directory)
         identity = identity_of(campaign.configuration)
         create_store(directory / ROWS_FILE, {"identity": identity.configuration})
-        record.begin(directory, campaign.configuration, identity, crew.describe())
+        record.begin(
+            directory,
+            campaign.configuration,
+            identity,
+            crew.describe(),
+            command=campaign.command,
+            algorithms=describe_algorithms(campaign),
+        )
         with RowStore(directory / ROWS_FILE) as store:
             _run(_Work(campaign, directory, crew, store, watch), ())
 
@@ -175,6 +183,7 @@ def _go_on(
         if changes:
             said["changes"] = [*stored["changes"], {"utc": record.utc_now(), "cases_before": before, "in": changes}]
             said["identity"] = identity_of(configuration).plain()
+            said["algorithms"] = describe_algorithms(campaign)
         said.update(cases=configuration.total_cases, configuration=configuration.model_dump(mode="json"))
         record.update(directory, said)
         _note_other_machine(stored["environment"], said["sessions"][-1]["environment"], watch)

@@ -9,7 +9,7 @@ import platform
 import re
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -51,8 +51,28 @@ def claim(directory: Path) -> None:
         raise StoreError(f"{directory} already holds a campaign ({held[0]}); choose another folder with --out")
 
 
-def begin(directory: Path, configuration: CampaignConfiguration, identity: Identity, crew: str) -> None:
-    """Writes the record of a campaign that begins; `crew` says who runs it."""
+def begin(
+    directory: Path,
+    configuration: CampaignConfiguration,
+    identity: Identity,
+    crew: str,
+    *,
+    command: Sequence[str] = (),
+    algorithms: Sequence[Mapping[str, Any]] = (),
+) -> None:
+    """Writes the record of a campaign that begins.
+
+    Parameters
+    ----------
+    directory, configuration, identity
+        The campaign's folder, what it states, and what its rows depend on.
+    crew
+        Who runs it.
+    command
+        The words of the command that runs it again, from the current folder.
+    algorithms
+        The algorithms under test, as `campaigns.definition.algorithms.describe_algorithms` has them.
+    """
     stated = configuration.model_dump(mode="json")
     write(
         directory,
@@ -70,6 +90,8 @@ def begin(directory: Path, configuration: CampaignConfiguration, identity: Ident
             "requirements": stated["requirements"],
             "configuration": stated,
             "identity": identity.plain(),
+            "command": {"words": list(command), "folder": str(Path.cwd())} if command else None,
+            "algorithms": list(algorithms),
             "sessions": [session("run", crew, 0)],
             "changes": [],
             "showcase": None,

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from campaigns.errors import CampaignError
+from reports.algorithms import Algorithm, algorithms_of, judged_text
 from reports.campaign import TWIN_FILE, write_report
 from reports.stored import RECORD_FILE, TABLE_FILE, table
 from reports.twin import SCHEMA
@@ -52,6 +53,8 @@ class Entry:
         Where it is stored.
     name, system, sites, algorithms, commit, started, state, cases, crashed, verdict, sentence
         As its record and its report have it; empty where they do not say.
+    tested
+        The algorithms under test with their versions, options and sources, the judged one first.
     shown
         What it shows of each requirement.
     kept, worst
@@ -64,6 +67,7 @@ class Entry:
     system: str
     sites: tuple[str, ...]
     algorithms: tuple[str, ...]
+    tested: tuple[Algorithm, ...]
     commit: str
     started: str
     state: str
@@ -75,6 +79,11 @@ class Entry:
     kept: tuple[int, ...]
     worst: tuple[str, ...]
     outcomes: Mapping[str, int]
+
+    @property
+    def judged(self) -> str:
+        """Names and versions of the algorithms that are judged; as the rows name them where the record does not."""
+        return judged_text(self.tested) or ", ".join(self.algorithms)
 
     @property
     def finished(self) -> bool:
@@ -137,6 +146,7 @@ def _entry(path: Path, twin: Mapping[str, Any]) -> Entry:
         system=next((one for one in _SYSTEMS if name.startswith(one)), "other"),
         sites=_named(twin, "sites", parameters, "site"),
         algorithms=_named(twin, "algorithms", parameters, "algorithm"),
+        tested=tuple(algorithms_of(record)),
         commit=str(twin.get("git_commit") or "")[:10],
         started=str(twin.get("started_utc") or ""),
         state=str(twin.get("state") or ""),

@@ -122,7 +122,7 @@ def basis_text(shown: Shown) -> str:
 
 
 def margin_text(shown: Shown) -> str:
-    """By how much what decides lies above or below the rate asked, in points of per cent."""
+    """By how much what decides lies above or below the rate asked, in percentage points."""
     if math.isnan(shown.margin):
         return NOTHING
-    return f"{100.0 * shown.margin:+.2f} %".replace("-", "−")
+    return f"{100.0 * shown.margin:+.2f} pp".replace("-", "−")

@@ -158,6 +158,7 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
             {
                 "slug": cell.entry.slug,
                 "name": cell.entry.name,
+                "algorithm": cell.entry.judged,
                 "status": cell.shown.status,
                 "margin": margin_text(cell.shown),
                 "date": cell.entry.started[:10],
@@ -176,7 +177,7 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
 
 def _matrix(rows: Sequence[RequirementRow]) -> str:
     """The traceability matrix of all: the latest of each campaign, and a row for what none shows."""
-    from reports.traceability import verification_csv
+    from reports.traceability import algorithm_cells, verification_csv
 
     found: list[dict[str, Any]] = []
     for row in rows:
@@ -189,6 +190,7 @@ def _matrix(rows: Sequence[RequirementRow]) -> str:
                 {
                     **about,
                     "campaign": cell.entry.name,
+                    **algorithm_cells(cell.entry.tested),
                     "verdict": cell.shown.status,
                     "probability": shown["probability"],
                     "confidence": shown["confidence"],

@@ -26,7 +26,7 @@ from reports.svg import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
 from reports.verdicts import is_flag, members
 from reports.wording import NOTHING, count, number, percent, stated
 
-#: Difference from the paper that is called large, points of per cent.
+#: Difference from the paper that is called large, percentage points.
 LARGE_POINTS = 10.0
 
 
@@ -84,7 +84,7 @@ class Cell:
     paper_percent
         The paper's per cent valid; None where it has no such cell.
     difference_points
-        Ours less the paper's, points of per cent; NaN where there is none.
+        Ours less the paper's, percentage points; NaN where there is none.
     """
 
     category: str
@@ -162,21 +162,21 @@ def _points(difference: float) -> str:
     if math.isnan(difference):
         return NOTHING
     mark = " (large)" if abs(difference) > LARGE_POINTS else ""
-    return f"{difference:+.1f}{mark}".replace("-", "−")
+    return f"{difference:+.1f} pp{mark}".replace("-", "−")
 
 
 def _note(found: Sequence[Cell]) -> str:
     """What a reader must know of the table: the paper's misprints, and which cells differ."""
     said = (
-        "Difference: ours less the paper's, in points of per cent. Intervals: two-sided, Clopper and Pearson, as for "
-        "independent triples; triples of a run share its pictures and are not."
+        "Difference: ours less the paper's, in percentage points (pp). Intervals: two-sided, Clopper and Pearson, as "
+        "for independent triples; triples of a run share its pictures and are not."
     )
     if not any(one.paper_percent is not None for one in found):
         return said
     odd = [f"{run}, {category} ({cell.valid} + {cell.invalid} ≠ {cell.total})" for (category, run), cell in _odd()]
     totals, counts = sum(c.total for c in PAPER.values()), sum(c.valid + c.invalid for c in PAPER.values())
     large = [f"{one.category}, {one.run}" for one in found if abs(one.difference_points) > LARGE_POINTS]
-    apart = f"More than {LARGE_POINTS:g} points apart: {'; '.join(large)}." if large else ""
+    apart = f"More than {LARGE_POINTS:g} percentage points apart: {'; '.join(large)}." if large else ""
     return (
         f"{said} Misprints of the paper's table: the rows {'; '.join(odd)}; its totals sum to {totals:,}, its counts "
         f"to {counts:,}. Its totals are taken. Of Pisgah Run 3's same direction it prints 99 %, its counts give 97 %. "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
@@ -19,7 +20,7 @@ from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.samples import quantile_bounds
 from reports.svg import MARKERS, SERIES, in_page_style, new_axes
-from reports.wording import number, stated
+from reports.wording import NOTHING, number, stated
 from scenarios.landing.confusion import CLASS_NAMES, CLASSES
 
 #: What is true of the ground that both pictures show, best first.
@@ -218,7 +219,15 @@ def _distance_grid(distances: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
         if values.size:
             quantiles = [number(float(one)) for one in np.quantile(values, (0.05, 0.5))]
             bound = quantile_bounds(values, 0.05, CONFIDENCE)[0]
-            rows.append([name, f"{values.size:,}", number(float(values.min())), *quantiles, number(bound)])
+            rows.append(
+                [
+                    name,
+                    f"{values.size:,}",
+                    number(float(values.min())),
+                    *quantiles,
+                    NOTHING if math.isinf(bound) else number(bound),
+                ]
+            )
     return Grid(["Distance (m)", "Cases", "Least", "5 % quantile", "Median", "5 % quantile is at least"], rows)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
@@ -10,16 +11,24 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from reports.columns import numbers, rank_correlation
+from reports.columns import numbers
 from reports.hda.rows import is_landing, varies
 from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
+from reports.statistics.drivers import FEWEST_CASES
+from reports.statistics.drivers import driver as explained
 from reports.svg import SERIES, in_page_style
-from reports.wording import number
+from reports.verdicts import terrain_groups
+from reports.wording import NOTHING, coefficient, count, number, stated
 
 #: Fewest cases with a map for the section to be shown.
 FEWEST = 8
+#: Confidence of the intervals of rank correlations.
+CONFIDENCE = 0.9
+_RANKS = (
+    f"Intervals at {stated(CONFIDENCE)} confidence; a dash for fewer than {FEWEST_CASES} maps, or where nothing varies."
+)
 #: Bins of a driver, each with as many cases as the others; fewer where cases are few.
 _BINS = 5
 _FEWEST_IN_BIN = 4
@@ -58,8 +67,8 @@ class Effect:
     ----------
     driver, error
         Their names.
-    rank_correlation
-        Spearman's.
+    rank_correlation, lower, upper
+        Spearman's, and its interval at 90 % confidence; NaN for fewer than 20 maps or a constant.
     centres, medians
         Of the bins: the driver's median and the error's.
     """
@@ -67,6 +76,8 @@ class Effect:
     driver: str
     error: str
     rank_correlation: float
+    lower: float
+    upper: float
     centres: Sequence[float]
     medians: Sequence[float]
 
@@ -86,7 +97,7 @@ def map_section(subject: Subject) -> Section | None:
     ]
     head = ["", *(error.name for error in ERRORS)]
     rows = [
-        [driver.name, *(number(one.rank_correlation) for one in effects if one.driver == driver.name)]
+        [driver.name, *(_rank_text(one) for one in effects if one.driver == driver.name)]
         for driver in DRIVERS
         if any(one.driver == driver.name for one in effects)
     ]
@@ -98,8 +109,12 @@ def map_section(subject: Subject) -> Section | None:
     )
     blocks = [
         Block(plates=[plate(map_figure(mapped, effects), "maperrors", caption, wide=True)]),
-        Block(heading=f"Errors of {len(mapped):,} maps", grid=Grid(["", "5 %", "Median", "95 %"], summary), note=note),
-        Block(heading="Rank correlations", grid=Grid(head, rows)),
+        Block(
+            heading=f"Errors of {count(len(mapped), 'map')}",
+            grid=Grid(["", "5 %", "Median", "95 %"], summary),
+            note=note,
+        ),
+        Block(heading="Rank correlations", grid=Grid(head, rows), note=_RANKS),
     ]
     data = {"maps": len(mapped), "effects": [asdict(one) for one in effects]}
     return Section("map-errors", "Map", "Errors of the elevation map", blocks, data)
@@ -119,14 +134,24 @@ def with_shares(frame: pd.DataFrame) -> pd.DataFrame:
 def analyse(mapped: pd.DataFrame) -> list[Effect]:
     """Effects of every driver that varies on every error."""
     found = []
+    groups = terrain_groups(mapped)
     for driver in DRIVERS:
         if varies(mapped, driver.column):
             x = _scaled(mapped, driver)
             for error in ERRORS:
                 y = _scaled(mapped, error)
                 centres, medians = _binned(x, y)
-                found.append(Effect(driver.name, error.name, rank_correlation(x, y), centres, medians))
+                ranks = explained(x, y, groups, CONFIDENCE)
+                of_ranks = (math.nan,) * 3 if ranks is None else (ranks.correlation, ranks.lower, ranks.upper)
+                found.append(Effect(driver.name, error.name, *of_ranks, centres, medians))
     return found
+
+
+def _rank_text(effect: Effect) -> str:
+    """A rank correlation with its interval; a dash where there is none."""
+    if math.isnan(effect.rank_correlation):
+        return NOTHING
+    return f"{coefficient(effect.rank_correlation)} ({coefficient(effect.lower)} to {coefficient(effect.upper)})"
 
 
 def _scaled(frame: pd.DataFrame, one: Driver) -> Float[np.ndarray, " n"]:

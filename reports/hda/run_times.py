@@ -11,7 +11,7 @@ from reports.columns import numbers
 from reports.hda.rows import is_landing
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
-from reports.wording import NOTHING, number
+from reports.wording import NOTHING, count, number
 
 
 @dataclass(frozen=True)
@@ -97,10 +97,10 @@ def run_times_section(subject: Subject) -> Section | None:
     rows.append(["Together", f"{paper:.2f}", f"{1e3 * ours:.1f}", NOTHING, f"{ours * factor:.2f}", NOTHING, NOTHING])
     head = ["Stage", "Paper (s)", "Here, median (ms)", "95 %", "Scaled (s)", "Paper's parameters", "Parameters here"]
     note = (
-        f"Processor time of {cases:,} cases that reached a map. The paper's is of a 400 MHz R12000. Scaled: times "
-        f"{number(factor)}, which makes the sum the paper's, as no benchmark is known of both processors: it compares "
-        "how the time is shared out, not how fast either is. Here the elevation map counts with the hazards, the scale "
-        "with the motion. Stages with exactly the paper's parameters, on an idle machine: make bench."
+        f"Processor time of {count(cases, 'case')} that reached a map. The paper's is of a 400 MHz R12000. Scaled: "
+        f"times {number(factor)}, which makes the sum the paper's, as no benchmark is known of both processors: it "
+        "compares how the time is shared out, not how fast either is. Here the elevation map counts with the hazards, "
+        "the scale with the motion. Stages with exactly the paper's parameters, on an idle machine: make bench."
     )
     data = {"factor": factor, "cases": cases, "stages": [asdict(one) for one in times]}
     return Section(

@@ -63,7 +63,7 @@
       link.textContent = one.name;
       date.className = "date";
       date.textContent = one.date;
-      about.append(...(names.size > 1 ? [word, " "] : []), link, ", ", date, one.finished ? "" : ", not finished");
+      about.append(...(names.size > 1 ? [word, " "] : []), link, ", ", date, one.algorithm ? `, ${one.algorithm}` : "", one.finished ? "" : ", not finished");
       item.append(about);
       list.append(item);
     }

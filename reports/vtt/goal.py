@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
 from reports.answers import CONFIDENCE, Share, share_of
 from reports.columns import numbers
+from reports.figures import axis_edge, note_beyond
 from reports.plates import plate
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
@@ -192,18 +193,19 @@ def losses_grid(frame: pd.DataFrame) -> Grid:
 def error_figure(frame: pd.DataFrame) -> Figure:
     """Fraction of completed runs up to each position error, a line for each camera."""
     figure, axes = new_axes(6.2, 3.3)
-    edge = 1.25 * WITHIN_M
+    errors = known(frame, "position_error_m")
+    edge = max(1.25 * WITHIN_M, axis_edge(errors, WITHIN_M))
     for place, camera in enumerate(sorted(frame["camera"].dropna().unique())):
         error = np.sort(known(frame[frame["camera"].eq(camera)], "position_error_m"))
         if error.size == 0:
             continue
-        edge = max(edge, min(float(error[-1]), 3.0 * WITHIN_M))
         share = np.arange(1, error.size + 1) / error.size
-        x, y = np.concatenate([[0.0], error, [1e3]]), np.concatenate([[0.0], share, [1.0]])
+        x, y = np.concatenate([[0.0], error, [max(edge, error[-1])]]), np.concatenate([[0.0], share, [1.0]])
         style: dict[str, Any] = {"color": SERIES[place % len(SERIES)], "linestyle": _LINES[place % len(_LINES)]}
         axes.plot(100.0 * x, y, drawstyle="steps-post", linewidth=1.8, label=f"{camera} ({error.size:,})", **style)
     axes.axvline(100.0 * WITHIN_M, color=REQUIREMENT, linewidth=1.5, linestyle="--")
     axes.set(xlim=(0.0, 102.0 * edge), ylim=(0.0, 1.03), xlabel="position error at the goal (cm)")
     axes.set_ylabel("fraction of completed runs")
+    note_beyond(axes, int((errors > edge).sum()))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
     return figure

@@ -7,10 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from algorithms.dimes import DimesOptions
 from algorithms.exchange import PREFIXES, ExecutableLimits
-from algorithms.hda import HdaOptions
-from algorithms.vtt import VttOptions
 from scenarios.conformance import estimators, inputs, parts, streams, surfaces, trackers
 from scenarios.conformance.findings import Check, Finding
 from scenarios.dotted import found_at
@@ -22,7 +19,6 @@ _INPUTS: Mapping[str, Sequence[Callable[[], object]]] = {
     "landing": [inputs.landing],
     "tracking": [trackers.mast, surfaces.texture],
 }
-_OPTIONS = {"velocity": DimesOptions, "tracking": VttOptions, "landing": HdaOptions}
 
 
 @dataclass(frozen=True)
@@ -52,7 +48,7 @@ class Subject:
         program = self.spec.startswith(tuple(PREFIXES))
 
         def make() -> Any:
-            return task.make(self.spec, _OPTIONS[self.task](), limits)
+            return task.make(self.spec, task.options(), limits)
 
         if task is TRACKING:
             return trackers.TrackerSuite(make, self.spec, program, self.limit_s).checks()

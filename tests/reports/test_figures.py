@@ -6,9 +6,10 @@ from collections.abc import Callable
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Rectangle
 
 from reports.figures import (
+    beyond_the_axis,
     error_against,
     error_distribution,
     error_histogram,
@@ -86,3 +87,54 @@ def test_hostile_texts_are_drawn_as_text(make_rows: Rows) -> None:
     assert "<script>" not in markup
     assert "&lt;script&gt;" in markup
     assert "$\\frac$" in markup
+
+
+def _with_gross_errors(frame: pd.DataFrame, gross: slice) -> pd.DataFrame:
+    """The rows with some errors a hundred times as large."""
+    parts = [METRIC, "velocity_error_x_m_s", "velocity_error_y_m_s"]
+    frame.loc[frame.index[gross], parts] *= 100.0
+    return frame
+
+
+def test_a_histogram_counts_errors_beyond_its_axis_in_a_bar_of_their_own(make_rows: Rows) -> None:
+    frame = _with_gross_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
+    figure = error_histogram(frame, METRIC, 5.0)
+    assert figure is not None
+    bars = [patch for patch in figure.axes[0].patches if isinstance(patch, Rectangle)]
+    (overflow,) = [bar for bar in bars if bar.get_hatch()]
+    assert overflow.get_height() == (frame[METRIC] > 15.0).sum() >= 4
+    # no other bar holds them: those end with the largest error on the axis
+    assert sum(bar.get_height() for bar in bars) == 60
+    largest = frame[METRIC][frame[METRIC] <= 15.0].max()
+    assert max(bar.get_x() + bar.get_width() for bar in bars if bar is not overflow) == pytest.approx(largest)
+    assert any("> 15" in text.get_text() for text in figure.axes[0].texts)
+
+
+def test_axes_follow_errors_that_are_mostly_gross(make_rows: Rows) -> None:
+    frame = _with_gross_errors(make_rows(60, answered=1.0), slice(None))
+    for draw in (error_histogram, error_distribution):
+        figure = draw(frame, METRIC, 5.0)
+        assert figure is not None
+        # at least the errors up to their 95 % quantile lie on the axis
+        assert figure.axes[0].get_xlim()[1] >= frame[METRIC].quantile(0.95)
+    distribution = error_distribution(frame, METRIC, 5.0)
+    assert distribution is not None
+    axes = distribution.axes[0]
+    x, share = axes.lines[0].get_data()
+    assert share[x <= axes.get_xlim()[1]].max() > 0.9
+    assert any("beyond" in text.get_text() for text in axes.texts)
+
+
+def test_points_beyond_the_axes_are_hollow_and_counted(make_rows: Rows) -> None:
+    frame = _with_gross_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
+    figure = error_scatter(frame, METRIC, 5.0)
+    assert figure is not None
+    hollow = [line for line in figure.axes[0].lines if line.get_markerfacecolor() == "none" and len(line.get_xdata())]
+    count = sum(len(line.get_xdata()) for line in hollow)
+    assert count >= 4
+    assert f"{count} beyond the axes" in [text.get_text() for text in figure.axes[0].get_legend().texts]
+    driven = error_against(frame, METRIC, "off_nadir_max_deg", 5.0)
+    assert driven is not None
+    hollow = [line for line in driven.axes[0].lines if line.get_markerfacecolor() == "none"]
+    drawn = sum(len(line.get_xdata()) for line in hollow)
+    assert drawn == beyond_the_axis(frame, METRIC, "off_nadir_max_deg", 5.0) == (frame[METRIC] > 15.0).sum()

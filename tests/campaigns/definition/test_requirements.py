@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -92,3 +94,13 @@ def test_a_file_that_states_no_requirements_is_refused(tmp_path: Path, text: str
 def test_a_missing_file_is_said(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="cannot be read"):
         read_requirements(tmp_path / "none.toml")
+
+
+def test_texts_of_requirements_name_no_algorithm() -> None:
+    # the algorithm that is judged is the user's choice: the reports name it
+    named = re.compile(r"\b(DIMES|VTT|HDA|NCC)\b(?! paper)")
+    for name, path in catalogue().items():
+        campaign = tomllib.loads(path.read_text(encoding="utf-8"))
+        texts = [campaign["description"], *(one.get("statement", "") for one in campaign.get("requirements", ()))]
+        assert not [text for text in texts if named.search(text)], name
+    assert not [one.statement for one in shipped_requirements().values() if named.search(one.statement)]

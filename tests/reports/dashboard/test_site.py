@@ -160,8 +160,8 @@ def test_sparkline_draws_better_higher() -> None:
 
 
 def test_margin_in_words() -> None:
-    assert margin_text(_shown(0.9)) == "−5.00 %"  # noqa: RUF100
-    assert margin_text(_shown(0.9, margin=0.0123)) == "+1.23 %"
+    assert margin_text(_shown(0.9)) == "−5.00 pp"
+    assert margin_text(_shown(0.9, margin=0.0123)) == "+1.23 pp"
     assert margin_text(_shown(0.9, margin=float("nan"))) == "–"
 
 

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from campaigns.definition.configuration import CampaignConfiguration, problems_of
-from campaigns.definition.identity import _foreign_sources, chosen_parts
+from campaigns.definition.identity import chosen_parts, foreign_sources
 from scenarios.descent import DescentScenarioParameters
 from scenarios.parts import named
 from scenarios.parts.motions import OwnMotion
@@ -168,4 +168,4 @@ def test_the_identity_covers_the_modules_of_parts() -> None:
         "other:Falling",
         "own_parts:PulsedLidar",
     )
-    assert list(_foreign_sources("own_parts:Glider")) == [("own_parts.py", EXAMPLES / "own_parts.py")]
+    assert list(foreign_sources("own_parts:Glider")) == [("own_parts.py", EXAMPLES / "own_parts.py")]
