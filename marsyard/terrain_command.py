@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -63,49 +64,62 @@ def stats(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    max_holes: Annotated[
+        float | None,
+        typer.Option(
+            "--max-holes", metavar="F", min=0.0, max=0.99, help="Of a DTM: fraction of posts without height allowed."
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", metavar="PNG", help="Write a picture from above; filled holes are red.")
+    ] = None,
 ) -> None:
     """Print albedo, slopes, relief and image contrast of a site's terrain beside the paper's figures."""
     import json
 
     import numpy as np
 
+    from marsyard.terrain_picture import write_terrain_picture
+    from scenarios.imported_site import MAX_HOLE_FRACTION, site_or_file
+    from scenarios.terrain_files import grid_north_deg
     from sim.terrain.embedding import embed
     from sim.terrain.sites import PAPER
     from sim.terrain.statistics import terrain_statistics
     from sim.terrain.synthesis import synthesise
 
     try:
-        parameters = _terrain(site, scale)
+        known = site_or_file(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)
+        parameters = known.terrain(scale)
         source = parameters.source
-        extent = None if source is None else embed(source, parameters.samples, parameters.spacing_m).extent
+        real = None if source is None else embed(source, parameters.samples, parameters.spacing_m)
+        grid_north = None if source is None else grid_north_deg(source.dtm)
         surface = synthesise(parameters, np.random.default_rng(seed))
+        if picture is not None:
+            write_terrain_picture(picture, surface, real)
     except ValueError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(WRONG) from None
-    area = None if extent is None else (extent.west_m, extent.south_m, extent.east_m, extent.north_m)
-    measured = terrain_statistics(surface, area)
+    measured = terrain_statistics(surface, None if real is None else real.real_samples(parameters.samples))
+    extent = None if real is None else real.extent
     if as_json:
-        typer.echo(json.dumps(_record(site, parameters, seed, measured, PAPER.get(site), extent), indent=2))
+        record = _record(site, parameters, seed, measured, PAPER.get(site), extent)
+        typer.echo(json.dumps({**record, "grid_north_deg": grid_north}, indent=2))
     else:
         _print(site, parameters, seed, measured, PAPER.get(site), extent)
+        if grid_north is not None:
+            _print_grid_north(grid_north)
 
 
-def _terrain(site: str, scale: str | None) -> TerrainParameters:
-    """Parameters of a site's terrain, or of one around a file. Raises ValueError."""
-    from pathlib import Path
+def _print_grid_north(grid_north_deg: float) -> None:
+    """State from which north azimuths count."""
+    from rich.console import Console
 
-    from scenarios.terrain_files import check_source
-    from sim.terrain.embedding import grid_for
-    from sim.terrain.imported import RealTerrain
-    from sim.terrain.parameters import TerrainParameters
-    from sim.terrain.sites import site as preset
-
-    if Path(site).suffix.lower() in (".npz", ".tif", ".tiff"):
-        source = RealTerrain(dtm=Path(site))
-        check_source(source)
-        samples, spacing_m = grid_for(source)
-        return TerrainParameters(samples=samples, spacing_m=spacing_m, craters_per_km2=0.0, source=source)
-    return preset(site).terrain(scale)
+    side, sign = ("east", "-") if grid_north_deg >= 0.0 else ("west", "+")
+    away = f"{abs(grid_north_deg):.2f} deg"
+    Console().print(
+        f"Grid north (the y axis) points {away} {side} of true north in the middle of the file. All azimuths, the "
+        f"sun's too, count from grid north: azimuth from grid north = azimuth from true north {sign} {away}."
+    )
 
 
 def _record(
@@ -165,7 +179,7 @@ def _print(
     table.add_row("mean slope over 30 m, deg", _number(measured.mean_slope_30_m_deg, 2), slope)
     table.add_row("mean slope over 90 m, deg", _number(measured.mean_slope_90_m_deg, 2), slope)
     relief = "" if paper is None or paper.relief_m is None else f"more than {paper.relief_m[0]:.0f}"
-    table.add_row("relief, m", f"{measured.relief_m:.{0 if measured.relief_m >= 10.0 else 2}f}", relief)
+    table.add_row("relief, m", f"{measured.relief_m:.{1 if measured.relief_m >= 10.0 else 2}f}", relief)
     table.add_row("image contrast, RMS / mean", f"{measured.contrast:.3f}", "" if paper is None else paper.contrast)
     console = Console()
     console.print(f"{site}: {side:g} m x {side:g} m, samples {parameters.spacing_m:g} m apart, seed {seed}")
@@ -179,8 +193,8 @@ def _print(
         console.print(
             f"Real from east {extent.west_m:g} to {extent.east_m:g} m and north {extent.south_m:g} to "
             f"{extent.north_m:g} m, posts {extent.posting_m:g} m apart, synthetic around it; the figures are those of "
-            f"the real part. Filled: {extent.holes} posts without height, {extent.ortho_holes} pixels without "
-            "brightness."
+            f"the real part, without holes. Filled: {extent.holes} posts without height ({extent.hole_fraction:.1%}), "
+            f"{extent.ortho_holes} pixels without brightness."
         )
 
 

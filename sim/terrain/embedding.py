@@ -32,6 +32,8 @@ class RealExtent:
         Distance between the DTM's posts.
     holes, ortho_holes
         Posts without a height, and pixels without a brightness; they are filled from around.
+    hole_fraction
+        Posts without a height over all posts of the DTM.
     """
 
     west_m: float
@@ -41,6 +43,7 @@ class RealExtent:
     posting_m: float
     holes: int
     ortho_holes: int
+    hole_fraction: float
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,8 @@ class Embedded:
         Natural logarithm of brightness over its mean, or None.
     weight
         1 inside, falling to 0 at the border.
+    real
+        Whether the DTM has a height at the post next to each sample; elsewhere a hole is filled.
     extent
         Where that is.
     """
@@ -66,7 +71,20 @@ class Embedded:
     height: Float32[np.ndarray, "rows columns"]
     tone: Float32[np.ndarray, "rows columns"] | None
     weight: Float32[np.ndarray, "rows columns"]
+    real: Bool[np.ndarray, "rows columns"]
     extent: RealExtent
+
+    def real_samples(self, side: int) -> Bool[np.ndarray, "side side"]:
+        """Which samples of the whole terrain lie on posts with a height: what its statistics are computed from."""
+        samples = np.zeros((side, side), dtype=np.bool_)
+        samples[self.rows, self.columns] = self.real
+        return samples
+
+    def filled_samples(self, side: int) -> Bool[np.ndarray, "side side"]:
+        """Which samples of the whole terrain lie in a hole of the DTM, which is filled."""
+        samples = np.zeros((side, side), dtype=np.bool_)
+        samples[self.rows, self.columns] = ~self.real
+        return samples
 
 
 def embed(source: RealTerrain, side: int, spacing_m: float) -> Embedded:
@@ -101,8 +119,15 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> Embedded:
     tone, ortho_holes = None, 0
     if ortho is not None:
         tone, ortho_holes = _tone(source, raster, ortho, x - west, y - south)
-    extent = RealExtent(west, south, west + width, south + length, raster.posting_m, holes, ortho_holes)
-    return Embedded(slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), control, tone, weight, extent)
+    extent = RealExtent(
+        west, south, west + width, south + length, raster.posting_m, holes, ortho_holes, holes / heights.size
+    )
+    rows_of, columns_of = (
+        np.clip(np.rint(along / raster.posting_m).astype(int), 0, count - 1)
+        for along, count in ((y - south, rows), (x - west, columns))
+    )
+    real = np.isfinite(raster.values)[np.ix_(rows_of, columns_of)]
+    return Embedded(slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), control, tone, weight, real, extent)
 
 
 def _tone(

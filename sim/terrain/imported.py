@@ -21,7 +21,10 @@ class RealTerrain(BaseModel):
 
     The file is a GeoTIFF (rows from north to south, projected, metres; needs the extra `geo`) or an ``.npz`` with
     ``dem`` (heights, m, row 0 in the north) and ``dem_gsd`` (m), and optionally ``ortho``, ``ortho_gsd`` and
-    ``ortho_valid``. Its middle lies at the middle of the periodic terrain.
+    ``ortho_valid``. Its middle lies at the middle of the periodic terrain, whose y axis is the grid's north: azimuths,
+    the sun's too, count from there, which is not true north off a projection's central meridian.
+
+    Posts without height are filled smoothly, up to `max_hole_fraction` of them; ground that is filled is not real.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -36,6 +39,10 @@ class RealTerrain(BaseModel):
     border_m: Annotated[
         float, Field(gt=0.0, description="width of the seam within the DTM over which it blends into its surround, m")
     ] = 20.0
+    max_hole_fraction: Annotated[
+        float,
+        Field(ge=0.0, lt=1.0, description="fraction of the DTM's posts without height above which it is refused"),
+    ] = 0.05
     roughen: Annotated[
         bool, Field(description="add the fractal ground's detail finer than twice the DTM's posting")
     ] = True
@@ -73,13 +80,25 @@ def read_rasters(source: RealTerrain) -> tuple[Raster, Raster | None]:
         if not source.ortho.exists():
             raise TerrainFileError(f"ortho image {source.ortho} does not exist")
         ortho = _read_geotiff(source.ortho)
-    if np.isnan(heights.values).all():
-        raise TerrainFileError(f"{source.dtm} has no valid height at all")
+    check_holes(source, heights.values)
     return heights, ortho if source.use_ortho else None
 
 
+def check_holes(source: RealTerrain, heights: Float64[np.ndarray, "rows columns"]) -> None:
+    """Raises TerrainFileError where more heights are missing (not finite) than the source allows."""
+    fraction = float(np.mean(~np.isfinite(heights)))
+    if fraction == 1.0:
+        raise TerrainFileError(f"{source.dtm}: has no valid height at all")
+    if fraction > source.max_hole_fraction:
+        raise TerrainFileError(
+            f"{source.dtm}: {fraction:.1%} of its posts have no height; allowed: up to {source.max_hole_fraction:.1%}. "
+            "Cut out a part without holes (rio clip --bounds), or allow them to be filled smoothly by "
+            "max_hole_fraction (marsyard terrain stats and render: --max-holes)"
+        )
+
+
 def _read_npz(path: Path) -> tuple[Raster, Raster | None]:
-    with np.load(path) as file:
+    with np.load(path, allow_pickle=False) as file:
         missing = [key for key in ("dem", "dem_gsd") if key not in file]
         if missing:
             raise TerrainFileError(
@@ -114,7 +133,7 @@ def _read_geotiff(path: Path) -> Raster:
         values = file.read(1, masked=True).astype(np.float64).filled(np.nan)
         transform, crs = file.transform, file.crs
     if crs is not None and crs.is_geographic:
-        raise TerrainFileError(f"{path} is in degrees ({crs}); project it to metres first, for example with gdalwarp")
+        raise TerrainFileError(f"{path} is in degrees ({crs}); project it to metres first, with rio warp --dst-crs")
     if transform.b or transform.d or abs(transform.a + transform.e) > 1e-6 * abs(transform.a):
         raise TerrainFileError(f"{path} has rotated or oblong cells; square cells, north up, are needed")
     factor = 1.0 if crs is None else float(crs.linear_units_factor[1])

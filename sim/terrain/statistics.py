@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float32, Float64
+from scipy.ndimage import correlate1d
 
 from sim.terrain.surface import ALBEDO, HEIGHT, Surface
 
@@ -42,65 +43,89 @@ class TerrainStatistics:
     contrast: float
 
 
-#: West, south, east and north borders of a part of a terrain, metres.
-Area = tuple[float, float, float, float]
+#: Which samples of a terrain figures are computed from; None for all.
+Samples = Bool[np.ndarray, "side side"]
+#: A cubic B-spline at its knots, from the control values around.
+_AT_KNOTS = np.array([1.0, 4.0, 1.0]) / 6.0
 
 
-def terrain_statistics(surface: Surface, area: Area | None = None) -> TerrainStatistics:
-    """All figures of a terrain, or of a part of it; a slope is NaN where that is too small for its baseline."""
-    base = _part(surface.levels[0], surface.spacing_m, area)
+def terrain_statistics(surface: Surface, samples: Samples | None = None) -> TerrainStatistics:
+    """All figures of a terrain, or of some of its samples; a slope is NaN where they are too few for its baseline."""
+    heights, chosen = _heights(surface), samples if samples is not None else np.s_[:]
     return TerrainStatistics(
-        albedo=float(base[..., ALBEDO].mean(dtype=np.float64)),
-        mean_slope_30_m_deg=mean_slope_deg(surface, 30.0, area),
-        mean_slope_90_m_deg=mean_slope_deg(surface, 90.0, area),
-        relief_m=float(np.ptp(base[..., HEIGHT])),
-        contrast=image_contrast(surface, CONTRAST_PIXEL_M, area),
+        albedo=float(surface.levels[0][..., ALBEDO][chosen].mean(dtype=np.float64)),
+        mean_slope_30_m_deg=_slope_deg(heights, surface.spacing_m, 30.0, samples),
+        mean_slope_90_m_deg=_slope_deg(heights, surface.spacing_m, 90.0, samples),
+        relief_m=float(np.ptp(heights[chosen])),
+        contrast=image_contrast(surface, CONTRAST_PIXEL_M, samples),
     )
 
 
-def mean_slope_deg(surface: Surface, baseline_m: float, area: Area | None = None) -> float:
+def _heights(surface: Surface) -> Float32[np.ndarray, "side side"]:
+    """Heights of the surface at its samples, metres: the spline's values, not its control values."""
+    heights = surface.levels[0][..., HEIGHT]
+    for axis in (0, 1):
+        heights = correlate1d(heights, _AT_KNOTS, axis=axis, mode="wrap")
+    return np.asarray(heights, dtype=np.float32)
+
+
+def mean_slope_deg(surface: Surface, baseline_m: float, samples: Samples | None = None) -> float:
     """Mean absolute slope along lines to the east and to the north over a baseline, degrees.
 
     The slope from a terrain model's posts a baseline apart, ``atan(|z(x + L) - z(x)| / L)``: the bidirectional slope of
     the MER landing site studies (Golombek et al. 2003; Kirk et al. 2003). The slope of a plane's steepest
-    descent is larger, on average by a factor of pi / 2 for small slopes in random directions. NaN where the terrain
-    is not twice as wide as the baseline.
+    descent is larger, on average by a factor of pi / 2 for small slopes in random directions. NaN where the terrain,
+    or the part of it that holds the samples, is not twice as wide as the baseline. Of some samples, the lines
+    begin and end at one of them.
     """
+    return _slope_deg(_heights(surface), surface.spacing_m, baseline_m, samples)
+
+
+def _slope_deg(
+    heights: Float32[np.ndarray, "side side"], spacing_m: float, baseline_m: float, samples: Samples | None
+) -> float:
     step = 1
-    while surface.spacing_m * 2 * step <= baseline_m / 8.0:
+    while spacing_m * 2 * step <= baseline_m / 8.0:
         step *= 2
-    spacing = surface.spacing_m * step
-    z = _part(surface.levels[0][::step, ::step, HEIGHT], spacing, area)
-    lag = round(baseline_m / spacing)
+    z, chosen = heights[::step, ::step], None if samples is None else samples[::step, ::step]
+    if chosen is not None:
+        part = _around(chosen)
+        z, chosen = z[part], chosen[part]
+    lag = round(baseline_m / (spacing_m * step))
     if lag < 1 or 2 * lag > min(z.shape):
         return float("nan")
-    if area is None:
+    if chosen is None:
         rises = [np.roll(z, -lag, axis=axis) - z for axis in (0, 1)]
     else:
-        rises = [z[lag:] - z[:-lag], z[:, lag:] - z[:, :-lag]]
-    slopes = [np.degrees(np.arctan(np.abs(rise) / (lag * spacing))).mean(dtype=np.float64) for rise in rises]
-    return float(np.mean(slopes))
+        rises = [
+            (z[lag:] - z[:-lag])[chosen[lag:] & chosen[:-lag]],
+            (z[:, lag:] - z[:, :-lag])[chosen[:, lag:] & chosen[:, :-lag]],
+        ]
+    if not all(rise.size for rise in rises):
+        return float("nan")
+    length = lag * spacing_m * step
+    return float(np.mean([np.degrees(np.arctan(np.abs(rise) / length)).mean(dtype=np.float64) for rise in rises]))
 
 
-def _part(values: np.ndarray, spacing_m: float, area: Area | None) -> np.ndarray:
-    """The samples within an area, rows and columns first."""
-    if area is None:
-        return values
-    west, south, east, north = (border / spacing_m for border in area)
-    return values[int(np.ceil(south)) : int(north) + 1, int(np.ceil(west)) : int(east) + 1]
+def _around(chosen: Samples) -> tuple[slice, slice]:
+    """The smallest part of a grid that holds all chosen samples."""
+    along = [np.flatnonzero(chosen.any(axis=axis)) for axis in (1, 0)]
+    rows, columns = (slice(int(some[0]), int(some[-1]) + 1) if some.size else slice(0) for some in along)
+    return rows, columns
 
 
-def image_contrast(surface: Surface, pixel_m: float, area: Area | None = None) -> float:
-    """RMS over mean of the brightness seen from straight above, over the whole terrain or a part of it.
+def image_contrast(surface: Surface, pixel_m: float, samples: Samples | None = None) -> float:
+    """RMS over mean of the brightness seen from straight above, over the whole terrain or some of its samples.
 
     Each pixel takes slope and albedo of the pyramid's level whose samples are about as far apart as pixels. The
     brightness is Lunar-Lambert's under the sun 45 deg high in the west and an even sky; shadows and
-    detector are left out.
+    detector are left out. NaN where no sample falls on a pixel.
     """
     level = min(max(round(np.log2(pixel_m / surface.spacing_m)), 0), len(surface.levels) - 1)
-    picture = nadir_picture(surface, level, np.radians(270.0), np.radians(CONTRAST_SUN_ELEVATION_DEG))
-    seen = _part(picture, surface.spacing_m * 2.0**level, area)
-    return float(seen.std() / seen.mean())
+    seen = nadir_picture(surface, level, np.radians(270.0), np.radians(CONTRAST_SUN_ELEVATION_DEG)).reshape(-1)
+    if samples is not None:
+        seen = seen[samples[:: 2**level, :: 2**level].reshape(-1)]
+    return float(seen.std() / seen.mean()) if seen.size else float("nan")
 
 
 def nadir_picture(

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -51,6 +52,28 @@ def test_stats_of_a_file_say_what_is_real_and_what_was_filled(tile: str) -> None
     assert "mean slope over 30 m, deg" in said
     assert "synthetic around it" in said
     assert json.loads(invoke("stats", tile, "--json")[1])["real"]["posting_m"] == 2.0
+
+
+def test_holes_are_refused_or_counted_and_shown(tmp_path: Path) -> None:
+    """A tile half of which has no height, as reprojection leaves it."""
+    path, picture = tmp_path / "half.npz", tmp_path / "half.png"
+    heights = np.add.outer(np.sin(np.arange(64) / 5.0), np.cos(np.arange(64) / 6.0))
+    heights[:, :31] = np.nan
+    np.savez(path, dem=heights, dem_gsd=2.0)
+    status, printed = invoke("stats", str(path))
+    assert status == 2
+    assert "48.4% of its posts have no height; allowed: up to 5.0%" in printed
+    status, printed = invoke("stats", str(path), "--max-holes", "0.5", "--picture", str(picture))
+    assert status == 0, printed
+    assert "1984 posts without height (48.4%)" in " ".join(printed.split())
+    shown = cv2.imread(str(picture))
+    assert shown is not None
+    red = (shown[..., 2].astype(int) - shown[..., 1]) > 40
+    # 128 samples a side; a line of the outline covers some
+    assert red.sum() == pytest.approx(31 * 64, rel=0.1)
+    west = np.flatnonzero(red.any(axis=0))
+    assert west[0] == pytest.approx(32, abs=1)
+    assert invoke("stats", str(path), "--max-holes", "0.5", "--picture", str(picture))[0] == 2
 
 
 @pytest.mark.parametrize(

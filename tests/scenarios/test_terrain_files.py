@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import math
+import os
 import warnings
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,10 +17,11 @@ import rasterio
 from pydantic import ValidationError
 from rasterio.crs import CRS
 from rasterio.transform import Affine
+from rasterio.warp import transform
 
 from campaigns.definition.loading import load_campaign
 from scenarios.descent import DescentScenarioParameters
-from scenarios.terrain_files import check_source
+from scenarios.terrain_files import check_source, grid_north_deg
 from sim.terrain.imported import RealTerrain, TerrainFileError
 
 #: Mars, equidistant cylindrical about the equator, in metres (IAU 2000 sphere).
@@ -72,7 +77,7 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"crs": CRS.from_string("+proj=geocent +R=3396190 +units=m +no_defs")}, "coordinates are no map projection's"),
     (
         {"crs": CRS.from_epsg(3857), "transform": Affine(1.0, 0.0, 1_000_000.0, 0.0, -1.0, 8_399_738.0)},
-        r"stretches lengths by 2\.000 to the east",
+        r"stretches lengths by 2\.000 to 2\.000",
     ),
     ({"transform": Affine(1.0, 0.1, 0.0, -0.1, -1.0, 0.0)}, "rotated or oblong cells"),
     ({"transform": Affine(1.0, 0.0, 0.0, 0.0, -2.0, 0.0)}, "rotated or oblong cells"),
@@ -92,10 +97,109 @@ def test_faults_are_named(tmp_path: Path, changes: dict[str, Any], fault: str) -
     assert "dtm.tif" in str(raised.value)
 
 
+MOON, MARS_ELLIPSOID = "+R=1737400", "+a=3396190 +b=3376200"
+#: Projection, and where a file lies in it: longitude, latitude, and grid convergence there (degrees, Snyder 1987:
+#: equations 8-9 for transverse Mercator, (lon - lon_0) times the cone's constant n for polar and conic projections).
+CONFORMAL: list[tuple[str, float, float, float]] = [
+    *[("+proj=stere +lat_0=90 +lon_0=0 +k=1", lon, 85.0, lon) for lon in (0.0, 45.0, 90.0, 177.0, -120.0)],
+    *[("+proj=stere +lat_0=-90 +lon_0=0 +k=1", lon, -85.0, -lon) for lon in (0.0, 45.0, 90.0, 177.0, -120.0)],
+    # one standard parallel: n = sin 45 deg
+    *[("+proj=lcc +lat_1=45 +lat_0=45 +lon_0=10", lon, 45.0, (lon - 10.0) * 0.5**0.5) for lon in (-50.0, 10.0, 80.0)],
+    *[
+        (
+            "+proj=tmerc +lat_0=0 +lon_0=137 +k=0.9996",
+            137.0 + off,
+            60.0,
+            math.degrees(math.atan(math.tan(math.radians(off)) * math.sin(math.radians(60.0)))),
+        )
+        for off in (-5.0, 0.0, 5.0)
+    ],
+]
+
+
+@pytest.mark.parametrize("body", [MOON, MARS_ELLIPSOID], ids=["moon", "mars"])
+@pytest.mark.parametrize(("projection", "lon", "lat", "convergence"), CONFORMAL)
+def test_conformal_maps_pass_off_their_central_meridian(
+    tmp_path: Path, projection: str, lon: float, lat: float, convergence: float, body: str
+) -> None:
+    crs = CRS.from_string(f"{projection} {body} +units=m")
+    (x,), (y,) = transform(CRS.from_string(f"+proj=longlat {body} +no_defs"), crs, [lon], [lat])
+    path = tif(tmp_path, crs=crs, transform=Affine(2.0, 0.0, x - 40.0, 0.0, -2.0, y + 50.0))
+    check_source(RealTerrain(dtm=path))
+    # the formulas are the sphere's; Mars' flattening turns north by thousandths of a degree
+    assert grid_north_deg(path) == pytest.approx(convergence, abs=0.01)
+
+
+def test_a_map_of_the_pole_itself_passes_and_has_no_true_north(tmp_path: Path) -> None:
+    crs = CRS.from_string(f"+proj=stere +lat_0=-90 +lon_0=0 +k=1 {MOON} +units=m")
+    path = tif(tmp_path, crs=crs, transform=Affine(5.0, 0.0, -100.0, 0.0, -5.0, 125.0))
+    check_source(RealTerrain(dtm=path))
+    assert grid_north_deg(path) is None
+
+
+def test_a_sheared_map_is_refused(tmp_path: Path) -> None:
+    """Sinusoidal 10 deg off its meridian at 60 deg: lengths along x and areas are true, but x and y are not at right angles."""
+    crs = CRS.from_string(f"+proj=sinu +lon_0=0 {MOON} +units=m")
+    (x,), (y,) = transform(CRS.from_string(f"+proj=longlat {MOON} +no_defs"), crs, [10.0], [60.0])
+    path = tif(tmp_path, crs=crs, transform=Affine(2.0, 0.0, x - 40.0, 0.0, -2.0, y + 50.0))
+    # a shear by s = lon sin(lat) = 0.1511, whose singular values are (sqrt(4 + s**2) -+ s) / 2
+    with pytest.raises(TerrainFileError, match=r"stretches lengths by 0\.927 to 1\.078"):
+        check_source(RealTerrain(dtm=path))
+
+
+def npz(folder: Path, **arrays: Any) -> Path:
+    path = folder / "dtm.npz"
+    np.savez_compressed(path, **{"dem": np.zeros((20, 30)), "dem_gsd": 1.0} | arrays)
+    return path
+
+
+NPZ_FAULTS: list[tuple[dict[str, Any], str]] = [
+    ({"dem": np.full((20, 30), np.nan)}, "has no valid height at all"),
+    ({"dem": np.full((20, 30), "high")}, "dem holds values of type <U4; allowed: real numbers"),
+    ({"dem": np.zeros((20, 30), dtype=complex)}, "dem holds values of type complex128"),
+    ({"dem": np.zeros((20, 30, 3))}, r"dem has a grid of shape \(20, 30, 3\); two dimensions"),
+    ({"dem": np.full((20, 30), 1e300)}, r"holds heights of 1e\+300 m"),
+    ({"dem": np.where(np.eye(20, 30) > 0, -32767.0, 5.0)}, "holds heights of -32767 m"),
+    ({"dem": np.array([[{}] * 30] * 20, dtype=object)}, "dem holds values of type object"),
+    ({"dem_gsd": np.array("one")}, "dem_gsd holds values of type <U3"),
+    ({"dem_gsd": np.array([1.0, 1.0])}, r"dem_gsd has the shape \(2,\); one number is needed"),
+    ({"dem_gsd": -1.0}, "dem_gsd is -1.0; allowed: metres between posts, above 0"),
+    ({"ortho": np.zeros((20, 30))}, "has an ortho, but lacks ortho_gsd"),
+    ({"ortho": np.zeros((20, 30)), "ortho_gsd": np.nan}, "ortho_gsd is nan"),
+    ({"ortho": np.ones((20, 30)), "ortho_gsd": 1.0, "ortho_valid": np.ones((4, 4), dtype=bool)}, "another shape"),
+]
+
+
+@pytest.mark.parametrize(("arrays", "fault"), NPZ_FAULTS, ids=[fault for _, fault in NPZ_FAULTS])
+def test_archives_get_the_checks_of_geotiffs(tmp_path: Path, arrays: dict[str, Any], fault: str) -> None:
+    with pytest.raises(TerrainFileError, match=fault) as raised:
+        check_source(RealTerrain(dtm=npz(tmp_path, **arrays)))
+    assert "dtm.npz" in str(raised.value)
+
+
+def test_an_archive_that_expands_to_gigabytes_is_refused_by_its_headers(tmp_path: Path) -> None:
+    """20000 x 20000 zeros, 3.2 GB, of which the archive holds the header alone."""
+    path = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, shape in (("dem", (20000, 20000)), ("dem_gsd", ())):
+            header = io.BytesIO()
+            np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
+            archive.writestr(f"{name}.npy", header.getvalue() + np.ones(1).tobytes())
+    with pytest.raises(TerrainFileError, match=r"dem has a grid of shape \(20000, 20000\)"):
+        check_source(RealTerrain(dtm=path))
+
+
+@pytest.mark.parametrize("name", ["pipe.tif", "pipe.npz"])
+def test_a_named_pipe_is_refused_at_once(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(TerrainFileError, match=f"{name}: is a named pipe; a regular file is needed"):
+        check_source(RealTerrain(dtm=tmp_path / name))
+
+
 def test_missing_nodata_is_told_by_impossible_heights(tmp_path: Path) -> None:
     values = np.full((50, 40), -4450.0, dtype=np.float32)
     values[10, 10] = -32767.0
-    with pytest.raises(TerrainFileError, match=r"holds heights of -32767 m and states no nodata value"):
+    with pytest.raises(TerrainFileError, match=r"holds heights of -32767 m; .*it states no nodata value"):
         check_source(RealTerrain(dtm=tif(tmp_path, values=values, nodata=None)))
     check_source(RealTerrain(dtm=tif(tmp_path, "stated.tif", values=values)))
 

@@ -9,6 +9,7 @@ import pytest
 from sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
 from sim.terrain.embedding import embed, grid_for
 from sim.terrain.imported import RealTerrain, TerrainFileError, filled, read_rasters
+from sim.terrain.statistics import terrain_statistics
 
 ROWS, COLUMNS = 90, 110
 
@@ -185,3 +186,34 @@ def test_reads_geotiff_in_its_own_units_with_holes(tmp_path: Path) -> None:
         file.crs = "EPSG:4326"
     with pytest.raises(TerrainFileError, match="in degrees"):
         read_rasters(RealTerrain(dtm=path))
+
+
+def test_statistics_are_those_of_posts_with_heights(tmp_path: Path) -> None:
+    """Half a tile of ridges is missing: its slopes and relief are those of the other half, not of the filled ground."""
+    x, y = np.meshgrid(np.arange(160.0), np.arange(140.0))
+    heights = 3.0 * np.sin(x / 9.0) + 2.0 * np.cos(y / 7.0)
+    heights[:, 80:] = np.nan
+    path = tmp_path / "half.npz"
+    np.savez(path, dem=heights, dem_gsd=1.0)
+    source = RealTerrain(dtm=path, border_m=2.0, roughen=False, max_hole_fraction=0.6)
+    real = embed(source, 256, 1.0)
+    assert real.extent.hole_fraction == pytest.approx(0.5)
+    assert real.real_samples(256).sum() == np.isfinite(heights).sum()
+    assert real.filled_samples(256).sum() == np.isnan(heights).sum()
+    measured = terrain_statistics(made(around(source)), real.real_samples(256))
+    whole = heights[:, :80]
+    rises = (whole[30:] - whole[:-30], whole[:, 30:] - whole[:, :-30])
+    expected = np.mean([np.degrees(np.arctan(np.abs(rise) / 30.0)).mean() for rise in rises])
+    # the outermost 2 m blend into the surround
+    assert measured.mean_slope_30_m_deg == pytest.approx(expected, rel=0.02)
+    assert measured.relief_m == pytest.approx(float(np.ptp(whole)), rel=0.02)
+
+
+def test_a_file_with_many_holes_is_refused_unless_they_are_allowed(tmp_path: Path) -> None:
+    heights = dem()
+    heights[:, :9] = np.nan  # 8.2 % of 110 columns
+    path = tmp_path / "holes.npz"
+    np.savez(path, dem=heights, dem_gsd=1.0)
+    with pytest.raises(TerrainFileError, match=r"holes.npz: 8.2% of its posts have no height; allowed: up to 5.0%"):
+        embed(RealTerrain(dtm=path), 256, 1.0)
+    assert embed(RealTerrain(dtm=path, max_hole_fraction=0.1), 256, 1.0).extent.holes == 9 * ROWS

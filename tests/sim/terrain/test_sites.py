@@ -107,7 +107,9 @@ def test_mean_slope_of_a_plane_wave_and_of_a_part() -> None:
     steepest = 10.0 * 2 * 2 * np.pi / 512
     assert mean_slope_deg(surface, 16.0) == pytest.approx(np.degrees(steepest * 2 / np.pi) / 2, rel=0.02)
     # around the crossing at x = 256 m the slope is the steepest all along
-    part = mean_slope_deg(surface, 4.0, (246.0, 0.0, 266.0, 500.0))
+    part_of = np.zeros((side, side), dtype=np.bool_)
+    part_of[:251, 123:134] = True
+    part = mean_slope_deg(surface, 4.0, part_of)
     assert part == pytest.approx(np.degrees(np.arctan(steepest)) / 2, rel=0.02)
     assert np.isnan(mean_slope_deg(surface, 300.0))
 
@@ -195,3 +197,15 @@ def test_the_suns_disc_shrinks_with_distance() -> None:
     # 0.0093 rad across at 1 AU, 0.35 deg at Mars' mean distance
     assert site("kelso").environment.sun_radius_rad == pytest.approx(0.00465)
     assert np.degrees(2.0 * site("gusev").environment.sun_radius_rad) == pytest.approx(0.35, abs=0.01)
+
+
+def test_relief_is_that_of_the_surface_not_of_its_control_values() -> None:
+    """A chequerboard of control values of +1 and -1 m is a surface of +1/9 and -1/9 m at the knots: (4 - 2)**2 / 36."""
+    samples = np.full((32, 32, 2), 0.2, dtype=np.float32)
+    rows, columns = np.indices((32, 32))
+    samples[..., 0] = np.where((rows + columns) % 2 == 0, 1.0, -1.0)
+    surface = Surface.from_samples(samples, 2.0)
+    relief = terrain_statistics(surface).relief_m
+    assert relief == pytest.approx(2.0 / 9.0, rel=1e-5)
+    knots = surface.height(2.0 * columns, 2.0 * rows)
+    assert relief == pytest.approx(float(np.ptp(knots)), rel=1e-5)

@@ -1,0 +1,60 @@
+"""A user's terrain model as a site: its ground in a synthetic surround, in the light of a preset."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+from scenarios.terrain_files import check_source
+from sim.terrain import Site, TerrainParameters, site
+from sim.terrain.embedding import grid_for
+from sim.terrain.imported import RealTerrain
+
+#: Endings of terrain models.
+ENDINGS = (".npz", ".tif", ".tiff")
+#: Whose light, air, scattering and fine texture imported ground has.
+LIGHT_OF = "gusev"
+#: Fraction of posts without height up to which a terrain model is used, unless stated.
+MAX_HOLE_FRACTION = float(RealTerrain.model_fields["max_hole_fraction"].default)
+
+
+def is_terrain_file(name: str) -> bool:
+    """Whether a name is that of a terrain model's file, not of a site."""
+    return Path(name).suffix.lower() in ENDINGS
+
+
+def site_or_file(name: str, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Site:
+    """A preset by its name, or the site of a terrain model's file.
+
+    Raises
+    ------
+    ValueError
+        Where no site has the name, or the file cannot be used.
+    """
+    return imported_site(Path(name), max_hole_fraction) if is_terrain_file(name) else site(name)
+
+
+def imported_site(path: Path, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Site:
+    """A terrain model's file as a site, the same terrain at both scales, without rocks or craters of its own.
+
+    Raises
+    ------
+    TerrainFileError
+        Where the file cannot be used.
+    """
+    source = RealTerrain(dtm=path, max_hole_fraction=max_hole_fraction)
+    check_source(source)
+    return _imported(source, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _imported(source: RealTerrain, _changed_ns: int) -> Site:
+    samples, spacing_m = grid_for(source)
+    terrain = TerrainParameters(samples=samples, spacing_m=spacing_m, craters_per_km2=0.0, source=source)
+    described = {
+        "name": source.dtm.name,
+        "description": f"terrain model {source.dtm} in the light of {LIGHT_OF}",
+        "descent": terrain,
+        "ground": terrain,
+    }
+    return site(LIGHT_OF).model_copy(update=described)
