@@ -36,20 +36,29 @@ def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict
     The site is where the coordinates that were handed over lead a helicopter whose navigation is off as it was at the
     first picture. Nothing but SAFE_SITE reports a safe site: where the algorithm did not converge the a-priori site is
     scored.
+
+    Every flight is in one of three populations: `none_exists` (no place is safe), `roomy_exists` (a safe place has a
+    lander's radius of safe places about it) and `narrow_exists` (places are safe, none of them has that room).
     """
-    places = {"site": estimate.site_world}
+    site = place_row("site", _reported_place(estimate, flight), truth)
+    refused = estimate.outcome is SiteOutcome.NO_SAFE_SITE
     row: dict[str, Scalar] = {
         "converged": estimate.outcome.converged,
         "site_reported": estimate.outcome is SiteOutcome.SAFE_SITE,
-        "no_site_reported": estimate.outcome is SiteOutcome.NO_SAFE_SITE,
+        "no_site_reported": refused,
+        "safe_or_no_site_reported": refused or (estimate.outcome is SiteOutcome.SAFE_SITE and bool(site["site_safe"])),
         "safe_exists": bool(np.any(truth.safe)),
         "none_exists": not np.any(truth.safe),
         "roomy_exists": bool(np.any(truth.roomy)),
+        "narrow_exists": bool(np.any(truth.safe) and not np.any(truth.roomy)),
         "truly_safe_share": float(truth.safe.sum() / max(int(truth.covered.sum()), 1)),
     }
-    for name, place in places.items():
-        row |= place_row(name, None if place is None else (place - flight.position_error_m)[:2], truth)
-    return row
+    return {**row, **site}
+
+
+def _reported_place(estimate: SiteEstimate, flight: Flight) -> np.ndarray | None:
+    """The true x, y to which the reported coordinates lead; None where there are none."""
+    return None if estimate.site_world is None else (estimate.site_world - flight.position_error_m)[:2]
 
 
 def place_row(name: str, place: np.ndarray | None, truth: GroundTruth) -> dict[str, Scalar]:
@@ -251,6 +260,7 @@ def products(
         "camera_believed": flight.poses[0].world_from_body.as_matrix(),
         "limits": np.array([p.hda.max_slope_rad, p.hda.max_roughness_m, truth.limits.diameter_m]),
     }
-    if estimate.site_world is not None:
-        kept["site_true"] = (estimate.site_world - flight.position_error_m)[:2]
+    reported = _reported_place(estimate, flight)
+    if reported is not None:
+        kept["site_true"] = reported
     return kept
