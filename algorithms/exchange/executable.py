@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import Any
 
 from algorithms.answers import checked_site, checked_velocity
 from algorithms.exchange import serving
-from algorithms.exchange.files import EXCHANGE, write_case, write_frame
+from algorithms.exchange.files import write_case, write_frame
 from algorithms.exchange.process import KEPT_STDERR, Child, Command, ExecutableLimits, Said
 from algorithms.exchange.replies import (
     ProgramDetails,
@@ -121,17 +120,18 @@ def _asked(
     """Hands a case to a program; its answer, read but not checked."""
     with tempfile.TemporaryDirectory(prefix="marsyard-case-") as folder:
         write_case(Path(folder), measurements)
-        said = _persistent(command, limits, folder) if command.persistent else _once(command, limits, folder)
-    return table_of(said), ProgramDetails(said.stderr, said.time_s)
+        answer, said = (_ask_server if command.persistent else _run_once)(command, limits, folder)
+    return answer, ProgramDetails(said.stderr, said.time_s)
 
 
-def _once(command: Command, limits: ExecutableLimits, folder: str) -> Said:
-    return Child((*command.words, folder), limits).answer()
+def _run_once(command: Command, limits: ExecutableLimits, folder: str) -> tuple[Mapping[str, Any], Said]:
+    said = Child((*command.words, folder), limits).answer()
+    return table_of(said), said
 
 
-def _persistent(command: Command, limits: ExecutableLimits, folder: str) -> Said:
-    """An answer of a program that runs on; one that fails is ended, and started anew for the next case."""
-    child = serving.taken(command, limits)
-    said = child.line(json.dumps({"exchange": EXCHANGE, "case": folder}))
-    serving.given_back(command, limits, child)
-    return said
+def _ask_server(command: Command, limits: ExecutableLimits, folder: str) -> tuple[Mapping[str, Any], Said]:
+    """The answer of a program that runs on; one that fails is ended, and started again for the next case."""
+    server = serving.taken(command, limits)
+    answer, said = server.ask({"case": folder})
+    serving.given_back(command, limits, server)
+    return answer, said

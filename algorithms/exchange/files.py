@@ -32,8 +32,11 @@ from sim.measurements import (
     PoseMeasurement,
 )
 
-#: Version of the exchange: of `case.json`, of the answer, and of the lines of a persistent process.
+#: Version of the files of a case.
 EXCHANGE = 1
+#: Versions of answers, and of the lines of a program that is asked line by line: from 2 on each request has an `id`,
+#: which its answer repeats.
+ANSWER_VERSIONS = (1, 2)
 
 CASE_FILE, FRAME_FILE = "case.json", "frame.json"
 

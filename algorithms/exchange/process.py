@@ -120,10 +120,15 @@ class Child:
         return said
 
     def line(self, asked: str | None = None) -> Said:
-        """The next line that the program writes, after a line that it is given."""
+        """The next line that the program writes, after a line that it is given.
+
+        A program that has written something since its last answer is ended (BAD_ANSWER): a late second line would be
+        taken as the answer to the next case.
+        """
         started = time.perf_counter()
         self._begin()
         if asked is not None:
+            self._refuse_unasked_output()
             self._tell(asked)
         self._read(lambda: b"\n" in self._output)
         if b"\n" not in self._output:
@@ -156,6 +161,17 @@ class Child:
         except BrokenPipeError:
             self._wait()
             raise self._ended(Fault.CRASHED, "it reads no more cases") from None
+
+    def _refuse_unasked_output(self) -> None:
+        stdout = self._process.stdout
+        if stdout is None or stdout.closed:
+            return
+        with selectors.DefaultSelector() as selector:
+            selector.register(stdout, selectors.EVENT_READ)
+            # an empty read is the end of its output, which is reported when it is asked
+            if selector.select(0.0) and (unasked := os.read(stdout.fileno(), 1 << 16)):
+                message = f"before it was asked it wrote {shortened(unasked)}; expected one line for each request"
+                raise self._ended(Fault.BAD_ANSWER, message)
 
     def _close_input(self) -> None:
         if self._process.stdin is not None:
@@ -248,6 +264,12 @@ def _signal_name(number: int) -> str:
         return signal.Signals(number).name
     except ValueError:
         return f"signal {number}"
+
+
+def shortened(raw: bytes) -> str:
+    """The first 200 bytes that a program wrote, as text in quotes."""
+    text = raw[:200].decode("utf-8", errors="replace")
+    return repr(text + ("..." if len(raw) > 200 else ""))
 
 
 def _text(raw: bytearray) -> str:

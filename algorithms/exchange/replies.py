@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from algorithms.exchange.files import EXCHANGE
-from algorithms.exchange.process import Said
+from algorithms.exchange.files import ANSWER_VERSIONS
+from algorithms.exchange.process import Said, shortened
 from algorithms.faults import AlgorithmError, Fault
 
 Member = TypeVar("Member", bound=Enum)
@@ -42,8 +42,10 @@ def table_of(said: Said) -> Mapping[str, Any]:
 
 def check_keys(answer: Mapping[str, Any], allowed: set[str]) -> None:
     """Raises AlgorithmError (BAD_ANSWER) where a table's version is another, or it has a key that is not allowed."""
-    if type(answer.get("exchange")) is not int or answer["exchange"] != EXCHANGE:
-        raise bad_answer(f"the answer's exchange is {answer.get('exchange')!r}; allowed: {EXCHANGE}")
+    if type(answer.get("exchange")) is not int or answer["exchange"] not in ANSWER_VERSIONS:
+        raise bad_answer(
+            f"the answer's exchange is {answer.get('exchange')!r}; allowed: {', '.join(map(str, ANSWER_VERSIONS))}"
+        )
     unknown = sorted(set(answer) - allowed - {"exchange"})
     if unknown:
         raise bad_answer(
@@ -92,9 +94,3 @@ def in_its_words(stderr: str, make: Callable[[], Answer]) -> Answer:
 def bad_answer(message: str) -> AlgorithmError:
     """The fault of an answer that is not of the form that the exchange states."""
     return AlgorithmError(Fault.BAD_ANSWER, message)
-
-
-def shortened(raw: bytes) -> str:
-    """The first of what a program wrote, for a message."""
-    text = raw[:200].decode("utf-8", errors="replace")
-    return repr(text + ("..." if len(raw) > 200 else ""))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 import weakref
@@ -11,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from algorithms.exchange import serving
-from algorithms.exchange.files import EXCHANGE
-from algorithms.exchange.process import Child, Command, ExecutableLimits, Said
-from algorithms.exchange.replies import ProgramDetails, table_of
+from algorithms.exchange.process import Command, ExecutableLimits, Said
+from algorithms.exchange.replies import ProgramDetails
 from algorithms.faults import AlgorithmError
 
 
@@ -28,7 +26,7 @@ class Session:
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
         self._command, self._limits = command, limits
-        self._child: Child | None = None
+        self._server: serving.Server | None = None
         self._leave: weakref.finalize[Any, Any] | None = None
         self.folder = Path(tempfile.mkdtemp(prefix="marsyard-talk-"))
         weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
@@ -45,22 +43,22 @@ class Session:
         files
             By the key that names the folder in the line: what writes it. It is there until the program has answered.
         """
-        line = {"exchange": EXCHANGE, "do": do, **told}
+        request = {"do": do, **told}
         with tempfile.TemporaryDirectory(prefix=f"{do}-", dir=self.folder) as below:
             for key, write in (files or {}).items():
                 folder = Path(below) / key
                 folder.mkdir()
                 write(folder)
-                line[key] = str(folder)
-            said = self._said(json.dumps(line, allow_nan=False))
-        return table_of(said), ProgramDetails(said.stderr, said.time_s)
+                request[key] = str(folder)
+            answer, said = self._ask_server(request)
+        return answer, ProgramDetails(said.stderr, said.time_s)
 
-    def _said(self, line: str) -> Said:
-        if self._child is None:
-            self._child = serving.taken(self._command, self._limits)
-            self._leave = weakref.finalize(self, serving.given_back, self._command, self._limits, self._child)
+    def _ask_server(self, request: Mapping[str, Any]) -> tuple[Mapping[str, Any], Said]:
+        if self._server is None:
+            self._server = serving.taken(self._command, self._limits)
+            self._leave = weakref.finalize(self, serving.given_back, self._command, self._limits, self._server)
         try:
-            return self._child.line(line)
+            return self._server.ask(request)
         except AlgorithmError:
             # it is ended already, and is not to be asked by others
             if self._leave is not None:

@@ -166,9 +166,10 @@ def between(left: CameraModel, left_px: np.ndarray, right: CameraModel, right_px
 def main() -> None:
     """Answers line by line until the input ends."""
     tracker = WholePixelTracker()
-    print(json.dumps({"exchange": 1, "ready": True}), flush=True)
+    print(json.dumps({"exchange": 2, "ready": True}), flush=True)
     for line in sys.stdin:
-        print(json.dumps({"exchange": 1, **tracker.answer(json.loads(line))}), flush=True)
+        asked = json.loads(line)
+        print(json.dumps({"exchange": 2, "id": asked["id"], **tracker.answer(asked)}), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-/* A velocity estimator in C for Marsyard's exchange, version 1 (docs/own-algorithms.md).
+/* A velocity estimator in C for Marsyard's exchange, version 2 (docs/own-algorithms.md).
  *
  *   cc -O2 -std=c11 -o velocity_estimator docs/examples/velocity_estimator.c -lm
  *   marsyard run dimes-gusev --algorithm "exec:./velocity_estimator"            one process a case
@@ -16,7 +16,7 @@
 
 enum { HALF_COLUMNS = 20, HALF_ROWS = 5, REACH_COLUMNS = 48, REACH_ROWS = 14, ACROSS = 5, MOST = ACROSS * ACROSS };
 static const double LEAST_CORRELATION = 0.6;
-static const char *REFUSED = "{\"exchange\": 1, \"outcome\": \"NO_VALID_TRACK\"}";
+static const char *REFUSED = "\"outcome\": \"NO_VALID_TRACK\"";
 
 typedef struct { int columns, rows; unsigned short *counts; } Picture;
 typedef struct { double c[3], a[3], h[3], v[3]; } Camera; /* the linear part of CAHVOR */
@@ -210,18 +210,18 @@ static void estimate(const char *folder, char *answer, size_t room)
         }
         fprintf(stderr, "%d of %d templates found\n", found, MOST);
         if (found >= 3)
-            snprintf(answer, room, "{\"exchange\": 1, \"outcome\": \"VALID\", \"velocity_m_s\": [%.17g, %.17g]}", median(east, found), median(north, found));
+            snprintf(answer, room, "\"outcome\": \"VALID\", \"velocity_m_s\": [%.17g, %.17g]", median(east, found), median(north, found));
     }
     free(second.counts);
     free(third.counts);
     free(text);
 }
 
-/* The folder in a line {"exchange": 1, "case": "/tmp/..."}; Marsyard's folders need no escapes. */
-static int folder_of(char *line, char **folder)
+/* The number and the folder in a line {"exchange": 2, "id": 7, "case": "/tmp/..."}; Marsyard's folders need no escapes. */
+static int read_request(char *line, long *id, char **folder)
 {
-    char *at = strstr(line, "\"case\": \""), *end;
-    if (!at || !(end = strchr(at + 9, '"'))) return 0;
+    char *number = strstr(line, "\"id\": "), *at = strstr(line, "\"case\": \""), *end;
+    if (!number || sscanf(number + 6, "%ld", id) != 1 || !at || !(end = strchr(at + 9, '"'))) return 0;
     *end = '\0';
     *folder = at + 9;
     return 1;
@@ -230,19 +230,20 @@ static int folder_of(char *line, char **folder)
 int main(int count, char **words)
 {
     char answer[512], line[8192], *folder;
+    long id;
     if (count == 2 && strcmp(words[1], "--serve") == 0) {
-        printf("{\"exchange\": 1, \"ready\": true}\n");
+        printf("{\"exchange\": 2, \"ready\": true}\n");
         fflush(stdout);
         while (fgets(line, sizeof line, stdin)) {
-            if (!folder_of(line, &folder)) { complain("no case in", line); return 1; }
+            if (!read_request(line, &id, &folder)) { complain("no case in", line); return 1; }
             estimate(folder, answer, sizeof answer);
-            printf("%s\n", answer);
+            printf("{\"exchange\": 2, \"id\": %ld, %s}\n", id, answer);
             fflush(stdout);
         }
         return 0;
     }
     if (count != 2) { fprintf(stderr, "usage: velocity_estimator CASE | velocity_estimator --serve\n"); return 2; }
     estimate(words[1], answer, sizeof answer);
-    printf("%s\n", answer);
+    printf("{\"exchange\": 2, %s}\n", answer);
     return 0;
 }

@@ -162,7 +162,7 @@ def told(estimate: VelocityEstimate | None) -> dict[str, Any]:
 def main() -> None:
     """Answers line by line until the input ends."""
     stream = ChainedShifts()
-    print(json.dumps({"exchange": 1, "ready": True}), flush=True)
+    print(json.dumps({"exchange": 2, "ready": True}), flush=True)
     for line in sys.stdin:
         asked = json.loads(line)
         if asked["do"] == "start":
@@ -171,7 +171,7 @@ def main() -> None:
             answer = stream.picture(read_frame(Path(asked["frame"])))
         else:
             answer = stream.finish()
-        print(json.dumps({"exchange": 1, **told(answer)}), flush=True)
+        print(json.dumps({"exchange": 2, "id": asked["id"], **told(answer)}), flush=True)
 
 
 if __name__ == "__main__":

@@ -115,11 +115,13 @@ def site_shares(frame: pd.DataFrame) -> dict[str, Share]:
         flag(frame, name) for name in ("site_reported", "none_exists", "roomy_exists", "landed")
     )
     refused, safe = flag(frame, "no_site_reported"), flag(frame, "site_safe")
+    narrow, right = flag(frame, "safe_exists") & ~roomy, refused | (reported & safe)
     shares = {
         "chosen sites that are truly safe": share_of(safe[reported], frame[reported]),
         "'no safe site', where none exists": share_of(refused[none], frame[none]),
         "a site reported, where none exists": share_of(reported[none], frame[none]),
         "a site found, where one has room about it": share_of(reported[roomy], frame[roomy]),
+        "a truly safe site or 'no safe site', where safe sites have no room": share_of(right[narrow], frame[narrow]),
         "ground mapped, of all flights": share_of(flag(frame, "converged"), frame),
         "landings on safe ground": share_of(flag(frame, "touchdown_safe")[landed], frame[landed]),
     }

@@ -49,8 +49,10 @@ def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict
     first picture. Nothing but SAFE_SITE reports a safe site: where the algorithm did not converge the a-priori site is
     scored.
     """
-    site = estimate.site_world
-    return place_row("site", None if site is None else (site - flight.position_error_m)[:2], truth)
+    site = None if estimate.site_world is None else (estimate.site_world - flight.position_error_m)[:2]
+    row = place_row("site", site, truth)
+    safe_reported = estimate.outcome is SiteOutcome.SAFE_SITE and bool(row["site_safe"])
+    return {**row, "safe_or_no_site_reported": safe_reported or estimate.outcome is SiteOutcome.NO_SAFE_SITE}
 
 
 def place_row(name: str, place: np.ndarray | None, truth: GroundTruth) -> dict[str, Scalar]:
@@ -207,6 +209,7 @@ def conditions(
         "safe_exists": bool(np.any(truth.safe)),
         "none_exists": not np.any(truth.safe),
         "roomy_exists": bool(np.any(truth.roomy)),
+        "narrow_exists": bool(np.any(truth.safe) and not np.any(truth.roomy)),
         "truly_safe_share": float(truth.safe.sum() / max(int(covered.sum()), 1)),
         "within_limits": _within_limits(true_motion(flight, pair), flight, pair.axis_range_m),
         "true_slope_median_deg": _median_deg(truth, covered),
@@ -256,6 +259,7 @@ def products(
         "camera_believed": flight.poses[0].world_from_body.as_matrix(),
         "limits": np.array([p.hda.max_slope_rad, p.hda.max_roughness_m, truth.limits.diameter_m]),
     }
-    if estimate.site_world is not None:
-        kept["site_true"] = (estimate.site_world - flight.position_error_m)[:2]
+    reported = _reported_place(estimate, flight)
+    if reported is not None:
+        kept["site_true"] = reported
     return kept

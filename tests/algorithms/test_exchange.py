@@ -182,6 +182,73 @@ def test_a_persistent_program_answers_many_cases_and_is_started_anew(
     end_persistent()
 
 
+#: Answers each case with its number, `{pause_s}` after it was asked, and as long after that once more.
+TWICE = """
+print(json.dumps({"exchange": {version}, "ready": True}), flush=True)
+for number, line in enumerate(sys.stdin):
+    asked = json.loads(line)
+    time.sleep({pause_s})
+    answer = {"exchange": {version}, {identity}"outcome": "VALID", "velocity_m_s": [number, 0]}
+    print(json.dumps(answer), flush=True)
+    time.sleep({pause_s})
+    print(json.dumps(answer), flush=True)
+"""
+
+
+def twice(version: int, pause_s: float = 0.05) -> str:
+    identity = '"id": asked["id"], ' if version > 1 else ""
+    text = TWICE.replace("{version}", str(version)).replace("{identity}", identity)
+    return text.replace("{pause_s}", str(pause_s))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_late_second_line_is_not_the_answer_to_the_next_case(
+    measured: DescentMeasurements, tmp_path: Path, version: int
+) -> None:
+    spec = f"serve:{program(tmp_path, twice(version))}"
+    first = ask(spec, measured).velocity_m_s
+    assert first is not None
+    time.sleep(0.5)  # the second line stands in the pipe
+    with pytest.raises(AlgorithmError, match="before it was asked it wrote") as caught:
+        ask(spec, measured)
+    assert caught.value.fault is Fault.BAD_ANSWER
+    # the next case is answered by a new process, of which it is the first one
+    again = ask(spec, measured).velocity_m_s
+    assert again is not None
+    assert again[0] == 0.0
+    end_persistent()
+
+
+def test_an_answer_to_another_request_is_refused(measured: DescentMeasurements, tmp_path: Path) -> None:
+    # the second line comes after the next request was written: only its id shows that it answers the one before
+    spec = f"serve:{program(tmp_path, twice(2, pause_s=1.0))}"
+    ask(spec, measured)
+    with pytest.raises(AlgorithmError, match="the answer's id is 1; allowed: 2") as caught:
+        ask(spec, measured)
+    assert caught.value.fault is Fault.BAD_ANSWER
+    end_persistent()
+
+
+@pytest.mark.parametrize(
+    ("reply", "message"),
+    [
+        ('{"exchange": 1, "outcome": "NO_VALID_TRACK"}', "the answer's exchange is 1; allowed: 2"),
+        ('{"exchange": 2, "outcome": "NO_VALID_TRACK"}', "the answer's id is None; allowed: 1"),
+        ('{"exchange": 2, "id": true, "outcome": "NO_VALID_TRACK"}', "the answer's id is True; allowed: 1"),
+        ('{"exchange": 2, "id": "1", "outcome": "NO_VALID_TRACK"}', "the answer's id is '1'; allowed: 1"),
+    ],
+)
+def test_an_answer_must_repeat_the_id_of_its_request(
+    measured: DescentMeasurements, tmp_path: Path, reply: str, message: str
+) -> None:
+    body = (
+        f"""print('{{"exchange": 2, "ready": true}}', flush=True)\nsys.stdin.readline()\nprint('{reply}', flush=True)"""
+    )
+    with pytest.raises(AlgorithmError, match=message) as caught:
+        ask(f"serve:{program(tmp_path, body)}", measured)
+    assert caught.value.fault is Fault.BAD_ANSWER
+
+
 def test_a_persistent_program_must_say_that_it_is_ready(measured: DescentMeasurements, tmp_path: Path) -> None:
     with pytest.raises(AlgorithmError, match="its first line is") as caught:
         ask(f"serve:{program(tmp_path, 'print({}, flush=True); time.sleep(60)')}", measured)

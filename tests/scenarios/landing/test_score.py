@@ -1,0 +1,80 @@
+"""What a flight's row says of an answer, against ground whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from algorithms.interface import SiteEstimate, SiteOutcome
+from campaigns.definition.loading import load_campaign
+from scenarios.conformance.parts import motion
+from scenarios.landing.flight import Flight
+from scenarios.landing.relief import Footprints, Limits, Relief
+from scenarios.landing.score import site_row
+from scenarios.landing.truth import GroundTruth
+from sim.frames import rigid
+from sim.measurements import PoseMeasurement
+
+SAFE_SITE, UNSAFE_SITE = np.array([-3.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0])
+REPORTED, REFUSED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
+
+
+def flight() -> Flight:
+    """A flight whose navigation is exact."""
+    states = motion().state(0.0), motion().state(3.75)
+    first, second = (PoseMeasurement(rigid(one.attitude, one.position_m), one.time_s) for one in states)
+    return Flight(states, (first, second), np.array([0.0, 0.0, 1.0]))
+
+
+def truth(safe_places: int) -> GroundTruth:
+    """Ground of 12 m that is level in the west and steeper than the limit in the east, on a lattice of 1 m.
+
+    As many places as stated are safe, side by side in the middle: a square of 5 x 5 has one with a lander's radius of
+    1 m of safe places about it, three in a row have none.
+    """
+    x, _ = np.meshgrid(np.arange(-6.0, 6.0, 0.1), np.arange(-6.0, 6.0, 0.1))
+    line = np.linspace(-4.0, 4.0, 9)
+    places_m = np.stack(np.meshgrid(line, line), axis=-1)
+    safe = np.zeros(places_m.shape[:2], dtype=bool)
+    if safe_places == 25:
+        safe[2:7, 2:7] = True
+    else:
+        safe[4, 3 : 3 + safe_places] = True
+    still = np.zeros(safe.shape)
+    footprints = Footprints(still, still, still, safe)
+    return GroundTruth(
+        Relief(np.maximum(x, 0.0), -6.0, -6.0, 0.1), Limits(2.0, 0.26, 0.2), places_m, footprints, safe | True, 1.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("safe_places", "population"), [(0, "none_exists"), (3, "narrow_exists"), (25, "roomy_exists")]
+)
+def test_every_flight_is_in_one_population(safe_places: int, population: str) -> None:
+    row = site_row(SiteEstimate(REFUSED, None), flight(), truth(safe_places))
+    populations = ("none_exists", "narrow_exists", "roomy_exists")
+    assert [name for name in populations if row[name]] == [population]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "site", "right"),
+    [
+        (REPORTED, SAFE_SITE, True),
+        (REPORTED, UNSAFE_SITE, False),
+        (REFUSED, None, True),
+        # the a-priori site is kept where the algorithm does not converge: that it is safe is luck
+        (SiteOutcome.NO_MOTION, SAFE_SITE, False),
+    ],
+)
+def test_a_safe_site_or_no_safe_site_is_right(outcome: SiteOutcome, site: np.ndarray | None, right: bool) -> None:
+    row = site_row(SiteEstimate(outcome, site), flight(), truth(3))
+    assert row["safe_or_no_site_reported"] is right
+
+
+def test_every_hazardous_flight_has_a_requirement_on_its_answer() -> None:
+    asked = load_campaign("hda-hazardous").configuration.requirements
+    populations = {one.population for one in asked}
+    assert {"none_exists", "narrow_exists", "roomy_exists"} <= populations
+    (narrow,) = [one for one in asked if one.population == "narrow_exists"]
+    # a verdict by confidence: "met" must be shown, not seen
+    assert (narrow.metric, narrow.decide_by) == ("safe_or_no_site_reported", "confidence")
