@@ -73,7 +73,7 @@ def given_back(command: Command, limits: ExecutableLimits, server: Server) -> No
 
 def waiting_processes() -> set[int]:
     """Process ids of the persistent programs that wait for a case."""
-    return {child.process for child in _waiting.values()}
+    return {server.child.process for server in _waiting.values()}
 
 
 @atexit.register

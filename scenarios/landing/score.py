@@ -49,10 +49,14 @@ def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict
     first picture. Nothing but SAFE_SITE reports a safe site: where the algorithm did not converge the a-priori site is
     scored.
     """
-    site = None if estimate.site_world is None else (estimate.site_world - flight.position_error_m)[:2]
-    row = place_row("site", site, truth)
+    row = place_row("site", _reported_place(estimate, flight), truth)
     safe_reported = estimate.outcome is SiteOutcome.SAFE_SITE and bool(row["site_safe"])
     return {**row, "safe_or_no_site_reported": safe_reported or estimate.outcome is SiteOutcome.NO_SAFE_SITE}
+
+
+def _reported_place(estimate: SiteEstimate, flight: Flight) -> np.ndarray | None:
+    """The true x, y to which the reported coordinates lead; None where there are none."""
+    return None if estimate.site_world is None else (estimate.site_world - flight.position_error_m)[:2]
 
 
 def place_row(name: str, place: np.ndarray | None, truth: GroundTruth) -> dict[str, Scalar]:
