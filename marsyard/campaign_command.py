@@ -125,6 +125,7 @@ def run(
     crew = make_crew(jobs, cluster)
     if dry_run:
         _print_estimate(loaded, crew)
+        _print_limits(loaded)
         return
     directory = out if out is not None else default_directory(loaded.configuration.name)
     start = run_until_decided if until_decided else run_campaign
@@ -171,11 +172,12 @@ def append(
 ) -> None:
     """Add a block of cases to a finished campaign, run them, and judge all; the cases that are there stay."""
     from campaigns.errors import CampaignError
-    from campaigns.running.engine import append_cases
+    from campaigns.running.engine import append_cases, with_block
     from campaigns.store.record import stored_configuration
 
     if stored_configuration(directory).most_cases is not None:
         raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
+    _print_limits(with_block(directory, cases))
     crew = make_crew(jobs, cluster)
     carry_out(directory, lambda watch: append_cases(directory, cases, crew, watch, allow_changed=allow_changed))
 
@@ -333,6 +335,14 @@ def _print_estimate(campaign: Campaign, crew: Crew) -> None:
     if found.inputs_bytes:
         limit = size_text(found.cache_limit_bytes)
         typer.echo(f"  {size_text(found.inputs_bytes)} of terrains in the cache, which keeps at most {limit}")
+
+
+def _print_limits(campaign: Campaign) -> None:
+    """Prints why the campaign's requirements cannot read PASS, and the change that helps."""
+    from marsyard.evidence import evidence_limits
+
+    for limit in evidence_limits(campaign):
+        typer.echo(f"note: {limit}")
 
 
 def _duration(seconds: float) -> str:

@@ -9,6 +9,9 @@ from campaigns.errors import CampaignError
 from scenarios.descent.parameters import binned_size_for
 from sim.camera import CameraFileError, read_camera
 
+#: Terrains of a new campaign's bank: enough for cases that are appended, and as many as a bank may have.
+FEWEST_TERRAINS, MOST_TERRAINS = 10_000, 100_000
+
 
 @dataclass(frozen=True)
 class Choices:
@@ -67,7 +70,8 @@ def _head(c: Choices, scenario: str, about: str) -> str:
 name = {json.dumps(c.name)}
 scenario = {json.dumps(scenario)}
 description = {json.dumps(about)}
-# More cases narrow what can be said: 230 without a failure show a probability of 0.99 with a confidence of 0.90.
+# 230 cases without a failure show a probability of 0.99 with a confidence of 0.90. Choose the number before the first
+# run: a campaign that has been judged needs more (marsyard append).
 cases = {c.cases}
 # The same seed gives the same cases, one by one, on any machine of this kind.
 seed = 1
@@ -104,8 +108,14 @@ def _uniform(path: str, low: float, high: float, source: str) -> str:
     return _line(path, f'distribution = "uniform", low = {low!r}, high = {high!r}', source)
 
 
-def _terrains(path: str, last: int) -> str:
-    return _line(path, f'distribution = "integer", low = 0, high = {last}', "every terrain of the bank alike")
+def _bank(cases: int) -> int:
+    """Terrains to take in turn: one for each case, and for those appended. Only terrains that cases use are built."""
+    return min(MOST_TERRAINS, max(FEWEST_TERRAINS, cases))
+
+
+def _terrains(table: str) -> str:
+    each = "each case has a terrain of its own, so that cases are independent"
+    return _line(f"{table}.terrain", f'distribution = "in-turn", low = 0, high = "{table}.bank - 1"', each)
 
 
 def _requirement(name: str, statement: str, metric: str, bound: float | None, probability: float, whom: str) -> str:
@@ -137,9 +147,10 @@ site = {json.dumps(c.site)}
 samples = 2048
 spacing_m = 2.0
 
-# Terrains that are built once and shared by all cases.
+# Terrains, which cases take in turn. Cases that share a terrain count as one where the verdict counts terrains. Only
+# those that cases use are built.
 [parameters.place]
-bank = 2
+bank = {_bank(c.cases)}
 """
     ]
     if c.camera:
@@ -180,7 +191,7 @@ lead_s = 5.0
     ]
     parts.append(
         _dispersions(
-            _terrains("place.terrain", 1),
+            _terrains("place"),
             _uniform("place.east_m", 0.0, 4096.0, "anywhere on the terrain"),
             _uniform("place.north_m", 0.0, 4096.0, "anywhere on the terrain"),
             _uniform("sun.azimuth_deg", 230.0, 310.0, "afternoon, as both MER landings"),
@@ -212,9 +223,10 @@ site = {json.dumps(c.site)}{camera}
 [parameters.terrain]
 samples = 2048
 
-# Terrains that are built once and shared by all cases.
+# Terrains, which cases take in turn. Cases that share a terrain count as one where the verdict counts terrains. Only
+# those that cases use are built.
 [parameters.place]
-bank = 2
+bank = {_bank(c.cases)}
 """,
         _detector(c),
         """# The lander: what it can stand on.
@@ -229,7 +241,7 @@ lander_diameter_m = 2.0
 max_roughness_m = 0.2
 """,
         _dispersions(
-            _terrains("place.terrain", 1),
+            _terrains("place"),
             _uniform("place.east_m", 0.0, 102.4, "anywhere on the terrain"),
             _uniform("place.north_m", 0.0, 102.4, "anywhere on the terrain"),
             _uniform("sun.azimuth_deg", 90.0, 270.0, "from morning to afternoon"),
@@ -252,10 +264,11 @@ max_roughness_m = 0.2
 
 def _tracking(c: Choices) -> list[str]:
     return [
-        f"""# Ground, rocks and light: `marsyard terrain list`. Terrains of a bank are built once.
+        f"""# Ground, rocks and light: `marsyard terrain list`. Cases take the bank's terrains in turn. Those sharing a
+# terrain count as one where the verdict counts terrains. Only terrains that cases use are built.
 [parameters.world]
 site = {json.dumps(c.site)}
-bank = 2
+bank = {_bank(c.cases)}
 
 # A stereo pair on a mast: mer-navcam, research-navcam or research-pancam.
 [parameters.camera]
@@ -271,7 +284,7 @@ step_share = 0.1
 goal_m = 2.0
 """,
         _dispersions(
-            _terrains("world.terrain", 1),
+            _terrains("world"),
             _uniform("target.yaw_deg", -180.0, 180.0, "any turn"),
             _uniform("target.across", -0.5, 0.5, "off the rock's edges; spread assumed"),
             _uniform("target.up", 0.35, 0.7, "off the rock's edges; spread assumed"),

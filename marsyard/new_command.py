@@ -56,6 +56,7 @@ def new(
     """Write a commented campaign of your own; at a terminal asks for what is not given."""
     from campaigns.definition.loading import load_campaign
     from campaigns.errors import CampaignError
+    from marsyard.evidence import evidence_limits
     from marsyard.new_campaign import Choices, campaign_text
     from reports.wording import count
 
@@ -79,7 +80,7 @@ def new(
     except OSError as error:
         raise CampaignError(f"{path}: cannot be written: {error.strerror or error}") from error
     try:
-        load_campaign(str(path))
+        loaded = load_campaign(str(path))
     except CampaignError:
         # what was asked for cannot be run: nothing of it stays
         path.unlink() if before is None else path.write_text(before, encoding="utf-8")
@@ -88,6 +89,8 @@ def new(
         f"{path}: {chosen.value} over {site}, {count(cases, 'case')}. See it with `marsyard show {path}`, run it with"
     )
     typer.echo(f"  marsyard run {path}")
+    for limit in evidence_limits(loaded):
+        typer.echo(f"note: {limit}")
 
 
 def _asked(question: str, usual: str, asked: bool) -> str:

@@ -31,17 +31,22 @@ class Overall:
 
 
 def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = INDEPENDENT) -> Overall:
-    """The campaign's verdict: FAIL if any requirement failed, else INSUFFICIENT if any is open, else PASS."""
+    """The campaign's verdict: that of the worst requirement, by the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
     crashed = crashed_cases(frame)
     statuses = [verdict.status for verdict in verdicts]
     tail = f" {count(crashed, 'case')} crashed." if crashed else ""
     if not statuses:
         return Overall(None, crashed, "The campaign asks for no requirement." + tail)
-    worst = next((status for status in (Status.FAIL, Status.INSUFFICIENT) if status in statuses), Status.PASS)
+    order = (Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE)
+    worst = next((status for status in order if status in statuses), Status.PASS)
     if not how.independent:
         return Overall(worst, crashed, _by_rates(verdicts) + how.no_probability + tail)
     sentence = {
-        Status.PASS: f"{count(len(statuses), 'requirement')} met.{_estimated(verdicts)}",
+        Status.PASS: f"{count(len(statuses), 'requirement')} met.",
+        Status.MET_BY_RATE: (
+            f"{statuses.count(Status.MET_BY_RATE)} of {count(len(statuses), 'requirement')} met by the rate alone, not "
+            "at the confidence."
+        ),
         Status.FAIL: f"{statuses.count(Status.FAIL)} of {count(len(statuses), 'requirement')} not met.",
         Status.INSUFFICIENT: (
             f"{statuses.count(Status.INSUFFICIENT)} of {count(len(statuses), 'requirement')} "
@@ -51,30 +56,31 @@ def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = IND
     return Overall(worst, crashed, sentence + tail)
 
 
-def _estimated(verdicts: Sequence[Verdict]) -> str:
-    """How many requirements are met by the rate seen alone; empty for none."""
-    alone = sum(one.decide_by == ESTIMATE and one.confident_status is not Status.PASS for one in verdicts)
-    return f" {alone} of them by the rate seen alone, not at the confidence." if alone else ""
-
-
 def _by_rates(verdicts: Sequence[Verdict]) -> str:
     """How many requirements the rates of a designed campaign's own cases meet; empty where none is decided by them."""
     statuses = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
     if not statuses:
         return ""
-    return f"{statuses.count(Status.PASS)} of {count(len(statuses), 'requirement')} met by the rate of these cases. "
+    met = statuses.count(Status.MET_BY_RATE)
+    return f"{met} of {count(len(statuses), 'requirement')} met by the rate of these cases. "
 
 
 def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
-    """The exit code of a campaign: 1 a requirement failed or a case crashed, 3 not enough cases to say, 0 otherwise."""
-    statuses = {verdict.status for verdict in verdicts}
-    if crashed or Status.FAIL in statuses:
+    """The exit code of a campaign: 1 a requirement failed or a case crashed, 3 some are not shown, 0 otherwise.
+
+    A requirement that is MET BY RATE gives 3, unless it says `accept_rate`.
+    """
+    if crashed or any(one.status is Status.FAIL for one in verdicts):
         return 1
-    return 3 if Status.INSUFFICIENT in statuses else 0
+    by_rate = any(one.status is Status.MET_BY_RATE and not one.accept_rate for one in verdicts)
+    return 3 if by_rate or any(one.status is Status.INSUFFICIENT for one in verdicts) else 0
 
 
 def _further(verdicts: Sequence[Verdict]) -> str:
-    """How many cases would decide what is open, where that can be said."""
+    """How many cases would decide what is open, or what keeps more cases from it, where that can be said."""
+    limited = next((verdict for verdict in verdicts if verdict.advice), None)
+    if limited is not None:
+        return f" {limited.advice}"
     needed = [verdict for verdict in verdicts if verdict.further_cases is not None]
     if not needed:
         return ""

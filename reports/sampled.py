@@ -2,18 +2,51 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pandas as pd
+from jaxtyping import Bool
 
 from campaigns.sampling.design import said_of
 from reports.statistics.sequential import looks_of, spent_share
 from reports.stored import table
+from reports.wording import count, stated
 
 #: The design of cases that are drawn independently.
 RANDOM = "random"
+
+
+@dataclass(frozen=True)
+class TerrainSupply:
+    """The terrains that a campaign's cases can be on.
+
+    Attributes
+    ----------
+    terrains
+        How many there are.
+    key
+        What sets their number: the parameter of the bank's size, or the dispersion of the terrain's number.
+    in_turn
+        Whether the cases take them one after the other; otherwise they draw them with replacement.
+    """
+
+    terrains: int
+    key: str
+    in_turn: bool = False
+
+    def advice(self, fewest: int, probability: float, confidence: float) -> str:
+        """Why further cases cannot help, and the change that does."""
+        asked = f"{stated(probability)} at {stated(confidence)} confidence takes at least {count(fewest, 'terrain')}"
+        has = f"The campaign draws from {count(self.terrains, 'terrain')} ({self.key} = {self.terrains}); {asked}"
+        if not self.key.endswith(".bank"):
+            return f"{has}: widen the range of {self.key}, and the bank, and run the campaign again."
+        # cases that draw a terrain each from ten times as many rarely meet: 1.1 cases a terrain are enough
+        bank, cases = (fewest, fewest) if self.in_turn else (10 * fewest, math.ceil(1.1 * fewest))
+        return f"{has}: run the campaign again with --set {self.key}={bank} -n {cases}."
 
 
 @dataclass(frozen=True)
@@ -30,12 +63,18 @@ class Sampled:
         Whether case 0 is the nominal one, which nothing was drawn for.
     most_cases
         Cases of the last look at a campaign that stops itself when it is decided; None where it does not.
+    first_look
+        Cases at which the campaign was judged for the first time, where cases have been appended since; else None.
+    terrains
+        The terrains that the cases draw from; None where the configuration does not say.
     """
 
     design: str = RANDOM
     grids: tuple[str, ...] = ()
     nominal: bool = False
     most_cases: int | None = None
+    first_look: int | None = None
+    terrains: TerrainSupply | None = None
 
     @property
     def independent(self) -> bool:
@@ -54,12 +93,28 @@ class Sampled:
             return ""
         return (
             f"No probability statement: the design is {said_of(self.design, self.grids, nominal=False)}, and only "
-            "independent random draws carry one."
+            f"independent random draws carry one. {self._remedy}"
         )
+
+    @property
+    def _remedy(self) -> str:
+        """The change that gives independent random draws."""
+        changes = [] if self.design == RANDOM else ['set design.kind = "random"']
+        changes += [f"give '{path}' a distribution that is drawn" for path in self.grids]
+        text = " and ".join(changes)
+        return f"{text[:1].upper()}{text[1:]}, and run it again."
 
     def risk_share(self, cases: int) -> float:
         """Which share of the risk that a confidence leaves may be spent on a judgement of so many cases."""
         return 1.0 if self.most_cases is None else spent_share(looks_of(self.most_cases), cases)
+
+    def seen_before(self, frame: pd.DataFrame, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
+        """Which of the chosen rows a first look has judged already; None where the first look is now."""
+        if self.first_look is None or self.most_cases is not None or "case" not in frame:
+            return None
+        if not bool((frame["case"] >= self.first_look).any()):
+            return None
+        return np.asarray(chosen["case"] < self.first_look, dtype=np.bool_)
 
     def drawn(self, frame: pd.DataFrame) -> pd.DataFrame:
         """The rows of the cases that were drawn: all but the nominal one."""
@@ -79,4 +134,31 @@ def sampled(configuration: Mapping[str, Any]) -> Sampled:
     grids = tuple(str(path) for path, one in dispersions.items() if table(one).get("distribution") == "grid")
     most = configuration.get("most_cases")
     most_cases = most if isinstance(most, int) and not isinstance(most, bool) and most > 0 else None
-    return Sampled(str(design.get("kind") or RANDOM), grids, design.get("nominal") is True, most_cases)
+    first = configuration.get("cases") if configuration.get("appended") else None
+    return Sampled(
+        str(design.get("kind") or RANDOM),
+        grids,
+        design.get("nominal") is True,
+        most_cases,
+        first if isinstance(first, int) else None,
+        terrain_supply(configuration),
+    )
+
+
+def terrain_supply(configuration: Mapping[str, Any]) -> TerrainSupply | None:
+    """The terrains that the cases of a stored campaign can be on; None where its configuration does not say."""
+    parameters, dispersions = table(configuration.get("parameters")), table(configuration.get("dispersions"))
+    for name in ("place", "world"):
+        bank = table(parameters.get(name)).get("bank")
+        if not isinstance(bank, int):
+            continue
+        path = f"{name}.terrain"
+        drawn = table(dispersions.get(path))
+        if not drawn:
+            return TerrainSupply(1, path)
+        in_turn = drawn.get("distribution") == "in-turn"
+        low, high = drawn.get("low"), drawn.get("high")
+        if isinstance(low, int) and isinstance(high, int) and high - low + 1 < bank:
+            return TerrainSupply(high - low + 1, f'dispersions."{path}"', in_turn)
+        return TerrainSupply(bank, f"{name}.bank", in_turn)
+    return None

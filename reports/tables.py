@@ -18,7 +18,12 @@ from reports.statistics.samples import ErrorSummary, summarize
 from reports.verdicts import ENGINE_FAILURES, Status, Verdict, is_flag, members, terrain_groups
 from reports.wording import NOTHING, asked_text, interval, number, percent, stated
 
-_STYLES = {Status.PASS: "bold green", Status.FAIL: "bold red", Status.INSUFFICIENT: "bold yellow"}
+_STYLES = {
+    Status.PASS: "bold green",
+    Status.MET_BY_RATE: "bold cyan",
+    Status.FAIL: "bold red",
+    Status.INSUFFICIENT: "bold yellow",
+}
 
 
 def verdict_table(verdicts: Sequence[Verdict]) -> Table:

@@ -44,6 +44,8 @@ COLUMNS = (
     "further_cases",
     "note",
 )
+#: Verdicts that show a requirement neither met nor missed at its confidence.
+_SKIPPED = (Status.INSUFFICIENT, Status.MET_BY_RATE)
 #: What XML 1.0 cannot hold.
 _UNPRINTABLE = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -115,7 +117,8 @@ def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall, algori
     """A test case for each requirement, and one that says whether all cases came to an end.
 
     Properties of the suite name the algorithms that are judged.
-    FAIL is a failure, INSUFFICIENT is skipped: a server of tests then shows it, and neither as passed nor as failed.
+    FAIL is a failure; INSUFFICIENT and MET BY RATE are skipped: a server of tests then shows them neither as passed nor
+    as failed.
     """
     statuses = [one.status for one in verdicts]
     suite = Xml.Element(
@@ -123,7 +126,7 @@ def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall, algori
         name=_text(campaign),
         tests=str(len(verdicts) + 1),
         failures=str(statuses.count(Status.FAIL) + bool(whole.crashed)),
-        skipped=str(statuses.count(Status.INSUFFICIENT)),
+        skipped=str(sum(status in _SKIPPED for status in statuses)),
     )
     cells = {name: value for name, value in algorithm_cells(algorithms).items() if value}
     if cells:
@@ -139,7 +142,7 @@ def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall, algori
         )
         if one.status is Status.FAIL:
             Xml.SubElement(case, "failure", message=said, type=str(one.status))
-        elif one.status is Status.INSUFFICIENT:
+        elif one.status in _SKIPPED:
             Xml.SubElement(case, "skipped", message=f"{one.status}: {said}")
         Xml.SubElement(case, "system-out").text = _text(f"{subject}{one.statement} {said}")
     ended = Xml.SubElement(suite, "testcase", classname=_text(campaign), name="all cases end")

@@ -11,9 +11,9 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 #: Version of the layout.
-SCHEMA = 3
+SCHEMA = 4
 
-Word = Literal["PASS", "FAIL", "INSUFFICIENT"]
+Word = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE"]
 
 
 class _Part(BaseModel):
@@ -56,8 +56,9 @@ class TwinVerdict(_Part):
     failures: int
     estimate: float | None
     lower: float | None = Field(description="one-sided, at `bounds_confidence`")
-    upper: float | None
-    bounds_confidence: float | None
+    upper: float | None = Field(description="one-sided, at `upper_confidence`")
+    bounds_confidence: float | None = Field(description="of the lower bound")
+    upper_confidence: float | None
     plain_lower: float | None
     plain_upper: float | None
     consumer_risk: float | None = Field(description="chance of evidence as good from a rate only just the one asked")
@@ -66,6 +67,8 @@ class TwinVerdict(_Part):
     terrains: int | None
     clustered: TwinClusters | None
     reason: str
+    advice: str = Field(description="what keeps more cases from helping, and the change that helps")
+    accept_rate: bool = Field(description="whether MET BY RATE gives the exit status 0")
     note: str
 
 
@@ -97,6 +100,14 @@ class TwinStatistics(_Part):
     confidence: float
 
 
+class TwinTerrains(_Part):
+    """The terrains that cases can be on."""
+
+    terrains: int
+    key: str = Field(description="what sets their number")
+    in_turn: bool
+
+
 class TwinSampling(_Part):
     """How cases were drawn."""
 
@@ -104,6 +115,8 @@ class TwinSampling(_Part):
     grids: list[str]
     nominal: bool
     most_cases: int | None
+    first_look: int | None = Field(description="cases at the first verdict, where cases were appended")
+    terrains: TwinTerrains | None
     independent: bool
     text: str
 
@@ -122,7 +135,7 @@ class TwinAlgorithm(_Part):
 class Twin(_Part):
     """A campaign's report in numbers."""
 
-    report_schema: Literal[3] = Field(alias="schema")
+    report_schema: Literal[4] = Field(alias="schema")
     campaign: str
     state: Any = Field(description="as the campaign's record has it, as are seed, git_commit and the times")
     seed: Any

@@ -2,12 +2,13 @@
 
 A requirement asks that `metric <= bound` (in magnitude), or a column of true and false, holds for a stated fraction of
 a population of cases, at a stated confidence. Its status follows from one-sided Clopper-Pearson bounds of the success
-rate; or from the rate alone where the requirement is decided by the estimate. Where cases share terrains they are not
-independent: the bounds then are those that hold nevertheless (`reports.statistics.clusters`), and the verdict says
-what independent cases would have shown. Where a campaign stops itself when it is decided, each look at it has its share
-of the risk (`reports.statistics.sequential`). Where cases are no random draws at all (Latin hypercube, Sobol, grids) no
-bounds are told and no confidence can be had: only a requirement that is decided by the estimate is then decided, by the
-rate of these very cases, and the verdict says so.
+rate. A requirement that is decided by the estimate and whose rate reaches the fraction, but not at the confidence, is
+MET BY RATE. Where cases share terrains they are not independent: the bounds then are those that hold nevertheless
+(`reports.statistics.clusters`), and the verdict says what independent cases would have shown. Where a campaign is
+judged more than once (cases were appended, or it stops itself when it is decided) the bounds keep the risk of all looks
+together (`reports.bounds`). Where cases are no random draws at all (Latin hypercube, Sobol, grids) there are no bounds
+and no confidence: only a requirement that is decided by the estimate is then decided, by the rate of these very cases,
+and the verdict says so.
 """
 
 from __future__ import annotations
@@ -23,11 +24,12 @@ import pandas as pd
 from jaxtyping import Bool, Int
 
 from campaigns.outcomes import UNFINISHED
+from reports.bounds import Looks, bounds_of
 from reports.columns import numbers
 from reports.sampled import INDEPENDENT, Sampled
-from reports.statistics.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
-from reports.statistics.proportions import consumer_risk, further_cases_needed, proportion_lower, proportion_upper
-from reports.statistics.sequential import confidence_at
+from reports.statistics.clusters import ClusteredEvidence, ClusterMethod
+from reports.statistics.proportions import consumer_risk, minimum_sample_size
+from reports.statistics.sequential import LaterLook
 from reports.wording import count, percent, stated
 
 #: Outcomes of cases that the engine could not finish; the algorithm under test may be innocent of them.
@@ -40,6 +42,7 @@ class Status(StrEnum):
     """What the evidence says of a requirement."""
 
     PASS = "PASS"  # noqa: S105  (a verdict, not a password)
+    MET_BY_RATE = "MET BY RATE"
     FAIL = "FAIL"
     INSUFFICIENT = "INSUFFICIENT"
 
@@ -54,8 +57,9 @@ class Verdict:
         The requirement, as the campaign states it; NaN for a number that is missing or is none. Without a bound the
         metric is a column of true and false.
     status
-        PASS where the lower bound reaches the probability, FAIL where the upper bound is below it, else INSUFFICIENT;
-        where the estimate decides, PASS if it reaches the probability, else FAIL.
+        PASS where the lower bound reaches the probability, FAIL where the upper bound is below it, else INSUFFICIENT.
+        Where the estimate decides and the bounds do not give PASS: FAIL if the rate is below the probability, MET BY
+        RATE if it is not, INSUFFICIENT instead if the cases are fewer than `fewest_cases_for_rate`.
     n, failures
         Cases of the population, and those that did not succeed: a metric that is missing or NaN is a failure, and so is
         a case that the engine could not finish, or whose membership is unknown.
@@ -67,14 +71,19 @@ class Verdict:
         and FAIL, and where it cannot be said.
     reason
         Why nothing could be judged, or why the verdict is withheld; empty otherwise.
+    advice
+        What keeps more cases from helping, and the change that helps; empty where there is nothing to say.
+    accept_rate
+        Whether MET BY RATE is enough for the exit status 0.
     terrains
         Distinct terrains behind the population; None where the rows do not say.
     clustered
         What the cases show when terrains are shared between them; None where none is.
     plain_lower, plain_upper
         The bounds as they would be for independent cases; NaN where there are none.
-    bounds_confidence
-        The confidence of the bounds: the requirement's, or higher at a look of a campaign that stops itself.
+    bounds_confidence, upper_confidence
+        The confidences of the lower and of the upper bound: the requirement's, or higher where the campaign is judged
+        more than once.
     """
 
     requirement_id: str
@@ -98,6 +107,9 @@ class Verdict:
     plain_lower: float = math.nan
     plain_upper: float = math.nan
     bounds_confidence: float = math.nan
+    upper_confidence: float = math.nan
+    advice: str = ""
+    accept_rate: bool = False
     source: str = ""
     kind: str = ""
     scale: float = 1.0
@@ -135,12 +147,17 @@ class Verdict:
         """What a reader must know before trusting the verdict; empty where there is nothing to say."""
         if self.reason:
             return self.reason
-        return " ".join(part for part in (self._basis(), self._sharing(), self._look()) if part)
+        return " ".join(part for part in (self._basis(), self._sharing(), self._look(), self.advice) if part)
 
     def _basis(self) -> str:
         if self.decide_by != ESTIMATE or self.n == 0:
             return ""
-        return f"Decided by the rate seen; at {stated(self.confidence)} confidence it would be {self.confident_status}."
+        at = f"at {stated(self.confidence)} confidence"
+        if self.status is Status.PASS:
+            return f"Decided by the rate; met {at} as well."
+        if self.status is Status.INSUFFICIENT:
+            return f"Decided by the rate, which takes {count(fewest_cases_for_rate(self.probability), 'case')} or more."
+        return f"Decided by the rate; {at} it would be {self.confident_status}."
 
     def _sharing(self) -> str:
         shared = self.clustered
@@ -156,16 +173,20 @@ class Verdict:
         )
         if self.plain_status is not None and self.plain_status is not self.status:
             said += f" Independent cases would show at least {percent(self.plain_lower)}: {self.plain_status}."
-        if shared.method is ClusterMethod.TERRAIN_COUNT and self.further_cases:
+        if shared.method is ClusterMethod.TERRAIN_COUNT and self.further_cases and self.decide_by != ESTIMATE:
             said += f" {count(self.further_cases, 'further terrain')} would do if no case fails on them."
         return said
 
     def _look(self) -> str:
-        if math.isnan(self.bounds_confidence) or self.bounds_confidence == self.confidence:
+        if math.isnan(self.bounds_confidence) or self.bounds_confidence == self.upper_confidence == self.confidence:
             return ""
+        lower, upper = (f"{100.0 * level:.4g} %" for level in (self.bounds_confidence, self.upper_confidence))
+        kept = f"so that all looks together keep {stated(self.confidence)}"
+        if lower == upper:
+            return f"The campaign is judged more than once: its bounds are at {lower} confidence, {kept}."
         return (
-            f"The campaign stops itself when it is decided: its bounds are at {100.0 * self.bounds_confidence:.4g} % "
-            f"confidence, so that all looks together keep {stated(self.confidence)}."
+            f"The campaign is judged more than once: its lower bound is at {lower} confidence and its upper bound at "
+            f"{upper}, {kept}."
         )
 
 
@@ -217,9 +238,7 @@ def members(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
     return _members_of(frame, population.split(" and "))[0]
 
 
-def _members_of(
-    frame: pd.DataFrame, parts: Sequence[str]
-) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def _members_of(frame: pd.DataFrame, parts: Sequence[str]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Members of the intersection of populations, and those of them whose membership is unknown."""
     chosen, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
     for part in parts:
@@ -228,7 +247,7 @@ def _members_of(
         elif part != "all":
             column = "answered" if part == "valid" else part
             if not is_flag(frame, column):
-                raise ValueError(f"the rows have no column '{column}' of true and false, by which a population is known")
+                raise ValueError(f"the rows have no column '{column}' of true and false, by which membership is known")
             missing = frame[column].isna().to_numpy(dtype=np.bool_)
             chosen &= _true(frame, column) | missing
             unknown |= missing
@@ -261,11 +280,10 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
     except ValueError as error:
         return replace(open_verdict, reason=_sentence(str(error)))
     if chosen.empty:
-        asked = (open_verdict.probability, open_verdict.confidence)
-        further = further_cases_needed(0, 0, *asked) if how.independent else None
+        needed = LaterLook(1.0 - open_verdict.probability, 1.0 - open_verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{open_verdict.population}'."
-        return replace(open_verdict, reason=reason, further_cases=further)
-    return _withhold(*(_decide(open_verdict, cases, how, len(frame)) for cases in (chosen, suspected)))
+        return replace(open_verdict, reason=reason, further_cases=needed if how.independent else None)
+    return _withhold(*(_decide(open_verdict, cases, how, frame) for cases in (chosen, suspected)))
 
 
 def _members_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
@@ -289,11 +307,11 @@ def _withhold(verdict: Verdict, suspected: Verdict) -> Verdict:
     return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
 
 
-def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, cases: int) -> Verdict:
-    """The verdict by the members of its population, of which there is at least one, among so many cases."""
+def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, frame: pd.DataFrame) -> Verdict:
+    """The verdict by the members of its population, of which there is at least one, among all cases."""
     if not how.independent:
         return _described(verdict, chosen, how)
-    return _weighed(verdict, chosen, how.risk_share(cases))
+    return _weighed(verdict, chosen, Looks(how.seen_before(frame, chosen), how.risk_share(len(frame))), how)
 
 
 def _successes(verdict: Verdict, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"]:
@@ -310,7 +328,7 @@ def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
     decided = verdict.decide_by == ESTIMATE
     return replace(
         verdict,
-        status=status_of(rate, rate, verdict.probability) if decided else verdict.status,
+        status=_status_by_rate(rate, success.size, verdict.probability) if decided else verdict.status,
         n=success.size,
         failures=int((~success).sum()),
         estimate=rate,
@@ -319,48 +337,64 @@ def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
     )
 
 
-def _weighed(verdict: Verdict, chosen: pd.DataFrame, share: float) -> Verdict:
-    """The verdict by the cases of its population, of which there is at least one; `share` of the risk may be spent."""
+def _weighed(verdict: Verdict, chosen: pd.DataFrame, looks: Looks, how: Sampled) -> Verdict:
+    """The verdict by the cases of its population, of which there is at least one."""
     success = _successes(verdict, chosen)
     n, failures = success.size, int((~success).sum())
-    confidence = confidence_at(verdict.confidence, share)
-    plain = proportion_lower(n - failures, n, confidence), proportion_upper(n - failures, n, confidence)
     groups = terrain_groups(chosen)
-    shared = None
-    if groups is not None and int(groups.max()) + 1 < n:
-        shared = clustered_evidence(success, groups, confidence)
-    lower, upper = plain if shared is None else (shared.lower, shared.upper)
-    estimate = (n - failures) / n
-    decisive = (estimate, estimate) if verdict.decide_by == ESTIMATE else (lower, upper)
-    status = status_of(*decisive, verdict.probability)
+    bounds = bounds_of(success, groups, verdict.probability, verdict.confidence, looks)
+    status = status_of(bounds.lower, bounds.upper, verdict.probability)
+    by_rate = verdict.decide_by == ESTIMATE and status is not Status.PASS
+    if by_rate:
+        status = _status_by_rate((n - failures) / n, n, verdict.probability)
     judged = replace(
         verdict,
         status=status,
         n=n,
         failures=failures,
-        estimate=estimate,
-        lower=lower,
-        upper=upper,
+        estimate=(n - failures) / n,
+        lower=bounds.lower,
+        upper=bounds.upper,
         terrains=None if groups is None else int(chosen["terrain"].nunique()),
-        clustered=shared,
-        plain_lower=plain[0],
-        plain_upper=plain[1],
-        bounds_confidence=confidence,
+        clustered=bounds.clustered,
+        plain_lower=bounds.plain_lower,
+        plain_upper=bounds.plain_upper,
+        bounds_confidence=bounds.lower_confidence,
+        upper_confidence=bounds.upper_confidence,
     )
-    return replace(judged, further_cases=_further_cases(judged)) if status is Status.INSUFFICIENT else judged
+    if status is not Status.INSUFFICIENT:
+        return judged
+    if by_rate:
+        return replace(judged, further_cases=fewest_cases_for_rate(verdict.probability) - n)
+    return _with_advice(judged, bounds.further_cases, how)
 
 
-def _further_cases(verdict: Verdict) -> int:
-    """How many more cases would show the requirement met if none of them fails."""
-    asked = (verdict.probability, verdict.bounds_confidence)
+def _with_advice(verdict: Verdict, further: int, how: Sampled) -> Verdict:
+    """The verdict with the further cases that it needs, or with what keeps further cases from helping."""
     shared = verdict.clustered
-    if shared is None:
-        return further_cases_needed(verdict.n, verdict.failures, *asked)
-    if shared.method is ClusterMethod.TERRAIN_COUNT:
-        return further_cases_needed(shared.terrains, shared.failed_terrains, *asked)
-    worth = shared.effective_n / verdict.n
-    effective = further_cases_needed(math.floor(shared.effective_n), math.ceil(verdict.failures * worth), *asked)
-    return math.ceil(effective / worth)
+    counted = shared is not None and shared.method is ClusterMethod.TERRAIN_COUNT
+    supply = how.terrains
+    if not counted or supply is None or (verdict.terrains or 0) + further <= supply.terrains:
+        return replace(verdict, further_cases=further)
+    fewest = minimum_sample_size(verdict.probability, verdict.confidence)
+    return replace(verdict, advice=supply.advice(fewest, verdict.probability, verdict.confidence))
+
+
+def _status_by_rate(rate: float, n: int, probability: float) -> Status:
+    """What the rate of n cases says where it decides alone."""
+    if rate < probability:
+        return Status.FAIL
+    return Status.MET_BY_RATE if n >= fewest_cases_for_rate(probability) else Status.INSUFFICIENT
+
+
+def fewest_cases_for_rate(probability: float) -> int:
+    """The fewest cases by whose rate alone a requirement can be met: those of which one may fail.
+
+    Of fewer cases none may fail, and the rate of a requirement that is met and of one that is missed look alike: with
+    n = 1 / (1 - probability) cases one failure is expected at the rate asked.
+    """
+    # the tolerance keeps 1 / (1 - 0.9), which is 10.000000000000002, at 10
+    return math.ceil(1.0 / (1.0 - probability) - 1e-9)
 
 
 def status_of(lower: float, upper: float, probability: float) -> Status:
@@ -399,7 +433,7 @@ def _unjudged(requirement: Mapping[str, Any]) -> Verdict:
     """The requirement without evidence."""
     return Verdict(
         requirement_id=str(requirement.get("id", "?")),
-        statement=str(requirement.get("statement", "")),
+        statement=_statement(requirement),
         metric=str(requirement.get("metric", "?")),
         bound=_number(requirement.get("bound")),
         probability=_number(requirement.get("probability")),
@@ -409,6 +443,7 @@ def _unjudged(requirement: Mapping[str, Any]) -> Verdict:
         source=str(requirement.get("source") or ""),
         kind=str(requirement.get("kind") or ""),
         scale=_number(requirement.get("scale", 1.0)),
+        accept_rate=requirement.get("accept_rate") is True,
         status=Status.INSUFFICIENT,
         n=0,
         failures=0,
@@ -417,6 +452,12 @@ def _unjudged(requirement: Mapping[str, Any]) -> Verdict:
         upper=math.nan,
         further_cases=None,
     )
+
+
+def _statement(requirement: Mapping[str, Any]) -> str:
+    """The requirement's text, which says where the rate decides."""
+    text = str(requirement.get("statement", ""))
+    return f"{text.rstrip('.')} (decided by rate).".lstrip() if requirement.get("decide_by") == ESTIMATE else text
 
 
 def _number(value: object) -> float:

@@ -50,7 +50,7 @@ def asked_text(asked: Asked, metric: str) -> str:
     scaled = "" if asked.scale == 1.0 else f"{asked.scale:g} × "
     what = metric if unbounded else f"{scaled}|{metric}| ≤ {asked.bound:g}"
     confidence = f"{stated(asked.confidence)} confidence"
-    how = f"by the estimate, bounds at {confidence}" if asked.decide_by == "estimate" else f"at {confidence}"
+    how = f"decided by rate, bounds at {confidence}" if asked.decide_by == "estimate" else f"at {confidence}"
     return f"{what} in at least {stated(asked.probability)} of {population_text(asked.population)}, {how}"
 
 

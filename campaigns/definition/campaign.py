@@ -15,7 +15,7 @@ from campaigns.sampling.correlation import Correlation
 from campaigns.sampling.design import SMALLEST, Layout, Place, correlated, grid_probabilities, place_of, stratified
 from campaigns.sampling.dispersion import Dispersion
 from campaigns.sampling.levels import Derived, Fixed, Grid
-from campaigns.sampling.ranges import Normal
+from campaigns.sampling.ranges import InTurn, Normal
 from scenarios.interface import Scenario
 from sim.streams import Streams
 
@@ -61,6 +61,9 @@ class Campaign:
                 values[path] = value_at(self.configuration.parameters, path)
                 continue
             given = dispersion.given(self._numbers_for(dispersion, values))
+            if isinstance(given, InTurn):
+                values[path] = given.value(case)
+                continue
             probability = 0.5 if probabilities is None else probabilities.get(path, 0.5)
             values[path] = given.quantile(probability)
         return {path: values[path] for path in dispersions}
@@ -122,7 +125,7 @@ class Campaign:
     def drawn_paths(self) -> tuple[str, ...]:
         """The dispersions that take a random number, in the file's order."""
         stated = self.configuration.dispersions.items()
-        return tuple(path for path, one in stated if not isinstance(one, Grid | Fixed | Derived))
+        return tuple(path for path, one in stated if not isinstance(one, Grid | Fixed | Derived | InTurn))
 
     @cached_property
     def _groups(self) -> tuple[tuple[tuple[int, ...], tuple[tuple[float, ...], ...]], ...]:

@@ -37,7 +37,8 @@ class Requirement(BaseModel):
     joined by " and ", as in `valid and room`. A metric with a bound may be a sum of columns, joined by " + ", and is
     multiplied by `scale` before it is held against the bound. `decide_by = "estimate"` compares the rate that was seen
     with the probability, whatever its interval, which is stated beside it: for requirements that are not asked at a
-    confidence. `source` and `kind` say whose requirement it is.
+    confidence. They are at best MET BY RATE, with the exit status 3, which `accept_rate` makes 0. `source` and `kind`
+    say whose requirement it is.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -50,11 +51,20 @@ class Requirement(BaseModel):
     confidence: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)]
     population: Annotated[str, Field(pattern=r"^[A-Za-z]\w*( and [A-Za-z]\w*)*$")] = "all"
     decide_by: Literal["confidence", "estimate"] = "confidence"
+    accept_rate: Annotated[bool, Field(strict=True)] = Field(
+        default=False, description="whether MET BY RATE, where the estimate decides, gives the exit status 0"
+    )
     source: str = ""
     kind: Literal["requirement", "observation", "ours"] | None = Field(
         default=None, description="of a paper: its requirement, or what it observed; or ours"
     )
     scale: Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)] = 1.0
+
+    @model_validator(mode="after")
+    def _rate_is_accepted_where_it_decides(self) -> Requirement:
+        if self.accept_rate and self.decide_by != "estimate":
+            raise ValueError('accept_rate needs decide_by = "estimate"')
+        return self
 
     @property
     def metric_columns(self) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from campaigns.errors import ConfigurationError, Problem, not_allowed
 REQUIREMENTS_FILE = Path(__file__).resolve().parents[2] / "scenarios" / "requirements.toml"
 
 #: What a campaign that names a stated requirement may say of it anew.
-RESTATED = ("statement", "population", "probability", "confidence", "decide_by")
+RESTATED = ("statement", "population", "probability", "confidence", "decide_by", "accept_rate")
 
 
 class StatedRequirement(Requirement):

@@ -149,6 +149,20 @@ def append_cases(directory: Path, cases: int, crew: Crew, watch: Watch, *, allow
         _go_on(_Folder(directory, configuration), crew, watch, "append", allow_changed=allow_changed)
 
 
+def with_block(directory: Path, cases: int) -> Campaign:
+    """A stored campaign with another block of cases, which is not run. Raises CampaignError as `append_cases` does."""
+    configuration = _with_block(directory, record.stored_configuration(directory), cases)
+    return _campaign(directory, configuration)
+
+
+def _campaign(directory: Path, configuration: CampaignConfiguration) -> Campaign:
+    """The campaign that a folder's configuration states."""
+    try:
+        return Campaign(configuration, scenario(configuration.scenario))
+    except UnknownScenarioError as error:
+        raise CampaignError(f"{directory}: {error}") from error
+
+
 def _with_record(directory: Path) -> Path:
     """The folder, if it holds a campaign: nothing, not even a lock, is put into one that does not."""
     record.read(directory)
@@ -170,10 +184,7 @@ def _go_on(
     directory, configuration = folder.directory, folder.configuration
     stored = record.read(directory)
     changes = _identity_changes(directory, stored, configuration, allow_changed)
-    try:
-        campaign = Campaign(configuration, scenario(configuration.scenario))
-    except UnknownScenarioError as error:
-        raise CampaignError(f"{directory}: {error}") from error
+    campaign = _campaign(directory, configuration)
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         _check_together(directory, stored, store)
         before = store.count()

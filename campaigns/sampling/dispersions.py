@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, mod
 from campaigns.errors import near_match
 from campaigns.sampling.dispersion import Dispersion
 from campaigns.sampling.levels import Choice, Derived, Fixed, Grid
-from campaigns.sampling.ranges import Integer, Normal, Uniform
+from campaigns.sampling.ranges import Integer, InTurn, Normal, Uniform
 from campaigns.sampling.shapes import Frozen, Shape, parameters_of, scipy_distributions, truncated_quantile
 from campaigns.sampling.stated import Limits, Number, limits_of
 
@@ -82,6 +82,7 @@ FRIENDLY: Mapping[str, type[Dispersion]] = {
     "normal": Normal,
     "choice": Choice,
     "integer": Integer,
+    "in-turn": InTurn,
     "fixed": Fixed,
     "derived": Derived,
     "grid": Grid,
@@ -99,6 +100,7 @@ AnyDispersion = Annotated[
     | Annotated[Normal, Tag("normal")]
     | Annotated[Choice, Tag("choice")]
     | Annotated[Integer, Tag("integer")]
+    | Annotated[InTurn, Tag("in-turn")]
     | Annotated[Fixed, Tag("fixed")]
     | Annotated[Derived, Tag("derived")]
     | Annotated[Grid, Tag("grid")]

@@ -1,4 +1,4 @@
-"""Dispersions over a range of numbers: uniform, normal, whole numbers."""
+"""Dispersions over a range of numbers: uniform, normal, whole numbers drawn or taken in turn."""
 
 from __future__ import annotations
 
@@ -97,10 +97,9 @@ class Normal(Dispersion):
         return (known[0], known[1]) if known else None
 
 
-class Integer(Dispersion):
-    """Every whole number from `low` to `high` alike, both included."""
+class _WholeNumbers(Dispersion):
+    """Whole numbers from `low` to `high`, both included."""
 
-    distribution: Literal["integer"]
     low: WholeNumber
     high: WholeNumber
 
@@ -128,3 +127,24 @@ class Integer(Dispersion):
         """See `Dispersion.bounds`."""
         known = numbers_of(self.low, self.high)
         return (known[0], known[1]) if known else None
+
+
+class Integer(_WholeNumbers):
+    """Every whole number from `low` to `high` alike, both included."""
+
+    distribution: Literal["integer"]
+
+
+class InTurn(_WholeNumbers):
+    """The whole numbers from `low` to `high`, both included, one case after the other, then from `low` again.
+
+    No number is met twice before all are met once: cases are on as many terrains as there can be. Where the numbers
+    mean nothing but which of many independent terrains it is, cases with different ones are independent.
+    """
+
+    distribution: Literal["in-turn"]
+
+    def value(self, case: int) -> int:
+        """The number that a case takes."""
+        low, high = int(self.low), int(self.high)
+        return low + case % (high - low + 1)

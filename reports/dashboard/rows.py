@@ -105,7 +105,7 @@ def sparkline(shown: Sequence[Shown]) -> Sparkline | None:
 def coverage(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
     """Latest verdicts and how many requirements have each, those that no campaign shows last."""
     words = [row.latest.shown.status for row in rows if row.latest is not None]
-    known = [word for word in dict.fromkeys(("FAIL", "INSUFFICIENT", "PASS", *words)) if word in words]
+    known = [word for word in dict.fromkeys(("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS", *words)) if word in words]
     found = [(word, words.count(word)) for word in known]
     missing = sum(row.latest is None for row in rows)
     return [*found, ("NO CAMPAIGN", missing)] if missing else found
@@ -118,7 +118,7 @@ def evidence_text(shown: Shown) -> str:
 
 def basis_text(shown: Shown) -> str:
     """What a verdict rests on where that is no confidence; empty otherwise."""
-    return "by the rate seen" if shown.decide_by == ESTIMATE else ""
+    return "decided by rate" if shown.decide_by == ESTIMATE else ""
 
 
 def margin_text(shown: Shown) -> str:

@@ -36,12 +36,13 @@
     add(drawn, "circle", {cx: places[places.length - 1][0], cy: places[places.length - 1][1], r: 2.6});
     return [drawn];
   };
+  const statusClass = (status) => `status-${status.toLowerCase().replaceAll(" ", "-")}`;
   const show = (row, found) => {
     const verdict = row.querySelector(".verdict");
     if (!verdict) return;
     const [evidence, margin, shown] = ["evidence", "margin", "shown"].map((name) => row.querySelector(`.${name}`));
     const latest = found[0];
-    verdict.className = `verdict status-${latest ? latest.status.toLowerCase() : "no-campaign"}`;
+    verdict.className = `verdict ${statusClass(latest ? latest.status : "NO CAMPAIGN")}`;
     const badge = latest && badges.get(latest.status);
     if (badge) {
       const basis = document.createElement("span");
@@ -57,7 +58,7 @@
       const [item, about, word, link, date] = ["li", "span", "b", "a", "span"].map((name) => document.createElement(name));
       item.textContent = one.evidence;
       about.className = "asked";
-      word.className = `status-${one.status.toLowerCase()}`;
+      word.className = statusClass(one.status);
       word.textContent = one.status;
       link.href = `c/${one.slug}/index.html`;
       link.textContent = one.name;

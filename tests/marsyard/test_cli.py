@@ -161,6 +161,7 @@ def test_a_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Com
     appended = marsyard("append", tmp_path / "run", 20, "--jobs", 1, "--allow-changed")
     assert appended.status == 3
     assert "of 60" in appended.out
+    assert "takes at least 230 cases without a failure, and 60 are asked for" in appended.out
 
 
 def test_a_dry_run_only_estimates(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:

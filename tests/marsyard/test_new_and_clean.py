@@ -6,11 +6,15 @@ import json
 import tomllib
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
 from campaigns.definition.loading import load_campaign
 from marsyard.cli import app
+from marsyard.evidence import evidence_limits
+from reports.sampled import sampled
+from reports.verdicts import Status, judge_campaign
 
 #: EuRoC's first camera (its sensor.yaml), of the fields that are read.
 EUROC = """resolution: [752, 480]
@@ -48,6 +52,44 @@ def test_a_new_campaign_is_one(here: Path, system: str, scenario: str, bound: fl
     lines = (here / "mine.toml").read_text().splitlines()
     assert sum(line.startswith("#") for line in lines) >= 8
     assert load_campaign("mine.toml").draws(3)
+
+
+@pytest.mark.parametrize("system", ["velocity", "landing", "tracking"])
+def test_each_case_of_a_new_campaign_has_a_terrain_of_its_own(here: Path, system: str) -> None:
+    """A bank of 2 terrains kept the verdict of any number of cases INSUFFICIENT."""
+    status, output = told("new", "mine", "--system", system, "-n", "1000")
+    assert (status, "note:" in output) == (0, False), output
+    campaign = load_campaign("mine.toml")
+    path = "world.terrain" if system == "tracking" else "place.terrain"
+    assert len({campaign.draws(case)[path] for case in range(0, 1000, 7)}) == len(range(0, 1000, 7))
+
+
+def test_a_new_campaign_without_failures_passes(here: Path) -> None:
+    """230 cases show 99 % at 90 % confidence, on the terrains that the campaign draws."""
+    assert told("new", "mine", "--system", "velocity", "--site", "gusev", "-n", "230")[0] == 0
+    campaign = load_campaign("mine.toml")
+    terrains = [campaign.draws(case)["place.terrain"] for case in range(230)]
+    frame = pd.DataFrame({"case": range(230), "terrain": terrains, "answered": True, "velocity_error_m_s": 1.0})
+    plain = campaign.configuration.model_dump(mode="json")
+    (verdict,) = judge_campaign(frame.assign(outcome="VALID"), plain["requirements"], sampled(plain))
+    assert (verdict.status, verdict.n, verdict.terrains) == (Status.PASS, 230, 230)
+
+
+def test_what_limits_the_evidence_is_printed_before_a_run(here: Path) -> None:
+    """`new` and `--dry-run` name too few cases, too few terrains, and designs that are no random draws."""
+    assert "takes at least 230 cases without a failure, and 24 are asked for" in told("new", "few")[1]
+    assert evidence_limits(load_campaign("few.toml", cases=230)) == []
+    cases, terrains = evidence_limits(load_campaign("dimes-smoke"))
+    assert cases.startswith("DIMES-VEL: 99 % at 90 % confidence takes at least 230 cases")
+    assert "draws from 8 terrains (place.bank = 8)" in terrains
+    assert "--set place.bank=2300 -n 254" in terrains
+    advised = load_campaign("dimes-smoke", ["place.bank=2300"], 254)
+    assert evidence_limits(advised) == []
+    # more cases on the same terrains do not help
+    (terrains,) = evidence_limits(load_campaign("dimes-smoke", cases=1000))
+    assert "draws from 8 terrains" in terrains
+    grid = evidence_limits(load_campaign("dimes-smoke", ["design.kind=sobol"], 32))
+    assert 'Set design.kind = "random", and run it again.' in grid[0]
 
 
 def test_own_files_are_named_in_it(here: Path) -> None:

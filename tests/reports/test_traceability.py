@@ -39,11 +39,18 @@ def test_matrix_has_a_row_for_each_requirement(make_rows: Rows, velocity: dict[s
 
 def test_junit_tells_failures_and_what_is_open(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame = make_rows(40, crashed=2, terrains=10_000)
-    asked = [{**velocity, "bound": 0.01, "id": "FAILS"}, _undecided(velocity), {**velocity, "probability": 0.5}]
+    by_rate = {**velocity, "id": "RATE", "probability": 0.95, "decide_by": "estimate"}
+    asked = [
+        {**velocity, "bound": 0.01, "id": "FAILS"},
+        _undecided(velocity),
+        {**velocity, "probability": 0.5},
+        by_rate,
+    ]
     verdicts = judge_campaign(frame, asked)
     suite = Xml.fromstring(junit_xml(HOSTILE, verdicts, overall(verdicts, frame)))  # noqa: S314
-    assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("4", "2", "1")
-    fails, undecided, passes, ended = suite
+    assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("5", "2", "2")
+    fails, undecided, passes, met, ended = suite
+    assert met.find("skipped").get("message").startswith("MET BY RATE: ")
     assert fails.find("failure") is not None
     assert "INSUFFICIENT" in undecided.find("skipped").get("message")
     assert [child.tag for child in passes] == ["system-out"]

@@ -211,3 +211,13 @@ def test_draws_arrive_in_the_parameters(campaign_file: CampaignFile) -> None:
     assert parameters["heights_m"] == (1.0, drawn["heights_m.1"])
     assert parameters["kind"] == drawn["kind"]
     assert parameters["lowest_altitude_m"] == 0.0
+
+
+@pytest.mark.parametrize("design", ["random", "sobol"])
+def test_whole_numbers_in_turn_repeat_only_when_all_are_used(campaign_file: CampaignFile, design: str) -> None:
+    dispersions = '[dispersions]\nterrain = {distribution = "in-turn", low = 2, high = "2 + 2"}\n'
+    path = campaign_file(dispersions=dispersions, more=f'[design]\nkind = "{design}"\n')
+    campaign = load_campaign(str(path), cases=8)
+    assert [campaign.draws(case)["terrain"] for case in range(8)] == [2, 3, 4, 2, 3, 4, 2, 3]
+    with pytest.raises(ValidationError, match="must not be above"):
+        dispersion(distribution="in-turn", low=3, high=2)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from reports.statistics.proportions import proportion_lower, proportion_upper
-from reports.statistics.sequential import confidence_at, looks_of, spent_share
+from reports.statistics.sequential import LaterLook, confidence_at, looks_of, spent_share
 
 
 def test_looks_halve_from_the_last_case() -> None:
@@ -67,3 +69,67 @@ def test_peeking_without_a_share_passes_falsely() -> None:
         failed = np.cumsum(rng.random(1000) < 0.1)
         passed += any(proportion_lower(n - int(failed[n - 1]), n, 0.9) >= 0.9 for n in (look.cases for look in looks))
     assert passed / 400 > 0.15
+
+
+def _follow_advice(rng: np.random.Generator, first: int, most: int, passes: LaterLook, fails: LaterLook) -> set[str]:
+    """Verdicts of one campaign at a true rate of 0.99, asked 0.99 at 0.9, which is appended to as it advises."""
+    cases, failures, verdicts = first, int(rng.binomial(first, 0.01)), set()
+    pass_risk = fail_risk = 0.1
+    while True:
+        if stats.binom.cdf(cases - failures, cases, 0.99) < fail_risk:
+            verdicts.add("FAIL")
+        if stats.binom.cdf(failures, cases, 0.01) <= pass_risk:
+            return verdicts | {"PASS"}
+        if cases >= most:
+            return verdicts
+        needed = min(most, passes.cases_needed(cases, failures))
+        failures += int(rng.binomial(needed - cases, 0.01))
+        cases = needed
+        pass_risk, fail_risk = passes.risk_of_bound(cases), fails.risk_of_bound(cases)
+
+
+@pytest.mark.parametrize("first", [24, 230])
+def test_appending_as_advised_keeps_the_confidence(first: int) -> None:
+    """At most 5,000 cases; with the ordinary bounds at each look 38.6 % of these campaigns passed falsely."""
+    rng = np.random.default_rng(21)
+    passes, fails = LaterLook(0.01, 0.1, first), LaterLook(0.99, 0.1, first)
+    for look in (passes, fails):
+        object.__setattr__(look, "risk_of_bound", cache(look.risk_of_bound))
+        object.__setattr__(look, "cases_needed", cache(look.cases_needed))
+    verdicts = [_follow_advice(rng, first, 5000, passes, fails) for _ in range(1500)]
+    # one standard deviation of a share of 10 % of 1,500 is 0.8 %
+    for verdict in ("PASS", "FAIL"):
+        assert np.mean([verdict in one for one in verdicts]) <= 0.1 + 2 * 0.008
+
+
+@pytest.mark.parametrize("first", [1, 24, 230, 388])
+@pytest.mark.parametrize(("rate", "confidence"), [(0.01, 0.9), (0.1, 0.95), (0.95, 0.9)])
+def test_a_look_at_any_time_keeps_the_risk_exactly(first: int, rate: float, confidence: float) -> None:
+    """Looks at every tenth case after the first look, exact: the chance of a verdict at any of them is below the risk.
+
+    No rule for when to look can do worse.
+    """
+    risk, look = 1.0 - confidence, LaterLook(rate, 1.0 - confidence, first)
+    counts = np.arange(first + 1)
+    undecided = stats.binom.pmf(counts, first, rate)
+    undecided[stats.binom.cdf(counts, first, rate) <= risk] = 0.0
+    decided = 1.0 - undecided.sum()
+    for cases in range(first + 1, first + 1501):
+        undecided = np.convolve(undecided, [1.0 - rate, rate])
+        if cases % 10 == 0:
+            verdict = stats.binom.cdf(np.arange(cases + 1), cases, rate) <= look.risk_of_bound(cases)
+            decided += undecided[verdict].sum()
+            undecided[verdict] = 0.0
+    assert decided <= risk
+
+
+@given(st.integers(0, 400), st.integers(0, 5), st.sampled_from([0.5, 0.9, 0.99]))
+def test_the_cases_that_are_advised_are_the_fewest_that_pass(first: int, failures: int, asked: float) -> None:
+    look = LaterLook(1.0 - asked, 0.1, first)
+    needed = look.cases_needed(max(first, failures), failures)
+
+    def passes(cases: int) -> bool:
+        return proportion_lower(cases - failures, cases, 1.0 - look.risk_of_bound(cases)) >= asked
+
+    assert passes(needed)
+    assert needed == max(first, failures) or not passes(needed - 1)
