@@ -22,6 +22,7 @@ from campaigns.execution.work import Work, Workers
 from campaigns.outcomes import RETRYABLE, UNFINISHED
 from campaigns.running.inputs import plan_inputs
 from campaigns.running.replay import replay_with
+from campaigns.running.stored import loaded_campaign
 from campaigns.store import record
 from campaigns.store.columns import Row
 from campaigns.store.lock import folder_lock
@@ -29,7 +30,7 @@ from campaigns.store.retention import ProductStore, keep_while_running
 from campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from campaigns.store.table import TABLE_FILE, write_table
 from campaigns.store.worst import showcase_case, worst_cases
-from scenarios.registry import SCENARIOS, UnknownScenarioError, scenario
+from scenarios.registry import SCENARIOS
 from sim.kernel_cache import kernels_are_ready, note_ready
 
 #: What a requirement without a bound, and a population, ask a column to be.
@@ -161,11 +162,8 @@ def _go_on(
     """Runs what a stored campaign lacks."""
     directory, configuration = folder.directory, folder.configuration
     stored = record.read(directory)
+    campaign = loaded_campaign(directory, configuration)
     changes = _identity_changes(directory, stored, configuration, allow_changed)
-    try:
-        campaign = Campaign(configuration, scenario(configuration.scenario))
-    except UnknownScenarioError as error:
-        raise CampaignError(f"{directory}: {error}") from error
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         _check_together(directory, stored, store)
         before = store.count()
