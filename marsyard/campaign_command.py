@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
 import signal
@@ -83,6 +84,11 @@ def says_what_is_wrong(command: Callable[Parameters, None]) -> Callable[Paramete
         try:
             command(*args, **kwargs)
         except CampaignError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(Exit.WRONG) from None
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+                raise
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(Exit.WRONG) from None
 
@@ -195,27 +201,36 @@ def replay(
 ) -> None:
     """Run one case again, keep and draw its intermediate results, and compare its row with the stored one."""
     from campaigns.running.replay import replay as run_again
-    from campaigns.store.products import PackedProducts, save_packed, unpack_products
     from campaigns.store.retention import case_directory
-    from marsyard.steps import write_steps
-    from reports.systems import write_case_figures
 
     replayed = run_again(directory, case)
     target = out if out is not None else case_directory(directory, case)
-    packed = replayed.products or PackedProducts.nothing()
-    save_packed(target, packed, replayed.row)
+    if (replayed.failed or replayed.products is None) and (target / "products.json").exists():
+        written = [f"{target} keeps the products that it had: this time the case delivered none to replace them"]
+    else:
+        written = _write_products(target, replayed, step=step)
     typer.echo(f"case {case}: {replayed.row['outcome']}")
-    if replayed.row["error"]:
-        typer.echo(replayed.row["traceback"] or replayed.row["error"])
-    for line in (replayed.note, f"products: {target}"):
+    for line in (replayed.row["error"] and (replayed.row["traceback"] or replayed.row["error"]), replayed.note):
         if line:
             typer.echo(line)
-    products = unpack_products(packed)
-    if step:
-        typer.echo(f"stages: {write_steps(target / 'steps', products)} files in {target / 'steps'}")
-    for figure in write_case_figures(target, products):
-        typer.echo(f"figure: {figure}")
+    typer.echo("\n".join(written))
     _compare(replayed)
+
+
+def _write_products(target: Path, replayed: Replay, *, step: bool) -> list[str]:
+    """Writes the products, stages and figures of a replayed case, all of them or none; returns lines that name them."""
+    from campaigns.store.products import PackedProducts, replaced_files, unpack_products, write_packed
+    from marsyard.steps import write_steps
+    from reports.systems import write_case_figures
+
+    packed = replayed.products or PackedProducts.nothing()
+    products = unpack_products(packed)
+    with replaced_files(target) as folder:
+        write_packed(folder, packed, replayed.row)
+        stages = write_steps(folder / "steps", products) if step else 0
+        figures = [target / path.relative_to(folder) for path in write_case_figures(folder, products)]
+    lines = [f"stages: {stages} files in {target / 'steps'}"] if step else []
+    return [f"products: {target}", *lines, *(f"figure: {figure}" for figure in figures)]
 
 
 def _compare(replayed: Replay) -> None:

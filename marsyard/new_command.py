@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -65,13 +66,22 @@ def new(
         raise CampaignError(f"{path}: there already; --overwrite replaces it, --out writes another")
     if not name or any(letter in name for letter in '/\\"\n'):
         raise CampaignError(f"'{name}' is no name for a campaign: without slashes and quotes")
-    asked = system is None and sys.stdin.isatty()
-    chosen = System(_asked("System: velocity, landing or tracking", "velocity", asked)) if system is None else system
+    asked = system is None and _is_terminal()
+    chosen = System(_asked("System", "velocity", asked, _one_of(list(System)))) if system is None else system
     usual_site, usual_bound, about = _USUAL[chosen]
-    site = site or _asked("Site", usual_site, asked)
-    camera = camera or _asked("Camera's file (empty: the paper's camera)", "", asked and chosen != System.TRACKING)
-    flight = flight or _asked("Trajectory's file (empty: simulated)", "", asked and chosen == System.VELOCITY)
-    stated = float(_asked(f"Requirement: {about}", f"{usual_bound:g}", asked)) if bound is None else bound
+    site = site or _asked("Site", usual_site, asked, _one_of(_sites(chosen)))
+    camera = camera or _asked(
+        "Camera's file (empty: the paper's camera)", "", asked and chosen != System.TRACKING, _camera_file
+    )
+    flight = flight or _asked(
+        "Trajectory's file (empty: simulated)", "", asked and chosen == System.VELOCITY, _readable_file
+    )
+    highest = 1.0 if chosen == System.LANDING else float("inf")
+    stated = (
+        float(_asked(f"Requirement: {about}", f"{usual_bound:g}", asked, _above_zero(highest)))
+        if bound is None
+        else bound
+    )
     choices = Choices(name, chosen.value, site, camera, detector or "", flight, axes, stated, cases)
     text = campaign_text(choices)
     before = path.read_text(encoding="utf-8") if path.exists() else None
@@ -93,6 +103,67 @@ def new(
         typer.echo(f"note: {limit}")
 
 
-def _asked(question: str, usual: str, asked: bool) -> str:
-    """The answer at the terminal, or the usual."""
-    return str(typer.prompt(question, default=usual, show_default=bool(usual))) if asked else usual
+def _is_terminal() -> bool:
+    return sys.stdin.isatty()
+
+
+def _asked(question: str, usual: str, asked: bool, check: Callable[[str], str]) -> str:
+    """The answer at the terminal, asked for again until `check` accepts it; or the usual."""
+    if not asked:
+        return usual
+    return str(typer.prompt(question, default=usual, show_default=bool(usual), value_proc=check))
+
+
+def _one_of(allowed: Sequence[str]) -> Callable[[str], str]:
+    """Accepts one of some words."""
+    from campaigns.errors import not_allowed
+
+    def check(answer: str) -> str:
+        if answer not in allowed:
+            raise typer.BadParameter(not_allowed("answer", answer, allowed))
+        return answer
+
+    return check
+
+
+def _sites(system: System) -> list[str]:
+    """Sites that a system's scenario accepts: those with a terrain at its scale."""
+    from sim.terrain import sites
+
+    scale = "descent" if system == System.VELOCITY else "ground"
+    return [name for name, one in sites().items() if getattr(one, scale) is not None]
+
+
+def _readable_file(answer: str) -> str:
+    """Accepts nothing, or a file that is there."""
+    if answer and not Path(answer).is_file():
+        raise typer.BadParameter(f"{answer}: no such file; allowed: the path of a file, or nothing")
+    return answer
+
+
+def _camera_file(answer: str) -> str:
+    """Accepts nothing, or a file that a camera is read from."""
+    from sim.camera import CameraFileError, read_camera
+
+    if answer:
+        try:
+            read_camera(answer)
+        except CameraFileError as error:
+            raise typer.BadParameter(f"{error}; allowed: the path of a camera's file, or nothing") from error
+    return answer
+
+
+def _above_zero(highest: float) -> Callable[[str], str]:
+    """Accepts a number above 0 and below `highest`."""
+
+    def check(answer: str) -> str:
+        try:
+            number = float(answer)
+        except ValueError:
+            number = 0.0
+        if not 0.0 < number < highest:
+            below = "" if highest == float("inf") else f" and below {highest:g}"
+            raise typer.BadParameter(f"'{answer}' is not allowed; allowed: a number above 0{below}")
+        return answer
+
+    return check

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import time
+from datetime import timedelta
 from types import TracebackType
 from typing import Protocol, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
 #: Seconds between two plain lines.
 LINE_INTERVAL_S = 10.0
+
+
+def left_s(done: int, total: int, elapsed_s: float) -> float:
+    """Seconds that a stage still takes at its mean rate so far, the rate that `rate_text` prints."""
+    return elapsed_s / done * (total - done) if done else 0.0
 
 
 def rate_text(done: int, elapsed_s: float) -> str:
@@ -22,9 +28,25 @@ def rate_text(done: int, elapsed_s: float) -> str:
     return f"{rate:.1f} /s" if rate >= 1.0 else f"{1.0 / rate:.1f} s each"
 
 
+def _elapsed_s(task: Task) -> float:
+    """Seconds of a stage up to now, or to its end: a stage that has ended stops counting."""
+    ended = task.finished_time if task.finished else task.elapsed
+    return ended or 0.0
+
+
 class _RateColumn(ProgressColumn):
     def render(self, task: Task) -> Text:
-        return Text(rate_text(int(task.completed), task.elapsed or 0.0))
+        return Text(rate_text(int(task.completed), _elapsed_s(task)))
+
+
+class _LeftColumn(ProgressColumn):
+    """Time left while a stage runs, its duration when it has ended."""
+
+    def render(self, task: Task) -> Text:
+        done, total, elapsed = int(task.completed), int(task.total or 0), _elapsed_s(task)
+        if task.finished or task.stop_time is not None:
+            return Text(f"{timedelta(seconds=round(elapsed))} in all")
+        return Text(f"{timedelta(seconds=round(left_s(done, total, elapsed)))} left" if done else "")
 
 
 class CampaignProgress(Protocol):
@@ -50,8 +72,7 @@ class BarProgress:
             BarColumn(),
             MofNCompleteColumn(),
             _RateColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            _LeftColumn(),
             console=console,
         )
         self._task = self._bars.add_task("starting", visible=False)
@@ -67,6 +88,7 @@ class BarProgress:
 
     def begin(self, stage: str, total: int) -> None:
         """See `campaigns.running.engine.Watch`."""
+        self._bars.stop_task(self._task)
         self._task = self._bars.add_task(stage, total=total)
 
     def step(self) -> None:
@@ -108,7 +130,7 @@ class LineProgress:
             return
         self._told, elapsed = now, now - self._began
         text = f"{self._stage}: {self._done}/{self._total}, {rate_text(self._done, elapsed)}"
-        left = elapsed / self._done * (self._total - self._done)
+        left = left_s(self._done, self._total, elapsed)
         self._line(f"{text}, {left:.0f} s left" if self._done < self._total else f"{text}, {elapsed:.1f} s")
 
     def note(self, text: str) -> None:

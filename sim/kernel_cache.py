@@ -55,6 +55,12 @@ def note_ready(user: str) -> None:
             mark.touch()
 
 
+def compiled_functions() -> int:
+    """Number of compiled functions that are kept so far; 0 where none can be kept."""
+    folder = os.environ.get("NUMBA_CACHE_DIR")
+    return 0 if folder is None else sum(1 for _ in Path(folder).rglob("*.nbc"))
+
+
 def _mark(user: str) -> Path | None:
     # numba keeps one compiled form for each kind of processor, as compiled code runs on its own kind only
     folder = os.environ.get("NUMBA_CACHE_DIR")

@@ -100,7 +100,11 @@ def _reach(campaign: Campaign, path: str, reach: Mapping[str, list[Any]]) -> tup
     for given, values in _met(campaign, path, reach):
         if isinstance(given, str):
             return found, given
-        for value in given.extremes():
+        try:
+            extremes = given.extremes()
+        except ValueError as error:
+            return found, _said(error)
+        for value in extremes:
             refused = _refusal(campaign, {**values, path: value})
             if refused:
                 where = "".join(f" where {name} = {one}" for name, one in values.items())

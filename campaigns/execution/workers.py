@@ -59,8 +59,11 @@ class LocalWorkers:
 
     def __init__(self, jobs: int, sharers: int = 1) -> None:
         self._share_bytes = _SHARE_OF_MEMORY * free_memory() / (jobs * sharers)
-        self._folder = TemporaryDirectory(prefix="marsyard-")
-        self._workers = [WatchedWorker(Path(self._folder.name) / str(number)) for number in range(jobs)]
+        try:
+            self._folder = TemporaryDirectory(prefix="marsyard-")
+            self._workers = [WatchedWorker(Path(self._folder.name) / str(number)) for number in range(jobs)]
+        except OSError as error:
+            raise CampaignError(f"temporary files cannot be written (TMPDIR says where they go): {error}") from error
 
     def __enter__(self) -> Self:
         return self

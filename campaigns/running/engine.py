@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -21,8 +21,10 @@ from campaigns.execution.cases import CompletedCase, configuration_text, prepare
 from campaigns.execution.crew import Crew, hire
 from campaigns.execution.work import Work, Workers
 from campaigns.outcomes import RETRYABLE, UNFINISHED
+from campaigns.running.compilation import compilation_reported
 from campaigns.running.inputs import plan_inputs
 from campaigns.running.replay import replay_with
+from campaigns.running.stored import loaded_campaign
 from campaigns.store import record
 from campaigns.store.columns import Row
 from campaigns.store.lock import folder_lock
@@ -30,8 +32,7 @@ from campaigns.store.retention import ProductStore, keep_while_running
 from campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from campaigns.store.table import TABLE_FILE, write_table
 from campaigns.store.worst import showcase_case, worst_cases
-from scenarios.registry import SCENARIOS, UnknownScenarioError, scenario
-from sim.kernel_cache import kernels_are_ready, note_ready
+from sim.kernel_cache import note_ready
 
 #: What a requirement without a bound, and a population, ask a column to be.
 FLAG = "column of true and false"
@@ -152,15 +153,7 @@ def append_cases(directory: Path, cases: int, crew: Crew, watch: Watch, *, allow
 def with_block(directory: Path, cases: int) -> Campaign:
     """A stored campaign with another block of cases, which is not run. Raises CampaignError as `append_cases` does."""
     configuration = _with_block(directory, record.stored_configuration(directory), cases)
-    return _campaign(directory, configuration)
-
-
-def _campaign(directory: Path, configuration: CampaignConfiguration) -> Campaign:
-    """The campaign that a folder's configuration states."""
-    try:
-        return Campaign(configuration, scenario(configuration.scenario))
-    except UnknownScenarioError as error:
-        raise CampaignError(f"{directory}: {error}") from error
+    return loaded_campaign(directory, configuration)
 
 
 def _with_record(directory: Path) -> Path:
@@ -183,12 +176,15 @@ def _go_on(
     """Runs what a stored campaign lacks."""
     directory, configuration = folder.directory, folder.configuration
     stored = record.read(directory)
+    campaign = loaded_campaign(directory, configuration)
     changes = _identity_changes(directory, stored, configuration, allow_changed)
-    campaign = _campaign(directory, configuration)
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         _check_together(directory, stored, store)
         before = store.count()
         again = store.with_outcomes(RETRYABLE[word] for word in retry)
+        if not again and _is_complete(directory, stored, configuration, store):
+            watch.note(f"the campaign is finished: all {before} cases have rows; nothing is run")
+            return
         said: dict[str, Any] = {"state": "running", "exit_code": None, "finished_utc": None}
         said["sessions"] = [*stored["sessions"], record.session(command, crew.describe(), before)]
         if changes:
@@ -199,6 +195,14 @@ def _go_on(
         record.update(directory, said)
         _note_other_machine(stored["environment"], said["sessions"][-1]["environment"], watch)
         _run(_Work(campaign, directory, crew, store, watch), again)
+
+
+def _is_complete(
+    directory: Path, stored: dict[str, Any], configuration: CampaignConfiguration, store: RowStore
+) -> bool:
+    """Whether a campaign ended, its table is there, and no case of its configuration lacks a row."""
+    ended = stored["state"] == "finished" and (directory / TABLE_FILE).is_file()
+    return ended and not store.missing(configuration.total_cases)
 
 
 def _note_other_machine(before: dict[str, Any], now: dict[str, Any], watch: Watch) -> None:
@@ -255,8 +259,9 @@ def _run(work: _Work, again: Sequence[int]) -> None:
     with _recorded(work), hire(work.crew) as workers:
         missing = work.store.missing(work.configuration.total_cases)
         if missing or again:
-            _prepare(work, workers, itertools.chain(*missing, again))
-            _run_cases(work, workers, [*missing, again])
+            with compilation_reported(work.configuration.scenario, work.watch) as first_case_ended:
+                _prepare(work, workers, itertools.chain(*missing, again))
+                _run_cases(work, workers, [*missing, again], first_case_ended)
         measures = [asked.metric for asked in work.configuration.requirements if asked.bound is not None]
         write_table(work.directory / TABLE_FILE, work.store, measures)
         _keep_worst(work, workers)
@@ -284,15 +289,15 @@ def _progress(store: RowStore) -> dict[str, Any]:
     }
 
 
-def _run_cases(work: _Work, workers: Workers, parts: Sequence[Sequence[int]]) -> None:
+def _run_cases(
+    work: _Work, workers: Workers, parts: Sequence[Sequence[int]], first_case_ended: Callable[[], None]
+) -> None:
     """Runs cases; stores their rows, a transaction for what ended together, and products before their rows."""
     total = sum(len(part) for part in parts)
     configuration, watch = work.configuration, work.watch
     products = ProductStore(work.directory, configuration.retain.budget_gb)
     keep = keep_while_running(configuration)
     cases = itertools.chain.from_iterable(parts)
-    if configuration.scenario in SCENARIOS and not kernels_are_ready(configuration.scenario):
-        watch.note("the first cases wait for kernels to be compiled, once on this machine (ahead: marsyard compile)")
     watch.begin("cases", total)
     checked = False
     for ended in run_cases(workers, configuration, cases, keep=keep, total=total):
@@ -303,6 +308,7 @@ def _run_cases(work: _Work, workers: Workers, parts: Sequence[Sequence[int]]) ->
         if not checked and finished is not None:
             check_metrics(configuration, finished, work.directory)
             note_ready(configuration.scenario)
+            first_case_ended()
             checked = True
         for _ in ended:
             watch.step()

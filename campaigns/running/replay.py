@@ -13,6 +13,7 @@ from campaigns.execution.cases import run_cases
 from campaigns.execution.work import Workers
 from campaigns.execution.workers import LocalWorkers
 from campaigns.outcomes import UNFINISHED
+from campaigns.running.stored import loaded_campaign
 from campaigns.store.columns import Row
 from campaigns.store.products import PackedProducts
 from campaigns.store.record import read, stored_configuration
@@ -50,6 +51,12 @@ class Replay:
     note: str = ""
     changed: tuple[str, ...] = ()
 
+    @property
+    def failed(self) -> bool:
+        """Whether the case did not come to its end this time, although the stored row says that it did."""
+        stored = self.stored
+        return self.row["outcome"] in UNFINISHED and stored is not None and stored["outcome"] not in UNFINISHED
+
 
 def replay(directory: Path, case: int) -> Replay:
     """Runs one case of a stored campaign again, in a worker as the campaign does.
@@ -57,11 +64,13 @@ def replay(directory: Path, case: int) -> Replay:
     Raises
     ------
     CampaignError
-        Where the folder holds no campaign, or the campaign has no such case.
+        Where the folder holds no campaign, the campaign has no such case, or its scenario or an algorithm cannot be
+        imported; no case is run then.
     """
     configuration = stored_configuration(directory)
     if not 0 <= case < configuration.total_cases:
         raise CampaignError(f"{directory} has no case {case}; allowed: 0 to {configuration.total_cases - 1}")
+    loaded_campaign(directory, configuration)
     stored = stored_row(directory, case)
     identity = read(directory).get("identity")
     changed = Identity.read(identity).differences(identity_of(configuration)) if identity else []

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from campaigns.errors import StoreError
 
 #: Stands for an array in `products.json`, with the name that it has in `products.npz`.
 _ARRAY = "__array__"
+_OUTLINE = "products.json"
 
 
 @dataclass(frozen=True)
@@ -59,14 +62,42 @@ def save_packed(directory: Path, packed: PackedProducts, row: Mapping[str, Any])
     Raises
     ------
     StoreError
+        Where the folder cannot be written; the files that it holds stay as they are.
+    """
+    with replaced_files(directory) as folder:
+        write_packed(folder, packed, row)
+
+
+def write_packed(folder: Path, packed: PackedProducts, row: Mapping[str, Any]) -> None:
+    """Writes packed products and their case's row into a folder that is there. Raises OSError where that fails."""
+    (folder / "row.json").write_text(json.dumps(dict(row), indent=2) + "\n", encoding="utf-8")
+    (folder / "products.npz").write_bytes(packed.arrays)
+    (folder / _OUTLINE).write_bytes(packed.outline)
+
+
+@contextmanager
+def replaced_files(directory: Path) -> Iterator[Path]:
+    """A temporary folder whose files are moved into `directory` at the end, in the place of files of their names.
+
+    Left by an exception, the files of `directory` stay as they are. The folder is made where it is missing.
+
+    Raises
+    ------
+    StoreError
         Where the folder cannot be written.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        (directory / "row.json").write_text(json.dumps(dict(row), indent=2) + "\n", encoding="utf-8")
-        (directory / "products.npz").write_bytes(packed.arrays)
-        # last, as a folder that has it counts as one of a kept case
-        (directory / "products.json").write_bytes(packed.outline)
+        with tempfile.TemporaryDirectory(dir=directory, prefix=".partial-") as name:
+            folder = Path(name)
+            yield folder
+            # the outline last, as a folder that has it counts as one of a kept case
+            for path in sorted(folder.rglob("*"), key=lambda path: (path == folder / _OUTLINE, path)):
+                target = directory / path.relative_to(folder)
+                if path.is_dir():
+                    target.mkdir(exist_ok=True)
+                else:
+                    path.replace(target)
     except OSError as error:
         raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
 
@@ -110,7 +141,7 @@ def load_products(directory: Path) -> dict[str, Any]:
         Where the folder holds none.
     """
     try:
-        files = [(directory / name).read_bytes() for name in ("products.json", "products.npz")]
+        files = [(directory / name).read_bytes() for name in (_OUTLINE, "products.npz")]
         return unpack_products(PackedProducts(*files))
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise StoreError(f"{directory} holds no products of a case: {error}") from error

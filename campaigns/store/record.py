@@ -17,6 +17,7 @@ from typing import Any
 from campaigns.definition.configuration import CampaignConfiguration
 from campaigns.definition.identity import Identity
 from campaigns.errors import StoreError
+from campaigns.store.rows import ROWS_FILE, is_empty_store
 
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1
@@ -24,7 +25,23 @@ SCHEMA = 1
 RECORD_FILE = "campaign.json"
 
 #: What a campaign writes into its folder; a folder with any of it is never written to again.
-OWN_FILES = (RECORD_FILE, "cases.parquet", "cases.sqlite", "report.html", "report.json", "cases")
+OWN_FILES = (RECORD_FILE, "cases.parquet", ROWS_FILE, "report.html", "report.json", "cases")
+
+
+#: JSON types of the keys of a record that commands read.
+_TYPES: Mapping[str, tuple[type, str]] = {
+    "name": (str, "a text"),
+    "state": (str, "a text"),
+    "cases": (int, "a whole number"),
+    "cases_finished": (int, "a whole number"),
+    "cases_crashed": (int, "a whole number"),
+    "requirements": (list, "a list"),
+    "configuration": (dict, "a table"),
+    "identity": (dict, "a table"),
+    "sessions": (list, "a list"),
+    "changes": (list, "a list"),
+    "environment": (dict, "a table"),
+}
 
 
 def utc_now() -> str:
@@ -35,6 +52,8 @@ def utc_now() -> str:
 def claim(directory: Path) -> None:
     """Makes a folder for a campaign.
 
+    A folder in which a run was killed before it wrote its record counts as free: nothing was stored in it.
+
     Raises
     ------
     StoreError
@@ -43,6 +62,8 @@ def claim(directory: Path) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         held = [name for name in OWN_FILES if (directory / name).exists()]
+        if held == [ROWS_FILE] and is_empty_store(directory / ROWS_FILE):
+            held = []
     except FileExistsError as error:
         raise StoreError(f"{directory} is taken; choose another folder with --out") from error
     except OSError as error:
@@ -154,7 +175,10 @@ def read(directory: Path) -> dict[str, Any]:
     if not directory.is_dir():
         raise StoreError(f"{directory}: no such folder")
     if not path.is_file():
-        raise StoreError(f"{directory} does not hold a campaign: it has no {RECORD_FILE}")
+        hint = ""
+        if (directory / ROWS_FILE).is_file() and is_empty_store(directory / ROWS_FILE):
+            hint = "; a run was stopped before it began: start it again with --out of this folder"
+        raise StoreError(f"{directory} does not hold a campaign: it has no {RECORD_FILE}{hint}")
     try:
         record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         schema = record["schema"]
@@ -164,7 +188,27 @@ def read(directory: Path) -> dict[str, Any]:
         raise StoreError(f"{path} is damaged: {error}") from error
     if schema != SCHEMA:
         raise StoreError(f"{path} has schema {schema}; this version of Marsyard reads {SCHEMA}")
+    _check_types(path, record)
     return record
+
+
+def _check_types(path: Path, record: Mapping[str, Any]) -> None:
+    """Raises StoreError where a key that commands read is missing or of another JSON type."""
+    # records of versions that kept no identity lack the other keys as well, and can still be judged
+    required = _TYPES if "identity" in record else ("name", "state", "cases", "configuration")
+    missing = [key for key in required if key not in record]
+    if missing:
+        raise StoreError(f"{path} is damaged: it has no {missing[0]}")
+    for key, (kind, what) in _TYPES.items():
+        if key in record and (not isinstance(record[key], kind) or isinstance(record[key], bool)):
+            raise StoreError(f"{path} is damaged: {key} is not {what}")
+    last = record.get("sessions", [{}])[-1:]
+    if "identity" in record:
+        versions = record["identity"].get("versions")
+        if not isinstance(versions, dict) or not {"configuration", "code"} <= set(record["identity"]):
+            raise StoreError(f"{path} is damaged: identity lacks configuration, code or versions")
+        if not last or not isinstance(last[0], dict):
+            raise StoreError(f"{path} is damaged: sessions holds none")
 
 
 def stored_configuration(directory: Path) -> CampaignConfiguration:

@@ -11,9 +11,12 @@ one `fsync` a batch, some milliseconds for a second of work.
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import sqlite3
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
@@ -98,10 +101,7 @@ class RowStore:
             self._check(thorough)
             self._connection.execute("PRAGMA journal_mode = WAL")
             self._connection.execute("PRAGMA synchronous = FULL")
-            self._layouts = {
-                tuple(json.loads(names)): layout
-                for layout, names in self._connection.execute("SELECT layout, names FROM layouts")
-            }
+            self._layouts = dict(map(self._layout, self._connection.execute("SELECT names, layout FROM layouts")))
             self._kinds = set(self._connection.execute("SELECT name, kind FROM kinds"))
         except BaseException as error:
             self._connection.close()
@@ -121,6 +121,17 @@ class RowStore:
             found = [text for (text,) in self._connection.execute("PRAGMA quick_check(1)")]
             if found != ["ok"]:
                 raise StoreError(f"{self._path} is damaged: {' '.join(found)}; nothing was written to it")
+
+    def _layout(self, entry: tuple[str, int]) -> tuple[tuple[str, ...], int]:
+        """Column names and number of a layout."""
+        text, layout = entry
+        try:
+            names = json.loads(text)
+        except (ValueError, TypeError):
+            names = None
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise StoreError(f"{self._path} is damaged: layout {layout} is not a list of column names")
+        return tuple(names), layout
 
     def _failed(self, error: sqlite3.Error) -> StoreError:
         """What went wrong, in one sentence that says what to do."""
@@ -144,7 +155,7 @@ class RowStore:
     @property
     def about(self) -> dict[str, str]:
         """What was said of the rows when the store was made."""
-        return dict(self._connection.execute("SELECT key, value FROM about"))
+        return dict(self._ask("SELECT key, value FROM about"))
 
     def add(self, rows: Iterable[Row]) -> None:
         """Stores rows in one transaction; a case that has a row gets the new one.
@@ -217,19 +228,28 @@ class RowStore:
     def row(self, case: int) -> Row | None:
         """The row of a case; None where it has none."""
         found = self._ask("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
-        return None if found is None else dict(zip(self.names()[found[0]], json.loads(found[1]), strict=True))
+        return None if found is None else self._decoded(self.names()[found[0]], found[1])
 
     def rows(self) -> Iterator[Row]:
         """The rows in the order of their cases."""
         names = self.names()
         for layout, text in self._ask("SELECT layout, row FROM cases ORDER BY case_number"):
-            yield dict(zip(names[layout], json.loads(text), strict=True))
+            yield self._decoded(names[layout], text)
+
+    def _decoded(self, names: Sequence[str], text: str) -> Row:
+        try:
+            return dict(zip(names, json.loads(text), strict=True))
+        except (ValueError, TypeError) as error:
+            raise StoreError(f"{self._path} is damaged: a row cannot be read: {error}") from error
 
     def names(self) -> dict[int, tuple[str, ...]]:
         """The columns of each layout, in the order in which the layouts come with the cases."""
         order = self._ask("SELECT layout FROM cases GROUP BY layout ORDER BY min(case_number)")
         known = {layout: names for names, layout in self._layouts.items()}
-        return {layout: known[layout] for (layout,) in order}
+        try:
+            return {layout: known[layout] for (layout,) in order}
+        except KeyError as error:
+            raise StoreError(f"{self._path} is damaged: rows have the unknown layout {error}") from error
 
     def kinds(self) -> dict[str, set[str]]:
         """What each column holds: any of `bool`, `int`, `big` (beyond 64 bits), `float`, `str`."""
@@ -243,7 +263,10 @@ class RowStore:
         cursor = self._ask("SELECT layout, row FROM cases ORDER BY case_number")
         while found := cursor.fetchmany(size):
             # one text for all: half the time of reading them one by one
-            values = json.loads(f"[{','.join(text for _, text in found)}]")
+            try:
+                values = json.loads(f"[{','.join(text for _, text in found)}]")
+            except (ValueError, TypeError) as error:
+                raise StoreError(f"{self._path} is damaged: a row cannot be read: {error}") from error
             yield [(layout, row) for (layout, _), row in zip(found, values, strict=True)]
 
     def _ask(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
@@ -251,6 +274,37 @@ class RowStore:
             return self._connection.execute(query, values)
         except sqlite3.Error as error:
             raise self._failed(error) from error
+
+
+def is_empty_store(path: Path) -> bool:
+    """Whether a file is a store without rows; False where it is damaged, or none."""
+    try:
+        with readable_store(path) as store:
+            return store.count() == 0
+    except StoreError:
+        return False
+
+
+@contextmanager
+def readable_store(path: Path) -> Iterator[RowStore]:
+    """The rows of a campaign, to be read only: of a folder that cannot be written to, a temporary copy.
+
+    SQLite needs files of its own next to the log even where it only reads. Raises StoreError as `RowStore` does, and
+    where the copy cannot be made.
+    """
+    if all(os.access(one, os.W_OK, effective_ids=True) for one in (path, path.parent)):
+        with RowStore(path) as store:
+            yield store
+        return
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="marsyard-"))
+            for file in (path, path.with_name(f"{path.name}-wal")):
+                if file.exists():
+                    shutil.copyfile(file, Path(folder, file.name))
+        except OSError as error:
+            raise StoreError(f"{path} cannot be copied to be read: {error.strerror or error}") from error
+        yield stack.enter_context(RowStore(Path(folder, path.name)))
 
 
 def kind_of(value: Any) -> str:

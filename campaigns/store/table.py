@@ -13,7 +13,7 @@ from typing import Any
 from campaigns.errors import StoreError
 from campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from campaigns.store.record import stored_configuration
-from campaigns.store.rows import ROWS_FILE, RowStore
+from campaigns.store.rows import ROWS_FILE, RowStore, readable_store
 
 TABLE_FILE = "cases.parquet"
 
@@ -66,6 +66,9 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
         partial.replace(path)
     except OSError as error:
         raise StoreError(f"{path} cannot be written: {error.strerror or error}") from error
+    except (TypeError, ValueError) as error:
+        partial.unlink(missing_ok=True)
+        raise StoreError(f"{path} cannot be made, as {ROWS_FILE} is damaged: a row cannot be read: {error}") from error
 
 
 def _columns(
@@ -172,7 +175,7 @@ def refresh_table(directory: Path) -> None:
 def stored_row(directory: Path, case: int) -> Row | None:
     """The row of a case of a stored campaign; None where it has none."""
     if (directory / ROWS_FILE).is_file():
-        with RowStore(directory / ROWS_FILE) as store:
+        with readable_store(directory / ROWS_FILE) as store:
             return store.row(case)
     table = directory / TABLE_FILE
     return next(iter(read_rows(table, case)), None) if table.exists() else None

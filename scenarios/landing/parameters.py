@@ -178,7 +178,12 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
         if not isinstance(stated, Mapping):
             return stated
         name, scale = stated.get("site", "heli-hazardous"), stated.get("scale", "ground")
-        if name not in sites() or getattr(sites()[name], str(scale), None) is None or "terrain_of" in stated:
+        if (
+            not isinstance(name, str)
+            or name not in sites()
+            or getattr(sites()[name], str(scale), None) is None
+            or "terrain_of" in stated
+        ):
             return stated
         changes = stated.get("terrain", {})
         if not isinstance(changes, Mapping):

@@ -119,6 +119,24 @@ def test_what_cannot_run_is_not_written(here: Path, words: tuple[str, ...], said
     assert not (here / "mine.toml").exists()
 
 
+def test_answers_of_the_dialogue_are_refused_at_once(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("marsyard.new_command._is_terminal", lambda: True)
+    answers = ["velocty", "velocity", "venus", "meridiani", "absent.yaml", "", "absent.csv", "", "-3", "many", "4"]
+    result = CliRunner().invoke(app, ["new", "mine"], input="\n".join(answers) + "\n")
+    assert result.exit_code == 0, result.output
+    text = " ".join(result.output.split())
+    for said in (
+        "unknown answer 'velocty' (did you mean 'velocity'?); allowed: landing, tracking, velocity",
+        "unknown answer 'venus'; allowed: ",
+        "absent.yaml",
+        "absent.csv: no such file; allowed: the path of a file, or nothing",
+        "'-3' is not allowed; allowed: a number above 0",
+        "'many' is not allowed",
+    ):
+        assert said in text
+    assert load_campaign("mine.toml").configuration.requirements[0].bound == 4.0
+
+
 def test_files_that_are_there_stay(here: Path) -> None:
     (here / "mine.toml").write_text("precious")
     status, output = told("new", "mine", "--system", "tracking")

@@ -45,6 +45,24 @@ def test_cases_are_added_behind_those_there_are(
         append_cases(done, 0, Crew(1), watch)
 
 
+def test_resume_of_a_finished_campaign_does_no_work(
+    done: Path, watch: Silence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {name: (done / name).stat().st_mtime_ns for name in ("campaign.json", "cases.parquet")}
+    record_before = record.read(done)
+    watch.steps.clear()
+
+    def forbidden(*_: object) -> None:
+        raise AssertionError("a worker is started")
+
+    monkeypatch.setattr("campaigns.running.engine.hire", forbidden)
+    resume_campaign(done, Crew(1), watch)
+    assert watch.notes[-1] == "the campaign is finished: all 4 cases have rows; nothing is run"
+    assert watch.steps == {}
+    assert {name: (done / name).stat().st_mtime_ns for name in before} == before
+    assert record.read(done) == record_before
+
+
 def test_crashed_cases_are_run_again_on_request(done: Path, watch: Silence) -> None:
     times = {row["case"]: row["wall_time_s"] for row in rows_of(done)}
     resume_campaign(done, Crew(1), watch)

@@ -1,0 +1,156 @@
+"""Folders that a kill, a full disk or an editor left odd: each is used again, or refused with one message."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from fake_campaign import Silence, rows_of, run
+
+from campaigns.definition.loading import load_campaign
+from campaigns.errors import CampaignError, ConfigurationError, StoreError
+from campaigns.execution.crew import Crew
+from campaigns.execution.workers import LocalWorkers
+from campaigns.running.engine import resume_campaign
+from campaigns.running.replay import replay
+from campaigns.store import record
+from campaigns.store.rows import ROWS_FILE, RowStore, create_store
+from campaigns.store.table import write_table
+from marsyard.campaign_command import says_what_is_wrong
+
+CampaignFile = Callable[..., Path]
+
+
+def test_a_run_killed_before_its_record_was_written_can_be_started_again(
+    campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+) -> None:
+    directory = tmp_path / "run"
+    directory.mkdir()
+    create_store(directory / ROWS_FILE, {"identity": "of the run that was killed"})
+    with pytest.raises(StoreError, match="a run was stopped before it began: start it again with --out"):
+        resume_campaign(directory, Crew(1), watch)
+    run(campaign_file(), directory, watch, "cases=2", jobs=1)
+    assert len(rows_of(directory)) == 2
+    # a store with rows is never written over, whatever became of the record
+    (directory / "campaign.json").unlink()
+    for name in ("cases.parquet", "cases"):
+        path = directory / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    with pytest.raises(StoreError, match=r"already holds a campaign \(cases.sqlite\)"):
+        run(campaign_file(), directory, watch, "cases=2", jobs=1)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("state", ["finished"], "state is not a text"),
+        ("cases", "12", "cases is not a whole number"),
+        ("cases_finished", True, "cases_finished is not a whole number"),
+        ("sessions", {"a": 1}, "sessions is not a list"),
+        ("sessions", [], "sessions holds none"),
+        ("identity", "abc", "identity is not a table"),
+        ("identity", {"configuration": "a"}, "identity lacks"),
+        ("environment", 3, "environment is not a table"),
+        ("configuration", [], "configuration is not a table"),
+        ("changes", None, "changes is not a list"),
+    ],
+)
+def test_a_record_of_wrong_types_is_refused(troubled: Path, tmp_path: Path, key: str, value: Any, said: str) -> None:
+    stored = json.loads((troubled / "campaign.json").read_text())
+    (tmp_path / "campaign.json").write_text(json.dumps({**stored, key: value}))
+    with pytest.raises(StoreError, match=said):
+        record.read(tmp_path)
+
+
+def test_a_record_that_lacks_a_key_is_refused(troubled: Path, tmp_path: Path) -> None:
+    stored = json.loads((troubled / "campaign.json").read_text())
+    del stored["sessions"]
+    (tmp_path / "campaign.json").write_text(json.dumps(stored))
+    with pytest.raises(StoreError, match="damaged: it has no sessions"):
+        record.read(tmp_path)
+
+
+@pytest.mark.parametrize("command", [lambda folder: replay(folder, 0), lambda folder: resume_campaign(
+    folder, Crew(1), Silence()
+)])  # fmt: skip
+def test_stored_parameters_of_wrong_types_are_refused(
+    troubled: Path, tmp_path: Path, command: Callable[[Path], Any]
+) -> None:
+    stored = json.loads((troubled / "campaign.json").read_text())
+    stored["configuration"]["parameters"] = {"altitude_m": [1], "wind": 3}
+    (tmp_path / "campaign.json").write_text(json.dumps(stored))
+    shutil.copy(troubled / ROWS_FILE, tmp_path)
+    with pytest.raises(ConfigurationError, match=r"parameters\.altitude_m"):
+        command(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("UPDATE cases SET layout = 77", "unknown layout 77"),
+        ("UPDATE layouts SET names = '{\"a\": 1}'", "is not a list of column names"),
+        ("UPDATE layouts SET names = 'x'", "is not a list of column names"),
+        ("UPDATE cases SET row = '[1'", "a row cannot be read"),
+        ("UPDATE cases SET row = '[1]'", "a row cannot be read"),
+        ("DROP TABLE layouts", "no such table"),
+    ],
+)
+def test_an_unknown_layout_of_the_store_is_one_message(tmp_path: Path, change: str, said: str) -> None:
+    path = tmp_path / ROWS_FILE
+    create_store(path, {})
+    with RowStore(path) as store:
+        store.add([{"case": 0, "outcome": "VALID", "answered": True}])
+    connection = sqlite3.connect(path)
+    connection.execute(change)
+    connection.commit()
+    connection.close()
+
+    def read() -> None:
+        with RowStore(path) as store:
+            write_table(tmp_path / "table", store)
+            store.row(0)
+
+    with pytest.raises(StoreError, match=said):
+        read()
+
+
+def test_a_full_folder_for_temporary_files_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("campaigns.execution.workers.TemporaryDirectory", full)
+    with pytest.raises(CampaignError, match=r"TMPDIR says where they go.*No space left"):
+        LocalWorkers(1)
+
+
+def test_a_full_disk_ends_any_command_with_one_message(capsys: pytest.CaptureFixture[str]) -> None:
+    @says_what_is_wrong
+    def command() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "somewhere")
+
+    with pytest.raises(typer.Exit) as ended:
+        command()
+    assert ended.value.exit_code == 2
+    assert capsys.readouterr().err == "error: [Errno 28] No space left on device: 'somewhere'\n"
+
+
+def test_a_site_that_is_a_table_and_a_distribution_beyond_numbers_are_problems_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text('name = "x"\nscenario = "landing"\ncases = 3\nseed = 1\n[parameters]\nsite = {a = 1}\n')
+    with pytest.raises(ConfigurationError, match=r"parameters\.site: input should be a valid string"):
+        load_campaign(str(path))
+    path.write_text(
+        'name = "x"\nscenario = "descent"\ncases = 3\nseed = 1\n[dispersions]\n'
+        '"place.east_m" = {distribution = "poisson", mu = 1e300}\n'
+    )
+    with pytest.raises(
+        ConfigurationError, match=r'dispersions\."place.east_m": poisson is not defined for mu = 1e\+300'
+    ):
+        load_campaign(str(path))

@@ -1,0 +1,110 @@
+"""Progress of a running campaign: rates, times left, and what is reported while kernels are compiled."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import re
+import time
+from pathlib import Path
+
+import pytest
+from fake_campaign import Silence
+from rich.console import Console
+
+from campaigns.running import compilation
+from campaigns.running.compilation import compilation_reported
+from marsyard.progress import BarProgress, LineProgress
+from sim.kernel_cache import note_ready
+
+
+class Clock:
+    """A clock that is set by the test."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def _shown(bars: BarProgress, clock: Clock) -> list[str]:
+    """The lines of the bars as they would be drawn now."""
+    console = Console(width=120, file=io.StringIO(), get_time=clock, force_terminal=False)
+    console.print(bars._bars.get_renderable())
+    file = console.file
+    assert isinstance(file, io.StringIO)
+    return file.getvalue().splitlines()
+
+
+def test_finished_stages_stop_counting_and_time_left_follows_the_rate() -> None:
+    clock = Clock()
+    bars = BarProgress(Console(file=io.StringIO(), force_terminal=True, get_time=clock))
+    bars._bars.live.auto_refresh = False
+    bars.begin("preparing", 2)
+    for _ in range(2):
+        clock.now_s += 5.0
+        bars.step()
+    bars.begin("cases", 10)
+    # slow at first, as the first cases load what the others find
+    for seconds in (90.0, 5.0, 5.0):
+        clock.now_s += seconds
+        bars.step()
+    first, second = (line for line in _shown(bars, clock) if line.strip())
+    assert "5.0 s each" in first
+    assert "0:00:10 in all" in first
+    # 7 cases are left, at 33.3 s each as is printed next to it
+    assert "33.3 s each" in second
+    assert "0:03:53 left" in second
+    clock.now_s += 1000.0
+    assert "0:00:10 in all" in _shown(bars, clock)[0]
+    assert "5.0 s each" in _shown(bars, clock)[0]
+
+
+def test_a_stage_that_is_left_before_its_end_stops_counting() -> None:
+    clock = Clock()
+    bars = BarProgress(Console(file=io.StringIO(), force_terminal=True, get_time=clock))
+    bars.begin("cases", 10)
+    clock.now_s += 4.0
+    bars.step()
+    bars.begin("showcase", 1)
+    clock.now_s += 60.0
+    assert "4.0 s each" in _shown(bars, clock)[0]
+
+
+def test_lines_give_the_time_left_at_the_printed_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    monkeypatch.setattr("marsyard.progress.time.monotonic", clock)
+    console = Console(file=io.StringIO(), force_terminal=False)
+    lines = LineProgress(console)
+    lines.begin("cases", 8)
+    clock.now_s += 12.5
+    lines.step()
+    file = console.file
+    assert isinstance(file, io.StringIO)
+    assert file.getvalue().splitlines()[-1] == "cases: 1/8, 12.5 s each, 88 s left"
+
+
+def test_compilation_is_reported_until_the_first_case_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(compilation, "REPORT_INTERVAL_S", 0.01)
+    watch = Silence()
+    with compilation_reported("descent", watch) as first_case_ended:
+        assert watch.notes[0].startswith("compiling numeric kernels once on this machine, about two minutes")
+        assert "marsyard compile" in watch.notes[0]
+        for number in range(3):
+            (tmp_path / f"kernel-{number}.nbc").touch()
+        deadline = time.monotonic() + 20.0
+        while not any("3 functions so far" in note for note in watch.notes) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        first_case_ended()
+    assert any("3 functions so far" in note for note in watch.notes)
+    assert re.fullmatch(r"numeric kernels are compiled, \d+ s", next(itertools.islice(reversed(watch.notes), 1)))
+    # the next run finds them
+    note_ready("descent")
+    again = Silence()
+    with compilation_reported("descent", again) as first_case_ended:
+        first_case_ended()
+    assert again.notes == []
