@@ -217,9 +217,7 @@ def members(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
     return _members_of(frame, population.split(" and "))[0]
 
 
-def _members_of(
-    frame: pd.DataFrame, parts: Sequence[str]
-) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def _members_of(frame: pd.DataFrame, parts: Sequence[str]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Members of the intersection of populations, and those of them whose membership is unknown."""
     chosen, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
     for part in parts:
@@ -228,7 +226,9 @@ def _members_of(
         elif part != "all":
             column = "answered" if part == "valid" else part
             if not is_flag(frame, column):
-                raise ValueError(f"the rows have no column '{column}' of true and false, by which a population is known")
+                raise ValueError(
+                    f"the rows have no column '{column}' of true and false, by which a population is known"
+                )
             missing = frame[column].isna().to_numpy(dtype=np.bool_)
             chosen &= _true(frame, column) | missing
             unknown |= missing

@@ -32,7 +32,6 @@ from campaigns.store.retention import Keep
 from scenarios.interface import CaseResult, Scalar, conditions_recorded_by
 from scenarios.registry import scenario
 
-
 #: Bits of the largest integers that are stored: all of these have a float64, whose maximum is below 2 ** 1024.
 _MAX_INT_BITS = 1023
 
