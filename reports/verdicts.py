@@ -247,7 +247,9 @@ def _members_of(frame: pd.DataFrame, parts: Sequence[str]) -> tuple[Bool[np.ndar
         elif part != "all":
             column = "answered" if part == "valid" else part
             if not is_flag(frame, column):
-                raise ValueError(f"the rows have no column '{column}' of true and false, by which membership is known")
+                raise ValueError(
+                    f"the rows have no column '{column}' of true and false, by which a population is known"
+                )
             missing = frame[column].isna().to_numpy(dtype=np.bool_)
             chosen &= _true(frame, column) | missing
             unknown |= missing

@@ -1,13 +1,15 @@
-"""A camera with what follows from its design alone."""
+"""A camera with what follows from its design alone, and the same camera as calibrated."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Annotated, cast
 
 import numpy as np
 from jaxtyping import Float32
+from pydantic import BaseModel, ConfigDict, Field
 
-from sim.camera import CameraModel
+from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 from sim.render import PixelRays
 from sim.sensor import natural_fall_off
 
@@ -24,3 +26,58 @@ class Optics:
     def of(cls, camera: CameraModel) -> Optics:
         """The optics of a camera."""
         return cls(camera, PixelRays.of(camera), natural_fall_off(camera))
+
+
+class CalibrationParameters(BaseModel):
+    """How far the calibrated camera, which an algorithm is given, is off the true one.
+
+    Assumed: the spreads of the descent camera's calibration, in pixels and as a fraction of the focal length.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    focal_error: Annotated[
+        float, Field(ge=0.0, le=0.05, description="RMS relative error of the calibrated focal length")
+    ] = 0.0002
+    centre_error_px: Annotated[
+        float, Field(ge=0.0, le=50.0, description="RMS error of the calibrated image centre per axis, px")
+    ] = 0.5
+    distortion_error_px: Annotated[
+        float, Field(ge=0.0, le=50.0, description="RMS error of the calibrated distortion in the picture's corners, px")
+    ] = 0.3
+
+
+def calibrated(
+    camera: CameraModel,
+    focal_error: float,
+    centre_error_px: tuple[float, float],
+    distortion_error_px: float,
+) -> CameraModel:
+    """A camera as calibrated, with the errors of its calibration.
+
+    Parameters
+    ----------
+    camera
+        The true one.
+    focal_error
+        Relative, of the focal length.
+    centre_error_px
+        Of the image centre, (columns, rows).
+    distortion_error_px
+        By how much the corners are taken to lie further outwards.
+    """
+    moved = camera.magnified(1.0 + focal_error).recentred(*centre_error_px)
+    if isinstance(moved, Cahv):
+        moved = Cahvor.from_cahv(moved, r=np.zeros(3))
+    # R1 moves a point outwards by the cube of its angle
+    corner = float(np.hypot(0.5 * (moved.size[0] - 1), 0.5 * (moved.size[1] - 1)))
+    radial = cast(Cahvor | Cahvore, moved)
+    chi = corner / (moved.focal_lengths[0] * (1.0 + float(radial.r[0])))
+    return replace(radial, r=radial.r + np.array([0.0, distortion_error_px / moved.focal_lengths[0] / chi**3, 0.0]))
+
+
+def draw_calibrated(camera: CameraModel, p: CalibrationParameters, rng: np.random.Generator) -> CameraModel:
+    """A camera as calibrated, the errors of its calibration drawn from normal distributions."""
+    focal, column, row, distortion = rng.standard_normal(4)
+    centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))
+    return calibrated(camera, p.focal_error * focal, centre, p.distortion_error_px * distortion)

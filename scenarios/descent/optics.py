@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
-from typing import cast
 
 import numpy as np
 from jaxtyping import Float64
 
 from scenarios.descent.parameters import CameraParameters
-from scenarios.optics import Optics
-from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from scenarios.optics import Optics, calibrated
+from sim.camera import Cahv, Cahvor, CameraModel
 
 
 @cache
@@ -27,22 +25,11 @@ def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) ->
     p = parameters
     focal, column, row, distortion = rng.standard_normal(4)
     if p.model is not None:
-        moved = p.centre_error_px * np.array([column, row])
-        camera = p.model.camera().magnified(1.0 + p.focal_error * focal).recentred(float(moved[0]), float(moved[1]))
-        return _bent(camera, p.distortion_error_px * distortion)
+        centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))
+        return calibrated(p.model.camera(), p.focal_error * focal, centre, p.distortion_error_px * distortion)
     return _camera(
         p, 1.0 + p.focal_error * focal, p.centre_error_px * np.array([column, row]), p.distortion_error_px * distortion
     )
-
-
-def _bent(camera: CameraModel, corner_px: float) -> CameraModel:
-    """The camera with its corners moved outwards by distortion, whatever its lens: R1 moves by chi^3."""
-    if isinstance(camera, Cahv):
-        camera = Cahvor.from_cahv(camera, r=np.zeros(3))
-    corner = float(np.hypot(0.5 * (camera.size[0] - 1), 0.5 * (camera.size[1] - 1)))
-    radial = cast(Cahvor | Cahvore, camera)
-    chi = corner / (camera.focal_lengths[0] * (1.0 + float(radial.r[0])))
-    return replace(radial, r=radial.r + np.array([0.0, corner_px / camera.focal_lengths[0] / chi**3, 0.0]))
 
 
 def _camera(

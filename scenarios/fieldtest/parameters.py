@@ -8,6 +8,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, field_validato
 
 from scenarios.chosen import ChosenAlgorithms
 from scenarios.estimators import VELOCITY, Task
+from scenarios.optics import CalibrationParameters
 from scenarios.parts.scores import OwnScores, ScoredFlight
 from sim.dynamics.helicopter import HelicopterParameters
 from sim.render import CloudParameters
@@ -151,6 +152,9 @@ class FieldTestParameters(ChosenAlgorithms, OwnScores):
     elevation: ElevationParameters = ElevationParameters()
     pictures: PictureParameters = PictureParameters()
     triples: TripleParameters = TripleParameters()
+    calibration: Annotated[
+        CalibrationParameters, Field(description="errors of the calibrated camera, the same in all cases")
+    ] = CalibrationParameters()
     detector: DetectorChoice = Field(default_factory=lambda: preset(CAMERA).detector)
     backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
         default_factory=default_backend

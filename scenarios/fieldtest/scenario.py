@@ -14,14 +14,16 @@ from algorithms.dimes import DimesOptions
 from scenarios.estimators import VELOCITY
 from scenarios.fieldtest.parameters import FieldTestParameters
 from scenarios.fieldtest.pictures import cloud_transmittances, field_optics, take_picture
-from scenarios.fieldtest.run import Run, RunKey, worked_out
+from scenarios.fieldtest.run import Run, RunKey, field_camera, worked_out
 from scenarios.fieldtest.triples import Category, Triple
 from scenarios.interface import CaseResult, Scalar
+from scenarios.optics import draw_calibrated
 from scenarios.parts.named import SCORE, Kind
 from scenarios.parts.scores import ScoredFlight, scored
 from scenarios.provenance import rendered
 from scenarios.trial import Judged, attempted_with, case_result
 from scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
+from sim.camera import CameraModel
 from sim.dynamics import State
 from sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from sim.sensor import Detector
@@ -78,7 +80,7 @@ class FieldTestScenario:
         noise = streams.generator("detector noise")
         taken = [take_picture(case.run, state, detector, noise) for state in case.states]
         pictures = [one.counts for one in taken]
-        measurements = measure(p, case, pictures, detector)
+        measurements = measure(p, case, pictures, detector, calibrated_camera(p, streams))
         truth = truth_velocities(p, case)[1, :2]
         known = {
             **_conditions(p, case, measurements),
@@ -119,6 +121,12 @@ class FieldTestScenario:
 def _bank(parameters: BaseModel, site_number: int) -> TerrainBank:
     p = _checked(parameters)
     return TerrainBank(p.terrain(p.site_names[site_number]), p.bank_seed)
+
+
+def calibrated_camera(p: FieldTestParameters, streams: Streams) -> CameraModel:
+    """The camera of the delivered pictures as calibrated before the field test: the same in all cases."""
+    rng = Streams(streams.seed, streams.campaign, 0).generator("camera calibration")
+    return draw_calibrated(field_camera(), p.calibration, rng).binned(columns=1, rows=p.detector.rows_summed)
 
 
 def _checked(parameters: BaseModel) -> FieldTestParameters:
@@ -172,10 +180,16 @@ def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, 
 
 
 def measure(
-    p: FieldTestParameters, case: Case, pictures: Sequence[UInt16[np.ndarray, "rows columns"]], detector: Detector
+    p: FieldTestParameters,
+    case: Case,
+    pictures: Sequence[UInt16[np.ndarray, "rows columns"]],
+    detector: Detector,
+    camera: CameraModel,
 ) -> DescentMeasurements:
-    """What DIMES is given of a triple (paper, III.D); pictures are tagged a virtual interval apart."""
-    camera = field_optics().camera.binned(columns=1, rows=p.detector.rows_summed)
+    """What DIMES is given of a triple (paper, III.D); pictures are tagged a virtual interval apart.
+
+    `camera` is the calibrated one, of the delivered pictures.
+    """
     tags = [number * p.triples.virtual_interval_s for number in range(PICTURES)]
     numbers = case.triple.pictures
     images = [DetectorImage(one, tag, camera, detector.calibration) for one, tag in zip(pictures, tags, strict=True)]

@@ -12,7 +12,9 @@ from scenarios.landing.faults import arrived_numbers, faulty_helicopter, faulty_
 from scenarios.landing.helicopter import HelicopterParameters, Transit
 from scenarios.landing.pair_choice import choose_pair
 from scenarios.landing.parameters import LandingScenarioParameters
+from scenarios.optics import draw_calibrated
 from scenarios.views import nadir_pose
+from sim.camera import CameraModel
 from sim.dynamics import State
 from sim.frames import rigid
 from sim.measurements import PoseMeasurement
@@ -66,6 +68,11 @@ class Flight:
         return error
 
 
+def calibrated_camera(p: LandingScenarioParameters, streams: Streams) -> CameraModel:
+    """The camera in the body frame as the helicopter's computer has it: the true one with its calibration's errors."""
+    return draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
+
+
 def _of_helicopter(
     p: LandingScenarioParameters, helicopter: HelicopterParameters, surface: Surface, streams: Streams
 ) -> Flight:
@@ -80,7 +87,9 @@ def _of_helicopter(
     numbers = arrived_numbers(p.faults, transit.times_s.size, streams.generator("lost pictures"))
     poses, height = transit.poses(), helicopter.transit.height_m
     ranges = faulty_ranges(p.faults, _laser_ranges(p, transit, surface, streams), height)
-    choice = choose_pair([poses[number] for number in numbers], ranges[numbers], p.optics, p.pair, height)
+    choice = choose_pair(
+        [poses[number] for number in numbers], ranges[numbers], calibrated_camera(p, streams), p.pair, height
+    )
     first, second = int(numbers[choice.first]), int(numbers[choice.second])
     return Flight(
         (transit.state(first), transit.state(second)),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from scenarios.landing.faults import faulty_ranges
-from scenarios.landing.flight import Flight
+from scenarios.landing.flight import Flight, calibrated_camera
 from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.landing.pictures import Pair
 from sim.measurements import LandingMeasurements
@@ -14,13 +16,19 @@ from sim.streams import Streams
 
 
 def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: Streams) -> LandingMeasurements:
-    """The measurements of a case. The a-priori site is the ground on the first picture's optical axis."""
+    """The measurements of a case.
+
+    The a-priori site is the ground on the first picture's optical axis, at the range measured; where the laser returned
+    none, at the height that was commanded.
+    """
     unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
     reading = unit.readings(np.zeros(1), np.array([pair.axis_range_m]), streams.generator("laser noise"))
     slant = float(faulty_ranges(p.faults, reading.values, p.height_m)[0])
-    ahead = pair.axis_range_m * pair.images[0].camera.a
+    camera = calibrated_camera(p, streams).binned(columns=1, rows=p.detector.rows_summed)
+    first, second = (replace(image, camera=camera) for image in pair.images)
+    ahead = (slant if np.isfinite(slant) else p.height_m) * camera.a
     return LandingMeasurements(
-        images=pair.images,
+        images=(first, second),
         poses=flight.poses,
         slant_range_m=slant,
         up_body=flight.up_body,

@@ -17,6 +17,7 @@ from scenarios.landing.helicopter import HelicopterParameters
 from scenarios.landing.pair_choice import PairParameters
 from scenarios.landing.relief import Limits
 from scenarios.meshes import MeshParameters
+from scenarios.optics import CalibrationParameters
 from scenarios.parts.scores import OwnScores, ScoredLanding
 from scenarios.terrain_files import check_terrain
 from sim.camera import CameraModel
@@ -121,6 +122,9 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
     camera: Annotated[
         NamedOrOwnCamera, Field(description="camera preset that looks down; or an own camera: a table with file")
     ] = "xc-55"
+    calibration: Annotated[
+        CalibrationParameters, Field(description="errors of the calibrated camera, drawn for a case")
+    ] = CalibrationParameters()
     detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
     exposure: Annotated[AutoExposureParameters, Field(description="how the exposure is set")] = AutoExposureParameters()
     flown: Annotated[

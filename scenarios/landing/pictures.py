@@ -26,7 +26,7 @@ class Pair:
     Attributes
     ----------
     images
-        As delivered.
+        As delivered, with the true camera.
     frames
         What was to be seen, without detector.
     """

@@ -1,0 +1,85 @@
+"""Algorithms that keep what they are given, and scores that keep what is true of the same case."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from algorithms.interface import (
+    MastAim,
+    SiteEstimate,
+    SiteOutcome,
+    TargetUpdate,
+    TrackingState,
+    VelocityEstimate,
+    VelocityOutcome,
+)
+from algorithms.vtt import VisualTargetTracker
+from scenarios.parts.scores import ScoredSite, ScoredVelocity
+from sim.measurements import (
+    DescentMeasurements,
+    LandingMeasurements,
+    MastCalibration,
+    RoverMeasurements,
+    TargetDesignation,
+)
+
+#: What algorithms were given, and the scored cases, in the order in which they came.
+GIVEN: list[Any] = []
+TRUE: list[Any] = []
+
+
+class VelocitySpy:
+    """A velocity estimator without an answer."""
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """See `VelocityEstimator`."""
+        GIVEN.append(measurements)
+        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+
+
+class SiteSpy:
+    """A site estimator that does not converge."""
+
+    def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
+        """See `SiteEstimator`."""
+        GIVEN.append(measurements)
+        return SiteEstimate(SiteOutcome.NO_STRUCTURE, np.array(measurements.apriori_site_world))
+
+
+class TrackerSpy:
+    """The paper's tracker; keeps (pose, mast) of each aim, and the measurements of each update."""
+
+    def __init__(self) -> None:
+        self.inner = VisualTargetTracker()
+
+    @property
+    def state(self) -> TrackingState:
+        """See `TargetTracker`."""
+        return self.inner.state
+
+    def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
+        """See `TargetTracker`."""
+        self.inner.designate(target, world_from_rover)
+
+    def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
+        """See `TargetTracker`."""
+        GIVEN.append((world_from_rover, mast))
+        return self.inner.aim(world_from_rover, mast)
+
+    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+        """See `TargetTracker`."""
+        GIVEN.append(measurements)
+        return self.inner.update(measurements)
+
+    def clear(self) -> None:
+        """See `TargetTracker`."""
+        self.inner.clear()
+
+
+def keep(case: ScoredVelocity | ScoredSite) -> dict[str, float]:
+    """A score that keeps the case."""
+    TRUE.append(case)
+    return {"kept": 1.0}
