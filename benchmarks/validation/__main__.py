@@ -18,6 +18,7 @@ from benchmarks.validation import (
     light_checks,
     motion_checks,
     sampling_checks,
+    soak,
     statistics_checks,
     tracking_checks,
 )
@@ -32,6 +33,7 @@ CHECKS = (
     *landing_checks.CHECKS,
     *sampling_checks.CHECKS,
     *campaign_checks.CHECKS,
+    *soak.CHECKS,
     *statistics_checks.CHECKS,
 )
 

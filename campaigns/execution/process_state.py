@@ -176,8 +176,9 @@ def _signals() -> tuple[Any, ...]:
 
 
 def _streams() -> tuple[Any, ...]:
-    """Standard output and error, and whether they can be written."""
-    return tuple((stream, getattr(stream, "closed", True)) for stream in (sys.stdout, sys.stderr))
+    """Standard output and error, whether they can be written, and the files below them."""
+    objects = [(stream, getattr(stream, "closed", True)) for stream in (sys.stdout, sys.stderr)]
+    return (*objects, _identity(1), _identity(2))
 
 
 class ProcessState:
@@ -277,21 +278,19 @@ class OpenFiles:
     """The files that a worker needs in order to work: its output, and the pipes to its parent."""
 
     def __init__(self) -> None:
-        self._needed: list[tuple[int, tuple[int, int]]] = []
-        with suppress(OSError):
-            for number in [int(one.name) for one in Path("/proc/self/fd").iterdir()]:
-                # the last is of the listing itself, and gone
-                with suppress(OSError):
-                    self._needed.append((number, _identity(number)))
+        numbers = [int(one.name) for one in Path("/proc/self/fd").glob("*")]
+        # without standard streams, and without the listing itself, which is gone
+        self._needed = [(one, _identity(one)) for one in numbers if one > 2 and _identity(one) is not None]
 
     def intact(self) -> bool:
         """Whether all of them are open still."""
-        try:
-            return all(_identity(number) == identity for number, identity in self._needed)
-        except OSError:
-            return False
+        return all(_identity(number) == identity for number, identity in self._needed)
 
 
-def _identity(number: int) -> tuple[int, int]:
-    found = os.fstat(number)
+def _identity(number: int) -> tuple[int, int] | None:
+    """Which file stands behind a number; None where none does."""
+    try:
+        found = os.fstat(number)
+    except OSError:
+        return None
     return found.st_dev, found.st_ino

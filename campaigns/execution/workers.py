@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -23,6 +22,7 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from campaigns.errors import CampaignError
 from campaigns.execution.batches import Batches
+from campaigns.execution.temporary import WorkersFolder
 from campaigns.execution.watched import LOOK_S, WatchedWorker
 from campaigns.execution.work import Work
 from campaigns.execution.worker_process import BatchEnd, Done
@@ -60,8 +60,8 @@ class LocalWorkers:
     def __init__(self, jobs: int, sharers: int = 1) -> None:
         self._share_bytes = _SHARE_OF_MEMORY * free_memory() / (jobs * sharers)
         try:
-            self._folder = TemporaryDirectory(prefix="marsyard-")
-            self._workers = [WatchedWorker(Path(self._folder.name) / str(number)) for number in range(jobs)]
+            self._folder = WorkersFolder()
+            self._workers = [WatchedWorker(self._folder.path / str(number)) for number in range(jobs)]
         except OSError as error:
             raise CampaignError(f"temporary files cannot be written (TMPDIR says where they go): {error}") from error
 
@@ -77,7 +77,7 @@ class LocalWorkers:
         """Ends the processes."""
         with ThreadPoolExecutor(len(self._workers)) as pool:
             list(pool.map(lambda worker: worker.stop(kill=kill), self._workers))
-        self._folder.cleanup()
+        self._folder.remove()
 
     def run(self, work: Work[Result]) -> Iterator[list[Done[Result]]]:
         """See `Workers.run`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import tempfile
 import time
 import warnings
 from pathlib import Path
@@ -39,6 +40,8 @@ class FakeParameters(BaseModel):
     swelling_cases: frozenset[int] = frozenset()
     chatting_cases: frozenset[int] = frozenset()
     leaving_cases: frozenset[int] = frozenset()
+    forking_cases: frozenset[int] = frozenset()
+    altering_cases: frozenset[int] = frozenset()
     shared: int = 0
     fail_prepare: bool = False
     cache: str = ""
@@ -62,6 +65,13 @@ def misbehave(parameters: FakeParameters, case: int) -> None:
         os.write(1, b"and another thing\n" * 1000)
     if case in parameters.leaving_cases:
         os._exit(0)
+    if case in parameters.forking_cases and os.fork() == 0:
+        # holds every file of the worker, in a session of its own, and leaves something to be cleared up
+        os.setsid()
+        Path(tempfile.gettempdir(), "left-behind").touch()
+        time.sleep(3600)
+    if case in parameters.altering_cases:
+        os.chdir("/")
     hoard = []
     while case in parameters.swelling_cases:
         hoard.append(np.ones(1_000_000))

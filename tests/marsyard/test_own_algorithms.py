@@ -56,6 +56,40 @@ def test_the_suite_outlives_what_it_examines(tmp_path: Path, monkeypatch: pytest
     assert "8 of 10 checks passed" in ended.output
 
 
+LEAVING = """
+import os, threading, time
+from algorithms.interface import VelocityEstimate, VelocityOutcome
+
+class Leaving:
+    def estimate(self, measurements):
+        if os.fork() == 0:
+            os.setsid()
+            time.sleep(3600)
+        threading.Thread(target=time.sleep, args=(3600,)).start()
+        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+
+class Altering:
+    def estimate(self, measurements):
+        os.chdir("/")
+        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"), [("Leaving", "child processes that it left running"), ("Altering", "the working folder")]
+)
+def test_the_suite_ends_and_finds_what_an_algorithm_changes_in_its_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, problem: str
+) -> None:
+    (tmp_path / "leaving_here.py").write_text(LEAVING)
+    monkeypatch.chdir(tmp_path)
+    ended = CliRunner().invoke(app, ["conformance", f"leaving_here:{name}"])
+    assert ended.exit_code == 1
+    assert "it changed the state of its process:" in ended.output
+    assert problem in ended.output
+    assert "next: set it back before returning" in ended.output
+
+
 def test_the_suite_for_programs() -> None:
     ended = CliRunner().invoke(app, ["conformance", "phase-correlation", "--json"])
     assert ended.exit_code == 0

@@ -99,15 +99,15 @@ def test_what_a_case_leaves_running_neither_holds_the_end_up_nor_outlives_it(kin
     began = time.monotonic()
     done = run(partial(leave_running, kind, str(tmp_path)), range(3))
     assert time.monotonic() - began < GUARD_S
-    # it is reported, and the next items run in another process
-    what = "threads" if kind == "thread" else "child processes"
-    assert f"{what} that it left running" in done[0].changed[-1]
-    assert done[1].changed == done[2].changed == ()
-    assert done[1].result == done[2].result != done[0].result
     started = tmp_path / "processes"
     processes = list(map(int, started.read_text().split())) if started.exists() else []
     assert len(processes) == {"thread": 0, "pool": 2}.get(kind, 1)
     assert all(map(is_gone, processes))
+    # the next items run in another process
+    assert done[1].result == done[2].result != done[0].result
+    what = "threads" if kind == "thread" else "child processes"
+    assert f"{what} that it left running" in done[0].changed[-1]
+    assert done[1].changed == done[2].changed == ()
 
 
 def wait_for_session(folder: str, item: int) -> int:
@@ -231,12 +231,12 @@ def test_state_of_the_process_does_not_reach_the_next_case(seconds: float) -> No
     """Also where cases are so short that several are checked at once."""
     number = 2 * len(STATE)
     done = run(partial(alter, seconds), range(number))
-    for place, name in enumerate(STATE):
-        assert done[2 * place].changed == ()
-        assert done[2 * place + 1].changed == (name,)
     # the last two are random numbers, which a case draws alike wherever it runs, and not as another case does
     assert len({str((done[item].result[1][:-2], done[item].result[2])) for item in range(number)}) == 1
     assert len({str(done[item].result[1][-2:]) for item in range(number)}) == number
+    for place, name in enumerate(STATE):
+        assert done[2 * place].changed == ()
+        assert done[2 * place + 1].changed == (name,)
     assert done[5].result[1][-2:] == run(partial(alter, 0.01), [5])[5].result[1][-2:]
 
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 from fake_campaign import Silence, rows_of, run
 
 from campaigns.execution.crew import Crew
+from campaigns.execution.workers import LocalWorkers
 from campaigns.running.engine import resume_campaign
 from campaigns.running.replay import differing_columns
 from campaigns.store import record
@@ -26,11 +28,12 @@ CampaignFile = Callable[..., Path]
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
-def _started(path: Path, directory: Path) -> subprocess.Popen[bytes]:
+def _started(path: Path, directory: Path, **environment: str) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "marsyard", "run", str(path), "--jobs", "2", "--out", str(directory)]
     process = subprocess.Popen(
         [*command, "--set", "sleep_s=0.2", "-n", "500"],
         stderr=subprocess.PIPE,
+        env={**os.environ, **environment},
         # what a script starts in the background ignores Ctrl-C, and so would its children
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
@@ -82,6 +85,83 @@ def test_workers_go_with_a_killed_parent(campaign_file: CampaignFile, tmp_path: 
         time.sleep(0.05)
     assert len(workers) == 2
     assert all(map(_gone, workers))
+
+
+def _marked(mark: str) -> list[int]:
+    """Processes that were started with a variable in their environment."""
+    found = []
+    for process in Path("/proc").glob("[1-9]*"):
+        with suppress(OSError):
+            if mark.encode() in (process / "environ").read_bytes() and not _gone(int(process.name)):
+                found.append(int(process.name))
+    return found
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_whatever_ends_the_runner_nothing_of_its_cases_is_left(
+    campaign_file: CampaignFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: int
+) -> None:
+    """Neither processes in sessions of their own that hold the worker's files, nor temporary files.
+
+    The folder of a runner that was killed is gone at the latest when the next one begins.
+    """
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    path = campaign_file("forking_cases = [0, 1, 2, 3, 4, 5]", dispersions="")
+    process = _started(path, tmp_path / "run", TMPDIR=str(temporary), MARSYARD_TEST_RUN=str(tmp_path))
+    process.send_signal(kind)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == (-9 if kind == signal.SIGKILL else 130)
+    assert (b"interrupted; the rows so far" in errors) == (kind != signal.SIGKILL)
+    deadline = time.monotonic() + 10.0
+    while _marked(str(tmp_path)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert _marked(str(tmp_path)) == []
+    if kind == signal.SIGKILL:
+        monkeypatch.setattr("tempfile.tempdir", str(temporary))
+        with LocalWorkers(1):
+            assert len(list(temporary.iterdir())) == 1
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_second_interruption_ends_the_program_at_once() -> None:
+    program = """
+import signal, sys, time
+from marsyard.campaign_command import stopped_by_signals
+with stopped_by_signals():
+    print("ready", flush=True)
+    try:
+        time.sleep(3600)
+    except KeyboardInterrupt:
+        print("stopping", flush=True)
+        time.sleep(3600)
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert process.stdout is not None
+    for word in (b"ready", b"stopping"):
+        assert process.stdout.readline().strip() == word
+        process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert (process.returncode, errors) == (130, b"killed\n")
+
+
+def test_a_case_that_changes_its_process_is_named_and_changes_no_other(
+    troubled: Path, campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+) -> None:
+    path = campaign_file("altering_cases = [1, 7]\nforking_cases = [4]\nsilent_cases = [2]")
+    rows = rows_of(run(path, tmp_path / "run", watch, "retain.showcase=none"))
+    assert sorted(watch.notes) == [
+        "case 1 changed its worker process: the working folder",
+        "case 4 changed its worker process: child processes that it left running (python)",
+        "case 7 changed its worker process: the working folder",
+    ]
+    for row, other in zip(rows, rows_of(troubled), strict=True):
+        assert row["case"] in (3, 5, 6) or differing_columns(row, other) == ()
 
 
 def test_hostile_cases_come_to_the_right_outcomes_and_touch_no_other(
