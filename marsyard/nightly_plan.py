@@ -14,6 +14,7 @@ from campaigns.definition.campaign import Campaign
 from campaigns.definition.configuration import MOST_CASES, key_text, problems_of
 from campaigns.definition.loading import load_campaign
 from campaigns.errors import ConfigurationError, Problem
+from sim.files import check_regular
 
 #: The plan that ships with Marsyard.
 PLAN_FILE = Path(__file__).resolve().parents[1] / "scenarios" / "nightly.toml"
@@ -65,6 +66,7 @@ def read_plan(path: Path) -> Plan:
         Where it cannot be read, or states something else.
     """
     try:
+        check_regular(path)
         return Plan.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
         raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error

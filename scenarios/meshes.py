@@ -7,6 +7,8 @@ would stand on), once on the periodic terrain.
 from __future__ import annotations
 
 import hashlib
+import json
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,11 +21,17 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from scenarios.own_files import OwnFile
+from sim.files import ARCHIVE_ERRORS, check_regular, expanded_bytes
 from sim.render import Objects
 from sim.terrain import Surface
 
 #: Largest file, and most triangles, that are read.
 MOST_BYTES, MOST_FACES = 1 << 28, 1_000_000
+#: Archives of any files, which are not read; and formats that are zip archives themselves.
+_ARCHIVES = frozenset({"zip", "bz2", "gz", "tar.gz", "tar.bz2"})
+_ZIPPED = frozenset({"3mf", "3dxml", "zae"})
+#: Numbers in an element of a glTF accessor.
+_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 #: Number given to the first mesh where bodies have names; rocks of a field count from 0.
 FIRST_NAME = 1 << 30
 #: Albedo where it is not stated: a rock's, painted structure, a bright target.
@@ -104,7 +112,7 @@ def standing(meshes: Sequence[MeshParameters], surface: Surface, near: tuple[flo
 def read_mesh(path: str) -> Mesh:
     """A mesh, checked; kept while its file does not change. Raises MeshFileError."""
     try:
-        about = Path(path).stat()
+        about = check_regular(path)
     except OSError as fault:
         raise MeshFileError(f"{path}: cannot be read ({fault.strerror})") from fault
     if about.st_size > MOST_BYTES:
@@ -117,8 +125,9 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     import trimesh
 
     kind = Path(path).suffix.lower().lstrip(".")
-    if kind not in trimesh.available_formats():
+    if kind not in _formats():
         raise MeshFileError(f"{path}: '.{kind}' is no format of meshes; allowed: {', '.join(_formats())}")
+    _check_expanded(path, kind)
     try:
         found = trimesh.load(path, force="mesh", process=False)
         digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
@@ -142,7 +151,32 @@ def _read(path: str, _changed_ns: int) -> Mesh:
 def _formats() -> list[str]:
     import trimesh
 
-    return sorted(trimesh.available_formats())
+    return sorted(set(trimesh.available_formats()) - _ARCHIVES)
+
+
+def _check_expanded(path: str, kind: str) -> None:
+    """Raises MeshFileError where a small file makes a mesh that is too large, before it does."""
+    try:
+        if kind in _ZIPPED:
+            size = expanded_bytes(path)
+        elif kind in ("glb", "gltf"):
+            size = _accessor_bytes(Path(path).read_bytes(), kind)
+        else:
+            return
+    except (*ARCHIVE_ERRORS, struct.error, AttributeError, RecursionError) as fault:
+        raise MeshFileError(f"{path}: cannot be read as a mesh ({fault})") from fault
+    if size > MOST_BYTES:
+        raise MeshFileError(f"{path}: expands to {size} bytes; allowed: up to {MOST_BYTES >> 20} MiB")
+
+
+def _accessor_bytes(contents: bytes, kind: str) -> int:
+    """Bytes of all accessors of a glTF file, whose buffers may be left out and are then zeros."""
+    if kind == "glb":
+        (length,) = struct.unpack("<I", contents[12:16])
+        contents = contents[20 : 20 + length]
+    accessors = json.loads(contents).get("accessors", [])
+    # a component has up to 4 bytes, an element (a matrix) up to 16 components
+    return sum(4 * _COMPONENTS.get(one.get("type"), 16) * int(one.get("count", 0)) for one in accessors)
 
 
 def _merged(triangles: Float64[np.ndarray, "faces 3 3"]) -> tuple[np.ndarray, np.ndarray]:

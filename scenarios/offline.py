@@ -24,6 +24,7 @@ from algorithms.faults import AlgorithmError, Fault
 from algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems
 from scenarios.own_files import listed
+from sim.files import check_regular
 from sim.measurements import DescentMeasurements, LandingMeasurements
 
 EXPORT, ANSWERS = "export:", "answers:"
@@ -201,7 +202,7 @@ def answers_of(file: Path, form: OfflineForm[Answer]) -> Mapping[int, Answer]:
         Where the file cannot be read, or holds anything that is no answer; all that is wrong is told, by line.
     """
     try:
-        status = file.stat()
+        status = check_regular(file)
     except OSError as error:
         raise ValueError(f"{file}: {error.strerror or error}") from error
     return _read(file, form.required, status.st_mtime_ns, status.st_size)

@@ -3,14 +3,42 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 #: Problems of a file that are told at once.
 _TOLD = 20
+
+
+@runtime_checkable
+class NamesFiles(Protocol):
+    """Parameters that name files; a user's own options may have the method, too."""
+
+    def input_files(self) -> Sequence[str]:
+        """Paths of the files, as stated."""
+        ...
+
+
+def input_files(parameters: Any) -> tuple[str, ...]:
+    """The files that a scenario's parameters name, anywhere in their tree; each once."""
+    return tuple(dict.fromkeys(_files_in(parameters)))
+
+
+def _files_in(value: Any) -> Iterator[str]:
+    if isinstance(value, NamesFiles):
+        yield from value.input_files()
+    if isinstance(value, BaseModel):
+        for name in type(value).model_fields:
+            yield from _files_in(getattr(value, name))
+    elif isinstance(value, Mapping):
+        for inner in value.values():
+            yield from _files_in(inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            yield from _files_in(inner)
 
 
 class OwnFile(BaseModel):
@@ -20,6 +48,10 @@ class OwnFile(BaseModel):
 
     file: Annotated[str, Field(description="path of the file")]
     sha256: Annotated[str | None, Field(description="of the file; filled in")] = None
+
+    def input_files(self) -> tuple[str, ...]:
+        """The file."""
+        return (self.file,)
 
     @classmethod
     @abstractmethod

@@ -1,4 +1,4 @@
-"""What a campaign's rows depend on beside the case's number: configuration, code, and the packages' versions."""
+"""What a campaign's rows depend on beside the case's number: configuration, code, packages' versions, input files."""
 
 from __future__ import annotations
 
@@ -14,13 +14,18 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Self
 
+from pydantic import ValidationError
+
 from algorithms.exchange import command_of
-from campaigns.definition.campaign import value_at
+from campaigns.definition.campaign import leaves, value_at
 from campaigns.definition.configuration import CampaignConfiguration
+from campaigns.errors import CampaignError
+from campaigns.sampling.levels import Choice, Fixed, Grid
 from scenarios.dotted import relative_to
 from scenarios.estimators import sources_of
 from scenarios.interface import TakesAlgorithms, TakesParts
 from scenarios.offline import answers_file
+from scenarios.own_files import input_files
 from scenarios.registry import UnknownScenarioError, scenario
 
 #: Folders of ours whose code rows depend on; what reports and commands do changes no row.
@@ -45,11 +50,16 @@ class Identity:
         and parts.
     versions
         Of Python, Marsyard and the packages that it requires.
+    inputs
+        Hashes of the contents of the files that the parameters name, by their paths as stated: terrain models, cameras,
+        datasheets, flights, meshes, measured cases. Files that are gone are left out. None where an earlier version
+        kept none: whether they have changed is then not known.
     """
 
     configuration: str
     code: str
     versions: Mapping[str, str]
+    inputs: Mapping[str, str] | None = None
 
     def plain(self) -> dict[str, Any]:
         """As it stands in the record."""
@@ -58,20 +68,64 @@ class Identity:
     @classmethod
     def read(cls, stored: Mapping[str, Any]) -> Self:
         """The identity in a record."""
-        return cls(str(stored["configuration"]), str(stored["code"]), dict(stored["versions"]))
+        inputs = stored.get("inputs")
+        return cls(
+            str(stored["configuration"]),
+            str(stored["code"]),
+            dict(stored["versions"]),
+            None if inputs is None else dict(inputs),
+        )
 
     def differences(self, other: Identity) -> list[str]:
         """In what another identity differs from this one, each in a few words."""
         pairs = {what: (getattr(self, what)[:12], getattr(other, what)[:12]) for what in ("configuration", "code")}
         for name in sorted({*self.versions, *other.versions}):
             pairs[name] = (str(self.versions.get(name)), str(other.versions.get(name)))
+        before, now = self.inputs or {}, other.inputs or {}
+        pairs.update({name: (before[name][:12], now[name][:12]) for name in sorted({*before} & {*now})})
         return [f"{what} ({before}, now {now})" for what, (before, now) in pairs.items() if before != now]
 
 
 def identity_of(configuration: CampaignConfiguration) -> Identity:
-    """The identity of a campaign if it were run now."""
+    """The identity of a campaign if it were run now.
+
+    Raises
+    ------
+    CampaignError
+        Where a file that the parameters name cannot be used any more.
+    """
     code = code_hash((configuration.scenario, *chosen_algorithms(configuration), *chosen_parts(configuration)))
-    return Identity(configuration_hash(configuration), code, package_versions())
+    return Identity(configuration_hash(configuration), code, package_versions(), input_hashes(configuration))
+
+
+def input_hashes(configuration: CampaignConfiguration) -> dict[str, str]:
+    """SHA-256 of each file that the parameters name, by its path; those that are dispersed over among them.
+
+    Raises
+    ------
+    CampaignError
+        Where the scenario refuses the parameters, as where a file is gone or has changed since the campaign was made.
+    """
+    try:
+        parameters = scenario(configuration.scenario).parameters_type.model_validate(configuration.parameters)
+    except UnknownScenarioError:
+        return {}
+    except ValidationError as error:
+        said = "; ".join(one["msg"].removeprefix("Value error, ") for one in error.errors(include_url=False))
+        raise CampaignError(f"the campaign's parameters cannot be used any more: {said}") from error
+    dispersed = [one for one in configuration.dispersions.values() if isinstance(one, Choice | Fixed | Grid)]
+    stated = [value for one in dispersed for extreme in one.extremes() for _, value in leaves(extreme)]
+    names = [*input_files(parameters), *(value for value in stated if isinstance(value, str) and Path(value).is_file())]
+    return {name: _file_hash(Path(name)) for name in dict.fromkeys(names) if Path(name).is_file()}
+
+
+def _file_hash(path: Path) -> str:
+    """SHA-256 of a file's contents. Raises CampaignError where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise CampaignError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def chosen_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:

@@ -177,7 +177,12 @@ def _go_on(
     directory, configuration = folder.directory, folder.configuration
     stored = record.read(directory)
     campaign = loaded_campaign(directory, configuration)
-    changes = _identity_changes(directory, stored, configuration, allow_changed)
+    known, identity = _stored_identity(directory, stored), identity_of(configuration)
+    changes = _identity_changes(directory, known, identity, allow_changed)
+    if known.inputs is None and identity.inputs:
+        watch.note(
+            f"whether these files have changed so far is not known, as no hash was kept: {', '.join(identity.inputs)}"
+        )
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         _check_together(directory, stored, store)
         before = store.count()
@@ -189,8 +194,9 @@ def _go_on(
         said["sessions"] = [*stored["sessions"], record.session(command, crew.describe(), before)]
         if changes:
             said["changes"] = [*stored["changes"], {"utc": record.utc_now(), "cases_before": before, "in": changes}]
-            said["identity"] = identity_of(configuration).plain()
             said["algorithms"] = describe_algorithms(campaign)
+        if changes or known.inputs is None:
+            said["identity"] = identity.plain()
         said.update(cases=configuration.total_cases, configuration=configuration.model_dump(mode="json"))
         record.update(directory, said)
         _note_other_machine(stored["environment"], said["sessions"][-1]["environment"], watch)
@@ -212,18 +218,21 @@ def _note_other_machine(before: dict[str, Any], now: dict[str, Any], watch: Watc
         watch.note(f"the campaign began on another processor ({was}): rows may differ from its rows in their last bits")
 
 
-def _identity_changes(
-    directory: Path, stored: dict[str, Any], configuration: CampaignConfiguration, allow_changed: bool
-) -> list[str]:
-    """In what the program differs from the one that ran the campaign so far; refused unless that is allowed."""
+def _stored_identity(directory: Path, stored: dict[str, Any]) -> Identity:
+    """The identity that a campaign has been run with so far."""
     if "identity" not in stored:
         raise StoreError(f"{directory} was run by an earlier version, which kept no rows to go on from; run it anew")
-    changes = Identity.read(stored["identity"]).differences(identity_of(configuration))
+    return Identity.read(stored["identity"])
+
+
+def _identity_changes(directory: Path, known: Identity, identity: Identity, allow_changed: bool) -> list[str]:
+    """In what program and input files differ from those of the campaign so far; refused unless that is allowed."""
+    changes = known.differences(identity)
     if changes and not allow_changed:
         listed = "\n  ".join(changes)
         raise CampaignError(
-            f"{directory} was run with another program or configuration; rows would not belong together. Changed:\n"
-            f"  {listed}\nTo go on nevertheless, and have it recorded: --allow-changed"
+            f"{directory} was run with another program, configuration or input files; rows would not belong together. "
+            f"Changed:\n  {listed}\nTo go on nevertheless, and have it recorded: --allow-changed"
         )
     return changes
 

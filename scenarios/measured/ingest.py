@@ -41,11 +41,14 @@ from scenarios.measured.table import CaseRows, PictureRow, read_table
 from scenarios.own_files import listed
 from sim.camera import CameraModel, Pds3Product, looking_down, read_cameras, read_pds3_product
 from sim.camera.pds_labels import is_pds3
+from sim.files import npy_header
 from sim.frames import SITE_FROM_WORLD
 
 POSITION = ("x_m", "y_m", "z_m")
 #: Relative response of the brightest pixel, at most: noise makes it a little more than 1.
 _MOST_FLAT = 1.5
+#: Pixels along a side of the largest camera.
+_MAX_SIDE = 16384
 
 
 @dataclass(frozen=True)
@@ -130,6 +133,10 @@ def _flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
     head = file_head(path)
     try:
         if head.startswith(b"\x93NUMPY"):
+            with path.open("rb") as file:
+                shape, kind = npy_header(file)
+            if len(shape) != 2 or max(shape) > _MAX_SIDE or kind.kind not in "iuf":
+                raise ValueError(f"holds an array of shape {shape} and type {kind}")
             response = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
         else:
             counts = read_counts(path, picture_size(path))

@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from scenarios.own_axes import RecordedAxes
+from sim.files import check_regular
 from sim.frames import direction
 
 #: The two files of every folder.
@@ -114,6 +115,7 @@ def read_ingest_file(folder: Path) -> IngestFile:
     """
     path = folder / INGEST_FILE
     try:
+        check_regular(path)
         stated = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise IngestError(f"{path}: cannot be read: {error.strerror or error}") from error

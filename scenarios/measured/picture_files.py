@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt16
 
 from scenarios.measured.layout import IngestError
+from sim.files import open_regular
 
 #: A header of a PGM with comments is shorter.
 _HEAD = 4096
@@ -21,7 +22,7 @@ _ALLOWED = "allowed: PNG, PGM or TIFF of one band with 8 or 16 bits, or a PDS3 p
 def file_head(path: Path) -> bytes:
     """The file's first bytes. Raises IngestError where it is not there, empty, or cannot be read."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             head = file.read(_HEAD)
     except OSError as error:
         raise IngestError(f"{path}: {error.strerror or error}") from error

@@ -20,6 +20,7 @@ from algorithms.exchange.files import read_picture, write_picture
 from scenarios.measured.layout import TaskName
 from scenarios.own_files import OwnFile
 from sim.camera import CameraModel, read_cahvor, write_cahvor
+from sim.files import check_regular
 from sim.frames import rigid
 from sim.measurements import (
     AltitudeMeasurement,
@@ -141,7 +142,7 @@ class CasesFile(OwnFile):
 
 def _version(file: str) -> tuple[str, int, int]:
     try:
-        about = Path(file).stat()
+        about = check_regular(file)
     except OSError as error:
         raise ValueError(f"{file}: {error.strerror or error}; marsyard ingest writes it") from error
     return file, about.st_mtime_ns, about.st_size

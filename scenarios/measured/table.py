@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems
 from scenarios.measured.layout import COLUMNS, PICTURES, TEXTS, IngestError
 from scenarios.own_files import listed
+from sim.files import check_regular
 
 #: A quaternion's length may be off 1 by this, as written with three digits.
 UNIT_TOLERANCE = 5e-3
@@ -99,6 +100,7 @@ def read_table(path: Path, task: str) -> tuple[CaseRows, ...]:
 def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Names of the columns, and the lines that are not empty with their numbers."""
     try:
+        check_regular(path)
         with path.open(newline="", encoding="utf-8-sig") as text:
             reader = csv.reader(text)
             header = [name.strip() for name in next(reader, [])]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from sim.camera.cahv import Cahv
 from sim.camera.cahvor import Cahvor
 from sim.camera.cahvore import Cahvore
 from sim.camera.vectors import Real
+from sim.files import open_regular
 
 #: Labels of several megabytes are there; camera files are small.
 _MOST_BYTES = 1 << 23
@@ -48,7 +48,7 @@ class Source:
     def head(self, count: int) -> bytes:
         """The file's first bytes, of which there must be some."""
         try:
-            with Path(self.path).open("rb") as file:
+            with open_regular(self.path) as file:
                 read = file.read(count)
         except OSError as fault:
             raise self.error("file", f"cannot be read ({fault.strerror})", "a readable camera file") from fault

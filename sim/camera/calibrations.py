@@ -63,7 +63,16 @@ class Calibration:
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
-    """Plain data, OpenCV's matrices as the mappings they are written as."""
+    """Plain data, OpenCV's matrices as the mappings they are written as; no aliases.
+
+    Aliases of aliases of lists make gigabytes of a few hundred bytes, and no calibration has any.
+    """
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Compose a node of the document. Raises yaml.YAMLError at an alias."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError(f"line {self.peek_event().start_mark.line + 1} has an alias (*), which is not read")
+        return super().compose_node(parent, index)
 
 
 def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> Any:

@@ -22,12 +22,15 @@ from jaxtyping import Float64
 
 from sim.dynamics.recorded import LEAST_INSTANTS
 from sim.dynamics.spice import SUFFIX, is_spice, spice_poses
+from sim.files import check_regular
 
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 #: A quaternion's length may be off 1 by this, as written with three digits.
 UNIT_TOLERANCE = 5e-3
 #: Ten hours at 100 Hz are 400 MB of text; nothing is read that is larger.
 MOST_BYTES = 1 << 29
+#: And no table of more rows, whatever it is compressed to.
+MAX_ROWS = 5_000_000
 _KEPT_FILES = 4
 #: Cells of a table of text that hold no number.
 _MISSING = ("", "na", "n/a", "null", "none")
@@ -74,7 +77,7 @@ def read_poses(path: str | Path) -> RecordedPoses:
         not increase, or a quaternion is not of length 1.
     """
     try:
-        about = Path(path).stat()
+        about = check_regular(path)
     except OSError as fault:
         raise TrajectoryFileError(f"{path}: cannot be read ({fault.strerror})") from fault
     return _read(str(path), about.st_mtime_ns, about.st_size)
@@ -139,15 +142,38 @@ def _by_pandas(path: str, first: str) -> Float64[np.ndarray, "n 8"]:
     import pandas as pd  # slow to import: for campaigns that have such a file
 
     if not first.startswith("#timestamp"):
-        frame = pd.read_parquet(path)
-        frame = frame.rename(columns=lambda name: str(name).strip())
-        _place_columns(path, list(frame.columns))
-        return np.asarray(frame[list(COLUMNS)].to_numpy(dtype=np.float64))
+        return _from_parquet(path)
     frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
     values = frame.to_numpy(dtype=np.float64)
     values[:, 0] = 1e-9 * (frame[0] - int(frame[0].iloc[0])).to_numpy(dtype=np.float64)
     values[:, 0] += 1e-9 * int(frame[0].iloc[0])
     return np.asarray(values[:, [0, 1, 2, 3, 5, 6, 7, 4]])
+
+
+def _from_parquet(path: str) -> Float64[np.ndarray, "n 8"]:
+    """The columns of poses alone, checked by the file's own description before anything is expanded."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    file = pq.ParquetFile(path)
+    rows = file.metadata.num_rows
+    if rows > MAX_ROWS:
+        raise TrajectoryFileError(f"{path}: has {rows} rows; allowed: up to {MAX_ROWS}")
+    fields = list(file.schema_arrow)
+    stored = [fields[place] for place in _place_columns(path, [field.name.strip() for field in fields])]
+    for field in stored:
+        if not (pa.types.is_floating(field.type) or pa.types.is_integer(field.type)):
+            raise TrajectoryFileError(f"{path}: the column {field.name} holds {field.type}; allowed: numbers")
+    values = np.empty((rows, len(COLUMNS)))
+    read = 0
+    for batch in file.iter_batches(columns=[field.name for field in stored]):
+        if read + batch.num_rows > rows:
+            raise TrajectoryFileError(f"{path}: has more rows than the {rows} that it states")
+        for column, field in enumerate(stored):
+            numbers = batch.column(field.name).cast(pa.float64(), safe=False)
+            values[read : read + batch.num_rows, column] = numbers.to_numpy(zero_copy_only=False)
+        read += batch.num_rows
+    return values[:read]
 
 
 def _comma_separated(path: str, first: str) -> Float64[np.ndarray, "n 8"]:

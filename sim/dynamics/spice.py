@@ -24,6 +24,8 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
+from sim.files import check_regular
+
 #: How such a file's name ends.
 SUFFIX = ".spice.toml"
 #: Poses of five hours at 50 Hz; nothing is sampled more finely.
@@ -60,6 +62,7 @@ def spice_poses(path: str) -> tuple[str, Float64[np.ndarray, "n 8"]]:
     ImportError
         Where the package spiceypy is not installed.
     """
+    check_regular(path)
     stated = _stated(path)
     folder = Path(path).parent
     kernels = [folder / name for name in stated.kernels]

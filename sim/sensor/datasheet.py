@@ -28,6 +28,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from sim.files import open_regular
 from sim.sensor.optics import OpticsParameters
 from sim.sensor.parameters import DetectorParameters
 from sim.sensor.radiometry import LENS_TRANSMISSION, LightPath, bright_exposure_s
@@ -165,7 +166,7 @@ def read_datasheet(path: str | Path) -> Datasheet:
         If it cannot be read, is no TOML, or a figure is missing or wrong; it names file and field.
     """
     try:
-        with Path(path).open("rb") as file:
+        with open_regular(path) as file:
             contents = file.read(_MOST_BYTES + 1)
     except OSError as fault:
         raise ValueError(f"{path}: cannot be read ({fault.strerror})") from fault

@@ -1,7 +1,8 @@
 """A user's own camera: its geometry from a camera file, its detector from a datasheet.
 
 A campaign names a camera's file once; what it says is put into the campaign's parameters when it is read, so that a
-campaign's folder holds the camera itself, and a file that changes afterwards changes no case.
+campaign's folder holds the camera itself, and a file that changes afterwards changes no case (`resume` and `append`
+report it).
 """
 
 from __future__ import annotations
@@ -62,6 +63,10 @@ class OwnCamera(BaseModel):
         return Cahvore.from_cahv(
             pinhole, np.array(self.r), np.array(self.e), linearity=self.linearity, o=np.array(self.o)
         )
+
+    def input_files(self) -> tuple[str, ...]:
+        """The file that the camera was read from."""
+        return () if self.file is None else (self.file,)
 
     @property
     def size(self) -> tuple[int, int]:

@@ -52,6 +52,11 @@ class DetectorParameters(BaseModel):
     optics: OpticsParameters = OpticsParameters()
     defects: DefectParameters = DefectParameters()
     bursts: BurstParameters = BurstParameters()
+    file: Annotated[str | None, Field(description="datasheet that the values were read from")] = None
+
+    def input_files(self) -> tuple[str, ...]:
+        """The datasheet that the values were read from."""
+        return () if self.file is None else (self.file,)
 
     @property
     def sunlight(self) -> float:

@@ -232,13 +232,16 @@ def _chosen(settings: object) -> object:
     """Settings with those of a preset or a datasheet put below them, where they name one."""
     if isinstance(settings, str):
         settings = {"file": settings} if settings.endswith(".toml") else {"preset": settings}
-    if not isinstance(settings, Mapping) or not ({"preset", "file"} & set(settings)):
+    if not isinstance(settings, Mapping) or all(settings.get(key) is None for key in ("preset", "file")):
+        return settings
+    if set(DetectorParameters.model_fields) <= set(settings):  # read before, and kept with the campaign
         return settings
     if {"preset", "file"} <= set(settings):
         raise ValueError("a detector is a preset or a datasheet's file, not both")
     changes = {key: value for key, value in settings.items() if key not in ("preset", "file")}
     if "file" in settings:
-        return _over(read_datasheet(str(settings["file"])).parameters().model_dump(), changes)
+        file = str(settings["file"])
+        return _over({**read_datasheet(file).parameters().model_dump(), "file": file}, changes)
     return _over(preset(str(settings["preset"])).detector.model_dump(), changes)
 
 

@@ -47,6 +47,10 @@ class RealTerrain(BaseModel):
         bool, Field(description="add the fractal ground's detail finer than twice the DTM's posting")
     ] = True
 
+    def input_files(self) -> tuple[str, ...]:
+        """Paths of the files that the terrain is made from."""
+        return tuple(str(path) for path in (self.dtm, self.ortho) if path is not None)
+
 
 @dataclass(frozen=True)
 class Raster:

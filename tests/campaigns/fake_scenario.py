@@ -48,6 +48,10 @@ class FakeParameters(BaseModel):
     sleep_s: float = 0.0
     error_scale: float = 1.0
     products: str = "good"
+    table: str = ""
+
+    def input_files(self) -> tuple[str, ...]:
+        return (self.table,) if self.table else ()
 
     @model_validator(mode="after")
     def _above_the_lowest(self) -> FakeParameters:

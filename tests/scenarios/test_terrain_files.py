@@ -138,7 +138,7 @@ def test_a_map_of_the_pole_itself_passes_and_has_no_true_north(tmp_path: Path) -
 
 
 def test_a_sheared_map_is_refused(tmp_path: Path) -> None:
-    """Sinusoidal 10 deg off its meridian at 60 deg: lengths along x and areas are true, but x and y are not at right angles."""
+    """Sinusoidal 10 deg off its meridian at 60 deg: areas are true, but x and y are not at right angles."""
     crs = CRS.from_string(f"+proj=sinu +lon_0=0 {MOON} +units=m")
     (x,), (y,) = transform(CRS.from_string(f"+proj=longlat {MOON} +no_defs"), crs, [10.0], [60.0])
     path = tif(tmp_path, crs=crs, transform=Affine(2.0, 0.0, x - 40.0, 0.0, -2.0, y + 50.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -67,6 +68,7 @@ def test_tables_that_cannot_be_used(tmp_path: Path, change: Callable[[Rows], Row
     [
         (lambda path: cv2.imwrite(str(path), np.zeros((480, 640), np.uint16)), "has 640 x 480 pixels; its camera has"),
         (lambda path: path.write_bytes(b""), "is empty (0 bytes)"),
+        (lambda path: (path.unlink(), os.mkfifo(path)), "is a named pipe; a regular file is needed"),
         (lambda path: path.write_bytes(b"GIF89a" + bytes(100)), "is no picture that is read; allowed: PNG"),
         (lambda path: cv2.imwrite(str(path), np.full((256, 1024), 5000, np.uint16)), "bits = 12 allows 4095"),
         (lambda path: cv2.imwrite(str(path), np.zeros((256, 1024, 3), np.uint8)), "has 3 bands"),

@@ -106,7 +106,11 @@ band_nm = [600.0, 800.0]
 def test_campaigns_name_the_file(tmp_path: Path) -> None:
     path = written(tmp_path)
     plain = CHOICE.validate_python(str(path))
-    assert plain == read_datasheet(path).parameters()
+    assert plain == read_datasheet(path).parameters().model_copy(update={"file": str(path)})
+    # as a campaign's folder keeps it, it is not read again
+    path.write_text("")
+    assert CHOICE.validate_python(plain.model_dump(mode="json")) == plain
+    path.write_text(SHEET)
     changed = CHOICE.validate_python({"file": str(path), "temperature_c": -10.0, "optics": {"dust_discs": 3}})
     assert (changed.temperature_c, changed.optics.dust_discs) == (-10.0, 3)
     assert changed.full_well_e == plain.full_well_e

@@ -1,0 +1,157 @@
+"""Files that would exhaust the memory or never end are refused by what they expand to, or at once, with one message."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import struct
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import trimesh
+
+from scenarios.measured.ingest import _flat_field
+from scenarios.measured.layout import VELOCITY, IngestError, read_ingest_file
+from scenarios.measured.picture_files import read_counts
+from scenarios.measured.store import CasesFile
+from scenarios.measured.table import read_table
+from scenarios.meshes import MOST_BYTES, MeshFileError, read_mesh
+from scenarios.offline import VELOCITY_FORM, answers_of
+from sim.camera import read_cameras
+from sim.dynamics.recorded_files import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
+from sim.sensor import read_datasheet
+
+
+def test_a_calibration_with_aliases_is_refused(tmp_path: Path) -> None:
+    """Nine lists of nine aliases each, in 500 bytes: 9**8 numbers where they are expanded."""
+    lines = ["a0: &a0 [0,0,0,0,0,0,0,0,0]"]
+    lines += [f"a{n}: &a{n} [{','.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 8)]
+    path = tmp_path / "camera.yaml"
+    path.write_text("\n".join([*lines, "camera_matrix: *a7", "image_width: 640", "image_height: 480"]))
+    assert path.stat().st_size < 600
+    with pytest.raises(ValueError, match=r"camera.yaml: file: is not valid YAML \(line 2 has an alias"):
+        read_cameras(path)
+
+
+@pytest.mark.parametrize("ending", ["zip", "tar.gz", "bz2"])
+def test_archives_are_no_meshes(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"rock.{ending}"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("rock.stl", b"solid\n" + b" " * 10_000_000)
+    with pytest.raises(MeshFileError, match="is no format of meshes; allowed: "):
+        read_mesh(str(path))
+
+
+def test_zipped_formats_of_meshes_are_measured_before_they_expand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """300 MB of blanks, 300 kB in the archive; trimesh reads 3MF where lxml and networkx are installed."""
+    monkeypatch.setattr(trimesh, "available_formats", lambda: {"3mf", "stl"})
+    monkeypatch.setattr(trimesh, "load", lambda *_, **__: pytest.fail("was expanded"))
+    path = tmp_path / "rock.3mf"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("3D/3dmodel.model", "w") as member:
+        for _ in range(30):
+            member.write(b" " * 10_000_000)
+    assert path.stat().st_size < 1_000_000
+    with pytest.raises(
+        MeshFileError, match=rf"rock.3mf: expands to 300000000 bytes; allowed: up to {MOST_BYTES >> 20}"
+    ):
+        read_mesh(str(path))
+
+
+def test_accessors_without_a_buffer_are_measured_before_they_expand(tmp_path: Path) -> None:
+    """glTF's accessors without a buffer are zeros, as many as they state."""
+    scene = {
+        "asset": {"version": "2.0"},
+        "accessors": [{"componentType": 5126, "count": 1_000_000_000, "type": "VEC3"}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+        "scene": 0,
+    }
+    text = json.dumps(scene).encode()
+    text += b" " * (-len(text) % 4)
+    path = tmp_path / "rock.glb"
+    path.write_bytes(struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text)
+    with pytest.raises(MeshFileError, match=r"rock.glb: expands to 12000000000 bytes"):
+        read_mesh(str(path))
+
+
+def _parquet(path: Path, rows: int, **columns: pa.Array) -> Path:
+    """A table of equal values, which Parquet keeps in a few bytes."""
+    zeros = pa.array(np.zeros(rows))
+    pq.write_table(pa.table({**dict.fromkeys(COLUMNS, zeros), **columns}), path)
+    return path
+
+
+def test_a_table_of_poses_with_too_many_rows_is_refused_unread(tmp_path: Path) -> None:
+    path = _parquet(tmp_path / "flight.parquet", MAX_ROWS + 1)
+    assert path.stat().st_size < 3_000_000
+    with pytest.raises(TrajectoryFileError, match=rf"has {MAX_ROWS + 1} rows; allowed: up to {MAX_ROWS}"):
+        read_poses(path)
+
+
+def test_only_columns_of_poses_are_read_and_they_are_numbers(tmp_path: Path) -> None:
+    path = _parquet(tmp_path / "flight.parquet", 10, qw=pa.array(["a"] * 10))
+    with pytest.raises(TrajectoryFileError, match="the column qw holds string; allowed: numbers"):
+        read_poses(path)
+
+
+def test_a_flat_field_is_measured_before_it_expands(tmp_path: Path) -> None:
+    path = tmp_path / "flat.npy"
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)})
+    with pytest.raises(IngestError, match=r"flat.npy: is no flat field: holds an array of shape \(1000000, 1000000\)"):
+        _flat_field(path)
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "picture.png": lambda path: read_counts(path, (8, 8)),
+    "camera.yaml": read_cameras,
+    "sensor.toml": read_datasheet,
+    "flight.csv": read_poses,
+    "flight.spice.toml": read_poses,
+    "rock.stl": lambda path: read_mesh(str(path)),
+    "answers.csv": lambda path: answers_of(path, VELOCITY_FORM),
+    "ingest.toml": lambda path: read_ingest_file(path.parent),
+    "pictures.csv": lambda path: read_table(path, VELOCITY),
+    "cases.json": lambda path: CasesFile.hash_of(str(path)),
+}
+
+
+@pytest.fixture
+def alarm() -> Iterator[None]:
+    """Ends a test that waits."""
+
+    def end(*_: object) -> None:
+        raise TimeoutError("waited for a file that never ends")
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("alarm")
+@pytest.mark.parametrize("name", READERS)
+def test_a_named_pipe_is_refused_at_once_wherever_a_file_is_read(tmp_path: Path, name: str) -> None:
+    """Opening a pipe that nothing writes to waits for ever."""
+    path = tmp_path / name
+    os.mkfifo(path)
+    with pytest.raises(ValueError, match="is a named pipe; a regular file is needed") as raised:
+        READERS[name](path)
+    assert name in str(raised.value)
+
+
+def test_a_device_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    path.symlink_to("/dev/zero")
+    with pytest.raises(TrajectoryFileError, match="is a character device; a regular file is needed"):
+        read_poses(path)
