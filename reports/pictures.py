@@ -1,12 +1,18 @@
-"""A picture of a case as figures show it."""
+"""Pictures of a case as figures show them."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from reports.svg import INK
+from reports.svg import INK, in_page_style
+
+#: Width of a row of pictures, and height of its titles, inches.
+_ROW_IN = (12.0, 0.35)
 
 
 def show_picture(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
@@ -19,3 +25,15 @@ def show_picture(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
     axes.grid(visible=False)
     for spine in axes.spines.values():
         spine.set_visible(False)
+
+
+@in_page_style
+def draw_pictures(pictures: Sequence[Float[np.ndarray, "_ _"]]) -> Figure:
+    """Pictures in a row, numbered, as they were delivered: of a case whose algorithm left no details to draw."""
+    width, title = _ROW_IN
+    rows, columns = pictures[0].shape
+    figure = Figure(figsize=(width, width / len(pictures) * rows / columns + title), layout="constrained")
+    for number, (axes, picture) in enumerate(zip(figure.subplots(1, len(pictures)), pictures, strict=True), start=1):
+        show_picture(axes, picture)
+        axes.set_title(f"Picture {number}", fontsize=9)
+    return figure

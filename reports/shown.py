@@ -20,12 +20,13 @@ class TableRow:
 
 @dataclass(frozen=True)
 class CaseView:
-    """A case as its page shows it: facts by name, figures, and a table."""
+    """A case as its page shows it: facts by name, figures, and a table; `legend` in place of its system's."""
 
     facts: Sequence[tuple[str, str]]
     plates: Sequence[Plate]
     head: Sequence[str]
     rows: Sequence[TableRow]
+    legend: str | None = None
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,9 @@ def shown_case(run: StoredRun, case: int) -> ShownCase | None:
     system = _system(products)
     if system is None:
         return None
-    return ShownCase(case, _outcome(run.whole, case), system.view(products, f"case{case}"), system.legend)
+    view = system.view(products, f"case{case}")
+    legend = system.legend if view.legend is None else view.legend
+    return ShownCase(case, _outcome(run.whole, case), view, legend)
 
 
 def write_case_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Polygon, Rectangle
 from scipy import ndimage
 
+from reports.pictures import draw_pictures
 from reports.products import numbers, plane
 from reports.svg import INK, in_page_style
 
@@ -28,6 +29,9 @@ TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
 _DEFAULT_SIDE = 15.0
 _PAIRS = (0, 1)
 _MOST_TRACKS = 2
+#: Relative heights of the rows of a pair's figure, and inches of one.
+_ROW_HEIGHTS = {"rectified": 1.95, "templates": 1.0, "delivered": 1.95}
+_INCHES = 8.3 / 4.9
 #: Side of a rectified picture as drawn, pixels.
 _RECTIFIED_PX = 384
 #: Numbers that a template may have; more than two a pair are not drawn, but their numbers are.
@@ -88,7 +92,7 @@ def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
     ValueError
         Where the products do not hold the three pictures; see `is_dimes_case`.
     """
-    figure = Figure(figsize=(12.0, 8.3), layout="constrained")
+    figure = Figure(figsize=(12.0, max(_height_in(products, pair) for pair in _PAIRS)), layout="constrained")
     halves = figure.add_gridspec(1, 2)
     for pair in _PAIRS:
         _draw_pair(figure.add_subfigure(halves[pair]), products, pair)
@@ -98,13 +102,26 @@ def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
 @in_page_style
 def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
     """One image pair of a case, 0 or 1; raises as `draw_dimes_case` does."""
-    figure = Figure(figsize=(6.0, 8.3), layout="constrained")
+    figure = Figure(figsize=(6.0, _height_in(products, pair)), layout="constrained")
     _draw_pair(figure, products, pair)
     return figure
 
 
+def has_dimes_details(products: Mapping[str, Any]) -> bool:
+    """Whether products hold what DIMES keeps of its answer: tracks, if only none of them."""
+    return "tracks" in products
+
+
+def delivered_pictures(products: Mapping[str, Any]) -> list[Float[np.ndarray, "_ _"]]:
+    """The three pictures, their columns binned; raises as `draw_dimes_case` does."""
+    return [_picture(products, f"image_{number}") for number in (1, 2, 3)]
+
+
 def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> Path:
-    """Writes a case's figure, as `draw_dimes_case` draws it, into a folder as `dimes.png`; returns its path.
+    """Writes a case's figure into a folder; returns its path.
+
+    It is `dimes.png`, as `draw_dimes_case` draws it; of an algorithm without DIMES' details `pictures.png`, the
+    pictures alone.
 
     Raises
     ------
@@ -113,24 +130,43 @@ def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> Path:
     OSError
         Where it cannot be written.
     """
-    path = directory / "dimes.png"
-    draw_dimes_case(products).savefig(path, dpi=110, facecolor="#ffffff", metadata={"Software": None})
+    drawn = has_dimes_details(products)
+    path = directory / ("dimes.png" if drawn else "pictures.png")
+    figure = draw_dimes_case(products) if drawn else draw_pictures(delivered_pictures(products))
+    figure.savefig(path, dpi=110, facecolor="#ffffff", metadata={"Software": None})
     return path
+
+
+def _row_heights(products: Mapping[str, Any], pair: int) -> dict[str, float]:
+    """Relative heights of the rows that a pair has something to show in, from above."""
+    shown = {
+        "rectified": any(numbers(products.get(f"rectified_{pair}_{side}")) is not None for side in (0, 1)),
+        "templates": any(one.pair == pair and one.patch is not None for one in tracks(products)),
+        "delivered": True,
+    }
+    return {name: _ROW_HEIGHTS[name] for name, has in shown.items() if has}
+
+
+def _height_in(products: Mapping[str, Any], pair: int) -> float:
+    return _INCHES * sum(_row_heights(products, pair).values())
 
 
 def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> None:
     pictures = [_picture(products, f"image_{number}") for number in (pair + 1, pair + 2)]
     ours = [track for track in tracks(products) if track.pair == pair][:_MOST_TRACKS]
-    grid = figure.add_gridspec(3, 1, height_ratios=(1.95, 1.0, 1.95))
-    upper = grid[0].subgridspec(1, 2)
-    for side, picture in enumerate(pictures):
-        _draw_rectified(figure.add_subplot(upper[side]), products, picture, ours, (pair, side))
-    middle = grid[1].subgridspec(1, 2 * _MOST_TRACKS)
-    for place in range(_MOST_TRACKS):
-        track = ours[place] if place < len(ours) else None
-        _draw_template(figure.add_subplot(middle[2 * place]), track)
-        _draw_window(figure.add_subplot(middle[2 * place + 1]), track)
-    lower = grid[2].subgridspec(1, 2)
+    heights = _row_heights(products, pair)
+    grid = dict(zip(heights, figure.add_gridspec(len(heights), 1, height_ratios=[*heights.values()]), strict=True))
+    if "rectified" in grid:
+        upper = grid["rectified"].subgridspec(1, 2)
+        for side, picture in enumerate(pictures):
+            _draw_rectified(figure.add_subplot(upper[side]), products, picture, ours, (pair, side))
+    if "templates" in grid:
+        middle = grid["templates"].subgridspec(1, 2 * _MOST_TRACKS)
+        for place in range(_MOST_TRACKS):
+            track = ours[place] if place < len(ours) else None
+            _draw_template(figure.add_subplot(middle[2 * place]), track)
+            _draw_window(figure.add_subplot(middle[2 * place + 1]), track)
+    lower = grid["delivered"].subgridspec(1, 2)
     for side, (picture, stem, colour) in enumerate(
         zip(pictures, ("template", "match"), (TEMPLATE, MATCH), strict=True)
     ):

@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 
 from reports.columns import label
-from reports.dimes.case_figures import Track, draw_dimes_pair, is_dimes_case, tracks, write_dimes_figures
+from reports.dimes.case_figures import (
+    Track,
+    delivered_pictures,
+    draw_dimes_pair,
+    has_dimes_details,
+    is_dimes_case,
+    tracks,
+    write_dimes_figures,
+)
+from reports.pictures import draw_pictures
 from reports.plates import plate
 from reports.shown import CaseView, System, TableRow
 from reports.wording import number
@@ -24,9 +33,18 @@ _LEGEND = (
     "passed."
 )
 
+_PLAIN_LEGEND = (
+    "Pictures as delivered, columns binned. Tracks and templates are drawn of algorithms whose answers have the "
+    "details of DIMES (docs/own-algorithms.md)."
+)
+
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """A DIMES case."""
+    """A DIMES case; of an algorithm without DIMES' details its pictures alone."""
+    if not has_dimes_details(products):
+        pictures = draw_pictures(delivered_pictures(products))
+        shown = plate(pictures, f"{key}pictures", "The three pictures that the algorithm was given.", wide=True)
+        return CaseView(_velocities(products), [shown], [], [], _PLAIN_LEGEND)
     pairs = enumerate(("first and second picture", "second and third picture"))
     plates = [plate(draw_dimes_pair(products, k), f"{key}pair{k}", f"Pair {k + 1}: {name}.") for k, name in pairs]
     of_each = tracks(products)

@@ -14,9 +14,11 @@ from reports.hda.products import (
     epipolar_matches,
     is_hda_case,
     landing_maps,
+    pictures,
     solved_motion,
     tracked_features,
 )
+from reports.pictures import draw_pictures
 from reports.plates import plate
 from reports.shown import CaseView, System, TableRow
 from reports.wording import number
@@ -39,10 +41,21 @@ _LEGEND = (
     "not all of the footprint is seen by both pictures."
 )
 
+_PLAIN_LEGEND = (
+    "Pictures as delivered. Stages are drawn of algorithms whose answers have the details of the paper's "
+    "(docs/own-algorithms.md)."
+)
+
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """A landing's case."""
+    """A landing's case; where no stage of the paper's left its results, its pictures alone."""
     names = [name for name in figures_reached(products) if name != _LEFT_OUT]
+    seen = pictures(products)
+    if not names and seen is not None:
+        shown = plate(
+            draw_pictures(seen), f"{key}pictures", "The two pictures that the algorithm was given.", wide=True
+        )
+        return CaseView([], [shown], *_stages(products), _PLAIN_LEGEND)
     plates = [plate(FIGURES[name](products), f"{key}{name[:4]}", _CAPTIONS[name], wide=True) for name in names]
     return CaseView(
         [("Figures", ", ".join(name.split("-")[0] for name in names) or "none")], plates, *_stages(products)

@@ -19,7 +19,9 @@ from reports.dimes.case_figures import (
     draw_dimes_pair,
     is_dimes_case,
     tracks,
+    write_dimes_figures,
 )
+from reports.dimes.shown import view
 from reports.systems import write_case_figures
 
 
@@ -110,3 +112,31 @@ def test_what_is_no_dimes_case(dimes_products: dict[str, Any]) -> None:
     assert tracks({}) == []
     with pytest.raises(ValueError, match="image_3"):
         draw_dimes_pair({**dimes_products, "image_3": None}, 1)
+
+
+def test_a_case_without_details_shows_its_pictures_alone(dimes_products: dict[str, Any]) -> None:
+    plain = {name: value for name, value in dimes_products.items() if name.startswith(("image_", "velocity_"))}
+    shown = view(plain, "k")
+    (pictures,) = shown.plates
+    assert pictures.wide
+    assert "templates" not in str(pictures.svg)
+    assert "Picture 3" in str(pictures.svg)
+    assert (shown.head, shown.rows) == ([], [])
+    assert shown.legend is not None
+    assert "squares mark" not in shown.legend
+    assert [name for name, _ in shown.facts] == ["Estimated velocity", "True velocity"]
+
+
+def test_figures_leave_out_rows_that_have_nothing_to_show(dimes_products: dict[str, Any]) -> None:
+    # a case that ended before any template was chosen
+    early = {name: value for name, value in dimes_products.items() if name.startswith("image_")}
+    early |= {"tracks": np.zeros((0, 13)), "tracks_columns": dimes_products["tracks_columns"]}
+    whole, short = (draw_dimes_pair(products, 0) for products in (dimes_products, early))
+    assert len(short.get_axes()) == 2
+    assert short.get_figheight() < 0.5 * whole.get_figheight()
+
+
+def test_replay_writes_the_pictures_of_a_case_without_details(dimes_products: dict[str, Any], tmp_path: Path) -> None:
+    plain = {name: value for name, value in dimes_products.items() if name.startswith("image_")}
+    assert write_dimes_figures(tmp_path, plain) == tmp_path / "pictures.png"
+    assert (tmp_path / "pictures.png").stat().st_size > 1000
