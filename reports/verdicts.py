@@ -219,7 +219,7 @@ def succeeded(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0
     """
     finished = ~_engine_failed(frame)
     if math.isnan(bound):
-        return np.logical_and(_true(frame, metric), finished)
+        return np.asarray(_true(frame, metric) & finished, dtype=np.bool_)
     values = sum((numbers(frame, part) for part in metric.split(" + ")), np.zeros(len(frame)))
     return np.asarray((np.abs(scale * values) <= bound) & finished, dtype=np.bool_)
 
@@ -291,8 +291,8 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
 def _members_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
     """The members of a population, and the cases that would be if the engine had finished them with an answer."""
     others = [part for part in population.split(" and ") if part not in ("valid", "completed")]
-    unfinished = np.logical_and(_members_of(frame, others)[0], _engine_failed(frame))
-    return np.logical_or(members(frame, population), unfinished)
+    unfinished = _members_of(frame, others)[0] & _engine_failed(frame)
+    return np.asarray(members(frame, population) | unfinished, dtype=np.bool_)
 
 
 def _withhold(verdict: Verdict, suspected: Verdict) -> Verdict:
@@ -320,7 +320,8 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, frame: pd.Data
 def _successes(verdict: Verdict, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"]:
     """Which members succeed: none of those whose membership is unknown."""
     _, unknown = _members_of(chosen, verdict.population.split(" and "))
-    return np.logical_and(succeeded(chosen, verdict.metric, verdict.bound, verdict.scale), ~unknown)
+    success = succeeded(chosen, verdict.metric, verdict.bound, verdict.scale)
+    return np.asarray(success & ~unknown, dtype=np.bool_)
 
 
 def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
