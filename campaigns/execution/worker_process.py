@@ -185,10 +185,10 @@ def lost_descriptors() -> list[int]:
 def _open_descriptors() -> dict[int, tuple[int, int]]:
     """Device and inode of each open file descriptor; none where the system does not list them."""
     found = {}
-    for name in os.listdir("/proc/self/fd") if sys.platform == "linux" else ():
+    for path in Path("/proc/self/fd").iterdir() if sys.platform == "linux" else ():
         with suppress(OSError):  # that of the listing itself is closed by now
-            status = os.fstat(int(name))
-            found[int(name)] = (status.st_dev, status.st_ino)
+            status = os.fstat(int(path.name))
+            found[int(path.name)] = (status.st_dev, status.st_ino)
     return found
 
 
