@@ -198,7 +198,7 @@ def succeeded(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0
     """
     finished = ~_engine_failed(frame)
     if math.isnan(bound):
-        return _true(frame, metric) & finished
+        return np.asarray(_true(frame, metric) & finished)
     values = sum((numbers(frame, part) for part in metric.split(" + ")), np.zeros(len(frame)))
     return np.asarray((np.abs(scale * values) <= bound) & finished, dtype=np.bool_)
 
@@ -271,7 +271,7 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
 def _members_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
     """The members of a population, and the cases that would be if the engine had finished them with an answer."""
     others = [part for part in population.split(" and ") if part not in ("valid", "completed")]
-    return members(frame, population) | (_members_of(frame, others)[0] & _engine_failed(frame))
+    return np.asarray(members(frame, population) | (_members_of(frame, others)[0] & _engine_failed(frame)))
 
 
 def _withhold(verdict: Verdict, suspected: Verdict) -> Verdict:
@@ -299,7 +299,7 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, cases: int) ->
 def _successes(verdict: Verdict, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"]:
     """Which members succeed: none of those whose membership is unknown."""
     _, unknown = _members_of(chosen, verdict.population.split(" and "))
-    return succeeded(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown
+    return np.asarray(succeeded(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
 
 
 def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:
