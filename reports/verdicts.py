@@ -291,8 +291,7 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
 def _members_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
     """The members of a population, and the cases that would be if the engine had finished them with an answer."""
     others = [part for part in population.split(" and ") if part not in ("valid", "completed")]
-    unfinished = _members_of(frame, others)[0] & _engine_failed(frame)
-    return np.asarray(members(frame, population) | unfinished, dtype=np.bool_)
+    return np.asarray(members(frame, population) | (_members_of(frame, others)[0] & _engine_failed(frame)))
 
 
 def _withhold(verdict: Verdict, suspected: Verdict) -> Verdict:
@@ -320,8 +319,7 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, frame: pd.Data
 def _successes(verdict: Verdict, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"]:
     """Which members succeed: none of those whose membership is unknown."""
     _, unknown = _members_of(chosen, verdict.population.split(" and "))
-    success = succeeded(chosen, verdict.metric, verdict.bound, verdict.scale)
-    return np.asarray(success & ~unknown, dtype=np.bool_)
+    return np.asarray(succeeded(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
 
 
 def _described(verdict: Verdict, chosen: pd.DataFrame, how: Sampled) -> Verdict:

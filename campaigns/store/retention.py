@@ -57,17 +57,21 @@ def keep_while_running(configuration: CampaignConfiguration) -> Keep:
 
 
 def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
-    """Whether a row counts against a requirement; an unfinished case does so where all cases are asked."""
-    if not _belongs(row, requirement.population):
-        return False
+    """Whether a row counts against a requirement; an unfinished case does so in every population that it may be in."""
+    belongs = _belongs(row, requirement.population)
+    if belongs is not True or row["outcome"] in UNFINISHED:
+        return belongs is not False
     value = row.get(requirement.metric)
     return value is not True if requirement.bound is None else not _within(value, requirement.bound)
 
 
-def _belongs(row: Mapping[str, Any], population: str) -> bool:
-    """Whether a row is a member of a population, as in `Requirement.population`."""
-    told = {"all": True, "completed": row["outcome"] not in UNFINISHED, "valid": row["answered"]}
-    return all(told[part] if part in told else row.get(part) is True for part in population.split(" and "))
+def _belongs(row: Mapping[str, Any], population: str) -> bool | None:
+    """Whether a row is a member of a population, as in `Requirement.population`; None where the row does not say."""
+    known = {"all": True, "completed": row["outcome"] not in UNFINISHED, "valid": row["answered"]}
+    parts = [known[part] if part in known else row.get(part) for part in population.split(" and ")]
+    if any(part is False for part in parts):
+        return False
+    return None if None in parts else True
 
 
 def _within(value: Any, bound: float) -> bool:

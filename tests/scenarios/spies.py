@@ -83,3 +83,65 @@ def keep(case: ScoredVelocity | ScoredSite) -> dict[str, float]:
     """A score that keeps the case."""
     TRUE.append(case)
     return {"kept": 1.0}
+
+
+def _blacken(picture: Any, how: str) -> None:
+    if how == "by force":
+        picture.counts.setflags(write=True)
+    picture.counts[:] = 0
+
+
+class WritingVelocity(VelocitySpy):
+    """Writes to its pictures."""
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """See `VelocityEstimator`."""
+        _blacken(measurements.images[0], "as if it could")
+        return super().estimate(measurements)
+
+
+class SpoilingVelocity(VelocitySpy):
+    """Makes its pictures writable first."""
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """See `VelocityEstimator`."""
+        _blacken(measurements.images[0], "by force")
+        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+
+
+class SpoilingSite(SiteSpy):
+    """The same for sites."""
+
+    def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
+        """See `SiteEstimator`."""
+        _blacken(measurements.images[0], "by force")
+        return SiteEstimate(SiteOutcome.NO_STRUCTURE, np.array(measurements.apriori_site_world))
+
+
+class SpoilingTracker(TrackerSpy):
+    """The same for targets."""
+
+    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+        """See `TargetTracker`."""
+        update = self.inner.update(measurements)
+        _blacken(measurements.left, "by force")
+        return update
+
+
+class RaisingTracker(TrackerSpy):
+    """Raises at its second stop."""
+
+    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+        """See `TargetTracker`."""
+        if any(isinstance(one, RoverMeasurements) for one in GIVEN):
+            raise RuntimeError("the tracker raised")
+        return super().update(measurements)
+
+
+class Leaving:
+    """An algorithm of any task that ends its process, as far as a test can bear that."""
+
+    def _leave(self, *_: object) -> None:
+        raise SystemExit("left")
+
+    estimate = designate = aim = update = clear = state = _leave
