@@ -93,7 +93,9 @@ def bounds_of(success: Success, groups: Groups | None, probability: float, confi
     lower, upper = (clustered_evidence(success, groups, level) for level in levels)
     shared = replace(lower, upper=upper.upper)
     if shared.method is ClusterMethod.TERRAIN_COUNT:
-        size, failed, worth = shared.terrains, shared.failed_terrains, 1.0
+        size, worth = shared.terrains, 1.0
+        # the tolerance keeps whole numbers whole
+        failed = math.ceil(size - shared.effective_successes - 1e-9)
     else:
         worth = shared.effective_n / n
         size, failed = math.floor(shared.effective_n), math.ceil(failures * worth)

@@ -1,4 +1,4 @@
-"""Which cases of a table came out worst, by the metric of the first requirement that has a bound."""
+"""Which cases of a table came out worst, by the metric of the first requirement that bounds a single column."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ def worst_cases(configuration: CampaignConfiguration, table: Path) -> list[int]:
 
 def _ranked(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:
     """The first so many answered cases by the size of their metric, the largest first; those without one are left."""
-    metric = next((asked.metric for asked in configuration.requirements if asked.bound is not None), None)
+    # a sum of columns is one of times, by which no case is worse than another
+    single = (one for one in configuration.requirements if one.bound is not None and len(one.metric_columns) == 1)
+    metric = next((asked.metric for asked in single), None)
     if metric is None:
         return []
     rows = _columns(table, ["case", "answered", metric])

@@ -3,7 +3,13 @@
 Korn & Graubard ("Confidence intervals for proportions with small expected number of positive counts estimated from
 survey data", Survey Methodology 24, 1998) put an effective sample size into the Clopper-Pearson interval: n divided by
 the design effect, which the terrains' own failure rates show. With few failures the design effect cannot be estimated
-and the method passes falsely; then whole terrains are counted, each as one case.
+and the method passes falsely; then whole terrains are counted, each as one case, or the rate of the cases is taken for
+that of as many independent ones as there are terrains, whichever is the safer.
+
+Bounds are for the rate of a case of the population. Where bad terrains answer less often than others both hold
+(`tests/reports/statistics/test_clusters.py`). Where rare terrains fail and have several times as many cases as others
+the lower bound does not hold: at a nominal 10 % it missed in 16 to 33 % of simulated campaigns, mostly those that drew
+none of these terrains.
 """
 
 from __future__ import annotations
@@ -83,18 +89,21 @@ def clustered_evidence(
     design_effect = _design_effect(successes, sizes)
     if sizes.size >= FEWEST_TERRAINS and min(failed, succeeded) >= FEWEST_MIXED_TERRAINS:
         return _korn_graubard(successes, sizes, design_effect, confidence)
-    # A terrain has a failure at least as often as a case fails, and a success at least as often as a case succeeds:
-    # both bounds are safe.
+    # With equally many cases on each, a terrain has a failure at least as often as a case fails, and a success at least
+    # as often as a case succeeds: both bounds are safe. Where bad terrains have fewer cases (they answer less often), or
+    # more, the rate of the cases is on the safe side of the terrains' rate for one of the two bounds.
     terrains = sizes.size
+    of_cases = terrains * float(successes.sum() / sizes.sum())
+    fewest, most = min(float(terrains - failed), of_cases), max(float(succeeded), of_cases)
     return ClusteredEvidence(
         terrains,
         failed,
         ClusterMethod.TERRAIN_COUNT,
         float("nan"),
         float(terrains),
-        float(terrains - failed),
-        proportion_lower(terrains - failed, terrains, confidence),
-        proportion_upper(succeeded, terrains, confidence),
+        fewest,
+        proportion_lower(fewest, terrains, confidence),
+        proportion_upper(most, terrains, confidence),
     )
 
 

@@ -6,6 +6,9 @@ velocity that it has when the rockets fire, to which the burn adds an error of i
 time, and is worth it, the burn is steered to take out what the inertial unit has made of it by then: all of it, or as
 much as the tilt allows. Without an answer the burn is not steered. Swinging and wind during the burn's three seconds
 are left out.
+
+Whether an answer is used follows from an assumed time of computation, so that rows repeat bit for bit. Whether the time
+that the algorithm really took would have done is `is_in_time`.
 """
 
 from __future__ import annotations
@@ -29,12 +32,17 @@ class Touchdown:
     with_answer, without_answer
         With the velocity used that was reported, and with none.
     punctual
-        Whether the answer would be there when the rockets fire.
+        Whether the answer would be there when the rockets fire, by the assumed time of computation.
     """
 
     with_answer: Horizontal
     without_answer: Horizontal
     punctual: bool
+
+
+def is_in_time(p: LandingParameters, measured_s: float, available_s: float) -> bool:
+    """Whether an answer is there when the rockets fire, by its measured time on this host and the flight computer's."""
+    return p.processor_factor * measured_s <= available_s
 
 
 def touchdown(

@@ -88,6 +88,10 @@ class LandingParameters(BaseModel):
     computation_s: Annotated[
         float, Field(ge=0.0, le=1000.0, description="from the third picture to the answer on the flight computer, s")
     ] = 14.0
+    processor_factor: Annotated[
+        float,
+        Field(gt=0.0, le=1e6, description="time on the flight computer over that measured on this host (assumed)"),
+    ] = 600.0
     least_steered_m_s: Annotated[
         float, Field(ge=0.0, le=100.0, description="speed up to which the thrusters do not steer, m/s")
     ] = 5.0

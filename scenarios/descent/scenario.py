@@ -122,18 +122,14 @@ class DescentScenario:
             span = None if estimate is None else estimate.span_s
             true = truth(span or measurements.last_interval_s)
             carried = carried_to_firing(estimate, instruments, at_firing.time_s)
-            landed = touchdown(
-                p.landing,
-                at_firing.velocity_m_s[:2],
-                carried,
-                at_firing.time_s - states[-1].time_s,
-                streams.generator("landing"),
-            )
+            available_s = at_firing.time_s - states[-1].time_s
+            velocity_at_firing = at_firing.velocity_m_s[:2]
+            landed = touchdown(p.landing, velocity_at_firing, carried, available_s, streams.generator("landing"))
             row = {
                 **velocity_row("velocity", velocity, true),
                 **consistency_row(estimate, true),
-                **velocity_row("firing_velocity", carried, at_firing.velocity_m_s[:2]),
-                **landing_row(landed),
+                **velocity_row("firing_velocity", carried, velocity_at_firing),
+                **landing_row(p.landing, landed, float(attempt.row["estimation_time_s"]), available_s),
                 **stream_row(estimate, truth),
                 **attempt.row,
             }

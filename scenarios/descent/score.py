@@ -11,9 +11,9 @@ from algorithms.dimes import DimesDetails, propagated
 from algorithms.dimes.binning import altitudes_at_images
 from algorithms.interface import VelocityEstimate
 from scenarios.descent.flight import mean_velocities, off_nadir_deg
-from scenarios.descent.landing import Touchdown
+from scenarios.descent.landing import Touchdown, is_in_time
 from scenarios.descent.measurement import Instruments
-from scenarios.descent.parameters import DescentScenarioParameters
+from scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
 from scenarios.descent.world import World
 from scenarios.interface import Scalar
 from sim.dynamics import State
@@ -117,12 +117,13 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
     return row
 
 
-def landing_row(landed: Touchdown) -> dict[str, Scalar]:
-    """What the answer did to the landing."""
+def landing_row(p: LandingParameters, landed: Touchdown, measured_s: float, available_s: float) -> dict[str, Scalar]:
+    """What the answer did to the landing, and whether it came in time by the time that was measured."""
     return {
         "touchdown_speed_with_m_s": float(np.hypot(*landed.with_answer)),
         "touchdown_speed_without_m_s": float(np.hypot(*landed.without_answer)),
         "answer_punctual": landed.punctual,
+        "answer_in_time": is_in_time(p, measured_s, available_s),
     }
 
 

@@ -35,6 +35,14 @@ def test_every_campaign_that_a_requirement_names_is_there() -> None:
 
 
 @pytest.mark.parametrize("name", catalogue())
+def test_campaigns_ask_every_requirement_that_names_them(name: str) -> None:
+    """Both ways: a requirement's list of campaigns, and the campaigns' lists of requirements."""
+    shipped = shipped_requirements()
+    asked = {one.id for one in load_campaign(name).configuration.requirements if one.id in shipped}
+    assert asked == {one.id for one in shipped.values() if one.applies_to(name)}
+
+
+@pytest.mark.parametrize("name", catalogue())
 def test_campaigns_ask_what_is_stated(name: str) -> None:
     for asked in load_campaign(name).configuration.requirements:
         stated = shipped_requirements().get(asked.id)

@@ -62,6 +62,10 @@ def test_which_case_is_shown(campaign_file: CampaignFile, tmp_path: Path) -> Non
         write_table(table, store)
         assert [showcase_case(asked, table, store) for asked in (worst, first, none, unasked)] == [3, 1, None, 1]
     assert [worst_cases(asked, table) for asked in (worst, unasked)] == [[3, 2], []]
+    # a requirement on a sum of columns, which are times, makes no case the worst
+    summed = 'id = "T"\nmetric = "a_time_s + b_time_s"\nbound = 2.0\nprobability = 0.9\nconfidence = 0.9\n'
+    times = load_campaign(str(campaign_file(requirement=f"[[requirements]]\n{summed}"))).configuration
+    assert worst_cases(times, table) == []
 
 
 def test_products_that_cannot_be_kept_stop_nothing(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> None:

@@ -215,3 +215,18 @@ def test_another_algorithm_is_given_the_same() -> None:
     assert result.outcome == "VALID"
     assert result.row["velocity_estimated_x_m_s"] == pytest.approx(14.0, abs=8.0)
     assert "tracks" not in result.products
+
+
+def test_a_slow_algorithm_is_late_at_the_firing() -> None:
+    """Its measured time decides, by the flight computer's factor: 0.1 s are 60 s there, and 14 to 24 s are left."""
+    slow = run(algorithm="tests.scenarios.descent.guesses:SlowInertial").row
+    quick = run(algorithm="tests.scenarios.descent.guesses:Inertial").row
+    assert slow["estimation_time_s"] >= 0.1
+    assert (slow["answer_in_time"], quick["answer_in_time"]) == (False, True)
+    unhurried = run(algorithm="tests.scenarios.descent.guesses:SlowInertial", landing={"processor_factor": 1.0}).row
+    assert unhurried["answer_in_time"] is True
+
+
+def test_dimes_time_is_asked_of_the_measured_time() -> None:
+    asked = {one.id: one for one in load_campaign("dimes-landing").configuration.requirements}
+    assert asked["DIMES-TIME"].metric == "answer_in_time"
