@@ -155,7 +155,8 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
     pictures = [_picture(products, f"image_{number}") for number in (pair + 1, pair + 2)]
     ours = [track for track in tracks(products) if track.pair == pair][:_MOST_TRACKS]
     heights = _row_heights(products, pair)
-    grid = dict(zip(heights, figure.add_gridspec(len(heights), 1, height_ratios=[*heights.values()]), strict=True))
+    cells = figure.add_gridspec(len(heights), 1, height_ratios=[*heights.values()])
+    grid = {name: cells[place] for place, name in enumerate(heights)}
     if "rectified" in grid:
         upper = grid["rectified"].subgridspec(1, 2)
         for side, picture in enumerate(pictures):
