@@ -15,6 +15,7 @@ from campaigns.definition.campaign import Campaign
 from campaigns.definition.catalogue import catalogue
 from campaigns.definition.checking import sampling_problems
 from campaigns.definition.configuration import CampaignConfiguration, Key, key_text, problems_of
+from campaigns.definition.metrics import metric_problems
 from campaigns.definition.requirements import completed
 from campaigns.errors import ConfigurationError, Problem, not_allowed
 from campaigns.sampling.correlation import KINDS
@@ -256,7 +257,8 @@ def _checked(document: _Document) -> Campaign:
         raise ConfigurationError(problems)
     complete = parameters.model_dump(mode="json", round_trip=True)
     campaign = Campaign(configuration.model_copy(update={"parameters": complete}), found)
-    problems += [document.problem(key, message) for key, message in sampling_problems(campaign)]
+    found_wrong = [*sampling_problems(campaign), *metric_problems(campaign)]
+    problems += [document.problem(key, message) for key, message in found_wrong]
     if problems:
         raise ConfigurationError(problems)
     return campaign

@@ -156,7 +156,7 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
     ours = [track for track in tracks(products) if track.pair == pair][:_MOST_TRACKS]
     heights = _row_heights(products, pair)
     cells = figure.add_gridspec(len(heights), 1, height_ratios=[*heights.values()])
-    grid = {name: cells[row] for row, name in enumerate(heights)}
+    grid = {name: cells[place] for place, name in enumerate(heights)}
     if "rectified" in grid:
         upper = grid["rectified"].subgridspec(1, 2)
         for side, picture in enumerate(pictures):

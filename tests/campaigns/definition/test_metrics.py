@@ -1,0 +1,80 @@
+"""Requirements are held against the scenario's columns before any terrain is built."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from campaigns.definition.catalogue import catalogue
+from campaigns.definition.loading import load_campaign
+from campaigns.errors import ConfigurationError
+from marsyard.cli import app
+from scenarios.descent import DescentScenario
+
+SCORE = """
+def braking(case):
+    return {"lateral_j": 1.0, "soft": True}
+"""
+ASKED = """
+[[requirements]]
+id = "OWN"
+metric = "{metric}"
+{bound}
+probability = 0.9
+confidence = 0.9
+population = "{population}"
+"""
+
+
+def _campaign(folder: Path, metric: str, population: str = "valid", bound: str = "bound = 5.0") -> Path:
+    text = catalogue()["dimes-smoke"].read_text(encoding="utf-8").partition("[[requirements]]")[0]
+    path = folder / "mine.toml"
+    path.write_text(text + ASKED.format(metric=metric, population=population, bound=bound))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("metric", "population", "bound", "key", "hint"),
+    [
+        ("velocity_eror_m_s", "valid", "bound = 5.0", "metric", "did you mean 'velocity_error_m_s'?"),
+        ("velocity_error_m_s + wind_m", "valid", "bound = 5.0", "metric", "unknown column of numbers 'wind_m'"),
+        ("answerd", "valid", "", "metric", "did you mean 'answered'?"),
+        ("velocity_error_m_s", "valid and rooom", "bound = 5.0", "population", "did you mean 'room'?"),
+        ("room", "valid", "bound = 5.0", "metric", "unknown column of numbers 'room'"),
+    ],
+)
+def test_misspelt_columns_are_found_before_terrains_are_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, metric: str, population: str, bound: str, key: str, hint: str
+) -> None:
+    prepared: list[int] = []
+    monkeypatch.setattr(DescentScenario, "prepare", lambda _, __, number: prepared.append(number))
+    path = _campaign(tmp_path, metric, population, bound)
+    with pytest.raises(ConfigurationError) as refused:
+        load_campaign(str(path))
+    assert f"requirements[0].{key}" in str(refused.value)
+    assert hint in str(refused.value)
+    ended = CliRunner().invoke(app, ["run", str(path), "-n", "1", "--jobs", "1", "--out", str(tmp_path / "run")])
+    assert ended.exit_code == 2
+    assert hint in ended.output
+    assert prepared == []
+    assert not (tmp_path / "run").exists()
+
+
+def test_columns_of_own_scores_parts_and_further_algorithms_are_accepted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_scores.py").write_text(SCORE)
+    monkeypatch.chdir(tmp_path)
+    path = _campaign(tmp_path, "braking_lateral_j", "valid and braking_soft")
+    load_campaign(str(path), ['scores=["my_scores:braking"]'])
+    with pytest.raises(ConfigurationError, match="braking_lateral_j"):
+        load_campaign(str(path))
+    compared = _campaign(tmp_path, "homography.velocity_error_m_s", "homography.answered".partition(".")[2])
+    load_campaign(str(compared), algorithms=["dimes", "homography"])
+
+
+@pytest.mark.parametrize("name", list(catalogue()))
+def test_campaigns_of_the_catalogue_ask_for_columns_that_are_stated(name: str) -> None:
+    load_campaign(name)
