@@ -10,10 +10,11 @@ was interrupted is gone on with, and the same campaign makes the same bytes.
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import tarfile
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import numpy as np
 from campaigns.definition.campaign import Campaign
 from campaigns.definition.identity import configuration_hash
 from campaigns.errors import CampaignError, StoreError
+from campaigns.running.inputs import plan_inputs
 from scenarios.samples import GivesSamples, Sample
 
 MANIFEST = "dataset.json"
@@ -50,8 +52,8 @@ def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: 
     if missing:
         from joblib import Parallel, delayed
 
-        # the first case builds what all share
-        _prepare(campaign)
+        # before the processes start, so that none builds what another does
+        _prepare(campaign, itertools.chain.from_iterable(cases for _, cases in missing))
         Parallel(n_jobs=jobs)(delayed(_write_shard)(campaign, path, cases) for path, cases in missing)
     return paths
 
@@ -79,9 +81,10 @@ def _claim(campaign: Campaign, folder: Path, cases_per_shard: int) -> None:
         raise StoreError(f"{path}: cannot be used: {error}") from error
 
 
-def _prepare(campaign: Campaign) -> None:
+def _prepare(campaign: Campaign, cases: Iterable[int]) -> None:
+    """Builds the shared inputs that cases use."""
     base = campaign.base_parameters()
-    for number in campaign.scenario.shared_inputs(base):
+    for number in plan_inputs(campaign, cases).to_prepare:
         campaign.scenario.prepare(base, number)
 
 

@@ -10,9 +10,15 @@ def keep_notable_cases(directory: Path, say: Callable[[str], None]) -> None:
     """Runs a campaign's notable cases again, as far as their products are not kept yet, and says what became of them.
 
     A case whose row does not come out as it is stored is kept all the same, and said.
+
+    Raises
+    ------
+    CampaignError
+        Where the campaign's scenario or an algorithm cannot be imported.
     """
     from campaigns.execution.workers import LocalWorkers
     from campaigns.running.replay import replay_with
+    from campaigns.running.stored import loaded_campaign
     from campaigns.store.products import save_packed
     from campaigns.store.record import stored_configuration
     from campaigns.store.retention import case_directory
@@ -25,10 +31,11 @@ def keep_notable_cases(directory: Path, say: Callable[[str], None]) -> None:
     if not lacking:
         return
     configuration = stored_configuration(directory)
+    loaded_campaign(directory, configuration)
     with LocalWorkers(1) as workers:
         for case in lacking:
             replayed = replay_with(workers, configuration, case, stored_row(directory, case))
-            if replayed.products is None:
+            if replayed.products is None or replayed.failed:
                 say(f"case {case}: ran again and left no pictures")
                 continue
             save_packed(case_directory(directory, case), replayed.products, replayed.row)

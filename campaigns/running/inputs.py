@@ -59,16 +59,19 @@ def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
         Where the cache's limit is not a number, or its folder cannot be made.
     """
     numbers = used_inputs(campaign, cases)
+    if not numbers:
+        return InputPlan((), {}, 0)
     scenario, base = campaign.scenario, campaign.base_parameters()
-    sizes = {n: scenario.missing_bytes(base, n) if isinstance(scenario, SelectsInputs) else 0 for n in numbers}
-    present = tuple(n for n in numbers if isinstance(scenario, SelectsInputs) and sizes[n] == 0)
+    selects = isinstance(scenario, SelectsInputs)
     try:
         folder = cache_directory("terrain")
         limit = limit_bytes(folder, kept_bytes(folder))
+        sizes = {n: scenario.missing_bytes(base, n) if isinstance(scenario, SelectsInputs) else 0 for n in numbers}
     except OSError as error:
         raise CampaignError(f"the cache cannot be used: {error}") from error
     except ValueError as error:
         raise CampaignError(str(error)) from error
+    present = tuple(n for n in numbers if selects and sizes[n] == 0)
     return InputPlan(present, {n: size for n, size in sizes.items() if n not in present}, limit)
 
 

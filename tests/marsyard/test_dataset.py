@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from campaigns.definition.loading import load_campaign
 from marsyard.cli import app
+from marsyard.dataset import _prepare
 from scenarios.descent.parameters import DescentScenarioParameters
 from scenarios.descent.world import World
 from sim.camera import read_cahvor
@@ -54,6 +55,17 @@ def made(folder: Path, *words: str) -> tuple[int, str]:
 def contents(path: Path) -> dict[str, bytes]:
     with tarfile.open(path) as shard:
         return {one.name: shard.extractfile(one).read() for one in shard.getmembers()}  # type: ignore[union-attr]
+
+
+def test_only_terrains_of_the_cases_are_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path / "cache"))
+    path = tmp_path / "samples.toml"
+    drawn = '"place.terrain" = { distribution = "integer", low = 0, high = 19, source = "any" }'
+    path.write_text(CAMPAIGN.replace("bank = 1", "bank = 20").replace("samples = 512", "samples = 256") + drawn)
+    campaign = load_campaign(str(path))
+    _prepare(campaign, range(2))
+    used = {campaign.parameters(case).model_dump()["place"]["terrain"] for case in range(2)}
+    assert len(list((tmp_path / "cache" / "terrain").iterdir())) == len(used)
 
 
 def points_of(told: dict[str, Any], camera_file: Path, distance: np.ndarray) -> np.ndarray:
