@@ -19,7 +19,10 @@ class StateNotes:
 
     def of(self, done: Done[Any]) -> str:
         """The note on a case; empty where there is nothing to note, or enough cases were named for the same reason."""
-        notes = [self._limited(name, f"case {done.item} changed its worker process: {name}") for name in done.changed]
+        notes = [
+            self._limited(name.partition(" (")[0], f"case {done.item} changed its worker process: {name}")
+            for name in done.changed
+        ]
         if done.spoiled_by is not None:
             text = f"case {done.item} crashed in the worker that had run case {done.spoiled_by}, and not in a fresh one"
             notes.append(self._limited("spoiled", f"{text}: an earlier case changed the state of that worker"))

@@ -62,32 +62,30 @@ from algorithms.interface import VelocityEstimate, VelocityOutcome
 
 class Leaving:
     def estimate(self, measurements):
-        if os.fork() == 0:
-            os.setsid()
-            time.sleep(3600)
-        threading.Thread(target=time.sleep, args=(3600,)).start()
-        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
-
-class Altering:
-    def estimate(self, measurements):
-        os.chdir("/")
+        level = int(measurements.images[0].counts.min())
+        if level == measurements.images[0].counts.max():
+            if level > 4000 and os.fork() == 0:
+                os.setsid()
+                time.sleep(3600)
+            if level > 4000:
+                threading.Thread(target=time.sleep, args=(3600,)).start()
+            os.chdir("/")
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 """
 
 
-@pytest.mark.parametrize(
-    ("name", "problem"), [("Leaving", "child processes that it left running"), ("Altering", "the working folder")]
-)
 def test_the_suite_ends_and_finds_what_an_algorithm_changes_in_its_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, problem: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "leaving_here.py").write_text(LEAVING)
     monkeypatch.chdir(tmp_path)
-    ended = CliRunner().invoke(app, ["conformance", f"leaving_here:{name}"])
-    assert ended.exit_code == 1
-    assert "it changed the state of its process:" in ended.output
-    assert problem in ended.output
+    ended = CliRunner().invoke(app, ["conformance", "leaving_here:Leaving"])
+    assert ended.exit_code == 1, ended.output
+    assert ended.output.count("it changed the state of its process: the working folder") == 3
+    assert "child processes that it left running (python)" in ended.output
+    assert "threads that it left running (Thread-" in ended.output
     assert "next: set it back before returning" in ended.output
+    assert "7 of 10 checks passed" in ended.output
 
 
 def test_the_suite_for_programs() -> None:
