@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
+from benchmarks.validation.bars import bar_of
 from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, meet_triangles
 from benchmarks.validation.records import Check, Measure
@@ -21,6 +22,7 @@ from sim.terrain import Surface
 #: Brightness is then albedo times the cosine of incidence in the sun, and 0 in shadow.
 LAMBERT = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
 FLAT_ALBEDO = 0.2
+FARTHEST_FROM_A_MAST_M = 40.0
 LAWS = {
     "Lambert": Photometry(lunar_share=0.0, surge_amplitude=0.0),
     "Mars": Photometry(),
@@ -54,7 +56,8 @@ def run_opposition(quick: bool) -> Iterator[Measure]:
             radiance = render(renderer(), view).radiance.astype(np.float64)
             errors.append(np.linalg.norm(_peak(radiance) - pixel))
         how = f"{len(errors)} suns; centre of the light above 90 % of the peak's height"
-        yield Measure(f"opposition peak from the antisolar point: {name}", max(errors), "px", 0.5, how)
+        claim = f"opposition peak from the antisolar point: {name}"
+        yield Measure(claim, max(errors), "px", bar_of(claim), how)
 
 
 def _peak(radiance: np.ndarray) -> np.ndarray:
@@ -108,7 +111,9 @@ def _shadow_row(name: str, view: View, sun: Sun, count: int, farthest: float, st
         f"{pixels.size} random pixels, {np.mean(facing <= 0.0):.1%} turned from the sun, "
         f"{np.mean(cast):.1%} in cast shadow{found}; {np.mean(theirs & ~ours):.2%} wrongly dark"
     )
-    return Measure(f"shadows as an independent ray cast has them: {name}", agree, "", 0.995, how, "at least")
+    # three times the worst disagreement seen from the air, 0.03 %; from a mast twice the worst, 0.24 %
+    bar = 0.999 if farthest > FARTHEST_FROM_A_MAST_M else 0.995
+    return Measure(f"shadows as an independent ray cast has them: {name}", agree, "", bar, how, "at least")
 
 
 def run_shadows(quick: bool) -> Iterator[Measure]:
@@ -123,10 +128,12 @@ def run_shadows(quick: bool) -> Iterator[Measure]:
     for sun, elevation in ((low, 20), (lower, 10)):
         yield _shadow_row(f"pisgah's ground from 2 km, sun at {elevation} deg", ground_only, sun, count, 1e5, 0.4)
         yield _shadow_row(f"kelso's dunes from 1 km, sun at {elevation} deg", dunes, sun, count, 1e5, 0.4)
-        yield _shadow_row(f"ripples from a mast, sun at {elevation} deg", ripples, sun, count // 2, 40.0, 0.008)
+        yield _shadow_row(
+            f"ripples from a mast, sun at {elevation} deg", ripples, sun, count // 2, FARTHEST_FROM_A_MAST_M, 0.008
+        )
     yield _shadow_row("pisgah with rocks from 2 km, sun at 20 deg", pisgah, low, count // 2, 1e5, 0.4)
     rocks, high = rock_view("gusev", 5.0), Sun(direction(np.radians(35.0), np.radians(30.0)))
-    yield _shadow_row("rocks from a mast, sun at 30 deg", rocks, high, count // 4, 40.0, 0.008)
+    yield _shadow_row("rocks from a mast, sun at 30 deg", rocks, high, count // 4, FARTHEST_FROM_A_MAST_M, 0.008)
 
 
 def _single_pixel() -> Cahv:
@@ -172,15 +179,13 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
             expected = FLAT_ALBEDO * bare.normalisation() * _law(bare, first[2], second[2], float(first @ second))
             off.append(abs(there / expected - 1.0))
         how = f"{pairs} pairs of sun and eye over flat ground"
-        yield Measure(f"rendered reflectance is reciprocal: {name}", max(away), "", 1e-3, how)
-        yield Measure(f"rendered brightness against the formula: {name}", max(off), "", 1e-3, how)
-        yield Measure(
-            f"spherical albedo from the stated one: {name}",
-            abs(_spherical_albedo(bare, 17 if quick else 20) * bare.normalisation() - 1.0),
-            "",
-            0.01,
-            "the law integrated over sun and eye by Sobol points",
-        )
+        albedo = abs(_spherical_albedo(bare, 20) * bare.normalisation() - 1.0)
+        for claim, measured, by in (
+            ("rendered reflectance is reciprocal", max(away), how),
+            ("rendered brightness against the formula", max(off), how),
+            ("spherical albedo from the stated one", albedo, "the law integrated over sun and eye by Sobol points"),
+        ):
+            yield Measure(f"{claim}: {name}", measured, "", bar_of(f"{claim}: {name}"), by)
 
 
 def _spherical_albedo(law: Photometry, log2_points: int) -> float:
@@ -222,7 +227,8 @@ def run_clouds(quick: bool) -> Iterator[Measure]:
         "share of the ground in clouds' shadows, from the stated one", abs(np.mean(covers) - 0.3), "", 0.1, how
     )
     how = "two pictures 3.75 s apart, the later from a place that drifted with the wind; change over slope at the edges"
-    yield Measure("motion of clouds' shadows from the wind's", max(moved), "px", 0.01, how)
+    # 0 was measured, as the same function is evaluated at a shifted place: the bar is what rounding may make of it
+    yield Measure("motion of clouds' shadows from the wind's", max(moved), "px", 1e-4, how)
 
 
 def _from_above(scene: Scene, camera: CameraModel, place: np.ndarray, time_s: float) -> np.ndarray:
@@ -249,10 +255,10 @@ def run_sun(quick: bool) -> Iterator[Measure]:
         off.append(float(np.linalg.norm(centre - camera.project(1e9 * sun.direction)[0])))
         angle = np.square(rays.pixel_angles.astype(np.float64)).reshape(radiance.shape)
         flux.append(abs(float((light * angle).sum()) / np.pi - 1.0))
-    yield Measure(
-        "the sun's disc from the sun's direction", max(off), "px", 0.1, f"{len(off)} suns in the navcam's sky"
-    )
-    yield Measure("light of the sun's disc from the direct sun", max(flux), "", 0.01, "the same pictures")
+    claim = "the sun's disc from the sun's direction"
+    yield Measure(claim, max(off), "px", bar_of(claim), f"{len(off)} suns in the navcam's sky")
+    claim = "light of the sun's disc from the direct sun"
+    yield Measure(claim, max(flux), "", bar_of(claim), "the same pictures")
 
 
 CHECKS = (

@@ -241,7 +241,7 @@ def _reason(error: BaseException) -> str:
     """How a worker ended, in words."""
     status = _exit_status(error)
     if status == f"EXIT ({FILES_CLOSED})":
-        return "closed files of the process that it ran in"
+        return "the case closed or replaced the worker's file descriptors"
     return f"the worker process died: {status}"
 
 
