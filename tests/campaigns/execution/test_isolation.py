@@ -267,7 +267,7 @@ def close_files(item: int) -> int:
 
 def test_a_case_that_closes_the_files_of_its_worker_crashes_alone() -> None:
     done = run(close_files, range(4))
-    assert str(done[1].error) == "closed files of the process that it ran in"
+    assert str(done[1].error) == "the case closed or replaced the worker's file descriptors"
     assert {item: one.result for item, one in done.items() if item != 1} == {0: 0, 2: 2, 3: 3}
 
 
