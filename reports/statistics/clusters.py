@@ -90,8 +90,8 @@ def clustered_evidence(
     if sizes.size >= FEWEST_TERRAINS and min(failed, succeeded) >= FEWEST_MIXED_TERRAINS:
         return _korn_graubard(successes, sizes, design_effect, confidence)
     # With equally many cases on each, a terrain has a failure at least as often as a case fails, and a success at least
-    # as often as a case succeeds: both bounds are safe. Where bad terrains have fewer cases (they answer less often), or
-    # more, the rate of the cases is on the safe side of the terrains' rate for one of the two bounds.
+    # as often as a case succeeds: both bounds are safe. Where bad terrains have fewer cases (they answer less often),
+    # or more, the rate of the cases is on the safe side of the terrains' rate for one of the two bounds.
     terrains = sizes.size
     of_cases = terrains * float(successes.sum() / sizes.sum())
     fewest, most = min(float(terrains - failed), of_cases), max(float(succeeded), of_cases)
