@@ -152,6 +152,20 @@ def test_report_without_requirements(make_rows: Rows, make_run: MakeRun) -> None
     assert "velocity error (m/s)" in text
 
 
+def test_a_rate_that_is_met_has_its_own_word_colour_and_sign(
+    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
+) -> None:
+    rate = {**velocity, "probability": 0.9, "confidence": 0.999, "decide_by": "estimate"}
+    directory = make_run(make_rows(24)[BARE], [rate])
+    text, _, twin = _read(directory)
+    assert '<div class="headline status-met-by-rate">' in text
+    assert ".status-met-by-rate { --status: var(--rate)" in text
+    assert "(decided by rate)." in text
+    diamond = "M12 1L23 12 12 23 1 12z"
+    assert diamond in text.split("<span>MET BY RATE</span>")[0].rsplit("<svg", 1)[1]
+    assert (twin["verdict"], twin["exit_code"]) == ("MET BY RATE", 3)
+
+
 def test_four_terrains_show_little_however_many_cases_they_bear(make_rows: Rows, make_run: MakeRun) -> None:
     text, _, twin = _read(make_run(make_rows(400, answered=1.0, spread=0.1)[[*BARE, "terrain"]]))
     assert (twin["verdict"], twin["verdicts"][0]["plain_status"]) == ("INSUFFICIENT", "PASS")
