@@ -60,8 +60,8 @@ def ingest(
     typer.echo(f"{count(len(stored.cases), 'case')} of {count(pictures, 'picture')}: {out}")
     if stored.detector.rows_summed > 1 and read_ingest_file(folder).detector.rows_summed is None:
         typer.echo(
-            f"rows_summed = {stored.detector.rows_summed}: taken from the camera, whose pixels are that many times longer "
-            f"than wide; rows_summed under [detector] of {INGEST_FILE} says otherwise"
+            f"rows_summed = {stored.detector.rows_summed}: taken from the camera, whose pixels are longer than wide by "
+            f"that factor; rows_summed under [detector] of {INGEST_FILE} says otherwise"
         )
     typer.echo(f"run them with: marsyard run {out / CAMPAIGN_FILE}")
 
