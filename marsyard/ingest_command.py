@@ -29,6 +29,7 @@ def ingest(
     """Make a campaign of real cases from pictures with measured attitude and altitude."""
     from campaigns.errors import CampaignError, StoreError
     from scenarios.measured.ingest import ingest as ingested
+    from scenarios.measured.layout import INGEST_FILE, read_ingest_file
 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StoreError(f"{out} is there already, and is not empty; name a new folder with --out")
@@ -57,6 +58,11 @@ def ingest(
         raise
     pictures = sum(len(case.pictures) for case in stored.cases)
     typer.echo(f"{count(len(stored.cases), 'case')} of {count(pictures, 'picture')}: {out}")
+    if stored.detector.rows_summed > 1 and read_ingest_file(folder).detector.rows_summed is None:
+        typer.echo(
+            f"rows_summed = {stored.detector.rows_summed}: taken from the camera, whose pixels are longer than wide by "
+            f"that factor; rows_summed under [detector] of {INGEST_FILE} says otherwise"
+        )
     typer.echo(f"run them with: marsyard run {out / CAMPAIGN_FILE}")
 
 

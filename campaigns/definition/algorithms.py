@@ -98,14 +98,17 @@ def _distribution_version(name: str) -> str | None:
 
 
 def _plain_options(options: object) -> dict[str, Any]:
-    """Options as JSON has them; empty where there are none, or they are of a kind without named fields."""
-    if isinstance(options, BaseModel):
-        options = options.model_dump(mode="json")
-    elif is_dataclass(options) and not isinstance(options, type):
-        options = asdict(options)
-    if not isinstance(options, Mapping):
+    """Options as JSON has them; empty where there are none, or they cannot be told so."""
+    try:
+        if isinstance(options, BaseModel):
+            options = options.model_dump(mode="json")
+        elif is_dataclass(options) and not isinstance(options, type):
+            options = asdict(options)
+        if not isinstance(options, Mapping):
+            return {}
+        plain: dict[str, Any] = json.loads(json.dumps({str(key): value for key, value in options.items()}, default=str))
+    except Exception:  # values of a user's own may raise anything, and no campaign fails for its record's sake
         return {}
-    plain: dict[str, Any] = json.loads(json.dumps({str(key): value for key, value in options.items()}, default=str))
     return plain
 
 

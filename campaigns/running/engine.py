@@ -85,6 +85,7 @@ def run_campaign(campaign: Campaign, directory: Path, crew: Crew, watch: Watch) 
     with folder_lock(directory):
         record.claim(directory)
         identity = identity_of(campaign.configuration)
+        algorithms = describe_algorithms(campaign)
         create_store(directory / ROWS_FILE, {"identity": identity.configuration})
         record.begin(
             directory,
@@ -92,7 +93,7 @@ def run_campaign(campaign: Campaign, directory: Path, crew: Crew, watch: Watch) 
             identity,
             crew.describe(),
             command=campaign.command,
-            algorithms=describe_algorithms(campaign),
+            algorithms=algorithms,
         )
         with RowStore(directory / ROWS_FILE) as store:
             _run(_Work(campaign, directory, crew, store, watch), ())

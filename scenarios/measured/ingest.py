@@ -49,6 +49,9 @@ POSITION = ("x_m", "y_m", "z_m")
 _MOST_FLAT = 1.5
 #: Pixels along a side of the largest camera.
 _MAX_SIDE = 16384
+#: Most rows that a detector sums, and how near to a whole number the ratio of a camera's scales must be. Calibrations
+#: know focal lengths to better than a part in a hundred, and the next whole number of 8 is 12 % away.
+_MAX_SUMMED, _WHOLE = 64, 0.05
 
 
 @dataclass(frozen=True)
@@ -111,20 +114,31 @@ def ingest(source: Path, target: Path) -> tuple[Path, StoredCases]:
         description=file.description,
         task=file.task,
         folder=str(source.resolve()),
-        detector=_detector(file),
+        detector=_detector(file, next(iter(folder.cameras))),
         cases=tuple(cases),
     )
     return write_cases(target, stored), stored
 
 
-def _detector(file: IngestFile) -> StoredDetector:
+def summed_rows(camera: CameraModel) -> int:
+    """Physical rows in a delivered one, by how much coarser a camera's pictures are downwards than to the right.
+
+    1 where the ratio of the scales is near no whole number: then the pixels are no sums of square ones.
+    """
+    to_the_right, down = camera.focal_lengths
+    ratio = to_the_right / down
+    whole = round(ratio)
+    return whole if 1 < whole <= _MAX_SUMMED and abs(ratio - whole) <= _WHOLE * whole else 1
+
+
+def _detector(file: IngestFile, camera: CameraModel) -> StoredDetector:
     stated = file.detector
     return StoredDetector(
         offset_dn=stated.offset_dn,
         full_scale_dn=(1 << stated.bits) - 1,
         transfer_row_s=stated.transfer_row_s,
         clear_row_s=stated.clear_row_s,
-        rows_summed=stated.rows_summed,
+        rows_summed=summed_rows(camera) if stated.rows_summed is None else stated.rows_summed,
     )
 
 

@@ -65,7 +65,10 @@ class DetectorTable(BaseModel):
     clear_row_s: Annotated[
         float, Field(ge=0.0, le=1.0, description="frame transfer: time under each row while cleared; 0: none")
     ] = 0.0
-    rows_summed: Annotated[int, Field(ge=1, le=64, description="physical rows in a delivered one")] = 1
+    rows_summed: Annotated[
+        int | None,
+        Field(ge=1, le=64, description="physical rows in a delivered one; by default the camera's ratio of scales"),
+    ] = None
     flat_field: Annotated[
         str | None,
         Field(

@@ -30,7 +30,7 @@ def test_real_pictures_are_run_and_reported(tmp_path: Path) -> None:
         tmp_path / "run",
     )
     status, output = told("ingest", str(folder), "--out", str(cases))
-    assert (status, "1 cases of 2 pictures" in output) == (0, True)
+    assert (status, "1 case of 2 pictures" in output) == (0, True)
     status, output = told("run", str(cases / "campaign.toml"), "--out", str(run), "--jobs", "1")
     assert status == 0, output
     frame = pd.read_parquet(run / "cases.parquet")
@@ -77,3 +77,23 @@ def test_what_is_wrong_ends_with_2_and_leaves_nothing(tmp_path: Path) -> None:
     assert (status, "is not empty" in output) == (2, True)
     status, output = told("ingest", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
     assert (status, "ingest.toml: cannot be read" in output) == (2, True)
+
+
+def test_summed_rows_are_taken_from_the_camera(tmp_path: Path) -> None:
+    # the suite's camera sums rows: its pixels are longer than wide
+    given = inputs.descent()
+    summed = given.images[0].calibration.rows_summed
+    assert summed > 1
+    folder = velocity_folder(tmp_path / "in", {"one": given}, {})
+    stated = (folder / "ingest.toml").read_text()
+    assert f"rows_summed = {summed}\n" in stated
+    status, output = told("ingest", str(folder), "--out", str(tmp_path / "stated"))
+    assert (status, "rows_summed" in output) == (0, False)
+    (folder / "ingest.toml").write_text(stated.replace(f"rows_summed = {summed}\n", ""))
+    status, output = told("ingest", str(folder), "--out", str(tmp_path / "inferred"))
+    assert status == 0
+    assert f"rows_summed = {summed}: taken from the camera" in output
+    detectors = [json.loads((tmp_path / one / "cases.json").read_text())["detector"] for one in ("stated", "inferred")]
+    assert detectors[0] == detectors[1]
+    campaigns = [tomllib.loads((tmp_path / one / "campaign.toml").read_text()) for one in ("stated", "inferred")]
+    assert campaigns[0]["parameters"]["dimes"] == campaigns[1]["parameters"]["dimes"]
