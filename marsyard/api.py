@@ -148,12 +148,12 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
     Parameters
     ----------
     site, camera
-        Names, as of `sites` and `marsyard render`.
+        Names, as of `sites` and `marsyard render`; for the site also the path of a DTM (.tif, .npz).
     detector
         Whether to expose a detector; without, a picture has its radiance alone (`Picture.frame`).
     **shot
         As `marsyard render` takes them: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
-        sun_azimuth_deg, sun_elevation_deg, seed.
+        sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction.
 
     Raises
     ------

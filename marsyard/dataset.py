@@ -134,9 +134,9 @@ def _npy(values: np.ndarray[Any, Any]) -> bytes:
 
 
 def _camera(sample: Sample) -> bytes:
-    from sim.camera import write_cahvor
+    from sim.camera import BODY_FRAME, write_cahvor
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "camera.cahvor"
-        write_cahvor(sample.camera, path, "in the body's axes")
+        write_cahvor(sample.camera, path, frame=BODY_FRAME)
         return path.read_bytes()

@@ -15,12 +15,13 @@ import typer
 
 if TYPE_CHECKING:
     import numpy as np
-    from jaxtyping import Float32, UInt16
+    from jaxtyping import Bool, Float32, UInt16
 
     from scenarios.views import SiteGround
     from sim.camera import CameraModel
     from sim.render import Frame, Scene
     from sim.sensor import AutoExposure
+    from sim.terrain import Site
 
 #: Exit status where the command or a file is wrong, as elsewhere.
 WRONG = 2
@@ -46,15 +47,18 @@ class Shot:
     sun_azimuth_deg: float
     sun_elevation_deg: float
     seed: int
+    max_hole_fraction: float
 
     @classmethod
     def usual(cls, site: str, camera: str, **settings: Any) -> Shot:
         """A picture from the camera's usual stance where not set otherwise. Raises ValueError for what cannot be."""
+        from scenarios.imported_site import MAX_HOLE_FRACTION, is_terrain_file, site_or_file
         from scenarios.views import STANCES
         from sim.sensor import PRESETS
         from sim.terrain import sites
 
-        _known("site", site, sites())
+        if not is_terrain_file(site):
+            _known("site", site, sites())
         _known("camera", camera, PRESETS)
         stance = STANCES[camera]
         usual = {
@@ -67,15 +71,24 @@ class Shot:
             "sun_azimuth_deg": 250.0,
             "sun_elevation_deg": 35.0,
             "seed": 1,
+            "max_hole_fraction": MAX_HOLE_FRACTION,
         }
         given = {name: value for name, value in settings.items() if value is not None}
+        if is_terrain_file(site):  # it lies in the middle of the periodic terrain
+            terrain = site_or_file(site, float(given.get("max_hole_fraction", MAX_HOLE_FRACTION))).terrain()
+            usual |= dict.fromkeys(("east_m", "north_m"), 0.5 * terrain.samples * terrain.spacing_m)
         shot = cls(site=site, camera=camera, **(usual | given))
         shot._check()
         return shot
 
-    def _check(self) -> None:
-        from sim.terrain import site
+    @property
+    def place(self) -> Site:
+        """The site, or that of the terrain model's file. Raises ValueError where it cannot be used."""
+        from scenarios.imported_site import site_or_file
 
+        return site_or_file(self.site, self.max_hole_fraction)
+
+    def _check(self) -> None:
         ranges = {
             "altitude": (self.altitude_m, 0.0, HIGHEST_M),
             "elevation": (self.elevation_deg, -90.0, 90.0),
@@ -90,7 +103,7 @@ class Shot:
         for name, value in (free | {"sun-azimuth": self.sun_azimuth_deg}).items():
             if not math.isfinite(value):
                 raise ValueError(f"--{name} {value} is not a finite number")
-        known = site(self.site)
+        known = self.place
         scales = [scale for scale in ("descent", "ground") if getattr(known, scale) is not None]
         if self.scale not in scales:
             raise ValueError(
@@ -107,22 +120,26 @@ class Picture:
     ----------
     suffix
         What tells the pictures of a pair apart: ``-left``, ``-right``; empty for a single camera.
-    camera
-        The camera model in the world frame.
+    camera, mounted
+        The camera model in the world frame; and in the body frame, as it is written.
     frame, scene
         Radiance and truth, and what was drawn.
     exposed
         The detector at the exposure time that was found; None without detector.
     counts
         What the detector delivered; None without detector.
+    filled
+        Whether a pixel sees ground of a terrain model's hole, which is filled; None where the ground is a preset's.
     """
 
     suffix: str
     camera: CameraModel
+    mounted: CameraModel
     frame: Frame
     scene: Scene
     exposed: AutoExposure | None
     counts: UInt16[np.ndarray, "rows columns"] | None
+    filled: Bool[np.ndarray, "rows columns"] | None
 
     def sixteen_bit(self) -> UInt16[np.ndarray, "rows columns"]:
         """Counts moved to the upper bits, or radiance factor in 65535ths of the full scale."""
@@ -142,7 +159,9 @@ class Picture:
 
 
 def render(
-    site: Annotated[str, typer.Argument(metavar="SITE", help="A site from `marsyard terrain list`.")],
+    site: Annotated[
+        str, typer.Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
+    ],
     camera: Annotated[
         str, typer.Option("--camera", metavar="NAME", help="Such as mer-navcam; a wrong name lists those there are.")
     ],
@@ -153,8 +172,14 @@ def render(
     altitude: Annotated[
         float | None, typer.Option("--altitude", metavar="M", help="Height above the ground; by default the usual.")
     ] = None,
-    east: Annotated[float, typer.Option("--east", metavar="M", help="Place on the terrain, which repeats.")] = 0.0,
-    north: Annotated[float, typer.Option("--north", metavar="M", help="Place on the terrain, which repeats.")] = 0.0,
+    east: Annotated[
+        float | None,
+        typer.Option("--east", metavar="M", help="By default 0, of a DTM its middle; repeats."),
+    ] = None,
+    north: Annotated[
+        float | None,
+        typer.Option("--north", metavar="M", help="By default 0, of a DTM its middle; repeats."),
+    ] = None,
     azimuth: Annotated[
         float, typer.Option("--azimuth", metavar="DEG", help="Where the camera looks, clockwise from north.")
     ] = 0.0,
@@ -168,8 +193,14 @@ def render(
     ] = True,
     seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Of the terrain and the noise.")] = 1,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+    max_holes: Annotated[
+        float | None,
+        typer.Option(
+            "--max-holes", metavar="F", min=0.0, max=0.99, help="Of a DTM: fraction of posts without height allowed."
+        ),
+    ] = None,
 ) -> None:
-    """Render a site: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; -left and -right for a pair."""
+    """Render a site or DTM: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; -left, -right of a pair."""
     with says_why_not(out):
         shot = Shot.usual(
             site,
@@ -183,9 +214,13 @@ def render(
             sun_azimuth_deg=sun_azimuth,
             sun_elevation_deg=sun_elevation,
             seed=seed,
+            max_hole_fraction=max_holes,
         )
         _check_files(out, camera, overwrite)
         for picture in take(shot, detector=detector):
+            if picture.filled is not None and picture.filled.any():
+                share = f"{picture.filled.mean():.1%} of the pixels{picture.suffix and f' ({picture.suffix[1:]})'}"
+                typer.echo(f"note: {share} see filled holes of the DTM (`filled` in the .npz)", err=True)
             typer.echo(", ".join(str(path) for path in write(picture, shot, out)))
 
 
@@ -213,9 +248,8 @@ def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Pictur
     from sim.render import PixelRays, Sun, process_renderer
     from sim.render.backend import default_backend
     from sim.sensor import preset
-    from sim.terrain import site
 
-    ground = SiteGround.of(site(shot.site), "descent" if shot.scale == "descent" else "ground", seed=shot.seed)
+    ground = SiteGround.of(shot.place, "descent" if shot.scale == "descent" else "ground", seed=shot.seed)
     of_camera = preset(shot.camera)
     cameras = of_camera.cameras()
     place = (shot.east_m, shot.north_m, shot.altitude_m)
@@ -231,8 +265,25 @@ def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Pictur
         frame = process_renderer(default_backend()).render(scene, rays[number], pose)
         exposed, counts = _exposed(shot, ground, camera, number, frame) if detector else (None, None)
         suffix = "" if len(cameras) == 1 else ("-left", "-right")[number]
-        pictures.append(Picture(suffix, camera.moved(pose), frame, scene, exposed, counts))
+        filled = _filled(ground, frame)
+        pictures.append(Picture(suffix, camera.moved(pose), camera, frame, scene, exposed, counts, filled))
     return pictures
+
+
+def _filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"] | None:
+    """Which pixels see ground in holes of a terrain model; None where the ground is a preset's."""
+    import numpy as np
+
+    from sim.terrain.embedding import embed
+
+    terrain = ground.terrain
+    if terrain.source is None:
+        return None
+    holes = embed(terrain.source, terrain.samples, terrain.spacing_m).filled_samples(terrain.samples)
+    seen = np.isfinite(frame.range_m)
+    points = np.where(seen[..., None], frame.points_world(), 0.0)
+    column, row = (np.rint(points[..., axis] / terrain.spacing_m).astype(int) % terrain.samples for axis in (0, 1))
+    return np.asarray(seen & holes[row, column])
 
 
 def _exposed(
@@ -288,6 +339,7 @@ def layers(picture: Picture) -> dict[str, Any]:
         "shadow": ground & (by_sun.radiance <= 0.0),
         "phase_deg": np.where(ground, phase.reshape(ground.shape), np.nan).astype(np.float32),
         "world_from_body": frame.world_from_body.as_matrix(),
+        **({} if picture.filled is None else {"filled": picture.filled}),
     }
 
 
@@ -298,7 +350,7 @@ def write(picture: Picture, shot: Shot, prefix: Path) -> list[Path]:
     import cv2
     import numpy as np
 
-    from sim.camera import write_cahvor
+    from sim.camera import BODY_FRAME, write_cahvor
 
     png, npz, cahvor, sidecar = (_path(prefix, picture.suffix, ending) for ending in ENDINGS)
     done, encoded = cv2.imencode(".png", picture.sixteen_bit())
@@ -307,8 +359,7 @@ def write(picture: Picture, shot: Shot, prefix: Path) -> list[Path]:
     png.write_bytes(encoded.tobytes())
     with npz.open("wb") as file:
         np.savez(file, **layers(picture))
-    comment = f"{shot.camera}{picture.suffix} at {shot.site}, world frame: x east, y north, z up, metres"
-    write_cahvor(picture.camera, cahvor, comment)
+    write_cahvor(picture.mounted, cahvor, f"{shot.camera}{picture.suffix} at {shot.site}", frame=BODY_FRAME)
     sidecar.write_text(json.dumps(record(picture, shot), indent=2) + "\n", encoding="utf-8")
     return [png, npz, cahvor, sidecar]
 
@@ -318,7 +369,6 @@ def record(picture: Picture, shot: Shot) -> dict[str, Any]:
     from importlib.metadata import version
 
     from sim.render.backend import default_backend
-    from sim.terrain import site
 
     columns, rows = picture.camera.size
     scene, exposed = picture.scene, picture.exposed
@@ -343,14 +393,17 @@ def record(picture: Picture, shot: Shot) -> dict[str, Any]:
         "npz": {
             "object": "number of the rock seen; -1 ground, -2 sky",
             "shadow": "no direct sunlight: a cast shadow, or a face turned away from the sun",
-            "frame": "world: x east, y north, z up, metres",
+            "frame": "world: x east, y north (of a DTM the grid's north), z up, metres",
+            "filled": "the ground is in a hole of the DTM, which is filled",
         },
+        "cahvor": {"frame": "body; world_from_body takes it to the world"},
+        "filled_fraction": None if picture.filled is None else float(picture.filled.mean()),
         "world_from_body": picture.frame.world_from_body.as_matrix().tolist(),
         "sun_direction": scene.sun.direction.tolist(),
         "photometry": asdict(scene.photometry),
         "mesh": {name: getattr(scene, name) for name in ("mesh_finest_m", "mesh_reach_m", "mesh_lines")},
         "rocks_drawn": len(scene.objects),
-        "site": site(shot.site).model_dump(mode="json"),
+        "site": shot.place.model_dump(mode="json"),
         "detector": None if exposed is None else exposed.detector.parameters.model_dump(mode="json"),
         "gl_backend": default_backend(),
     }

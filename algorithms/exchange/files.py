@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt16
 from scipy.spatial.transform import Rotation
 
-from sim.camera import read_cahvor, write_cahvor
+from sim.camera import BODY_FRAME, read_cahvor, write_cahvor
 from sim.frames import rigid
 from sim.measurements import (
     AltitudeMeasurement,
@@ -208,7 +208,7 @@ def _write_images(folder: Path, images: Sequence[DetectorImage], pictures: Pictu
     for number, image in enumerate(images, start=1):
         name, camera, known = f"image_{number}.{pictures}", f"camera_{number}.cahvor", image.calibration
         write_picture(folder / name, image.counts)
-        write_cahvor(image.camera, folder / camera)
+        write_cahvor(image.camera, folder / camera, frame=BODY_FRAME)
         flat = next((path for path, one in fields if np.array_equal(one, known.flat_field)), None)
         if flat is None:
             flat = f"flat_field_{len(fields) + 1}.f64"

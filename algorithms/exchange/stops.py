@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from algorithms.exchange.files import read_picture, write_picture
-from sim.camera import read_cahvor, write_cahvor
+from sim.camera import HEAD_FRAME, read_cahvor, write_cahvor
 from sim.frames import rigid
 from sim.measurements import (
     MastCalibration,
@@ -30,7 +30,7 @@ MAST_FILE, STOP_FILE = "mast.json", "stop.json"
 def write_mast(folder: Path, mast: MastCalibration) -> None:
     """Writes a mast and its two cameras into a folder that is there."""
     for name, camera in (("left", mast.left), ("right", mast.right)):
-        write_cahvor(camera, folder / f"{name}.cahvor")
+        write_cahvor(camera, folder / f"{name}.cahvor", frame=HEAD_FRAME)
     geometry = mast.geometry
     told = {
         "base_m": geometry.base_m.tolist(),

@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from algorithms.exchange.files import read_picture, write_picture
 from scenarios.measured.layout import TaskName
 from scenarios.own_files import OwnFile
-from sim.camera import CameraModel, read_cahvor, write_cahvor
+from sim.camera import BODY_FRAME, CameraModel, read_cahvor, write_cahvor
 from sim.files import check_regular
 from sim.frames import rigid
 from sim.measurements import (
@@ -185,7 +185,7 @@ def put_camera(folder: Path, number: int, camera: CameraModel) -> Named:
     """Writes a camera beside `cases.json`."""
     (folder / "cameras").mkdir(exist_ok=True)
     path = folder / "cameras" / f"{number:06d}.cahvor"
-    write_cahvor(camera, path)
+    write_cahvor(camera, path, frame=BODY_FRAME)
     return _named(folder, path)
 
 

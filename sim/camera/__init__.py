@@ -17,9 +17,11 @@ from sim.camera.opencv import OpenCVIntrinsics, Residual, from_opencv, from_open
 from sim.camera.pds4_labels import read_pds4
 from sim.camera.pds_labels import read_pds3
 from sim.camera.pds_products import Pds3Product, read_pds3_product
-from sim.camera.text_files import read_cahvor, write_cahvor
+from sim.camera.text_files import BODY_FRAME, HEAD_FRAME, read_cahvor, write_cahvor
 
 __all__ = [
+    "BODY_FRAME",
+    "HEAD_FRAME",
     "Cahv",
     "Cahvor",
     "Cahvore",

@@ -17,7 +17,9 @@ __all__ = ["CameraFileError", "read_camera", "read_cameras"]
 _HEAD = 4096
 
 
-def read_cameras(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
+def read_cameras(
+    path: str | Path, *, subframe_folded_in: bool = False, size: tuple[int, int] | None = None
+) -> tuple[CameraModel, ...]:
     """Every camera model of a file, whichever of these it is.
 
     A PDS3 label or product (`read_pds3`), a PDS4 label (`read_pds4`), a JPL text file (`read_cahvor`), or a calibration
@@ -29,6 +31,8 @@ def read_cameras(path: str | Path, *, subframe_folded_in: bool = False) -> tuple
         The file.
     subframe_folded_in
         Of PDS labels: takes the model of a subframe, or of averaged pixels, to describe the stored picture.
+    size
+        (columns, rows) of the pictures, for JPL text files without the line Dimensions.
 
     Raises
     ------
@@ -42,7 +46,7 @@ def read_cameras(path: str | Path, *, subframe_folded_in: bool = False) -> tuple
         return read_pds4(path, subframe_folded_in=subframe_folded_in)
     if is_calibration(head):
         return tuple(one.camera for one in read_calibrations(path))
-    return (read_cahvor(path),)
+    return (read_cahvor(path, size=size),)
 
 
 def read_camera(path: str | Path, *, subframe_folded_in: bool = False) -> CameraModel:

@@ -2,7 +2,8 @@
 
 Each group gives MODEL_TYPE, the letters of its components (MODEL_COMPONENT_ID) and the components themselves, in the
 frame named by REFERENCE_COORD_SYSTEM_NAME (a rover's frame, metres: x forward, y right, z down); the vectors are
-returned in that frame as they are. The picture's size is that of the label's IMAGE object.
+returned in that frame as they are. The picture's size is that of the label's IMAGE object. Curiosity's labels begin
+with ODL_VERSION_ID and name the group GEOMETRIC_CAMERA_MODEL_PARMS.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from sim.camera.base import CameraModel
 _GROUP = "GEOMETRIC_CAMERA_MODEL"
 _FIRST_BYTES = 1 << 16
 _MOST_BYTES = 1 << 23
-_START = re.compile(rb"^\s*PDS_VERSION_ID\s*=", re.MULTILINE)
+_START = re.compile(rb"^\s*(?:PDS|ODL)_VERSION_ID\s*=", re.MULTILINE)
 _START_WITHIN = 4096
 _END = re.compile(rb"^END\s*$", re.MULTILINE)
-_BLOCKS = (_GROUP, "IMAGE", "INSTRUMENT_STATE_PARMS")
+_GROUPS = (_GROUP, f"{_GROUP}_PARMS")
+_BLOCKS = (*_GROUPS, "IMAGE", "INSTRUMENT_STATE_PARMS")
 _METRES = ("METER", "METERS", "METRE", "METRES", "M", "N/A")
 
 
@@ -46,7 +48,7 @@ def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
     """
     source = Source(str(path))
     label = parsed_blocks(label_text(source), _BLOCKS, source)
-    groups = label.getall(_GROUP) if _GROUP in label else []
+    groups = [group for name, group in label.items() if name in _GROUPS]
     if not groups:
         raise source.error(_GROUP, "missing or not closed", "a label with at least one such group")
     size = picture_size(label, source)
@@ -123,7 +125,8 @@ def _refuse_subframes(label: Any, source: Source) -> None:
     if isinstance(state, Mapping):
         for field in ("PIXEL_AVERAGING_HEIGHT", "PIXEL_AVERAGING_WIDTH"):
             fields[f"INSTRUMENT_STATE_PARMS.{field}"] = state.get(field)
-    for field, value in fields.items():
+    for field, stated in fields.items():
+        value = getattr(stated, "value", stated)  # of a quantity with its unit, as 2 <pixel>
         if isinstance(value, int) and value != 1:
             raise source.error(
                 field, f"{value}: of a part of the detector or of averaged pixels", "1, or subframe_folded_in=True"

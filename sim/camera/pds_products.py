@@ -1,4 +1,4 @@
-"""PDS3 products with an attached label: the picture itself, and the pose that its label states."""
+"""PDS3 products: the picture itself, behind its label or in a file beside it, and the pose that the label states."""
 
 from __future__ import annotations
 
@@ -14,10 +14,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from sim.camera.assembly import Source
 from sim.camera.pds_labels import label_text, parsed_blocks, picture_size
+from sim.files import check_regular
 from sim.frames import rigid
 
-_ROVER = "ROVER_COORDINATE_SYSTEM"
-_POINTER = re.compile(r"^\^IMAGE[ \t]*=[ \t]*(\d+)[ \t]*(<BYTES>)?[ \t]*\r?$", re.MULTILINE)
+#: The rover's pose; the second is Curiosity's.
+_ROVERS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
+#: `9`, `20481 <BYTES>`, `("PICTURE.IMG", 9)`, `("PICTURE.IMG", 20481 <BYTES>)`, `"PICTURE.IMG"`.
+_POINTER = re.compile(
+    r"^[ \t]*\^IMAGE[ \t]*=[ \t]*"
+    r"(?:\([ \t]*\"(?P<beside>[^\"\n]+)\"[ \t]*,[ \t]*(?P<at>\d+)[ \t]*(?P<at_bytes><BYTES>)?[ \t]*\)"
+    r"|\"(?P<alone>[^\"\n]+)\"|(?P<place>\d+)[ \t]*(?P<bytes><BYTES>)?)[ \t]*\r?$",
+    re.MULTILINE,
+)
 _RECORD = re.compile(r"^[ \t]*RECORD_BYTES[ \t]*=[ \t]*(\d+)", re.MULTILINE)
 _CLOCK = re.compile(r"^[ \t]*SPACECRAFT_CLOCK_(START|STOP)_COUNT[ \t]*=[ \t]*\"?(\d+\.?\d*)\"?[ \t]*\r?$", re.MULTILINE)
 #: Samples of whole numbers by the first words of SAMPLE_TYPE; those of 8 bits have no order.
@@ -50,36 +58,51 @@ def read_pds3_product(path: str | Path) -> Pds3Product:
     Raises
     ------
     CameraFileError
-        If the label cannot be read, the picture is not in the same file, is of another kind, or is cut short, or the
+        If the label or the file of the picture cannot be read, the picture is of another kind, or is cut short, or the
         rover's pose is none; it names file, field and what is allowed.
     """
     source = Source(str(path))
     text = label_text(source)
-    label = parsed_blocks(text, ("IMAGE", _ROVER), source)
+    label = parsed_blocks(text, ("IMAGE", *_ROVERS), source)
     size = picture_size(label, source)
-    counts = _counts(label["IMAGE"], size, _offset(text, source), source)
+    counts = _counts(label["IMAGE"], size, _place(text, source), source)
     times = [float(found[2]) for found in _CLOCK.finditer(text)]
+    rover = next((name for name in _ROVERS if name in label), None)
     return Pds3Product(
         counts=counts,
-        site_from_rover=_pose(label[_ROVER], source) if _ROVER in label else None,
+        site_from_rover=None if rover is None else _pose(label[rover], rover, source),
         time_s=float(np.mean(times)) if times else None,
     )
 
 
-def _offset(text: str, source: Source) -> int:
-    """Bytes before the picture."""
+def _place(text: str, source: Source) -> tuple[Path, int]:
+    """The file that holds the picture, the label's own or one beside it, and the bytes before the picture."""
     pointer = _POINTER.search(text)
     if pointer is None:
-        raise source.error("^IMAGE", "missing, or points to another file", "a product with its picture in one file")
-    if pointer[2]:
-        return int(pointer[1]) - 1
+        raise source.error("^IMAGE", "missing, or of another form", 'a record, bytes, or ("FILE", record)')
+    name = pointer["beside"] or pointer["alone"]
+    path = Path(source.path) if name is None else _beside(name, source)
+    place = int(pointer["at"] or pointer["place"] or 1)
+    if place == 1 or pointer["at_bytes"] or pointer["bytes"]:
+        return path, place - 1
     record = _RECORD.search(text)
     if record is None:
         raise source.error("RECORD_BYTES", "missing", "the bytes of a record")
-    return (int(pointer[1]) - 1) * int(record[1])
+    return path, (place - 1) * int(record[1])
 
 
-def _counts(image: Any, size: tuple[int, int], offset: int, source: Source) -> UInt16[np.ndarray, "rows columns"]:
+def _beside(name: str, source: Source) -> Path:
+    """A file in the label's folder; archives differ in the case of names."""
+    folder = Path(source.path).parent
+    if Path(name).name != name:
+        raise source.error("^IMAGE", f"names {name!r}, a file elsewhere", "a file beside the label")
+    named = [folder / name, folder / name.lower(), folder / name.upper()]
+    return next((path for path in named if path.exists()), named[0])
+
+
+def _counts(
+    image: Any, size: tuple[int, int], place: tuple[Path, int], source: Source
+) -> UInt16[np.ndarray, "rows columns"]:
     bits, kind = image.get("SAMPLE_BITS"), str(image.get("SAMPLE_TYPE", ""))
     order = _ORDERS.get(kind.split("_")[0])
     if bits not in (8, 16) or order is None or not kind.endswith("INTEGER"):
@@ -90,10 +113,17 @@ def _counts(image: Any, size: tuple[int, int], offset: int, source: Source) -> U
     signed = bits == 16 and "UNSIGNED" not in kind
     sample = np.dtype(f"{order}{'i' if signed else 'u'}{bits // 8}")
     columns, rows = size
-    with Path(source.path).open("rb") as file:
-        file.seek(offset)
-        data = file.read(columns * rows * sample.itemsize)
-    if len(data) < columns * rows * sample.itemsize:
+    path, offset = place
+    wanted = columns * rows * sample.itemsize
+    try:
+        # what is not there is not asked for: a label may state any size
+        there = max(min(check_regular(path).st_size - offset, wanted), 0)
+        with path.open("rb") as file:
+            file.seek(offset)
+            data = file.read(there)
+    except OSError as fault:
+        raise source.error("^IMAGE", f"{path} cannot be read ({fault.strerror})", "the picture's file") from fault
+    if len(data) < wanted:
         raise source.error("IMAGE", f"ends after {len(data)} bytes", f"{columns} x {rows} samples of {bits} bits")
     counts = np.frombuffer(data, dtype=sample).reshape(rows, columns)
     if signed and counts.min() < 0:
@@ -101,16 +131,16 @@ def _counts(image: Any, size: tuple[int, int], offset: int, source: Source) -> U
     return counts.astype(np.uint16)
 
 
-def _pose(group: Any, source: Source) -> RigidTransform:
+def _pose(group: Any, name: str, source: Source) -> RigidTransform:
     """The rover's pose in its site, from the group's offset and quaternion (scalar first)."""
     vectors = {}
     for field, length in (("ORIGIN_OFFSET_VECTOR", 3), ("ORIGIN_ROTATION_QUATERNION", 4)):
         value = group.get(field) if isinstance(group, Mapping) else None
         numeric = isinstance(value, list) and all(isinstance(one, int | float) for one in value)
         if not numeric or len(value) != length:  # type: ignore[arg-type]  # a list, as just seen
-            raise source.error(f"{_ROVER}.{field}", f"{value!r}", f"{length} numbers")
+            raise source.error(f"{name}.{field}", f"{value!r}", f"{length} numbers")
         vectors[field] = np.array(value, dtype=np.float64)
     scalar_first = vectors["ORIGIN_ROTATION_QUATERNION"]
     if abs(float(np.linalg.norm(scalar_first)) - 1.0) > _UNIT:
-        raise source.error(f"{_ROVER}.ORIGIN_ROTATION_QUATERNION", "is not of length 1", "a unit quaternion")
+        raise source.error(f"{name}.ORIGIN_ROTATION_QUATERNION", "is not of length 1", "a unit quaternion")
     return rigid(Rotation.from_quat(scalar_first[[1, 2, 3, 0]]), vectors["ORIGIN_OFFSET_VECTOR"])

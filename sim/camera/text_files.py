@@ -20,6 +20,10 @@ from sim.camera.assembly import Source, assembled, linearity_of_type
 from sim.camera.base import CameraModel
 from sim.camera.cahvore import Cahvore
 
+#: Frames of the cameras that Marsyard writes, as their files state them.
+BODY_FRAME = "body (metres); the body's pose in the world, where it is known, is stated beside this file"
+HEAD_FRAME = "head of the mast (metres: x forward, y left, z up at azimuth and elevation zero)"
+
 _TYPE_NAMES = {
     "CAHV": "CAHV = perspective, linear",
     "CAHVOR": "CAHVOR = perspective, distortion",
@@ -36,8 +40,15 @@ class _Line:
     value: str
 
 
-def read_cahvor(path: str | Path) -> CameraModel:
+def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> CameraModel:
     """Read a JPL text file; whichever of the three models it holds.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        (columns, rows) of the pictures, for files without the line Dimensions; a file that has one must agree.
 
     Raises
     ------
@@ -47,12 +58,12 @@ def read_cahvor(path: str | Path) -> CameraModel:
     source = Source(str(path))
     lines = _assignments(source.text(), source)
     name, linearity = _model(_required(lines, "Model", source), source)
-    size = _dimensions(_required(lines, "Dimensions", source), source)
+    size = _size(lines, size, source)
     vectors = {letter: _vector(letter, _required(lines, letter, source), source) for letter in name}
     return assembled(name, vectors, size, linearity, source)
 
 
-def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "") -> None:
+def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "", *, frame: str = "") -> None:
     """Write a JPL text file that `read_cahvor` reads back as an equal camera.
 
     Parameters
@@ -63,13 +74,15 @@ def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "") -> No
         The file, which is overwritten.
     comment
         Text for the first lines, which begin with '#'.
+    frame
+        The frame that the camera's vectors are in, for a line ``# Frame: ...``; empty where it is not known.
     """
     if isinstance(camera, Cahvore):
         model = _TYPE_NAMES.get(camera.linearity, f"CAHVORE3,{camera.linearity!r} = general")
     else:
         model = _TYPE_NAMES[type(camera).__name__.upper()]
     (hs, vs), (hc, vc), theta = camera.focal_lengths, camera.image_centre, camera.theta
-    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    lines = [f"# {line}".rstrip() for line in (*comment.splitlines(), *([f"Frame: {frame}"] if frame else []))]
     lines += [f"Model = {model}", "", f"Dimensions = {camera.size[0]} {camera.size[1]}", ""]
     for letter in type(camera).__name__.upper():
         lines.append(f"{letter} = " + " ".join(repr(float(number)) for number in getattr(camera, letter.lower())))
@@ -107,6 +120,18 @@ def _model(line: _Line, source: Source) -> tuple[str, float | None]:
     parameter = None if match["parameter"] is None else _number("Model", match["parameter"], line, source)
     kind = None if match["type"] is None else int(match["type"])
     return "CAHVORE", linearity_of_type(kind, parameter, "Model", source)
+
+
+def _size(lines: dict[str, _Line], given: tuple[int, int] | None, source: Source) -> tuple[int, int]:
+    """(columns, rows) by the file, or as given where the file does not state them."""
+    if "Dimensions" not in lines and given is not None:
+        return given
+    if "Dimensions" not in lines:
+        raise source.error("Dimensions", "missing", "a line 'Dimensions = columns rows', or size = [columns, rows]")
+    stated = _dimensions(lines["Dimensions"], source)
+    if given is not None and given != stated:
+        raise source.error("Dimensions", f"{stated[0]} {stated[1]}", f"the given size, {given[0]} {given[1]}")
+    return stated
 
 
 def _dimensions(line: _Line, source: Source) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 from sim.camera import Cahv, Cahvor, Cahvore, CameraModel, looking_down, read_cameras
 
 Vector = tuple[float, float, float]
-_FILES = ("file", "number", "subframe_folded_in")
+_FILES = ("file", "number", "subframe_folded_in", "size")
 
 
 class OwnCamera(BaseModel):
@@ -103,7 +103,10 @@ def _read(stated: object) -> object:
     if unknown:
         raise ValueError(f"a camera file leaves nothing else to state than {', '.join(_FILES)}; given: {unknown[0]}")
     path, number, folded = str(stated["file"]), stated.get("number", 0), stated.get("subframe_folded_in", False)
-    cameras = read_cameras(path, subframe_folded_in=bool(folded))
+    size = stated.get("size")
+    if size is not None and not (isinstance(size, list | tuple) and [type(one) for one in size] == [int, int]):
+        raise ValueError(f"{path}: size is {size!r}; allowed: [columns, rows]")
+    cameras = read_cameras(path, subframe_folded_in=bool(folded), size=None if size is None else (size[0], size[1]))
     if not (isinstance(number, int) and 0 <= number < len(cameras)):
         raise ValueError(f"{path}: holds {len(cameras)} cameras; number may be 0 to {len(cameras) - 1}, not {number!r}")
     if len(cameras) > 1 and "number" not in stated:

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
 from marsyard import cli
 from marsyard.render_command import ENDINGS
@@ -40,9 +41,10 @@ def _check_picture(prefix: Path, size: tuple[int, int], multiple: int) -> None:
     assert picture.shape == (rows, columns)
     assert (picture % multiple == 0).all()
     assert picture.std() > 0.0
-    camera = read_cahvor(f"{prefix}.cahvor")
-    assert camera.size == size
     said = json.loads(Path(f"{prefix}.json").read_text())
+    assert "# Frame: body" in Path(f"{prefix}.cahvor").read_text()
+    camera = read_cahvor(f"{prefix}.cahvor").moved(RigidTransform.from_matrix(said["world_from_body"]))
+    assert camera.size == size
     with np.load(f"{prefix}.npz") as truth:
         seen = np.isfinite(truth["range_m"])
         points = truth["point_m"][seen]
@@ -128,3 +130,29 @@ def test_files_that_are_there_stay(marsyard: Command, tmp_path: Path, ending: st
     assert status == 2
     assert f"{kept}: there already" in error
     assert kept.read_text() == "mine"
+
+
+def test_a_terrain_model_is_rendered_with_its_holes_marked(marsyard: Command, tmp_path: Path) -> None:
+    """Seen from straight above the middle of its file, whose eastern quarter has no height."""
+    heights = 3.0 * np.add.outer(np.sin(np.arange(120) / 7.0), np.cos(np.arange(120) / 9.0))
+    heights[:, 90:] = np.nan
+    dtm, prefix = tmp_path / "site.npz", tmp_path / "view"
+    np.savez(dtm, dem=heights, dem_gsd=1.0)
+    command = ("render", dtm, "--camera", "xc-55", "--altitude", 150, "--radiance", "--out", prefix)
+    status, said = marsyard(*command)
+    assert status == 2
+    assert "25.0% of its posts have no height; allowed: up to 5.0%" in said
+    status, said = marsyard(*command, "--max-holes", 0.3)
+    assert status == 0, said
+    assert "see filled holes of the DTM" in said
+    with np.load(f"{prefix}.npz") as truth:
+        filled, points = truth["filled"], truth["point_m"]
+        assert filled.any()
+        assert not filled.all()
+        # 256 samples, the file's 119 m from 68 m (rounded) eastwards: no height from its post 90 on
+        west = round(0.5 * (256 - 119))
+        assert points[filled][:, 0].min() > west + 89.0
+        np.testing.assert_allclose(np.nanmean(points[..., :2], axis=(0, 1)), 128.0, atol=3.0)
+    made_from = json.loads(Path(f"{prefix}.json").read_text())
+    assert made_from["filled_fraction"] == pytest.approx(float(filled.mean()))
+    assert made_from["cahvor"]["frame"].startswith("body")

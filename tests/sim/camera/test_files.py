@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from pydantic import TypeAdapter
 
 from sim.camera import (
     Cahv,
@@ -24,6 +25,7 @@ from sim.camera import (
     read_pds3,
     write_cahvor,
 )
+from sim.sensor import OwnCamera, OwnCameraChoice
 
 LABEL = """PDS_VERSION_ID                    = PDS3
 RECORD_TYPE                       = FIXED_LENGTH
@@ -307,3 +309,54 @@ def test_damaged_files_never_crash_the_reader(tmp_path: Path, text: str, at: int
     path.write_bytes(whole[:at] + junk + whole[at + removed :])
     with contextlib.suppress(CameraFileError):
         assert len(read_cameras(path)) == 1
+
+
+#: Curiosity's: the head of a navigation camera's label (MSL_MMM EDR), its group and a part of the frame.
+CURIOSITY = (
+    LABEL.replace("PDS_VERSION_ID                    = PDS3", "ODL_VERSION_ID                    = ODL3")
+    .replace("^IMAGE                            = 3", '^IMAGE                            = ("NLB_0001.IMG", 9)')
+    .replace("GEOMETRIC_CAMERA_MODEL", "GEOMETRIC_CAMERA_MODEL_PARMS")
+    .replace("  MODEL_TYPE ", '  ^MODEL_DESC                     = "GEOMETRIC_CM.TXT"\n  MODEL_TYPE ')
+)
+
+
+@pytest.mark.parametrize("ending", ["\n", "\r\n"])
+def test_curiositys_labels_are_read(tmp_path: Path, ending: str) -> None:
+    ours, theirs = tmp_path / "spirit.lbl", tmp_path / "curiosity.lbl"
+    ours.write_text(LABEL)
+    theirs.write_bytes(CURIOSITY.replace("\n", ending).encode())
+    (expected,), (found,) = read_cameras(ours), read_cameras(theirs)
+    assert found == expected
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("FIRST_LINE                      = 1", "FIRST_LINE                      = 257", "IMAGE.FIRST_LINE: 257"),
+        ("FIRST_LINE_SAMPLE               = 1", "FIRST_LINE_SAMPLE               = 3", "IMAGE.FIRST_LINE_SAMPLE: 3"),
+        ("AVERAGING_WIDTH           = 1", "AVERAGING_WIDTH           = 2 <pixel>", "PIXEL_AVERAGING_WIDTH: 2"),
+    ],
+)
+def test_subframes_of_curiosity_are_read_only_where_the_model_is_said_to_be_theirs(
+    tmp_path: Path, old: str, new: str, field: str
+) -> None:
+    path = tmp_path / "curiosity.lbl"
+    path.write_text(CURIOSITY.replace(old, new))
+    with pytest.raises(CameraFileError, match=field):
+        read_pds3(path)
+    assert read_pds3(path, subframe_folded_in=True)[0].size == (1020, 1024)
+
+
+def test_text_files_without_dimensions_take_the_size_that_is_given(tmp_path: Path) -> None:
+    stated, unstated = tmp_path / "stated.cahvor", tmp_path / "unstated.cahvor"
+    stated.write_text(TEXT)
+    unstated.write_text(TEXT.replace("Dimensions = 1024 1024\n", ""))
+    with pytest.raises(CameraFileError, match=r"Dimensions: missing; allowed: a line .* or size = \[columns, rows\]"):
+        read_cameras(unstated)
+    assert read_cameras(unstated, size=(1024, 1024)) == read_cameras(stated)
+    with pytest.raises(CameraFileError, match="Dimensions: 1024 1024; allowed: the given size, 512 512"):
+        read_cameras(stated, size=(512, 512))
+    campaign: TypeAdapter[OwnCamera] = TypeAdapter(OwnCameraChoice)
+    assert campaign.validate_python({"file": str(unstated), "size": [1024, 1024]}).size == (1024, 1024)
+    with pytest.raises(ValueError, match=r"size is \[1024\]; allowed: \[columns, rows\]"):
+        campaign.validate_python({"file": str(unstated), "size": [1024]})

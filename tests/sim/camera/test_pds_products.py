@@ -70,7 +70,7 @@ def test_samples_of_all_kinds(tmp_path: Path, sample: str, pointer: str, kind: s
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"pointer": '("other.img", 3)'}, r"\^IMAGE: missing, or points to another file"),
+        ({"pointer": '("other.img", 3)'}, r"\^IMAGE: .*other.img cannot be read \(No such file"),
         ({"kind": "IEEE_REAL"}, "SAMPLE_TYPE, SAMPLE_BITS: IEEE_REAL, 16; allowed: integers of 8 or 16 bits"),
         ({"bits": 32}, "MSB_INTEGER, 32"),
         ({"pointer": "4"}, "ends after 0 bytes; allowed: 4 x 3 samples"),
@@ -105,3 +105,37 @@ def test_opportunitys_pictures_have_their_labels_statistics(
     counts = read_pds3_product(shared_data / "mer_opportunity" / name).counts
     assert (counts.shape, counts.min(), counts.max()) == ((1024, 1024), least, most)
     assert abs(counts.mean() - mean) < 0.005
+
+
+@pytest.mark.parametrize(
+    ("pointer", "before"),
+    [
+        ('("made_data.IMG", 3)', 1024),
+        ('("made_data.IMG", 101 <BYTES>)', 100),
+        ('("MADE_DATA.IMG",1)', 0),
+        ('"made_data.IMG"', 0),
+    ],
+)
+def test_pictures_in_a_file_beside_their_label(tmp_path: Path, pointer: str, before: int) -> None:
+    """Curiosity's pose group, too."""
+    label = LABEL.replace("PDS_VERSION_ID = PDS3", "ODL_VERSION_ID = ODL3")
+    label = label.replace("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
+    path = tmp_path / "made.LBL"
+    path.write_text(label.format(pointer=pointer, kind="MSB_INTEGER", bits=16, quaternion="(1.0, 0.0, 0.0, 0.0)"))
+    data = tmp_path / ("MADE_DATA.IMG" if "MADE" in pointer else "made_data.IMG")
+    data.write_bytes(bytes(before) + COUNTS.astype(">i2").tobytes())
+    found = read_pds3_product(path)
+    assert np.array_equal(found.counts, COUNTS)
+    assert found.site_from_rover is not None
+    assert np.allclose(found.site_from_rover.translation, [1.0, 2.0, 3.0])
+    data.write_bytes(bytes(before) + b"cut")
+    with pytest.raises(CameraFileError, match="IMAGE: ends after 3 bytes"):
+        read_pds3_product(path)
+    data.unlink()
+    with pytest.raises(CameraFileError, match=r"\^IMAGE: .*cannot be read \(No such file"):
+        read_pds3_product(path)
+
+
+def test_a_picture_elsewhere_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CameraFileError, match=r"names '\.\./made\.img', a file elsewhere; allowed: a file beside"):
+        read_pds3_product(product(tmp_path, pointer='("../made.img", 3)'))
