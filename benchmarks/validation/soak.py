@@ -28,8 +28,8 @@ seed = 21
 [retain]
 showcase = "none"
 [limits]
-case_time_s = 6
-memory_gb = 0.5
+case_time_s = 10
+memory_gb = 0.3
 output_mb = 0.2
 """
 
