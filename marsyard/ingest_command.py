@@ -134,7 +134,8 @@ def _requirement(stored: StoredCases) -> str:
 # confidence = 0.9
 # decide_by = "estimate"
 """
-    return """# Real cases are no random draws: the share of them decides, and no confidence is claimed.
+    return """# Real cases are no random draws: their rate decides, from 100 cases on, and no confidence is claimed.
+# MET BY RATE has the exit status 3; accept_rate = true makes it 0.
 [[requirements]]
 id = "VELOCITY"
 statement = "The horizontal velocity that is reported is within 5 m/s of the true one."

@@ -155,7 +155,8 @@ def test_the_campaign_itself(campaign_file: CampaignFile, head: str, said: str) 
             "requirements[0].population: string should match pattern",
         ),
         ("decide_by = 'luck'", "requirements[0].decide_by: input should be 'confidence' or 'estimate', got 'luck'"),
-        ("metrik = 'x'", "requirements[0].metrik: unknown key (did you mean 'metric'?); allowed: bound, confidence"),
+        ("metrik = 'x'", "requirements[0].metrik: unknown key (did you mean 'metric'?); allowed: accept_rate, bound"),
+        ("accept_rate = true", 'accept_rate needs decide_by = "estimate"'),
     ],
 )
 def test_requirements(campaign_file: CampaignFile, change: str, said: str) -> None:
