@@ -1,0 +1,20 @@
+"""Every file of a camera that is written states the frame of its vectors, and all of pictures state the same one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from algorithms.exchange.files import write_case
+from scenarios.conformance import inputs
+from scenarios.measured.store import put_camera
+from sim.camera import BODY_FRAME, read_cahvor
+
+
+def test_exports_and_ingested_cases_state_the_body_frame(tmp_path: Path) -> None:
+    measurements = inputs.descent()
+    write_case(tmp_path, measurements)
+    put_camera(tmp_path, 0, measurements.images[0].camera)
+    exported, ingested = tmp_path / "camera_1.cahvor", tmp_path / "cameras" / "000000.cahvor"
+    for path in (exported, ingested):
+        assert path.read_text().startswith(f"# Frame: {BODY_FRAME}\n")
+        assert read_cahvor(path) == measurements.images[0].camera
