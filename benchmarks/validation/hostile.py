@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from scenarios.handover import Handover
 from scenarios.interface import CaseResult
 from sim.streams import Streams
 
@@ -107,6 +108,13 @@ def _close_stream() -> None:
     sys.stdout.close()
 
 
+def _spoil_inputs() -> None:
+    handover = Handover([np.ones(9)])
+    handover.given[0].flags.writeable = True
+    handover.given[0][:] = 0.0
+    handover.check()
+
+
 #: What the next case of the same process finds spoiled.
 _SPOILED = "spoiled"
 
@@ -136,6 +144,9 @@ DEEDS: Mapping[str, tuple[Callable[[], object], str]] = {
     "write at length": (_flood, "TOO_MUCH_OUTPUT"),
     "take all memory": (_swell, "OUT_OF_MEMORY"),
     "answer with an array": (lambda: {"number": np.zeros(3)}, "CRASHED"),
+    "answer with a huge integer": (lambda: {"number": 10**5000}, "CRASHED"),
+    "answer with text in a metric": (lambda: {"number": "far"}, "CRASHED"),
+    "spoil its inputs": (_spoil_inputs, "CRASHED"),
 }
 
 

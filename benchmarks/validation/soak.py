@@ -31,6 +31,14 @@ showcase = "none"
 case_time_s = 10
 memory_gb = 0.3
 output_mb = 0.2
+[[requirements]]
+id = "NUMBER"
+statement = "The number is below 100."
+metric = "number"
+bound = 100.0
+probability = 0.5
+confidence = 0.9
+population = "all"
 """
 
 #: Variable in the environment of the runner, by which whatever it starts is found.

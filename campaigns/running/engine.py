@@ -362,12 +362,16 @@ def _prepare(work: _Work, workers: Workers, cases: Iterable[int]) -> None:
 def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Path) -> None:
     """Holds what requirements ask for against the columns of a finished case, before more cases are spent on them.
 
+    Columns that a scenario states may be absent from a row: they are held against that statement when the campaign is
+    loaded (`campaigns.definition.metrics`).
+
     Raises
     ------
     ConfigurationError
         Where a requirement asks for a column that is not there, or is of another kind: numbers for a metric with a
         bound, true and false for a metric without one and for a population.
     """
+    stated = stated_columns().get(configuration.scenario, StatedColumns((), ()))
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
     problems = []
@@ -375,7 +379,8 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
         key = f"requirements[{place}]"
         kind, allowed = ("column of numbers", numbers) if requirement.bound is not None else (FLAG, flags)
         for name in requirement.metric_columns:
-            if name not in allowed:
+            absent = name not in row and (stated.has_flag(name) or stated.has_number(name))
+            if name not in allowed and not absent:
                 message = not_allowed(kind, name, allowed)
                 problems.append(Problem(configuration.name, f"{key}.metric", message))
         for name in requirement.population_columns:

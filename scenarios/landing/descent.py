@@ -28,11 +28,14 @@ def landing_row(
     paper measured it; `touchdown_error_m` that of the true touchdown from where these coordinates led it, the error of
     the navigation at the first picture taken off; `touchdown_safe` whether it stands safely, `touchdown_sink_m_s` and
     `touchdown_drift_m_s` how fast it came down and went sideways. Without a site, or in a
-    case that states its pair and flies no helicopter, there is no landing.
+    case that states its pair and flies no helicopter, there is no landing: numbers are NaN, and `touchdown_safe` is
+    absent, as nothing stands anywhere.
     """
     landed = _landed(p, estimate, flight, truth, streams)
     if landed is None or estimate.site_world is None:
-        return {"landed": False, **place_row("touchdown", None, truth), **dict.fromkeys(_NUMBERS, NAN)}
+        nowhere = place_row("touchdown", None, truth)
+        del nowhere["touchdown_safe"]
+        return {"landed": False, **nowhere, **dict.fromkeys(_NUMBERS, NAN)}
     place = landed.state.position_m
     site = estimate.site_world
     numbers = (
