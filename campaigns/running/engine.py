@@ -32,6 +32,7 @@ from campaigns.store.retention import ProductStore, keep_while_running
 from campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from campaigns.store.table import TABLE_FILE, write_table
 from campaigns.store.worst import showcase_case, worst_cases
+from scenarios.columns import StatedColumns, stated_columns
 from sim.kernel_cache import note_ready
 
 #: What a requirement without a bound, and a population, ask a column to be.
