@@ -348,7 +348,7 @@ def test_a_choice_between_tables_draws_whole_tables(campaign_file: CampaignFile)
 @pytest.mark.parametrize(
     ("path", "allowed"),
     [
-        ("wnd.est_m_s", "aborting_cases, altitude_m, "),
+        ("wnd.est_m_s", "aborting_cases, altering_cases, altitude_m, "),
         ("wind.est_m_s", "wind.east_m_s, wind.north_m_s"),
         ("wind.east_m_s.x", "wind.east_m_s, wind.north_m_s"),
     ],

@@ -125,7 +125,7 @@ def test_a_full_folder_for_temporary_files_is_one_message(monkeypatch: pytest.Mo
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("campaigns.execution.workers.TemporaryDirectory", full)
+    monkeypatch.setattr("campaigns.execution.temporary.tempfile.mkdtemp", full)
     with pytest.raises(CampaignError, match=r"TMPDIR says where they go.*No space left"):
         LocalWorkers(1)
 

@@ -129,8 +129,8 @@ def test_a_second_interruption_ends_the_program_at_once() -> None:
 import signal, sys, time
 from marsyard.campaign_command import stopped_by_signals
 with stopped_by_signals():
-    print("ready", flush=True)
     try:
+        print("ready", flush=True)
         time.sleep(3600)
     except KeyboardInterrupt:
         print("stopping", flush=True)
