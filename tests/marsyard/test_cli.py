@@ -168,7 +168,7 @@ def test_a_dry_run_only_estimates(tmp_path: Path, marsyard: Command, monkeypatch
     monkeypatch.chdir(tmp_path)
     ended = marsyard("run", write_campaign(tmp_path, "sleep_s = 0.05"), "--dry-run", "-n", 100_000, "--jobs", 2)
     assert (ended.status, ended.err) == (0, "")
-    assert re.search(r"^100000 cases on 2 workers: about [\d.]+ (min|h)$", ended.out, re.MULTILINE)
+    assert re.search(r"^100,000 cases on 2 workers: about [\d.]+ (min|h)$", ended.out, re.MULTILINE)
     assert re.search(r"^  0\.\d+ s a case \(0\.\d+ to \d[\d.]* s in 9 trial cases\)$", ended.out, re.MULTILINE)
     assert re.search(r"^disk: [\d.]+ MB of rows, up to [\d.]+ bytes of products$", ended.out, re.MULTILINE)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fake.toml"]
@@ -349,5 +349,5 @@ def test_a_terminal_gets_a_bar(tmp_path: Path) -> None:
     ended = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert ended.returncode == 0, ended.stderr
     assert "2/2" in ended.stderr
-    assert "left" in ended.stderr
+    assert "in all" in ended.stderr
     assert "━" in ended.stderr

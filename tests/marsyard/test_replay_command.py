@@ -81,8 +81,8 @@ def test_an_algorithm_that_is_not_found_is_one_message(tmp_path: Path, monkeypat
     configuration = load_campaign("dimes-smoke", [], 1).configuration
     parameters = {**configuration.parameters, "algorithm": "my_absent_module:Estimator"}
     create_store(folder / ROWS_FILE, {"identity": "x"})
-    configuration = configuration.model_copy(update={"parameters": parameters})
-    record.begin(folder, configuration, identity_of(configuration), "nobody")
+    identity = identity_of(configuration)
+    record.begin(folder, configuration.model_copy(update={"parameters": parameters}), identity, "nobody")
     before = _content(folder)
     status, output = told("replay", folder, 0)
     assert status == 2
