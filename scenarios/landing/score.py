@@ -42,6 +42,15 @@ def outcome_row(estimate: SiteEstimate) -> dict[str, Scalar]:
     }
 
 
+def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
+    """What there is to find: every flight is in one of `none_exists`, `narrow_exists` and `roomy_exists`.
+
+    No place is safe; places are safe, none of them with a lander's radius of safe places about it; one has that room.
+    """
+    safe, roomy = bool(np.any(truth.safe)), bool(np.any(truth.roomy))
+    return {"safe_exists": safe, "none_exists": not safe, "narrow_exists": safe and not roomy, "roomy_exists": roomy}
+
+
 def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict[str, Scalar]:
     """The answer against the truth.
 
@@ -210,10 +219,7 @@ def conditions(
         "pose_azimuth_error_deg": float(np.degrees(errors[0][2])),
         "pose_turn_error_deg": float(np.degrees(np.linalg.norm(errors[1] - errors[0]))),
         "covered_m2": float(covered.sum() * truth.step_m**2),
-        "safe_exists": bool(np.any(truth.safe)),
-        "none_exists": not np.any(truth.safe),
-        "roomy_exists": bool(np.any(truth.roomy)),
-        "narrow_exists": bool(np.any(truth.safe) and not np.any(truth.roomy)),
+        **site_populations(truth),
         "truly_safe_share": float(truth.safe.sum() / max(int(covered.sum()), 1)),
         "within_limits": _within_limits(true_motion(flight, pair), flight, pair.axis_range_m),
         "true_slope_median_deg": _median_deg(truth, covered),

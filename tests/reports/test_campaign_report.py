@@ -111,7 +111,7 @@ RUNS: dict[str, Callable[[Rows], pd.DataFrame]] = {
 def test_report_of_any_run(make_rows: Rows, make_run: MakeRun, kind: str) -> None:
     text, page, twin = _read(make_run(RUNS[kind](make_rows)))
     _check(text, page)
-    assert twin["schema"] == 3
+    assert twin["schema"] == 4
     assert twin["verdict"] in text
     assert len(text) < 1_000_000
 

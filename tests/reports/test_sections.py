@@ -60,11 +60,11 @@ def test_answers_are_told_by_their_share_and_harm() -> None:
     assert answer_shares(subject(frame.drop(columns="answered"))) == {}
 
 
-def test_crashed_cases_count_against_the_answers_but_not_as_without_room(make_rows: Rows) -> None:
+def test_crashed_cases_of_unknown_room_count_as_failures_with_room(make_rows: Rows) -> None:
     frame = make_rows(50, answered=1.0, crashed=5)
     room: list[bool | None] = [True] * 45 + [None] * 5
     shares = answer_shares(subject(frame.assign(room=room)))
-    assert [(one.hits, one.n) for one in shares.values()] == [(45, 50), (45, 45), (0, 45), (0, 45)]
+    assert [(one.hits, one.n) for one in shares.values()] == [(45, 50), (45, 50), (0, 45), (0, 45)]
 
 
 def test_bins_hold_all_cases_once_and_know_their_errors() -> None:

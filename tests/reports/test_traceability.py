@@ -39,7 +39,8 @@ def test_matrix_has_a_row_for_each_requirement(make_rows: Rows, velocity: dict[s
 
 def test_junit_tells_failures_and_what_is_open(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame = make_rows(40, crashed=2, terrains=10_000)
-    by_rate = {**velocity, "id": "RATE", "probability": 0.95, "decide_by": "estimate"}
+    # 32 of 34, with the crashed cases as failures, still reach the rate, and no bound does
+    by_rate = {**velocity, "id": "RATE", "probability": 0.94, "decide_by": "estimate"}
     asked = [
         {**velocity, "bound": 0.01, "id": "FAILS"},
         _undecided(velocity),

@@ -10,7 +10,7 @@ from campaigns.definition.loading import load_campaign
 from scenarios.conformance.parts import motion
 from scenarios.landing.flight import Flight
 from scenarios.landing.relief import Footprints, Limits, Relief
-from scenarios.landing.score import site_row
+from scenarios.landing.score import site_populations, site_row
 from scenarios.landing.truth import GroundTruth
 from sim.frames import rigid
 from sim.measurements import PoseMeasurement
@@ -51,7 +51,7 @@ def truth(safe_places: int) -> GroundTruth:
     ("safe_places", "population"), [(0, "none_exists"), (3, "narrow_exists"), (25, "roomy_exists")]
 )
 def test_every_flight_is_in_one_population(safe_places: int, population: str) -> None:
-    row = site_row(SiteEstimate(REFUSED, None), flight(), truth(safe_places))
+    row = site_populations(truth(safe_places))
     populations = ("none_exists", "narrow_exists", "roomy_exists")
     assert [name for name in populations if row[name]] == [population]
 
