@@ -151,7 +151,7 @@ class EstimatorSuite:
         return str(self._ask(replace(measurements, slant_range_m=float("nan"))).outcome.name)
 
     def _inputs(self) -> str:
-        measurements = own_copy(self.protocol.measurements())
+        measurements = own_copy(self.protocol.measurements(), writable=True)
         before = fingerprint(measurements)
         self.make().estimate(measurements)
         if fingerprint(measurements) != before:

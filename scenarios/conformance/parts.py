@@ -136,7 +136,7 @@ class PartSuite:
 
     def _inputs(self) -> str:
         for case in self.cases():
-            mine = own_copy(case)
+            mine = own_copy(case, writable=True)
             before = fingerprint(mine)
             self._given(self._made(), mine, 1)
             if fingerprint(mine) != before:
@@ -152,8 +152,8 @@ class PartSuite:
             if fingerprint(self._asked(case)) != first:
                 raise BreachError("asked twice, it gives something else for the same case and stream")
             for other in self.cases():
-                self._given(kept, own_copy(other), 2)
-            if fingerprint(self._checked(self._given(kept, own_copy(case), 1), case)) != first:
+                self._given(kept, own_copy(other, writable=True), 2)
+            if fingerprint(self._checked(self._given(kept, own_copy(case, writable=True), 1), case)) != first:
                 raise BreachError("what it gives depends on the cases that it was asked before")
         return ""
 
@@ -178,7 +178,7 @@ class PartSuite:
         return f"{taken:.3g} s"
 
     def _prepared(self) -> Callable[[], object]:
-        part, case = self._made(), own_copy(self.cases()[0])
+        part, case = self._made(), own_copy(self.cases()[0], writable=True)
         return lambda: self._given(part, case, 1)
 
     def cases(self) -> Sequence[Any]:
@@ -200,7 +200,7 @@ class PartSuite:
         return part.read(case, rng) if self.kind is INSTRUMENT else part(case)
 
     def _asked(self, case: Any, seed: int = 1) -> Any:
-        return self._checked(self._given(self._made(), own_copy(case), seed), case)
+        return self._checked(self._given(self._made(), own_copy(case, writable=True), seed), case)
 
     def _checked(self, given: object, case: Any) -> Any:
         """What a part gave, held against what its kind gives."""

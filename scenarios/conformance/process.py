@@ -32,11 +32,11 @@ _TRUE_FILES = ("campaign.json", "cases.sqlite", "cases.parquet")
 _TRUE_FOLDER = "terrain"
 
 
-def own_copy(thing: Thing) -> Thing:
-    """A deep copy whose arrays can be written to, so that an algorithm that does so is seen."""
+def own_copy(thing: Thing, *, writable: bool = False) -> Thing:
+    """A deep copy; its arrays are read-only, as campaigns hand them over, or writable, to detect what is written."""
     made = copy.deepcopy(thing)
     for array in _arrays(made):
-        array.flags.writeable = True
+        array.flags.writeable = writable
     return made
 
 

@@ -147,10 +147,10 @@ class TrackerSuite:
         return checked_update(tracker.update(own_copy(measurements))).state.name
 
     def _inputs(self) -> str:
-        tracker, told = self.make(), own_copy(designation())
+        tracker, told = self.make(), own_copy(designation(), writable=True)
         before = fingerprint(told)
         tracker.designate(told, pose(0.0))
-        measurements = own_copy(taken(_aimed(tracker, pose(0.0)), pose(0.0)))
+        measurements = own_copy(taken(_aimed(tracker, pose(0.0)), pose(0.0)), writable=True)
         seen = fingerprint(measurements)
         tracker.update(measurements)
         if fingerprint(told) != before or fingerprint(measurements) != seen:
