@@ -69,6 +69,7 @@ def estimator(lines: str) -> str:
             "covariance_m2_s2 is not finite",
         ),
         ("answer", "return 1 / 0", "it raised ZeroDivisionError: division by zero (bad_"),
+        ("answer", "m.images[0].counts[:] = m.images[0].counts\nreturn NOTHING", "read-only"),
         ("featureless", "return VelocityEstimate(Outcome.VALID, np.zeros(2))", "it answers VALID to pictures that are"),
         ("saturated", "return NOTHING if seen(m) else 1 / 0", "it raised ZeroDivisionError"),
         ("inputs", "m.images[0].counts[:] = 0\nreturn NOTHING", "are not what they were before"),
