@@ -378,14 +378,15 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
     problems = []
     for place, requirement in enumerate(configuration.requirements):
         key = f"requirements[{place}]"
+        asked = {*requirement.metric_columns, *requirement.population_columns} - {*row}
+        absent = [name for name in asked if stated.has_flag(name) or stated.has_number(name)]
         kind, allowed = ("column of numbers", numbers) if requirement.bound is not None else (FLAG, flags)
         for name in requirement.metric_columns:
-            absent = name not in row and (stated.has_flag(name) or stated.has_number(name))
-            if name not in allowed and not absent:
+            if name not in allowed and name not in absent:
                 message = not_allowed(kind, name, allowed)
                 problems.append(Problem(configuration.name, f"{key}.metric", message))
         for name in requirement.population_columns:
-            if name not in flags:
+            if name not in flags and name not in absent:
                 message = not_allowed(FLAG, name, (*POPULATIONS, *flags))
                 problems.append(Problem(configuration.name, f"{key}.population", message))
     if problems:

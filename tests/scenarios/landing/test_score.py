@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from algorithms.interface import SiteEstimate, SiteOutcome
 from campaigns.definition.loading import load_campaign
+from campaigns.running.engine import check_metrics
 from scenarios.conformance.parts import motion
+from scenarios.landing.descent import landing_row
 from scenarios.landing.flight import Flight
+from scenarios.landing.parameters import LandingScenarioParameters
 from scenarios.landing.relief import Footprints, Limits, Relief
 from scenarios.landing.score import site_populations, site_row
 from scenarios.landing.truth import GroundTruth
 from sim.frames import rigid
 from sim.measurements import PoseMeasurement
+from sim.streams import Streams
 
 SAFE_SITE, UNSAFE_SITE = np.array([-3.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0])
 REPORTED, REFUSED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
@@ -69,6 +75,15 @@ def test_every_flight_is_in_one_population(safe_places: int, population: str) ->
 def test_a_safe_site_or_no_safe_site_is_right(outcome: SiteOutcome, site: np.ndarray | None, right: bool) -> None:
     row = site_row(SiteEstimate(outcome, site), flight(), truth(3))
     assert row["safe_or_no_site_reported"] is right
+
+
+def test_no_ground_is_judged_where_nothing_landed() -> None:
+    p, streams = LandingScenarioParameters(), Streams(1, "landing", 0)
+    row = landing_row(p, SiteEstimate(REFUSED, None), flight(), truth(3), streams)
+    assert row["landed"] is False
+    assert "touchdown_safe" not in row
+    # a first case that lands nowhere does not stop a campaign that asks where helicopters stand
+    check_metrics(load_campaign("hda-benign").configuration, {**row, "answered": True}, Path())
 
 
 def test_every_hazardous_flight_has_a_requirement_on_its_answer() -> None:
