@@ -61,8 +61,12 @@ def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
     belongs = _belongs(row, requirement.population)
     if belongs is not True or row["outcome"] in UNFINISHED:
         return belongs is not False
-    value = row.get(requirement.metric)
-    return value is not True if requirement.bound is None else not _within(value, requirement.bound)
+    values: list[Any] = [row.get(name) for name in requirement.metric_columns]
+    if requirement.bound is None:
+        return values != [True]
+    if not all(isinstance(value, int | float) for value in values):
+        return True
+    return not abs(requirement.scale * sum(values)) <= requirement.bound
 
 
 def _belongs(row: Mapping[str, Any], population: str) -> bool | None:
@@ -72,10 +76,6 @@ def _belongs(row: Mapping[str, Any], population: str) -> bool | None:
     if any(part is False for part in parts):
         return False
     return None if None in parts else True
-
-
-def _within(value: Any, bound: float) -> bool:
-    return isinstance(value, int | float) and abs(value) <= bound
 
 
 class ProductStore:

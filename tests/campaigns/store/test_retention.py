@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from fake_campaign import Silence, rows_of, run
 
+from campaigns.definition.configuration import Requirement
 from campaigns.definition.loading import load_campaign
 from campaigns.running.replay import differing_columns
 from campaigns.store import record
 from campaigns.store.products import load_products
+from campaigns.store.retention import fails
 from campaigns.store.rows import RowStore, create_store
 from campaigns.store.table import write_table
 from campaigns.store.worst import showcase_case, worst_cases
@@ -104,3 +106,21 @@ def test_products_are_kept_as_asked(
         if "retain.budget_gb=1e-6" in kept
         else []
     )
+
+
+def test_a_failing_case_is_found_by_sums_and_scales_of_columns() -> None:
+    time = Requirement(
+        id="TIME",
+        statement="A picture and a map take at most 2 s on the flight processor.",
+        metric="picture_time_s + map_time_s",
+        scale=60.0,
+        bound=2.0,
+        probability=0.95,
+        confidence=0.9,
+        population="all",
+    )
+    row = {"outcome": "VALID", "answered": True, "picture_time_s": 0.02, "map_time_s": 0.01}
+    assert not fails(row, time)
+    assert fails({**row, "map_time_s": 0.02}, time)
+    assert fails({**row, "map_time_s": float("nan")}, time)
+    assert fails({"outcome": "VALID", "answered": True, "picture_time_s": 0.02}, time)
