@@ -22,6 +22,9 @@ DUMP_SIGNAL = signal.SIGUSR2
 #: Has the supervisor kill everything and end.
 END_SIGNAL = signal.SIGTERM
 
+#: Sent by Linux where the parent ends; it also wakes a supervisor that a case has stopped.
+_PARENT_SIGNAL = signal.SIGCONT
+
 
 def become_supervised(parent: int, folder: Path) -> None:
     """Divides this process into a supervisor, which does not return, and a worker, which does.
@@ -36,9 +39,10 @@ def become_supervised(parent: int, folder: Path) -> None:
     if sys.platform != "linux":
         return
     adopt_orphans()
-    handled = {DUMP_SIGNAL, END_SIGNAL, signal.SIGCHLD}
+    # SIGHUP comes with the end of a parent that led the process group
+    handled = {DUMP_SIGNAL, END_SIGNAL, _PARENT_SIGNAL, signal.SIGCHLD, signal.SIGHUP}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, handled)
-    end_with_parent(parent, END_SIGNAL)
+    end_with_parent(parent, _PARENT_SIGNAL)
     supervisor = os.getpid()
     worker = os.fork()
     if worker:
@@ -55,7 +59,7 @@ def _supervise(worker: int, parent: int, folder: Path, handled: set[signal.Signa
         number = signal.sigwait(handled)
         if number == DUMP_SIGNAL:
             os.kill(worker, DUMP_SIGNAL)
-        elif number == END_SIGNAL:
+        elif number == END_SIGNAL or os.getppid() != parent:
             status = -signal.SIGKILL
         else:
             status = _exit_status(worker)

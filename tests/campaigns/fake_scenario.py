@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import tempfile
 import time
 import warnings
@@ -41,6 +42,7 @@ class FakeParameters(BaseModel):
     chatting_cases: frozenset[int] = frozenset()
     leaving_cases: frozenset[int] = frozenset()
     forking_cases: frozenset[int] = frozenset()
+    stopping_cases: frozenset[int] = frozenset()
     altering_cases: frozenset[int] = frozenset()
     shared: int = 0
     fail_prepare: bool = False
@@ -74,6 +76,8 @@ def misbehave(parameters: FakeParameters, case: int) -> None:
         os.setsid()
         Path(tempfile.gettempdir(), "left-behind").touch()
         time.sleep(3600)
+    if case in parameters.stopping_cases:
+        os.kill(os.getppid(), signal.SIGSTOP)
     if case in parameters.altering_cases:
         os.chdir("/")
     hoard = []

@@ -97,9 +97,17 @@ def _marked(mark: str) -> list[int]:
     return found
 
 
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    ("kind", "also"),
+    [
+        (signal.SIGINT, ""),
+        (signal.SIGTERM, ""),
+        (signal.SIGKILL, ""),
+        (signal.SIGKILL, "stopping_cases = [0, 1, 2, 3, 4, 5]"),
+    ],
+)
 def test_whatever_ends_the_runner_nothing_of_its_cases_is_left(
-    campaign_file: CampaignFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: int
+    campaign_file: CampaignFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: int, also: str
 ) -> None:
     """Neither processes in sessions of their own that hold the worker's files, nor temporary files.
 
@@ -107,7 +115,7 @@ def test_whatever_ends_the_runner_nothing_of_its_cases_is_left(
     """
     temporary = tmp_path / "tmp"
     temporary.mkdir()
-    path = campaign_file("forking_cases = [0, 1, 2, 3, 4, 5]", dispersions="")
+    path = campaign_file(f"forking_cases = [0, 1, 2, 3, 4, 5]\n{also}", dispersions="")
     process = _started(path, tmp_path / "run", TMPDIR=str(temporary), MARSYARD_TEST_RUN=str(tmp_path))
     process.send_signal(kind)
     _, errors = process.communicate(timeout=60)
