@@ -18,12 +18,12 @@ from jaxtyping import Float
 
 from reports.columns import label, numbers, primary_metric
 from reports.comparison import CONFIDENCE
+from reports.populations import is_flag, members, succeeded, terrain_groups
 from reports.sampled import sampled
 from reports.sections import Grid
 from reports.statistics.changes import Sample, difference_p, holm
 from reports.statistics.paired import compared_errors, compared_successes
 from reports.stored import StoredRun, table
-from reports.verdicts import is_flag, members, succeeded, terrain_groups
 from reports.wording import NOTHING, number, percent
 
 

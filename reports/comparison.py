@@ -16,11 +16,11 @@ import numpy as np
 import pandas as pd
 
 from reports.columns import numbers, split_unit
+from reports.populations import ENGINE_FAILURES, is_flag, succeeded, terrain_groups
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.changes import holm
 from reports.statistics.paired import compared_errors, compared_successes
-from reports.verdicts import ENGINE_FAILURES, is_flag, succeeded, terrain_groups
 from reports.wording import NOTHING, number, percent, stated
 
 CONFIDENCE = 0.9

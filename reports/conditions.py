@@ -14,10 +14,10 @@ from scipy import stats
 
 from reports.answers import CONFIDENCE, Share, share_of
 from reports.columns import axis_columns, label, numbers, split_unit
+from reports.populations import is_flag, members, terrain_groups
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.samples import quantile_bounds
-from reports.verdicts import is_flag, members, terrain_groups
 from reports.wording import number, percent, stated
 
 #: Beginnings of the columns by which errors are sorted, in the order of the page; the first column of each counts.

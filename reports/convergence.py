@@ -13,11 +13,12 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from reports.columns import magnitude_label, numbers
 from reports.plates import plate
+from reports.populations import terrain_groups
 from reports.sampled import sampled
 from reports.section import Block, Section, Subject
 from reports.statistics.samples import mean_interval, quantile_bounds
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.verdicts import judge_campaign, terrain_groups
+from reports.verdicts import judge_campaign
 
 #: Up to this ratio of the most cases to the fewest an axis has ticks within its decades too.
 _FEW_DECADES = 50

@@ -11,11 +11,11 @@ import pandas as pd
 from jaxtyping import Float
 
 from reports.columns import driver_columns, label, numbers
+from reports.populations import succeeded, terrain_groups
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.changes import holm
 from reports.statistics.drivers import Driver, driver
-from reports.verdicts import succeeded, terrain_groups
 from reports.wording import coefficient, percent, stated
 
 CONFIDENCE = 0.9

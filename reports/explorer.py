@@ -16,9 +16,9 @@ from jaxtyping import Int
 from markupsafe import Markup
 
 from reports.columns import axis_columns, driver_columns, label, numbers
+from reports.populations import ENGINE_FAILURES
 from reports.sections import replay_command
 from reports.stored import StoredRun
-from reports.verdicts import ENGINE_FAILURES
 
 #: Most points, and how many of the worst, of those without an answer and of the crashed are among them in any event.
 MOST_POINTS, MOST_NOTABLE = 2000, 150

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from reports.answers import CONFIDENCE, Share, share_of
 from reports.columns import label, numbers, split_unit
 from reports.plates import plate
+from reports.populations import is_flag, members, succeeded
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.verdicts import is_flag, members, succeeded
 from reports.wording import NOTHING, percent, stated
 
 #: Columns that name what is wrong in a case and how large it is.

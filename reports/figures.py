@@ -16,6 +16,7 @@ from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import MaxNLocator
 
 from reports.columns import axis_columns, category_column, label, magnitude_label, numbers, split_unit
+from reports.populations import ENGINE_FAILURES
 from reports.statistics.plane import error_ellipse
 from reports.svg import (
     INK,
@@ -28,7 +29,6 @@ from reports.svg import (
     new_axes,
 )
 from reports.tables import answered_outcomes, outcome_counts
-from reports.verdicts import ENGINE_FAILURES
 from reports.wording import count as counted
 from reports.wording import stated
 

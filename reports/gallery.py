@@ -20,8 +20,8 @@ from reports.figures import (
     worth_a_closer_look,
 )
 from reports.plates import Plate, plate
+from reports.populations import terrain_groups
 from reports.statistics.drivers import Driver, driver
-from reports.verdicts import terrain_groups
 from reports.wording import coefficient, count, stated
 
 

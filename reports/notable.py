@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from reports.columns import numbers, primary_metric
+from reports.populations import members
 from reports.stored import StoredRun
-from reports.verdicts import members
 
 #: Cases of each kind.
 OF_A_KIND = 2

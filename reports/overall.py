@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from reports.populations import crashed_cases
 from reports.sampled import INDEPENDENT, Sampled
 from reports.statistics.clusters import ClusterMethod
-from reports.verdicts import ESTIMATE, Status, Verdict, crashed_cases
+from reports.verdicts import ESTIMATE, Status, Verdict
 from reports.wording import count
 
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from reports.columns import axis_columns, label, numbers, split_unit
 from reports.figures import ELLIPSE
+from reports.populations import terrain_groups
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.plane import circular_error, error_ellipse
-from reports.verdicts import terrain_groups
 from reports.wording import interval, number, percent, stated
 
 #: Shares of the errors within the radii, and the confidence of the radii's bounds.

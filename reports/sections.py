@@ -15,10 +15,11 @@ import pandas as pd
 from reports.algorithms import algorithms_of
 from reports.columns import axis_columns, driver_columns, label, numbers
 from reports.overall import Overall
+from reports.populations import members
 from reports.sampled import sampled
 from reports.stored import StoredRun, table
 from reports.tables import error_summaries, outcome_counts, statistics_rows
-from reports.verdicts import Verdict, members
+from reports.verdicts import Verdict
 from reports.wording import NOTHING, asked_text, count, number, percent
 
 #: Rows of the tables of single cases; the rows that are left out are counted.

@@ -14,8 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from reports.columns import axis_columns, label, numbers
+from reports.populations import ENGINE_FAILURES, is_flag, members, terrain_groups
 from reports.statistics.samples import ErrorSummary, summarize
-from reports.verdicts import ENGINE_FAILURES, Status, Verdict, is_flag, members, terrain_groups
+from reports.verdicts import Status, Verdict
 from reports.wording import NOTHING, asked_text, interval, number, percent, stated
 
 _STYLES = {

@@ -21,19 +21,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 
-from campaigns.outcomes import UNFINISHED
 from reports.bounds import Looks, bounds_of
-from reports.columns import numbers
+from reports.populations import is_flag, members, members_and_unknown, members_if_answered, succeeded, terrain_groups
 from reports.sampled import INDEPENDENT, Sampled
 from reports.statistics.clusters import ClusteredEvidence, ClusterMethod
 from reports.statistics.proportions import consumer_risk, minimum_sample_size
 from reports.statistics.sequential import LaterLook
 from reports.wording import count, percent, stated
 
-#: Outcomes of cases that the engine could not finish; the algorithm under test may be innocent of them.
-ENGINE_FAILURES = UNFINISHED
 #: Value of a requirement's `decide_by` that has the rate seen compared with the probability.
 ESTIMATE = "estimate"
 
@@ -208,69 +205,6 @@ def judge_campaign(
     return [_judge(how.drawn(frame), requirement, how) for requirement in requirements]
 
 
-def crashed_cases(frame: pd.DataFrame) -> int:
-    """How many cases the engine could not finish."""
-    return int(_engine_failed(frame).sum())
-
-
-def succeeded(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
-    """Whether |scale * metric| <= bound, or the metric is true where the bound is NaN, case by case; False where
-    missing, and of every case that the engine could not finish. A metric may be a sum of columns, joined by " + ".
-    """
-    finished = ~_engine_failed(frame)
-    if math.isnan(bound):
-        return np.asarray(_true(frame, metric) & finished, dtype=np.bool_)
-    values = sum((numbers(frame, part) for part in metric.split(" + ")), np.zeros(len(frame)))
-    return np.asarray((np.abs(scale * values) <= bound) & finished, dtype=np.bool_)
-
-
-def members(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    """Which cases belong to a population: `all`, `completed`, `valid`, a column of true and false, or several of these
-    joined by " and ".
-
-    A case whose membership is unknown, as that of a crashed case without the column, is a member.
-
-    Raises
-    ------
-    ValueError
-        Where no row has the column.
-    """
-    return _members_of(frame, population.split(" and "))[0]
-
-
-def _members_of(frame: pd.DataFrame, parts: Sequence[str]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Members of the intersection of populations, and those of them whose membership is unknown."""
-    chosen, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
-    for part in parts:
-        if part == "completed":
-            chosen &= ~_engine_failed(frame)
-        elif part != "all":
-            column = "answered" if part == "valid" else part
-            if not is_flag(frame, column):
-                raise ValueError(
-                    f"the rows have no column '{column}' of true and false, by which a population is known"
-                )
-            missing = frame[column].isna().to_numpy(dtype=np.bool_)
-            chosen &= _true(frame, column) | missing
-            unknown |= missing
-    return chosen, chosen & unknown
-
-
-def is_flag(frame: pd.DataFrame, column: str) -> bool:
-    """Whether a column holds true and false, and nothing else but gaps."""
-    return column in frame and all(isinstance(value, bool | np.bool_) for value in frame[column].dropna().unique())
-
-
-def _true(frame: pd.DataFrame, column: str) -> Bool[np.ndarray, " n"]:
-    return np.asarray(frame[column].eq(True).fillna(False).to_numpy(dtype=np.bool_))
-
-
-def _engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-    if "outcome" not in frame:
-        return np.zeros(len(frame), dtype=np.bool_)
-    return frame["outcome"].isin(ENGINE_FAILURES).to_numpy(dtype=np.bool_)
-
-
 def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) -> Verdict:
     open_verdict = _unjudged(requirement)
     fault = _fault(frame, open_verdict)
@@ -278,7 +212,7 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
         return replace(open_verdict, reason=fault)
     try:
         chosen = frame[members(frame, open_verdict.population)]
-        suspected = frame[_members_if_answered(frame, open_verdict.population)]
+        suspected = frame[members_if_answered(frame, open_verdict.population)]
     except ValueError as error:
         return replace(open_verdict, reason=_sentence(str(error)))
     if chosen.empty:
@@ -286,12 +220,6 @@ def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) ->
         reason = f"No case belongs to the population '{open_verdict.population}'."
         return replace(open_verdict, reason=reason, further_cases=needed if how.independent else None)
     return _withhold(*(_decide(open_verdict, cases, how, frame) for cases in (chosen, suspected)))
-
-
-def _members_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    """The members of a population, and the cases that would be if the engine had finished them with an answer."""
-    others = [part for part in population.split(" and ") if part not in ("valid", "completed")]
-    return np.asarray(members(frame, population) | (_members_of(frame, others)[0] & _engine_failed(frame)))
 
 
 def _withhold(verdict: Verdict, suspected: Verdict) -> Verdict:
@@ -318,7 +246,7 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, frame: pd.Data
 
 def _successes(verdict: Verdict, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"]:
     """Which members succeed: none of those whose membership is unknown."""
-    _, unknown = _members_of(chosen, verdict.population.split(" and "))
+    _, unknown = members_and_unknown(chosen, verdict.population.split(" and "))
     return np.asarray(succeeded(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
 
 
@@ -404,17 +332,6 @@ def status_of(lower: float, upper: float, probability: float) -> Status:
     if lower >= probability:
         return Status.PASS
     return Status.FAIL if upper < probability else Status.INSUFFICIENT
-
-
-def terrain_groups(chosen: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
-    """Which cases share a terrain, from 0; None where no row says. A case of unknown terrain stands alone."""
-    if "terrain" not in chosen or bool(chosen["terrain"].isna().all()):
-        return None
-    codes, known = pd.factorize(chosen["terrain"])
-    groups = np.array(codes, dtype=np.int64)
-    alone = groups < 0
-    groups[alone] = len(known) + np.arange(int(alone.sum()))
-    return groups
 
 
 def _fault(frame: pd.DataFrame, verdict: Verdict) -> str:

@@ -20,10 +20,10 @@ from matplotlib.patches import Circle
 from reports.answers import CONFIDENCE, Share, share_of
 from reports.columns import axis_columns, label, numbers, split_unit
 from reports.plates import Plate, plate
+from reports.populations import is_flag, members
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.svg import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.verdicts import is_flag, members
 from reports.wording import NOTHING, count, number, percent, stated
 
 #: Difference from the paper that is called large, percentage points.

@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from reports.answers import CONFIDENCE, share_of
 from reports.columns import numbers
 from reports.plates import plate
+from reports.populations import is_flag, members, terrain_groups
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.samples import Groups, quantile_bounds
 from reports.svg import SERIES, in_page_style, new_axes
-from reports.verdicts import is_flag, members, terrain_groups
 from reports.wording import number, percent, stated
 
 WITH, WITHOUT = "touchdown_speed_with_m_s", "touchdown_speed_without_m_s"

@@ -18,10 +18,10 @@ from scipy import stats
 
 from reports.columns import label, magnitude_label, numbers, split_unit
 from reports.plates import plate
+from reports.populations import terrain_groups
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.svg import MUTED, SERIES, in_page_style, new_axes
-from reports.verdicts import terrain_groups
 from reports.wording import number, stated
 
 #: The drivers that the paper compares: all must be there and vary for the section to be shown.

@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from reports.columns import numbers
 from reports.hda.rows import is_landing, varies
 from reports.plates import plate
+from reports.populations import terrain_groups
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.drivers import FEWEST_CASES
 from reports.statistics.drivers import driver as explained
 from reports.svg import SERIES, in_page_style
-from reports.verdicts import terrain_groups
 from reports.wording import NOTHING, coefficient, count, number, stated
 
 #: Fewest cases with a map for the section to be shown.

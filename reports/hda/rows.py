@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 from reports.answers import CONFIDENCE, Share
 from reports.columns import numbers
 from reports.dimes.sensitivity import bootstrap_weights
+from reports.populations import is_flag, terrain_groups
 from reports.section import Subject
 from reports.stored import table
-from reports.verdicts import is_flag, terrain_groups
 from reports.wording import NOTHING, percent
 
 #: Columns that every row of a landing case has.

@@ -14,12 +14,12 @@ from reports.answers import CONFIDENCE, share_of
 from reports.columns import numbers
 from reports.hda.rows import flag, interval_text, is_landing, share_text
 from reports.plates import plate
+from reports.populations import terrain_groups
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.proportions import Interval
 from reports.statistics.samples import mean_interval
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.verdicts import terrain_groups
 from reports.wording import NOTHING, number, stated
 
 #: Table II: run, position error, deviations of northing and easting (m), run time (s). Run 2 is missing there.

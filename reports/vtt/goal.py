@@ -15,11 +15,11 @@ from reports.answers import CONFIDENCE, Share, share_of
 from reports.columns import numbers
 from reports.figures import axis_edge, note_beyond
 from reports.plates import plate
+from reports.populations import terrain_groups
 from reports.section import Block, Section, Subject
 from reports.sections import Grid
 from reports.statistics.samples import quantile_bounds
 from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.verdicts import terrain_groups
 from reports.vtt.rows import flag_share, interval_text, is_closed_loop, known, selectable, share_text
 from reports.wording import NOTHING, number, stated
 

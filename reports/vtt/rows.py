@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 
 from reports.answers import Share, share_of
 from reports.columns import numbers
+from reports.populations import is_flag
 from reports.section import Subject
 from reports.stored import table
-from reports.verdicts import is_flag
 from reports.wording import NOTHING, number, percent
 
 #: Columns that every row of a tracking case has.
