@@ -17,10 +17,14 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -56,12 +60,11 @@ class Differences:
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of the state: its name, how it is read and set, and whether modules change it when they are imported."""
+    """A part of the state: its name, how it is read, and how it is set."""
 
     name: str
     read: Callable[[], Any]
     set: Callable[[Any], object]
-    imports_change_it: bool = False
 
 
 def _folder() -> str:
@@ -140,9 +143,9 @@ def _set_collection(wanted: bool) -> None:
 
 _PARTS = (
     _Part("the working folder", _folder, os.chdir),
-    _Part("environment variables", _environment, _set_environment, imports_change_it=True),
-    _Part("sys.path", lambda: list(sys.path), _set_path, imports_change_it=True),
-    _Part("the filters of warnings", lambda: list(warnings.filters), _set_filters, imports_change_it=True),
+    _Part("environment variables", _environment, _set_environment),
+    _Part("sys.path", lambda: list(sys.path), _set_path),
+    _Part("the filters of warnings", lambda: list(warnings.filters), _set_filters),
     _Part("NumPy's handling of errors (numpy.seterr)", np.geterr, lambda saved: np.seterr(**saved)),
     _Part(
         "the locale",
@@ -157,6 +160,14 @@ _PARTS = (
     _Part("OpenCV's settings (optimised code, threads)", _opencv, _set_opencv),
     _Part("the arithmetic of floating-point numbers (rounding)", _arithmetic, _set_arithmetic),
     _Part("the collection of garbage", gc.isenabled, _set_collection),
+)
+
+
+#: Parts that modules change as they are imported.
+_CHANGED_BY_IMPORTS = tuple(
+    place
+    for place, part in enumerate(_PARTS)
+    if part.name in ("environment variables", "sys.path", "the filters of warnings")
 )
 
 
@@ -181,6 +192,43 @@ def _streams() -> tuple[Any, ...]:
     return (*objects, _identity(1), _identity(2))
 
 
+class _ImportRecorder(MetaPathFinder):
+    """Lets a state see each module that is executed, other than by an import within another."""
+
+    def __init__(self, state: ProcessState) -> None:
+        self._state = state
+        self._nested = False
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Find a module by the other finders, and have it executed by the state."""
+        if self._nested:
+            return None
+        found = (
+            finder.find_spec(fullname, path, target)
+            for finder in sys.meta_path
+            if finder is not self and hasattr(finder, "find_spec")
+        )
+        spec = next((one for one in found if one is not None), None)
+        # loaders of built-in modules are classes, without an instance for each module
+        if spec is not None and spec.loader is not None and not isinstance(spec.loader, type):
+            spec.loader.exec_module = partial(self._execute, spec.loader.exec_module)  # type: ignore[method-assign]
+        return spec
+
+    def _execute(self, execute: Callable[[ModuleType], None], module: ModuleType) -> None:
+        self._nested = True
+        try:
+            self._state.execute(module, execute)
+        finally:
+            self._nested = False
+
+
+def _record_imports_for(state: ProcessState) -> None:
+    sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _ImportRecorder)]
+    sys.meta_path.insert(0, _ImportRecorder(state))
+
+
 class ProcessState:
     """The state of this process as it was at a moment, to compare with."""
 
@@ -188,27 +236,37 @@ class ProcessState:
         self._parts = [part.read() for part in _PARTS]
         self._lasting = (_signals(), _streams())
         self._threads = set(threading.enumerate())
-        self._modules = len(sys.modules)
+        _record_imports_for(self)
 
     def differences(self) -> Differences:
-        """In what the process differs now; what can be set back is.
-
-        What modules change as they are imported is taken over where a module was: it happens once in every worker.
-        """
-        imported, self._modules = len(sys.modules) != self._modules, len(sys.modules)
+        """In what the process differs now; what can be set back is."""
         restored: list[str] = []
         lasting = list(self._leftovers())
-        for place, (part, before) in enumerate(zip(_PARTS, self._parts, strict=True)):
-            now = part.read()
-            if now == before:
-                continue
-            if part.imports_change_it and imported:
-                self._parts[place] = now
+        for part, before in zip(_PARTS, self._parts, strict=True):
+            if part.read() == before:
                 continue
             with suppress(Exception):
                 part.set(before)
             (restored if part.read() == before else lasting).append(part.name)
         return Differences(tuple(restored), tuple(lasting))
+
+    def execute(self, module: ModuleType, execute: Callable[[ModuleType], None]) -> None:
+        """Execute an imported module and accept its changes to the environment, `sys.path` and warning filters.
+
+        An import happens once in a process, whichever case comes first: its changes are not the case's.
+        """
+        before = {place: _PARTS[place].read() for place in _CHANGED_BY_IMPORTS}
+        try:
+            execute(module)
+        finally:
+            for place, old in before.items():
+                new, saved = _PARTS[place].read(), self._parts[place]
+                if isinstance(saved, dict):
+                    self._parts[place] = {
+                        name: value for name, value in saved.items() if name in new or name not in old
+                    } | {name: value for name, value in new.items() if old.get(name) != value}
+                elif saved == old:
+                    self._parts[place] = new
 
     def _leftovers(self) -> list[str]:
         """What the process has too much, or cannot set back."""

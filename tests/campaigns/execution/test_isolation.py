@@ -240,6 +240,27 @@ def test_state_of_the_process_does_not_reach_the_next_case(seconds: float) -> No
     assert done[5].result[1][-2:] == run(partial(alter, 0.01), [5])[5].result[1][-2:]
 
 
+def import_and_alter(folder: Path, item: int) -> tuple[str | None, ...]:
+    """The environment as the case finds it; the first case imports a module that changes it, and changes it itself."""
+    found = (os.environ.get("SET_BY_MODULE"), os.environ.get("LEFT_BEHIND"), os.environ.get("HOME"))
+    if item == 0:
+        os.environ["LEFT_BEHIND"] = "1"
+        sys.path.append(str(folder))
+        __import__("changes_environment")
+        del os.environ["HOME"]
+    return found
+
+
+def test_a_case_that_also_imports_a_module_does_not_reach_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/somewhere")
+    (tmp_path / "changes_environment.py").write_text("import os\nos.environ['SET_BY_MODULE'] = 'yes'\n")
+    done = run(partial(import_and_alter, tmp_path), range(3))
+    assert done[0].changed == ("environment variables", "sys.path")
+    assert [done[item].result for item in (1, 2)] == [("yes", None, "/somewhere")] * 2
+
+
 def crash_where_spoiled(item: int) -> int:
     """What a case alters that nobody compares makes the next one fail."""
     if item in _kept or item == 3:
