@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from algorithms.faults import AlgorithmError, Fault
-from algorithms.interface import (
+from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.interface import (
     MastAim,
     PixelBox,
     SiteEstimate,
@@ -22,8 +22,8 @@ from algorithms.interface import (
     TrackingState,
     VelocityEstimate,
 )
-from algorithms.interface import VelocityOutcome as Outcome
-from sim.measurements import MastCalibration
+from marsyard.algorithms.interface import VelocityOutcome as Outcome
+from marsyard.sim.measurements import MastCalibration
 
 #: Share of its largest variance by which a covariance may be off symmetry.
 _ROUNDING = 1e-9

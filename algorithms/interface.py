@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
-from sim.measurements import (
+from marsyard.sim.measurements import (
     DescentFrame,
     DescentMeasurements,
     LandingMeasurements,
@@ -74,7 +74,7 @@ class VelocityEstimator(Protocol):
 class VelocityStream(Protocol):
     """Estimates horizontal velocity from any number of descent pictures, given one by one as they are taken.
 
-    `algorithms.streams.StreamedEstimator` makes it a `VelocityEstimator`.
+    `marsyard.algorithms.streams.StreamedEstimator` makes it a `VelocityEstimator`.
     """
 
     def start(self) -> None:
@@ -125,7 +125,7 @@ class MastAim:
     Attributes
     ----------
     azimuth_rad, elevation_rad
-        Mast angles to command (see `sim.measurements.MastGeometry`).
+        Mast angles to command (see `marsyard.sim.measurements.MastGeometry`).
     left, right
         The parts of the full frames to deliver; their exposure is best set for them too.
     """

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import RigidTransform
 
-from sim.measurements import DriveCommand
+from marsyard.sim.measurements import DriveCommand
 
 #: Points at which a footprint is looked up in the map: its middle and its rim.
 _RIM = np.concatenate(

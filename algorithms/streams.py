@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from algorithms.answers import checked_velocity
-from algorithms.faults import AlgorithmError, Fault
-from algorithms.interface import VelocityEstimate, VelocityStream
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.answers import checked_velocity
+from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.interface import VelocityEstimate, VelocityStream
+from marsyard.sim.measurements import DescentMeasurements
 
 #: What a stream has, in the order in which it is called.
 STREAM_METHODS = ("start", "picture", "finish")

@@ -15,9 +15,9 @@ import cv2
 from benchmarks import beside, descent, engine, estimators, hda, pictures, reporting, starting, vtt
 from benchmarks.page import PAGE, write_page
 from benchmarks.timing import Figure
-from sim.processor import processor_features
-from sim.render import process_renderer
-from sim.render.backend import default_backend
+from marsyard.sim.processor import processor_features
+from marsyard.sim.render import process_renderer
+from marsyard.sim.render.backend import default_backend
 
 RESULTS = Path(__file__).parent / "results" / "benchmarks.json"
 PACKAGES = ("marsyard", "numpy", "numba", "pyrender2", "opencv-python-headless")

@@ -22,9 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.pictures import SUN, descent_exposure, descent_pose, descent_scene, on_all_cores
 from benchmarks.timing import Figure, core_seconds
-from scenarios.descent import CameraParameters, camera_optics
-from sim.render.mesh import graded_offsets, ground_mesh
-from sim.render.rays import VIEW_SIDE_PX
+from marsyard.scenarios.descent import CameraParameters, camera_optics
+from marsyard.sim.render.mesh import graded_offsets, ground_mesh
+from marsyard.sim.render.rays import VIEW_SIDE_PX
 
 #: Side of their frames, pixels; the delivered frame's own.
 SIDE_PX = 1024

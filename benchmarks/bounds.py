@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from benchmarks.pictures import descent_scene
 from benchmarks.stages import Stages, profiled
 from benchmarks.timing import Figure, core_seconds
-from sim.render.kernels.ground import height_range
-from sim.render.kernels.strips import STRIP, Near, fetch_cells, no_cells, spline
-from sim.terrain.kernels import Array, Level
+from marsyard.sim.render.kernels.ground import height_range
+from marsyard.sim.render.kernels.strips import STRIP, Near, fetch_cells, no_cells, spline
+from marsyard.sim.terrain.kernels import Array, Level
 
 PICTURES, SIDE_PX = 3, 1024
 #: Splines that a pixel needs: where its ray meets the ground, and how bright that is.

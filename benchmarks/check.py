@@ -21,14 +21,14 @@ import cv2
 import numpy as np
 from scipy import stats
 
-from algorithms.dimes import DimesEstimator
-from algorithms.hda import ElevationMap, HdaEstimator, HdaOptions, hazard_maps
 from benchmarks import hda
 from benchmarks.engine import table_seconds
 from benchmarks.estimators import recorded
 from benchmarks.pictures import descent_exposure
 from benchmarks.vtt import seeded_update
-from sim.processor import processor_features
+from marsyard.algorithms.dimes import DimesEstimator
+from marsyard.algorithms.hda import ElevationMap, HdaEstimator, HdaOptions, hazard_maps
+from marsyard.sim.processor import processor_features
 
 RATIOS = Path(__file__).parent / "results" / "ratios.json"
 #: Pairs of a path's run and the yardstick's.

@@ -10,15 +10,15 @@ from benchmarks.bounds import bounds
 from benchmarks.pictures import descent_pose, descent_scene
 from benchmarks.stages import stages
 from benchmarks.timing import Figure, core_seconds
-from campaigns.definition.loading import load_campaign
-from scenarios.descent import (
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.scenarios.descent import (
     CameraParameters,
     camera_optics,
 )
-from sim.render import process_renderer
-from sim.render.backend import default_backend
-from sim.terrain import TerrainParameters, synthesise
-from sim.terrain.sites import sites
+from marsyard.sim.render import process_renderer
+from marsyard.sim.render.backend import default_backend
+from marsyard.sim.terrain import TerrainParameters, synthesise
+from marsyard.sim.terrain.sites import sites
 
 
 def frame(repeats: int) -> list[Figure]:

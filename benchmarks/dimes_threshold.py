@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-import algorithms.dimes.threshold as derivation
-from algorithms.dimes.options import DimesOptions
-from reports.statistics.samples import quantile_bounds
+import marsyard.algorithms.dimes.threshold as derivation
+from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.reports.statistics.samples import quantile_bounds
 
 STORED = Path(derivation.__file__).with_name("imu_threshold.json")
 #: Raised when the derivation changes in a way that its inputs do not tell.
@@ -41,7 +41,7 @@ def derived(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
         for bounds in WRONG_BY_M_S
     ]
     return {
-        "derivation": "algorithms.dimes.threshold",
+        "derivation": "marsyard.algorithms.dimes.threshold",
         "derivation_version": VERSION,
         "versions": {name: version(name) for name in ("marsyard", "numpy", "scipy")},
         "inputs": asdict(inputs),

@@ -13,15 +13,15 @@ from joblib import Parallel, delayed
 from pydantic import BaseModel, ConfigDict
 
 from benchmarks.timing import Figure
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.configuration import CampaignConfiguration, Retain
-from campaigns.definition.loading import load_campaign
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import run_campaign
-from campaigns.store.rows import RowStore, create_store
-from campaigns.store.table import write_table
-from scenarios.interface import CaseResult
-from sim.streams import Streams
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import run_campaign
+from marsyard.campaigns.store.rows import RowStore, create_store
+from marsyard.campaigns.store.table import write_table
+from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.streams import Streams
 
 #: Columns of numbers of a row in the table of a million.
 COLUMNS = 30

@@ -9,12 +9,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
-from algorithms.dimes import DimesEstimator, DimesOptions
-from algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
 from benchmarks.timing import Figure
-from campaigns.definition.loading import load_campaign
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
+from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
+from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.sim.measurements import DescentMeasurements
 
 #: By name: what is compared.
 ESTIMATORS: Mapping[str, VelocityEstimator] = {

@@ -25,16 +25,16 @@ from benchmarks.engine import BusyParameters, BusyScenario, Stopwatch
 from benchmarks.pictures import descent_pose, descent_scene
 from benchmarks.reporting import made_up, marsyard
 from benchmarks.timing import core_seconds
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.configuration import CampaignConfiguration, Retain
-from campaigns.definition.loading import load_campaign
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import run_campaign
-from scenarios.descent import CameraParameters, camera_optics
-from scenarios.interface import CaseResult
-from sim.render import PixelRays, process_renderer
-from sim.render.backend import default_backend
-from sim.streams import Streams
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import run_campaign
+from marsyard.scenarios.descent import CameraParameters, camera_optics
+from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.render import PixelRays, process_renderer
+from marsyard.sim.render.backend import default_backend
+from marsyard.sim.streams import Streams
 
 KEPT = Path(__file__).parent / "results" / "growth.json"
 FIGURE = Path(__file__).parents[1] / "docs" / "images" / "growth.svg"

@@ -9,21 +9,21 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, hazard_maps
-from algorithms.hda.baselines import SemiGlobalEstimator
-from algorithms.hda.estimator import expected_pixels, matched_structure, motion_from_tracks
-from algorithms.hda.features import select_features
-from algorithms.hda.footprints import map_resolution
-from algorithms.hda.landing import map_ground
-from algorithms.hda.scale import scale_factor
-from algorithms.hda.sighting import sighting
-from algorithms.hda.tracking import track_features
-from algorithms.hda.view import undistorted
 from benchmarks.timing import Figure, core_seconds
-from campaigns.definition.loading import load_campaign
-from sim.camera import Cahv
-from sim.frames import rigid
-from sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
+from marsyard.algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, hazard_maps
+from marsyard.algorithms.hda.baselines import SemiGlobalEstimator
+from marsyard.algorithms.hda.estimator import expected_pixels, matched_structure, motion_from_tracks
+from marsyard.algorithms.hda.features import select_features
+from marsyard.algorithms.hda.footprints import map_resolution
+from marsyard.algorithms.hda.landing import map_ground
+from marsyard.algorithms.hda.scale import scale_factor
+from marsyard.algorithms.hda.sighting import sighting
+from marsyard.algorithms.hda.tracking import track_features
+from marsyard.algorithms.hda.view import undistorted
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
 
 #: The XC-55's picture. A block of 73 px gives about the paper's 59 tracks, a grid of 20 px its 600 structure pixels.
 CAMERA = Cahv.from_focal_length(0.006, 7.4e-6, (640, 480), axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0))

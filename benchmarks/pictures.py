@@ -15,17 +15,17 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.timing import Figure, core_seconds
-from scenarios.descent import CameraParameters, DescentScenarioParameters, camera_optics, flown_descent
-from scenarios.views import Eye, SiteGround, nadir_pose, site_scene
-from sim.camera import Cahv, Cahvor
-from sim.frames import direction, rigid
-from sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture, process_renderer
-from sim.render.backend import default_backend
-from sim.sensor import Detector, DetectorParameters
-from sim.streams import Streams
-from sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
-from sim.terrain.rocks import RockField, RockParameters
-from sim.terrain.sites import site
+from marsyard.scenarios.descent import CameraParameters, DescentScenarioParameters, camera_optics, flown_descent
+from marsyard.scenarios.views import Eye, SiteGround, nadir_pose, site_scene
+from marsyard.sim.camera import Cahv, Cahvor
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture, process_renderer
+from marsyard.sim.render.backend import default_backend
+from marsyard.sim.sensor import Detector, DetectorParameters
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
+from marsyard.sim.terrain.rocks import RockField, RockParameters
+from marsyard.sim.terrain.sites import site
 
 SUN = Sun(direction(4.0, 0.7))
 

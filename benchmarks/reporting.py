@@ -20,8 +20,8 @@ import pyarrow.parquet as pq
 from playwright.sync_api import Page, expect, sync_playwright
 
 from benchmarks.timing import Figure
-from campaigns.definition.requirements import shipped_requirements
-from campaigns.store.record import SCHEMA
+from marsyard.campaigns.definition.requirements import shipped_requirements
+from marsyard.campaigns.store.record import SCHEMA
 
 #: Columns of numbers beside those that reports know by name: a row of `dimes-gusev` has 99 columns.
 FURTHER = 82

@@ -8,15 +8,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
-from algorithms.vtt.lucas_kanade import lucas_kanade_tracker
-from algorithms.vtt.matching import cut_patch, search_window
-from algorithms.vtt.options import VttOptions
-from algorithms.vtt.tracker import VisualTargetTracker
 from benchmarks.timing import Figure, core_seconds
-from scenarios.rover import RoverScenarioParameters, run_case
-from sim.measurements import RoverMeasurements, RoverTarget
-from sim.streams import Streams
+from marsyard.algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
+from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
+from marsyard.algorithms.vtt.matching import cut_patch, search_window
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.tracker import VisualTargetTracker
+from marsyard.scenarios.rover import RoverScenarioParameters, run_case
+from marsyard.sim.measurements import RoverMeasurements, RoverTarget
+from marsyard.sim.streams import Streams
 from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, navcam, pose, waves
 
 TARGET = np.array([10.0, 0.1, 0.2])

@@ -1,4 +1,5 @@
-"""Outcomes of cases that did not come to an end, or whose algorithm failed to answer (`algorithms.faults.Fault`).
+"""Outcomes of cases that did not come to an end, or whose algorithm failed to answer
+(`marsyard.algorithms.faults.Fault`).
 
 No estimate may use these names.
 """

@@ -8,10 +8,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from reports.statistics.proportions import proportion_lower
-from sim.camera import CameraModel
-from sim.render import Photometry
-from sim.sensor.presets import preset
+from marsyard.reports.statistics.proportions import proportion_lower
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.render import Photometry
+from marsyard.sim.sensor.presets import preset
 
 mpl.rcParams["svg.hashsalt"] = "marsyard"
 INCIDENCE_DEG = 30.0

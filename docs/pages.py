@@ -16,9 +16,9 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from campaigns.definition.catalogue import catalogue
-from scenarios.measured.layout import COLUMNS, IngestFile
-from scenarios.registry import scenario, scenario_names
+from marsyard.campaigns.definition.catalogue import catalogue
+from marsyard.scenarios.measured.layout import COLUMNS, IngestFile
+from marsyard.scenarios.registry import scenario, scenario_names
 
 #: Where they are written, and what each begins with.
 FOLDER = Path(__file__).parent / "reference" / "generated"
@@ -36,7 +36,7 @@ def write_pages() -> None:
 
 def command_line_page() -> str:
     """Every command with its arguments and options, by Typer itself."""
-    command = [sys.executable, "-m", "typer", "marsyard.cli", "utils", "docs", "--name", "marsyard"]
+    command = [sys.executable, "-m", "typer", "marsyard.cli.app", "utils", "docs", "--name", "marsyard"]
     written = subprocess.run(command, check=True, capture_output=True, text=True).stdout  # noqa: S603
     return "# Command line\n" + written.split("\n", 1)[1]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from marsyard.cli import main
+from marsyard.cli.app import main
 
 if __name__ == "__main__":
     main()

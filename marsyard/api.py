@@ -17,19 +17,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from campaigns.definition import catalogue as shipped
-from campaigns.definition import loading
-from campaigns.definition.campaign import Campaign as Campaign
-from scenarios.interface import CaseResult as CaseResult
-from sim.camera import CameraModel as CameraModel
-from sim.camera import read_camera as read_camera
-from sim.camera import read_cameras as read_cameras
+from marsyard.campaigns.definition import catalogue as shipped
+from marsyard.campaigns.definition import loading
+from marsyard.campaigns.definition.campaign import Campaign as Campaign
+from marsyard.scenarios.interface import CaseResult as CaseResult
+from marsyard.sim.camera import CameraModel as CameraModel
+from marsyard.sim.camera import read_camera as read_camera
+from marsyard.sim.camera import read_cameras as read_cameras
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from marsyard.render_command import Picture
-    from reports.verdicts import Verdict
+    from marsyard.cli.render import Picture
+    from marsyard.reports.verdicts import Verdict
 
 
 def catalogue() -> list[str]:
@@ -39,7 +39,7 @@ def catalogue() -> list[str]:
 
 def sites() -> dict[str, str]:
     """What each site is, by its name."""
-    from sim.terrain import sites as known
+    from marsyard.sim.terrain import sites as known
 
     return {name: one.description for name, one in known().items()}
 
@@ -67,7 +67,7 @@ def load_campaign(
 
     Raises
     ------
-    campaigns.errors.CampaignError
+    marsyard.campaigns.errors.CampaignError
         Where there is none, or something in it is wrong; the message says what, where and what is allowed.
     """
     stated = [f"{path}={_toml(value)}" for path, value in (changes or {}).items()]
@@ -99,16 +99,16 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
 
     Raises
     ------
-    campaigns.errors.CampaignError
+    marsyard.campaigns.errors.CampaignError
         Where the folder is there already, or cannot be written.
     """
     from rich.console import Console
 
-    from campaigns.execution.crew import Crew
-    from campaigns.running.engine import run_campaign as run
-    from marsyard.outcome import settle
-    from marsyard.progress import campaign_progress
-    from marsyard.run_log import RunLog
+    from marsyard.campaigns.execution.crew import Crew
+    from marsyard.campaigns.running.engine import run_campaign as run
+    from marsyard.cli.outcome import settle
+    from marsyard.cli.progress import campaign_progress
+    from marsyard.cli.run_log import RunLog
 
     folder = Path(directory)
     with campaign_progress(Console(stderr=True)) as progress, RunLog(folder, progress) as log:
@@ -119,8 +119,8 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
 
 def results(directory: str | Path) -> pd.DataFrame:
     """The rows of a campaign that was run: one for each case, with its outcome, errors and what it drew."""
-    from campaigns.store.table import refresh_table
-    from marsyard.outcome import read_frame
+    from marsyard.campaigns.store.table import refresh_table
+    from marsyard.cli.outcome import read_frame
 
     refresh_table(Path(directory))
     return read_frame(Path(directory))
@@ -128,8 +128,8 @@ def results(directory: str | Path) -> pd.DataFrame:
 
 def verdicts(directory: str | Path) -> Sequence[Verdict]:
     """The requirements of a campaign that was run, judged on its rows."""
-    from campaigns.store.table import refresh_table
-    from reports.judged import judged
+    from marsyard.campaigns.store.table import refresh_table
+    from marsyard.reports.judged import judged
 
     refresh_table(Path(directory))
     return judged(Path(directory)).verdicts
@@ -160,7 +160,7 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
     ValueError
         For a name that is not known, or a value that cannot be.
     """
-    from marsyard.render_command import Shot, take
+    from marsyard.cli.render import Shot, take
 
     return take(Shot.usual(site, camera, **shot), detector=detector)
 

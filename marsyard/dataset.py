@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.identity import configuration_hash
-from campaigns.errors import CampaignError, StoreError
-from campaigns.running.inputs import plan_inputs
-from scenarios.samples import GivesSamples, Sample
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.identity import configuration_hash
+from marsyard.campaigns.errors import CampaignError, StoreError
+from marsyard.campaigns.running.inputs import plan_inputs
+from marsyard.scenarios.samples import GivesSamples, Sample
 
 MANIFEST = "dataset.json"
 
@@ -134,7 +134,7 @@ def _npy(values: np.ndarray[Any, Any]) -> bytes:
 
 
 def _camera(sample: Sample) -> bytes:
-    from sim.camera import BODY_FRAME, write_cahvor
+    from marsyard.sim.camera import BODY_FRAME, write_cahvor
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "camera.cahvor"

@@ -33,9 +33,9 @@ from rich.text import Text
 
 from marsyard import gl_probe
 
-#: The checkout, or site-packages: the folder that all of Marsyard's packages lie in.
+#: The folder that holds the package: the checkout, or site-packages.
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports", "marsyard")
+PACKAGE = "marsyard"
 #: Distributions that import under another name than their own.
 MODULES = {"opencv-python-headless": "cv2", "pyrender2": "pyrender", "pyyaml": "yaml"}
 #: Distributions that write into the same folder as one of ours, ours first.
@@ -135,27 +135,19 @@ def check_optimisation(assertions: bool) -> Check:
 
 
 def check_shadowing() -> Iterator[Check]:
-    """Whether each of our packages is the one that Python imports, and no distribution lies over another."""
-    elsewhere = []
-    for package in PACKAGES:
-        origin = _origin(package)
-        if origin != ROOT / package:
-            elsewhere.append(f"{package} from {origin}")
-    if elsewhere:
+    """Whether Python imports this package, and no distribution is installed over another."""
+    origin = _origin(PACKAGE)
+    if origin != ROOT / PACKAGE:
         mend = "uninstall what brought it, unset PYTHONPATH, or leave the folder that holds it; then " + REINSTALL
-        yield Check("package shadowing", f"another package comes first: {'; '.join(elsewhere)}", Verdict.FAIL, mend)
+        yield Check("package shadowing", f"another package comes first: {PACKAGE} from {origin}", Verdict.FAIL, mend)
     else:
-        yield Check("package shadowing", f"{', '.join(PACKAGES)} are ours")
-    owners = importlib.metadata.packages_distributions()
-    strangers = {
-        package: others
-        for package in PACKAGES
-        if (others := sorted({canonicalize_name(owner) for owner in owners.get(package, [])} - {"marsyard"}))
-    }
-    for package, others in strangers.items():
+        yield Check("package shadowing", f"{PACKAGE} is imported from {origin}")
+    owners = importlib.metadata.packages_distributions().get(PACKAGE, [])
+    others = sorted({canonicalize_name(owner) for owner in owners} - {"marsyard"})
+    if others:
         yield Check(
             "package names",
-            f"{', '.join(others)} also installs a package named {package}",
+            f"{', '.join(others)} also installs a package named {PACKAGE}",
             Verdict.WARN,
             f"pip uninstall {' '.join(others)}, then {REINSTALL}",
         )
@@ -323,7 +315,7 @@ def _check_backend(backend: str, probe: Probe) -> Check:
 def check_numba_cache() -> Check:
     """Whether compiled kernels can be kept; where not, every process compiles them anew."""
     with contextlib.suppress(ImportError):
-        importlib.import_module("sim")  # which tells numba where, unless the user has
+        importlib.import_module("marsyard.sim")  # which tells numba where, unless the user has
     place = Path(os.environ.get("NUMBA_CACHE_DIR", Path.home() / ".cache" / "numba"))
     if _writable(place):
         return Check("numba cache", f"{place} is writable")
@@ -337,7 +329,7 @@ def check_disk() -> Iterator[Check]:
     yield _check_room("disk, this folder", Path.cwd(), "free some, or run campaigns elsewhere with --out")
     mend = "export MARSYARD_CACHE=FOLDER, one with room that you may write to"
     try:
-        from sim.cache import cache_directory
+        from marsyard.sim.cache import cache_directory
 
         cache = cache_directory("terrain")
     except (ImportError, OSError) as error:

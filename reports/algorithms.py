@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from reports.stored import table
+from marsyard.reports.stored import table
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
-from reports.columns import split_unit
-from reports.populations import is_flag, members, succeeded, terrain_groups
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.clusters import clustered_evidence
-from reports.statistics.proportions import Interval, proportion_interval
-from reports.wording import NOTHING, percent, stated
+from marsyard.reports.columns import split_unit
+from marsyard.reports.populations import is_flag, members, succeeded, terrain_groups
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.clusters import clustered_evidence
+from marsyard.reports.statistics.proportions import Interval, proportion_interval
+from marsyard.reports.wording import NOTHING, percent, stated
 
 #: Column of true and false that says whether a case's geometry leaves room for the algorithm to work at all.
 ROOM = "room"

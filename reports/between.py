@@ -1,8 +1,8 @@
 """Two stored campaigns side by side: what each shows of the same figures, and whether they differ.
 
-Where both ran the same draws (name, seed, dispersions) cases are compared in pairs (`reports.statistics.paired`).
-Otherwise terrain by terrain, or by whole terrains where they have none in common (`reports.statistics.changes`). The p
-are corrected for their number by Holm's method.
+Where both ran the same draws (name, seed, dispersions) cases are compared in pairs
+(`marsyard.reports.statistics.paired`). Otherwise terrain by terrain, or by whole terrains where they have none in
+common (`marsyard.reports.statistics.changes`). The p are corrected for their number by Holm's method.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from reports.columns import label, numbers, primary_metric
-from reports.comparison import CONFIDENCE
-from reports.populations import is_flag, members, succeeded, terrain_groups
-from reports.sampled import sampled
-from reports.sections import Grid
-from reports.statistics.changes import Sample, difference_p, holm
-from reports.statistics.paired import compared_errors, compared_successes
-from reports.stored import StoredRun, table
-from reports.wording import NOTHING, number, percent
+from marsyard.reports.columns import label, numbers, primary_metric
+from marsyard.reports.comparison import CONFIDENCE
+from marsyard.reports.populations import is_flag, members, succeeded, terrain_groups
+from marsyard.reports.sampled import sampled
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.changes import Sample, difference_p, holm
+from marsyard.reports.statistics.paired import compared_errors, compared_successes
+from marsyard.reports.stored import StoredRun, table
+from marsyard.reports.wording import NOTHING, number, percent
 
 
 @dataclass(frozen=True)

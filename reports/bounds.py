@@ -1,9 +1,10 @@
 """Bounds of a success rate that decide a requirement, at one look at a campaign or at several.
 
-Cases are counted one by one where each has a terrain of its own, and by `reports.statistics.clusters` where terrains
-are shared. At a first look both bounds have the requirement's confidence. A campaign to which cases were appended has
-been judged before: its bounds then have the confidences that keep the risk of all looks together
-(`reports.statistics.sequential.LaterLook`). One that stops itself spends a planned share of the risk at each look.
+Cases are counted one by one where each has a terrain of its own, and by `marsyard.reports.statistics.clusters` where
+terrains are shared. At a first look both bounds have the requirement's confidence. A campaign to which cases were
+appended has been judged before: its bounds then have the confidences that keep the risk of all looks together
+(`marsyard.reports.statistics.sequential.LaterLook`). One that stops itself spends a planned share of the risk at each
+look.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Int
 
-from reports.statistics.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
-from reports.statistics.proportions import further_cases_needed, proportion_lower, proportion_upper
-from reports.statistics.sequential import LaterLook, confidence_at
+from marsyard.reports.statistics.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
+from marsyard.reports.statistics.proportions import further_cases_needed, proportion_lower, proportion_upper
+from marsyard.reports.statistics.sequential import LaterLook, confidence_at
 
 Success = Bool[np.ndarray, " n"]
 Groups = Int[np.ndarray, " n"]

@@ -14,42 +14,42 @@ import numpy as np
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from reports import gallery, sections
-from reports.algorithms import algorithms_of
-from reports.answers import answers_section
-from reports.columns import label, numbers, primary_metric
-from reports.comparison import comparison_section
-from reports.conditions import conditions_section
-from reports.consistency import consistency_section
-from reports.convergence import convergence_section
-from reports.dimes.carried import carried_section
-from reports.dimes.fieldtest import field_test_section
-from reports.dimes.landing import landing_section
-from reports.dimes.sensitivity import sensitivity_section
-from reports.drivers import drivers_section
-from reports.explorer import embedded, explorer_data, script_hash
-from reports.explorer import script as explorer_script
-from reports.faults import faults_section
-from reports.hda.every import HDA_SECTIONS
-from reports.judged import Judged, judged
-from reports.measured.agreement import agreement_section
-from reports.overall import Overall
-from reports.sampled import sampled
-from reports.scatter import scatter_section
-from reports.section import Section, SectionMaker, Subject
-from reports.stored import StoredRun
-from reports.systems import shown_cases
-from reports.tables import error_summaries, outcome_counts
-from reports.traceability import evidence_of, junit_xml, verification_csv
-from reports.twin import SCHEMA
-from reports.verdicts import Verdict
-from reports.vtt.beside import beside_section
-from reports.vtt.goal import goal_section
-from reports.vtt.kinds import regression_section, terrains_section
-from reports.vtt.steps import steps_section
-from reports.vtt.table_1 import table_1_section
-from reports.vtt.updates import updates_section
-from reports.wording import number
+from marsyard.reports import gallery, sections
+from marsyard.reports.algorithms import algorithms_of
+from marsyard.reports.answers import answers_section
+from marsyard.reports.columns import label, numbers, primary_metric
+from marsyard.reports.comparison import comparison_section
+from marsyard.reports.conditions import conditions_section
+from marsyard.reports.consistency import consistency_section
+from marsyard.reports.convergence import convergence_section
+from marsyard.reports.dimes.carried import carried_section
+from marsyard.reports.dimes.fieldtest import field_test_section
+from marsyard.reports.dimes.landing import landing_section
+from marsyard.reports.dimes.sensitivity import sensitivity_section
+from marsyard.reports.drivers import drivers_section
+from marsyard.reports.explorer import embedded, explorer_data, script_hash
+from marsyard.reports.explorer import script as explorer_script
+from marsyard.reports.faults import faults_section
+from marsyard.reports.hda.every import HDA_SECTIONS
+from marsyard.reports.judged import Judged, judged
+from marsyard.reports.measured.agreement import agreement_section
+from marsyard.reports.overall import Overall
+from marsyard.reports.sampled import sampled
+from marsyard.reports.scatter import scatter_section
+from marsyard.reports.section import Section, SectionMaker, Subject
+from marsyard.reports.stored import StoredRun
+from marsyard.reports.systems import shown_cases
+from marsyard.reports.tables import error_summaries, outcome_counts
+from marsyard.reports.traceability import evidence_of, junit_xml, verification_csv
+from marsyard.reports.twin import SCHEMA
+from marsyard.reports.verdicts import Verdict
+from marsyard.reports.vtt.beside import beside_section
+from marsyard.reports.vtt.goal import goal_section
+from marsyard.reports.vtt.kinds import regression_section, terrains_section
+from marsyard.reports.vtt.steps import steps_section
+from marsyard.reports.vtt.table_1 import table_1_section
+from marsyard.reports.vtt.updates import updates_section
+from marsyard.reports.wording import number
 
 #: Sections that a page has where the rows hold their columns, in the page's order.
 FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
@@ -101,7 +101,7 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
 
     Raises
     ------
-    campaigns.errors.StoreError
+    marsyard.campaigns.errors.StoreError
         Where the folder holds no rows.
     OSError
         Where the report cannot be written.

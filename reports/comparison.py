@@ -1,9 +1,9 @@
 """Several algorithms on the same cases: what each did, and what the pairs say of the differences.
 
 Cases are paired: both algorithms had the same pictures, or the same draws. Whether one succeeds more often is told by
-the cases in which just one of them does (`reports.statistics.paired`); whose errors are smaller, by the differences of
-the cases that both answered. Where cases share terrains, whole terrains are compared. Further algorithms stand in the
-rows as `scenarios.trial` puts them.
+the cases in which just one of them does (`marsyard.reports.statistics.paired`); whose errors are smaller, by the
+differences of the cases that both answered. Where cases share terrains, whole terrains are compared. Further algorithms
+stand in the rows as `marsyard.scenarios.trial` puts them.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 import pandas as pd
 
-from reports.columns import numbers, split_unit
-from reports.populations import ENGINE_FAILURES, is_flag, succeeded, terrain_groups
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.changes import holm
-from reports.statistics.paired import compared_errors, compared_successes
-from reports.wording import NOTHING, number, percent, stated
+from marsyard.reports.columns import numbers, split_unit
+from marsyard.reports.populations import ENGINE_FAILURES, is_flag, succeeded, terrain_groups
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.changes import holm
+from marsyard.reports.statistics.paired import compared_errors, compared_successes
+from marsyard.reports.wording import NOTHING, number, percent, stated
 
 CONFIDENCE = 0.9
 

@@ -12,13 +12,13 @@ import pandas as pd
 from jaxtyping import Bool, Float
 from scipy import stats
 
-from reports.answers import CONFIDENCE, Share, share_of
-from reports.columns import axis_columns, label, numbers, split_unit
-from reports.populations import is_flag, members, terrain_groups
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.samples import quantile_bounds
-from reports.wording import number, percent, stated
+from marsyard.reports.answers import CONFIDENCE, Share, share_of
+from marsyard.reports.columns import axis_columns, label, numbers, split_unit
+from marsyard.reports.populations import is_flag, members, terrain_groups
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.samples import quantile_bounds
+from marsyard.reports.wording import number, percent, stated
 
 #: Beginnings of the columns by which errors are sorted, in the order of the page; the first column of each counts.
 CONDITIONS = (

@@ -14,12 +14,12 @@ import pandas as pd
 from jaxtyping import Float
 from scipy import stats
 
-from reports.columns import numbers
-from reports.comparison import compared_names, own_frame
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.proportions import proportion_interval
-from reports.wording import number, percent
+from marsyard.reports.columns import numbers
+from marsyard.reports.comparison import compared_names, own_frame
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.proportions import proportion_interval
+from marsyard.reports.wording import number, percent
 
 #: The column, and the parts that the error behind it has.
 NEES, PARTS = "velocity_nees", 2

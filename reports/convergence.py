@@ -11,14 +11,14 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from reports.columns import magnitude_label, numbers
-from reports.plates import plate
-from reports.populations import terrain_groups
-from reports.sampled import sampled
-from reports.section import Block, Section, Subject
-from reports.statistics.samples import mean_interval, quantile_bounds
-from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.verdicts import judge_campaign
+from marsyard.reports.columns import magnitude_label, numbers
+from marsyard.reports.plates import plate
+from marsyard.reports.populations import terrain_groups
+from marsyard.reports.sampled import sampled
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
+from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
+from marsyard.reports.verdicts import judge_campaign
 
 #: Up to this ratio of the most cases to the fewest an axis has ticks within its decades too.
 _FEW_DECADES = 50

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from reports.sampled import Sampled
-from reports.statistics.proportions import proportion_lower, proportion_upper
-from reports.statistics.sequential import confidence_at, looks_of
-from reports.verdicts import ESTIMATE, Status, Verdict
+from marsyard.reports.sampled import Sampled
+from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.sequential import confidence_at, looks_of
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 
 
 def next_look(verdicts: Sequence[Verdict], how: Sampled, cases: int) -> int | None:

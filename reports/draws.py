@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from reports.columns import rank_correlation, split_unit
-from reports.svg import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RASTER_DPI, SERIES, in_page_style
-from reports.wording import count
+from marsyard.reports.columns import rank_correlation, split_unit
+from marsyard.reports.svg import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RASTER_DPI, SERIES, in_page_style
+from marsyard.reports.wording import count
 
 #: Size of a marginal, and of a heading, and the figure's margin, inches; how many a row holds if there are that many.
 _WIDTH, _HEIGHT, _HEAD, _MARGIN, _FEWEST_IN_ROW = 3.0, 1.9, 0.45, 0.15, 4

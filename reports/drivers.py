@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from reports.columns import driver_columns, label, numbers
-from reports.populations import succeeded, terrain_groups
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.changes import holm
-from reports.statistics.drivers import Driver, driver
-from reports.wording import coefficient, percent, stated
+from marsyard.reports.columns import driver_columns, label, numbers
+from marsyard.reports.populations import succeeded, terrain_groups
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.changes import holm
+from marsyard.reports.statistics.drivers import Driver, driver
+from marsyard.reports.wording import coefficient, percent, stated
 
 CONFIDENCE = 0.9
 #: Conditions that are ranked, and cases that are looked at: the first ones, which tell as much as they need to.

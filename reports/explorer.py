@@ -15,10 +15,10 @@ import pandas as pd
 from jaxtyping import Int
 from markupsafe import Markup
 
-from reports.columns import axis_columns, driver_columns, label, numbers
-from reports.populations import ENGINE_FAILURES
-from reports.sections import replay_command
-from reports.stored import StoredRun
+from marsyard.reports.columns import axis_columns, driver_columns, label, numbers
+from marsyard.reports.populations import ENGINE_FAILURES
+from marsyard.reports.sections import replay_command
+from marsyard.reports.stored import StoredRun
 
 #: Most points, and how many of the worst, of those without an answer and of the crashed are among them in any event.
 MOST_POINTS, MOST_NOTABLE = 2000, 150

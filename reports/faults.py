@@ -8,14 +8,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from reports.answers import CONFIDENCE, Share, share_of
-from reports.columns import label, numbers, split_unit
-from reports.plates import plate
-from reports.populations import is_flag, members, succeeded
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.wording import NOTHING, percent, stated
+from marsyard.reports.answers import CONFIDENCE, Share, share_of
+from marsyard.reports.columns import label, numbers, split_unit
+from marsyard.reports.plates import plate
+from marsyard.reports.populations import is_flag, members, succeeded
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
+from marsyard.reports.wording import NOTHING, percent, stated
 
 #: Columns that name what is wrong in a case and how large it is.
 FAULT, SIZE = "fault", "fault_size"

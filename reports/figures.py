@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import MaxNLocator
 
-from reports.columns import axis_columns, category_column, label, magnitude_label, numbers, split_unit
-from reports.populations import ENGINE_FAILURES
-from reports.statistics.plane import error_ellipse
-from reports.svg import (
+from marsyard.reports.columns import axis_columns, category_column, label, magnitude_label, numbers, split_unit
+from marsyard.reports.populations import ENGINE_FAILURES
+from marsyard.reports.statistics.plane import error_ellipse
+from marsyard.reports.svg import (
     INK,
     LARGEST_VECTOR_SAMPLE,
     MARKERS,
@@ -28,9 +28,9 @@ from reports.svg import (
     in_page_style,
     new_axes,
 )
-from reports.tables import answered_outcomes, outcome_counts
-from reports.wording import count as counted
-from reports.wording import stated
+from marsyard.reports.tables import answered_outcomes, outcome_counts
+from marsyard.reports.wording import count as counted
+from marsyard.reports.wording import stated
 
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95

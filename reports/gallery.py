@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from reports.columns import driver_columns, label, numbers
-from reports.drivers import CONFIDENCE
-from reports.figures import (
+from marsyard.reports.columns import driver_columns, label, numbers
+from marsyard.reports.drivers import CONFIDENCE
+from marsyard.reports.figures import (
     beyond_the_axis,
     error_against,
     error_distribution,
@@ -19,10 +19,10 @@ from reports.figures import (
     outcome_bars,
     worth_a_closer_look,
 )
-from reports.plates import Plate, plate
-from reports.populations import terrain_groups
-from reports.statistics.drivers import Driver, driver
-from reports.wording import coefficient, count, stated
+from marsyard.reports.plates import Plate, plate
+from marsyard.reports.populations import terrain_groups
+from marsyard.reports.statistics.drivers import Driver, driver
+from marsyard.reports.wording import coefficient, count, stated
 
 
 def error_plates(frame: pd.DataFrame, whole: pd.DataFrame, metric: str, bound: float | None) -> list[Plate]:

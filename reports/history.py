@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from campaigns.errors import StoreError
-from reports.statistics.changes import Sample
+from marsyard.campaigns.errors import StoreError
+from marsyard.reports.statistics.changes import Sample
 
 #: Version of the tables, as `PRAGMA user_version`.
 SCHEMA = 1

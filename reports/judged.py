@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reports.overall import Overall, exit_code, overall
-from reports.sampled import Sampled, sampled
-from reports.stored import StoredRun, read_run
-from reports.verdicts import Verdict, judge_campaign
+from marsyard.reports.overall import Overall, exit_code, overall
+from marsyard.reports.sampled import Sampled, sampled
+from marsyard.reports.stored import StoredRun, read_run
+from marsyard.reports.verdicts import Verdict, judge_campaign
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ def judged(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
 
     Raises
     ------
-    campaigns.errors.StoreError
+    marsyard.campaigns.errors.StoreError
         Where the folder holds no rows.
     """
     run = read_run(directory, requirements)

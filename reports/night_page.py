@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from reports.history import FINISHED, Night, NightCampaign
-from reports.regressions import FALSE_ALARMS, Change
-from reports.wording import count, number, percent, stated
+from marsyard.reports.history import FINISHED, Night, NightCampaign
+from marsyard.reports.regressions import FALSE_ALARMS, Change
+from marsyard.reports.wording import count, number, percent, stated
 
 
 def night_text(

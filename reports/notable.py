@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from reports.columns import numbers, primary_metric
-from reports.populations import members
-from reports.stored import StoredRun
+from marsyard.reports.columns import numbers, primary_metric
+from marsyard.reports.populations import members
+from marsyard.reports.stored import StoredRun
 
 #: Cases of each kind.
 OF_A_KIND = 2

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from reports.populations import crashed_cases
-from reports.sampled import INDEPENDENT, Sampled
-from reports.statistics.clusters import ClusterMethod
-from reports.verdicts import ESTIMATE, Status, Verdict
-from reports.wording import count
+from marsyard.reports.populations import crashed_cases
+from marsyard.reports.sampled import INDEPENDENT, Sampled
+from marsyard.reports.statistics.clusters import ClusterMethod
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
+from marsyard.reports.wording import count
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from reports.svg import INK, in_page_style
+from marsyard.reports.svg import INK, in_page_style
 
 #: Width of a row of pictures, and height of its titles, inches.
 _ROW_IN = (12.0, 0.35)

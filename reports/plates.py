@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from reports.svg import svg_markup
+from marsyard.reports.svg import svg_markup
 
 
 @dataclass(frozen=True)

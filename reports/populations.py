@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Int
 
-from campaigns.outcomes import UNFINISHED
-from reports.columns import numbers
+from marsyard.campaigns.outcomes import UNFINISHED
+from marsyard.reports.columns import numbers
 
 #: Outcomes of cases that the engine could not finish; the algorithm under test may be innocent of them.
 ENGINE_FAILURES = UNFINISHED

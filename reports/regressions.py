@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reports.history import History, NightFigure
-from reports.statistics.changes import Sample, difference_p, holm
+from marsyard.reports.history import History, NightFigure
+from marsyard.reports.statistics.changes import Sample, difference_p, holm
 
 #: The chance that a night in which nothing changed reports any change at all, at most.
 FALSE_ALARMS = 0.01

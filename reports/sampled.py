@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
-from campaigns.sampling.design import said_of
-from reports.statistics.sequential import looks_of, spent_share
-from reports.stored import table
-from reports.wording import count, stated
+from marsyard.campaigns.sampling.design import said_of
+from marsyard.reports.statistics.sequential import looks_of, spent_share
+from marsyard.reports.stored import table
+from marsyard.reports.wording import count, stated
 
 #: The design of cases that are drawn independently.
 RANDOM = "random"

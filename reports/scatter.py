@@ -6,13 +6,13 @@ from dataclasses import asdict
 
 import numpy as np
 
-from reports.columns import axis_columns, label, numbers, split_unit
-from reports.figures import ELLIPSE
-from reports.populations import terrain_groups
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.plane import circular_error, error_ellipse
-from reports.wording import interval, number, percent, stated
+from marsyard.reports.columns import axis_columns, label, numbers, split_unit
+from marsyard.reports.figures import ELLIPSE
+from marsyard.reports.populations import terrain_groups
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.plane import circular_error, error_ellipse
+from marsyard.reports.wording import interval, number, percent, stated
 
 #: Shares of the errors within the radii, and the confidence of the radii's bounds.
 SHARES, CONFIDENCE = (0.5, 0.95, 0.99), 0.9

@@ -1,7 +1,8 @@
 """What further sections of a report are made of, and what makes them.
 
 A section has a module of its own with a function that takes a `Subject` and returns the `Section`, or None where the
-rows hold none of its columns. `reports.campaign.FURTHER_SECTIONS` lists these functions in the order of the page.
+rows hold none of its columns. `marsyard.reports.campaign.FURTHER_SECTIONS` lists these functions in the order of the
+page.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from typing import Any
 
 import pandas as pd
 
-from reports.plates import Plate
-from reports.sections import Grid
-from reports.stored import StoredRun
+from marsyard.reports.plates import Plate
+from marsyard.reports.sections import Grid
+from marsyard.reports.stored import StoredRun
 
 
 @dataclass(frozen=True)

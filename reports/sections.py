@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from reports.algorithms import algorithms_of
-from reports.columns import axis_columns, driver_columns, label, numbers
-from reports.overall import Overall
-from reports.populations import members
-from reports.sampled import sampled
-from reports.stored import StoredRun, table
-from reports.tables import error_summaries, outcome_counts, statistics_rows
-from reports.verdicts import Verdict
-from reports.wording import NOTHING, asked_text, count, number, percent
+from marsyard.reports.algorithms import algorithms_of
+from marsyard.reports.columns import axis_columns, driver_columns, label, numbers
+from marsyard.reports.overall import Overall
+from marsyard.reports.populations import members
+from marsyard.reports.sampled import sampled
+from marsyard.reports.stored import StoredRun, table
+from marsyard.reports.tables import error_summaries, outcome_counts, statistics_rows
+from marsyard.reports.verdicts import Verdict
+from marsyard.reports.wording import NOTHING, asked_text, count, number, percent
 
 #: Rows of the tables of single cases; the rows that are left out are counted.
 _MOST_CASES = 10

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reports.plates import Plate
+from marsyard.reports.plates import Plate
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from typing import Any
 
 import pandas as pd
 
-from campaigns.errors import StoreError
-from campaigns.store.products import load_products
-from reports.columns import axis_columns, driver_columns, primary_metric
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.products import load_products
+from marsyard.reports.columns import axis_columns, driver_columns, primary_metric
 
 #: Up to so many cases all columns of all are read; of more, all columns of the first so many.
 LARGEST_WHOLE, FIRST_CASES = 50_000, 20_000

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from reports.columns import numbers, primary_metric
-from reports.dimes.shown import DIMES
-from reports.dimes.stream import STREAM
-from reports.hda.shown import HDA
-from reports.measured.shown import MEASURED
-from reports.shown import CaseView, System
-from reports.stored import StoredRun
-from reports.vtt.shown import VTT
-from reports.wording import NOTHING
+from marsyard.reports.columns import numbers, primary_metric
+from marsyard.reports.dimes.shown import DIMES
+from marsyard.reports.dimes.stream import STREAM
+from marsyard.reports.hda.shown import HDA
+from marsyard.reports.measured.shown import MEASURED
+from marsyard.reports.shown import CaseView, System
+from marsyard.reports.stored import StoredRun
+from marsyard.reports.vtt.shown import VTT
+from marsyard.reports.wording import NOTHING
 
 #: Those whose products are looked for in a case, in this order.
 SYSTEMS: tuple[System, ...] = (MEASURED, STREAM, DIMES, VTT, HDA)

@@ -13,11 +13,11 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from reports.columns import axis_columns, label, numbers
-from reports.populations import ENGINE_FAILURES, is_flag, members, terrain_groups
-from reports.statistics.samples import ErrorSummary, summarize
-from reports.verdicts import Status, Verdict
-from reports.wording import NOTHING, asked_text, interval, number, percent, stated
+from marsyard.reports.columns import axis_columns, label, numbers
+from marsyard.reports.populations import ENGINE_FAILURES, is_flag, members, terrain_groups
+from marsyard.reports.statistics.samples import ErrorSummary, summarize
+from marsyard.reports.verdicts import Status, Verdict
+from marsyard.reports.wording import NOTHING, asked_text, interval, number, percent, stated
 
 _STYLES = {
     Status.PASS: "bold green",

@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree as Xml
 
-from reports.algorithms import Algorithm, judged_text
-from reports.overall import Overall
-from reports.verdicts import Status, Verdict
-from reports.wording import count
+from marsyard.reports.algorithms import Algorithm, judged_text
+from marsyard.reports.overall import Overall
+from marsyard.reports.verdicts import Status, Verdict
+from marsyard.reports.wording import count
 
 #: Columns of the matrix; one row for each requirement and campaign.
 COLUMNS = (

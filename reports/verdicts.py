@@ -4,11 +4,11 @@ A requirement asks that `metric <= bound` (in magnitude), or a column of true an
 a population of cases, at a stated confidence. Its status follows from one-sided Clopper-Pearson bounds of the success
 rate. A requirement that is decided by the estimate and whose rate reaches the fraction, but not at the confidence, is
 MET BY RATE. Where cases share terrains they are not independent: the bounds then are those that hold nevertheless
-(`reports.statistics.clusters`), and the verdict says what independent cases would have shown. Where a campaign is
-judged more than once (cases were appended, or it stops itself when it is decided) the bounds keep the risk of all looks
-together (`reports.bounds`). Where cases are no random draws at all (Latin hypercube, Sobol, grids) there are no bounds
-and no confidence: only a requirement that is decided by the estimate is then decided, by the rate of these very cases,
-and the verdict says so.
+(`marsyard.reports.statistics.clusters`), and the verdict says what independent cases would have shown. Where a campaign
+is judged more than once (cases were appended, or it stops itself when it is decided) the bounds keep the risk of all
+looks together (`marsyard.reports.bounds`). Where cases are no random draws at all (Latin hypercube, Sobol, grids) there
+are no bounds and no confidence: only a requirement that is decided by the estimate is then decided, by the rate of
+these very cases, and the verdict says so.
 """
 
 from __future__ import annotations
@@ -23,13 +23,20 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
-from reports.bounds import Looks, bounds_of
-from reports.populations import is_flag, members, members_and_unknown, members_if_answered, succeeded, terrain_groups
-from reports.sampled import INDEPENDENT, Sampled
-from reports.statistics.clusters import ClusteredEvidence, ClusterMethod
-from reports.statistics.proportions import consumer_risk, minimum_sample_size
-from reports.statistics.sequential import LaterLook
-from reports.wording import count, percent, stated
+from marsyard.reports.bounds import Looks, bounds_of
+from marsyard.reports.populations import (
+    is_flag,
+    members,
+    members_and_unknown,
+    members_if_answered,
+    succeeded,
+    terrain_groups,
+)
+from marsyard.reports.sampled import INDEPENDENT, Sampled
+from marsyard.reports.statistics.clusters import ClusteredEvidence, ClusterMethod
+from marsyard.reports.statistics.proportions import consumer_risk, minimum_sample_size
+from marsyard.reports.statistics.sequential import LaterLook
+from marsyard.reports.wording import count, percent, stated
 
 #: Value of a requirement's `decide_by` that has the rate seen compared with the probability.
 ESTIMATE = "estimate"

@@ -6,8 +6,8 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from algorithms.exchange import ExecutableLimits
-from scenarios.estimators import Task, check_chosen
+from marsyard.algorithms.exchange import ExecutableLimits
+from marsyard.scenarios.estimators import Task, check_chosen
 
 
 class ChosenAlgorithms(BaseModel):

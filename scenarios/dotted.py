@@ -9,6 +9,23 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+#: Packages that were imported under their own names before they became parts of `marsyard`.
+_FORMER = ("sim", "algorithms", "scenarios", "campaigns", "reports")
+
+
+def current_module(module: str) -> str:
+    """The name under which a module is imported, also where a stored campaign or an older file has its former name.
+
+    ``algorithms.dimes`` is ``marsyard.algorithms.dimes``; names that Marsyard does not have stay as they are.
+    """
+    if module.partition(".")[0] not in _FORMER:
+        return module
+    try:
+        known = importlib.util.find_spec(f"marsyard.{module}") is not None
+    except ImportError:
+        known = False
+    return f"marsyard.{module}" if known else module
+
 
 def found_at(path: str) -> Any:
     """What stands at ``module:name``.
@@ -25,7 +42,7 @@ def found_at(path: str) -> Any:
     if here not in sys.path:
         sys.path.append(here)
     try:
-        return getattr(importlib.import_module(module), name)
+        return getattr(importlib.import_module(current_module(module)), name)
     except ImportError:
         raise
     except Exception as error:  # a module may raise anything
@@ -34,7 +51,8 @@ def found_at(path: str) -> Any:
 
 def sources_at(path: str) -> Iterator[tuple[str, Path]]:
     """The sources of the package, or the module, that ``module:name`` lies in: their names and files."""
-    top = path.partition(":")[0].partition(".")[0]
+    parts = current_module(path.partition(":")[0]).split(".")
+    top = ".".join(parts[:2] if parts[0] == "marsyard" else parts[:1])
     found = importlib.util.find_spec(top)
     if found is None or found.origin is None:
         return

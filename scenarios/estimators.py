@@ -8,7 +8,7 @@ An algorithm is named by
   module may lie in the current folder;
 - ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: a program of its own (docs/own-algorithms.md);
   ``exec-stream:`` or ``serve-stream:`` one that takes pictures one by one;
-- ``answers:FILE.csv``: one that was run elsewhere (`scenarios.offline`).
+- ``answers:FILE.csv``: one that was run elsewhere (`marsyard.scenarios.offline`).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
-from algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
-from algorithms.dimes import DimesEstimator, DimesOptions
-from algorithms.exchange import (
+from marsyard.algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
+from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
+from marsyard.algorithms.exchange import (
     PREFIXES,
     Command,
     ExecutableLimits,
@@ -34,13 +34,13 @@ from algorithms.exchange import (
     ExecutableVelocityStream,
     command_of,
 )
-from algorithms.hda import HdaEstimator, HdaOptions
-from algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
-from algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
-from algorithms.streams import STREAM_METHODS, StreamedEstimator
-from algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
-from scenarios.dotted import found_at, sources_at
-from scenarios.offline import SITE_FORM, VELOCITY_FORM, OfflineForm, check_offline, is_offline, made_offline
+from marsyard.algorithms.hda import HdaEstimator, HdaOptions
+from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
+from marsyard.algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
+from marsyard.algorithms.streams import STREAM_METHODS, StreamedEstimator
+from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
+from marsyard.scenarios.dotted import found_at, sources_at
+from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, OfflineForm, check_offline, is_offline, made_offline
 
 #: Entry points of other packages' algorithms.
 GROUP = "marsyard.algorithms"

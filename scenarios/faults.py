@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.sensor import DetectorParameters
+from marsyard.sim.sensor import DetectorParameters
 
 Size = Annotated[float, Field(ge=0.0)]
 

@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.faults import AlgorithmError, Fault
 
 Given = TypeVar("Given")
 

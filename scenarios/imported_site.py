@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from scenarios.terrain_files import check_source
-from sim.terrain import Site, TerrainParameters, site
-from sim.terrain.embedding import grid_for
-from sim.terrain.imported import RealTerrain
+from marsyard.scenarios.terrain_files import check_source
+from marsyard.sim.terrain import Site, TerrainParameters, site
+from marsyard.sim.terrain.embedding import grid_for
+from marsyard.sim.terrain.imported import RealTerrain
 
 #: Endings of terrain models.
 ENDINGS = (".npz", ".tif", ".tiff")

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from pydantic import BaseModel
 
-from sim.streams import Streams
+from marsyard.sim.streams import Streams
 
 if TYPE_CHECKING:
-    from scenarios.estimators import Task
-    from scenarios.parts.named import Kind
+    from marsyard.scenarios.estimators import Task
+    from marsyard.scenarios.parts.named import Kind
 
 #: A value that can stand in a column of the results.
 Scalar = float | int | str | bool
@@ -56,7 +56,7 @@ class Failure:
     Attributes
     ----------
     outcome
-        A name of `algorithms.faults.Fault`.
+        A name of `marsyard.algorithms.faults.Fault`.
     error, trace
         What is stored as `error` and `traceback`.
     """
@@ -155,7 +155,7 @@ class TakesAlgorithms(Protocol):
 
 @runtime_checkable
 class TakesParts(Protocol):
-    """A scenario whose cases can be made of a user's own parts (`scenarios.parts`)."""
+    """A scenario whose cases can be made of a user's own parts (`marsyard.scenarios.parts`)."""
 
     @property
     def part_keys(self) -> Mapping[str, Kind]:

@@ -20,10 +20,10 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from scenarios.own_files import OwnFile
-from sim.files import ARCHIVE_ERRORS, check_regular, expanded_bytes
-from sim.render import Objects
-from sim.terrain import Surface
+from marsyard.scenarios.own_files import OwnFile
+from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, expanded_bytes
+from marsyard.sim.render import Objects
+from marsyard.sim.terrain import Surface
 
 #: Largest file, and most triangles, that are read.
 MOST_BYTES, MOST_FACES = 1 << 28, 1_000_000

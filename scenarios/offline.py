@@ -18,14 +18,14 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from algorithms.answers import checked_site, checked_velocity
-from algorithms.exchange import write_case
-from algorithms.faults import AlgorithmError, Fault
-from algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
-from scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems
-from scenarios.own_files import listed
-from sim.files import check_regular
-from sim.measurements import DescentMeasurements, LandingMeasurements
+from marsyard.algorithms.answers import checked_site, checked_velocity
+from marsyard.algorithms.exchange import write_case
+from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
+from marsyard.scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems
+from marsyard.scenarios.own_files import listed
+from marsyard.sim.files import check_regular
+from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements
 
 EXPORT, ANSWERS = "export:", "answers:"
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float32
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
-from sim.render import PixelRays
-from sim.sensor import natural_fall_off
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from marsyard.sim.render import PixelRays
+from marsyard.sim.sensor import natural_fall_off
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from sim.frames import SITE_FROM_WORLD
+from marsyard.sim.frames import SITE_FROM_WORLD
 
 #: Rotations from a file's world axes to ours, which are east, north, up.
 _WORLD = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}

@@ -8,10 +8,10 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import UInt16
 
-from scenarios.interface import Scalar
-from sim.processor import processor_features
-from sim.render import process_renderer
-from sim.render.backend import Backend
+from marsyard.scenarios.interface import Scalar
+from marsyard.sim.processor import processor_features
+from marsyard.sim.render import process_renderer
+from marsyard.sim.render.backend import Backend
 
 
 def rendered(backend: Backend, pictures: Iterable[UInt16[np.ndarray, "rows columns"]]) -> dict[str, Scalar]:

@@ -6,19 +6,19 @@ import difflib
 from collections.abc import Mapping
 from typing import cast
 
-from scenarios.dotted import found_at
-from scenarios.interface import Scenario
+from marsyard.scenarios.dotted import found_at
+from marsyard.scenarios.interface import Scenario
 
 #: Where each scenario's class is found; imported only when asked for.
 SCENARIOS: Mapping[str, str] = {
-    "descent": "scenarios.descent:DescentScenario",
-    "fieldtest": "scenarios.fieldtest:FieldTestScenario",
-    "rover": "scenarios.rover:RoverScenario",
-    "rover-drive": "scenarios.rover:SharedDriveScenario",
-    "landing": "scenarios.landing:LandingScenario",
-    "measured-velocity": "scenarios.measured.descent:MeasuredVelocityScenario",
-    "measured-landing": "scenarios.measured.landing:MeasuredLandingScenario",
-    "measured-matching": "scenarios.measured.matching:MatchingScenario",
+    "descent": "marsyard.scenarios.descent:DescentScenario",
+    "fieldtest": "marsyard.scenarios.fieldtest:FieldTestScenario",
+    "rover": "marsyard.scenarios.rover:RoverScenario",
+    "rover-drive": "marsyard.scenarios.rover:SharedDriveScenario",
+    "landing": "marsyard.scenarios.landing:LandingScenario",
+    "measured-velocity": "marsyard.scenarios.measured.descent:MeasuredVelocityScenario",
+    "measured-landing": "marsyard.scenarios.measured.landing:MeasuredLandingScenario",
+    "measured-matching": "marsyard.scenarios.measured.matching:MatchingScenario",
 }
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 from pydantic import BaseModel
 
-from sim.camera import CameraModel
-from sim.streams import Streams
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.streams import Streams
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Own terrain looked at before it is used: a file that cannot be meant is refused by its header, at once.
 
-`sim.terrain` reads what passes here. A GeoTIFF must state a projection in metres (or another length, by which it is
-scaled) that keeps lengths, square cells with grid north up, a value that means no data where it has any, and heights in
-metres. An .npz archive is checked in the same way, from its headers before anything is expanded.
+`marsyard.sim.terrain` reads what passes here. A GeoTIFF must state a projection in metres (or another length, by which
+it is scaled) that keeps lengths, square cells with grid north up, a value that means no data where it has any, and
+heights in metres. An .npz archive is checked in the same way, from its headers before anything is expanded.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from scenarios.map_projection import map_scale
-from sim.files import ARCHIVE_ERRORS, ArrayHeader, check_regular, npz_headers
-from sim.terrain import TerrainParameters
-from sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, read_rasters
+from marsyard.scenarios.map_projection import map_scale
+from marsyard.sim.files import ARCHIVE_ERRORS, ArrayHeader, check_regular, npz_headers
+from marsyard.sim.terrain import TerrainParameters
+from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, read_rasters
 
 #: Most posts of a DTM and pixels of a picture along a side: what the largest terrain holds, and what memory does.
 MOST_POSTS, MOST_PIXELS = 5461, 8192

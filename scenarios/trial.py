@@ -13,11 +13,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-from algorithms.exchange import ProgramDetails
-from algorithms.faults import AlgorithmError, Fault, describe_error
-from scenarios.estimators import labels
-from scenarios.handover import Given, Handover
-from scenarios.interface import CaseResult, Failure, Scalar, record_conditions
+from marsyard.algorithms.exchange import ProgramDetails
+from marsyard.algorithms.faults import AlgorithmError, Fault, describe_error
+from marsyard.scenarios.estimators import labels
+from marsyard.scenarios.handover import Given, Handover
+from marsyard.scenarios.interface import CaseResult, Failure, Scalar, record_conditions
 
 Answer = TypeVar("Answer")
 

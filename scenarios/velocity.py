@@ -7,15 +7,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from algorithms.dimes import DimesDetails, dimes_products
-from algorithms.faults import AlgorithmError, Fault
-from algorithms.interface import VelocityEstimate, VelocityEstimator
-from algorithms.streams import StreamedEstimator, spanned
-from scenarios.handover import Handover
-from scenarios.interface import Scalar
-from scenarios.offline import Answered, Recorder
-from scenarios.trial import Attempt, attempted
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.dimes import DimesDetails, dimes_products
+from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator
+from marsyard.algorithms.streams import StreamedEstimator, spanned
+from marsyard.scenarios.handover import Handover
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.offline import Answered, Recorder
+from marsyard.scenarios.trial import Attempt, attempted
+from marsyard.sim.measurements import DescentMeasurements
 
 Horizontal = Float64[np.ndarray, "2"]
 #: Begin and end, as time tags, of what a velocity is the mean of; equal for that of an instant.

@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.frames import rigid
-from sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
-from sim.sensor import CameraDesign
-from sim.terrain import Environment, RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
-from sim.terrain.rocks.shapes import FINEST, pixels_held, rock_shapes
-from sim.terrain.sites import SiteTexture
+from marsyard.sim.frames import rigid
+from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
+from marsyard.sim.sensor import CameraDesign
+from marsyard.sim.terrain import Environment, RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
+from marsyard.sim.terrain.rocks.shapes import FINEST, pixels_held, rock_shapes
+from marsyard.sim.terrain.sites import SiteTexture
 
 Scale = Literal["descent", "ground"]
 
@@ -177,8 +177,9 @@ def rocks_in_sight(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> 
     """The rocks that the eye can tell apart, and those near it whose shadows it may see; bodies carry rocks' numbers.
 
     Where rocks of `SMALLEST_ROCK_PX` would come to more than about `ROCK_TRIANGLES`, only larger ones are taken. Rocks
-    are drawn so finely that they cannot be told from their finest shape (`sim.terrain.rocks.shapes.DEVIATION_PX`),
-    except where that takes more than `DETAIL_TRIANGLES`, as fine pixels over fields of clinker do.
+    are drawn so finely that they cannot be told from their finest shape
+    (`marsyard.sim.terrain.rocks.shapes.DEVIATION_PX`), except where that takes more than `DETAIL_TRIANGLES`, as fine
+    pixels over fields of clinker do.
     """
     field = ground.rocks
     if field is None or len(field) == 0:
@@ -252,8 +253,8 @@ class Stance:
     elevation_deg: float
 
 
-#: Usual stances of the cameras of `sim.sensor.PRESETS`: the first picture of a descent, masts of 1.5 m, MER's hazcams
-#: 0.53 m above the ground (Maki et al. 2003), a helicopter at 10 m.
+#: Usual stances of the cameras of `marsyard.sim.sensor.PRESETS`: the first picture of a descent, masts of 1.5 m, MER's
+#: hazcams 0.53 m above the ground (Maki et al. 2003), a helicopter at 10 m.
 STANCES: Mapping[str, Stance] = MappingProxyType(
     {
         "mer-descent-flown": Stance("descent", 2000.0, -90.0),

@@ -13,8 +13,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from sim.cache import cache_directory
-from sim.processor import processor_features
+from marsyard.sim.cache import cache_directory
+from marsyard.sim.processor import processor_features
 
 #: The folders that hold kernels, side by side in the tree and where they are installed.
 _FOLDERS = ("sim", "algorithms", "scenarios")

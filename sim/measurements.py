@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.camera import CameraModel
-from sim.frames import rigid_from_axes
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import rigid_from_axes
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ class DetectorImage:
 class AttitudeMeasurement:
     """Attitude as propagated on board.
 
-    `world_from_body` rotates body axes into the local level world frame (see `sim.frames`); `time_s` is its time tag.
+    `world_from_body` rotates body axes into the local level world frame (see `marsyard.sim.frames`); `time_s` is its
+    time tag.
     """
 
     world_from_body: Rotation

@@ -42,7 +42,14 @@ hypothesis.settings.register_profile("marsyard", deadline=None, derandomize="CI"
 hypothesis.settings.load_profile("marsyard")
 
 #: Packages whose signatures (array shapes, units' types) are checked at run time while the tests run.
-CHECKED_PACKAGES = ["sim.camera", "sim.dynamics", "sim.frames", "sim.measurements", "algorithms", "reports"]
+CHECKED_PACKAGES = [
+    "marsyard.sim.camera",
+    "marsyard.sim.dynamics",
+    "marsyard.sim.frames",
+    "marsyard.sim.measurements",
+    "marsyard.algorithms",
+    "marsyard.reports",
+]
 
 
 class _KernelsAreLeftAlone(MetaPathFinder):

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from algorithms.baselines.pairs import COMMON, CommonOptions, PairMatch, PairPatches, estimate_by_pairs
-from algorithms.interface import VelocityEstimate
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.baselines.pairs import COMMON, CommonOptions, PairMatch, PairPatches, estimate_by_pairs
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.sim.measurements import DescentMeasurements
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """Pairs of pictures rectified to a common camera that looks straight down, and what becomes of their shifts.
 
-The baselines see the same corrected pictures as DIMES, in the same geometry (`algorithms.dimes.rectification`), but all
-of what two pictures share rather than templates; and the IMU checks the change between their two velocities as DIMES'
-check does, with the same threshold. What differs is how the shift is found.
+The baselines see the same corrected pictures as DIMES, in the same geometry
+(`marsyard.algorithms.dimes.rectification`), but all of what two pictures share rather than templates; and the IMU
+checks the change between their two velocities as DIMES' check does, with the same threshold. What differs is how the
+shift is found.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.dimes.binning import View, usable_views
-from algorithms.dimes.consistency import combinations
-from algorithms.dimes.ground import inside_frame, pixel_angle_rad
-from algorithms.dimes.options import DimesOptions
-from algorithms.dimes.rectification import ground_lattice, rectified_patch
-from algorithms.interface import VelocityEstimate, VelocityOutcome
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.dimes.binning import View, usable_views
+from marsyard.algorithms.dimes.consistency import combinations
+from marsyard.algorithms.dimes.ground import inside_frame, pixel_angle_rad
+from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.rectification import ground_lattice, rectified_patch
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.sim.measurements import DescentMeasurements
 
 #: Rectified pixels between the points at which common ground is looked for.
 COARSE_STEP_PX = 8

@@ -8,9 +8,9 @@ from typing import final
 import cv2
 import numpy as np
 
-from algorithms.baselines.pairs import COMMON, CommonOptions, PairMatch, PairPatches, estimate_by_pairs
-from algorithms.interface import VelocityEstimate
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.baselines.pairs import COMMON, CommonOptions, PairMatch, PairPatches, estimate_by_pairs
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.sim.measurements import DescentMeasurements
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from sim.camera import CameraModel
-from sim.frames import rigid
-from sim.measurements import DescentMeasurements, DetectorCalibration, DetectorImage
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration, DetectorImage
 
 #: Heights outside of which nothing is tried: lower than the airbags are large, higher than the atmosphere.
 HEIGHTS_M = (1.0, 1e6)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.dimes.binning import View
-from algorithms.dimes.consistency import Combination
-from algorithms.dimes.ground import ground_from_pixels, pixels_from_ground
-from algorithms.dimes.validity import TrackMetrics, ValidityCheck
+from marsyard.algorithms.dimes.binning import View
+from marsyard.algorithms.dimes.consistency import Combination
+from marsyard.algorithms.dimes.ground import ground_from_pixels, pixels_from_ground
+from marsyard.algorithms.dimes.validity import TrackMetrics, ValidityCheck
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,13 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.dimes.binning import usable_views
-from algorithms.dimes.consistency import combinations
-from algorithms.dimes.details import DimesDetails, PairDetails
-from algorithms.dimes.options import DimesOptions
-from algorithms.dimes.tracking import track_pair
-from algorithms.interface import VelocityEstimate, VelocityOutcome
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.dimes.binning import usable_views
+from marsyard.algorithms.dimes.consistency import combinations
+from marsyard.algorithms.dimes.details import DimesDetails, PairDetails
+from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.tracking import track_pair
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.sim.measurements import DescentMeasurements
 
 
 @final

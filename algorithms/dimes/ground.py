@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from algorithms.dimes.binning import View
+from marsyard.algorithms.dimes.binning import View
 
 
 def ground_from_pixels(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from algorithms.dimes.binning import View
-from algorithms.dimes.ground import (
+from marsyard.algorithms.dimes.binning import View
+from marsyard.algorithms.dimes.ground import (
     ground_from_pixels,
     inside_frame,
     pixel_angle_rad,
@@ -16,7 +16,7 @@ from algorithms.dimes.ground import (
     square,
     square_outline,
 )
-from algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.options import DimesOptions
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.dimes.binning import View
-from algorithms.image.frame_transfer import without_frame_transfer
+from marsyard.algorithms.dimes.binning import View
+from marsyard.algorithms.image.frame_transfer import without_frame_transfer
 
 #: Responses below this are treated as this: what is nearly blind cannot be corrected.
 LEAST_RESPONSE = 0.02

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from algorithms.dimes.binning import View
-from algorithms.dimes.ground import pixels_from_ground
-from algorithms.dimes.radiometry import corrected_patch
-from algorithms.image.kernels import cubic as kernels
+from marsyard.algorithms.dimes.binning import View
+from marsyard.algorithms.dimes.ground import pixels_from_ground
+from marsyard.algorithms.dimes.radiometry import corrected_patch
+from marsyard.algorithms.image.kernels import cubic as kernels
 
 #: Pixels around the samples that the spline's coefficients are computed from; what is beyond changes them by 1e-6.
 SPLINE_MARGIN = 10

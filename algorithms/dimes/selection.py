@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from algorithms.dimes.binning import View
-from algorithms.dimes.options import DimesOptions
-from algorithms.dimes.overlap import Candidates
-from algorithms.image.interest import harris_interest, local_mean, structure_tensor
+from marsyard.algorithms.dimes.binning import View
+from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.overlap import Candidates
+from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
 
 #: Fraction of the full scale below which a mean signal no longer divides the interest: darkness is not contrast.
 DARK_FRACTION = 0.01

@@ -18,15 +18,15 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from algorithms.dimes.binning import View
-from algorithms.dimes.consistency import combinations
-from algorithms.dimes.ground import ground_from_pixels
-from algorithms.dimes.options import DimesOptions
-from algorithms.dimes.overlap import search_geometry, template_candidates
-from algorithms.dimes.selection import best_candidates
-from sim.camera import Cahv, CameraModel
-from sim.frames import rigid
-from sim.measurements import DetectorCalibration
+from marsyard.algorithms.dimes.binning import View
+from marsyard.algorithms.dimes.consistency import combinations
+from marsyard.algorithms.dimes.ground import ground_from_pixels
+from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.overlap import search_geometry, template_candidates
+from marsyard.algorithms.dimes.selection import best_candidates
+from marsyard.sim.camera import Cahv, CameraModel
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DetectorCalibration
 
 
 @dataclass(frozen=True)

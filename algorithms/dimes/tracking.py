@@ -5,23 +5,23 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.dimes.binning import View
-from algorithms.dimes.details import PairDetails, Track
-from algorithms.dimes.ground import pixels_from_ground
-from algorithms.dimes.options import DimesOptions
-from algorithms.dimes.overlap import (
+from marsyard.algorithms.dimes.binning import View
+from marsyard.algorithms.dimes.details import PairDetails, Track
+from marsyard.algorithms.dimes.ground import pixels_from_ground
+from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.overlap import (
     SearchGeometry,
     overlap_polygon,
     search_geometry,
     template_candidates,
     zero_phase_pixel,
 )
-from algorithms.dimes.rectification import rectified_patch
-from algorithms.dimes.selection import select_templates
-from algorithms.dimes.validity import failed_checks, track_metrics
-from algorithms.image.alignment import refine_shift
-from algorithms.image.correlation import pseudo_normalized_correlation
-from algorithms.image.peak import Peak, biquadratic_offset, highest_peak
+from marsyard.algorithms.dimes.rectification import rectified_patch
+from marsyard.algorithms.dimes.selection import select_templates
+from marsyard.algorithms.dimes.validity import failed_checks, track_metrics
+from marsyard.algorithms.image.alignment import refine_shift
+from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
+from marsyard.algorithms.image.peak import Peak, biquadratic_offset, highest_peak
 
 
 def match_corner(

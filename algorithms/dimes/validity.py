@@ -8,8 +8,8 @@ from enum import Enum
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.dimes.options import DimesOptions
-from algorithms.image.peak import Peak, peak_width, second_peak
+from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.image.peak import Peak, peak_width, second_peak
 
 
 class ValidityCheck(Enum):

@@ -1,16 +1,16 @@
 """Algorithms that are programs of their own: cases as files, answers as JSON (docs/own-algorithms.md)."""
 
-from algorithms.exchange.command import PREFIXES, command_of
-from algorithms.exchange.executable import (
+from marsyard.algorithms.exchange.command import PREFIXES, command_of
+from marsyard.algorithms.exchange.executable import (
     ExecutableSiteEstimator,
     ExecutableVelocityEstimator,
     ExecutableVelocityStream,
 )
-from algorithms.exchange.files import EXCHANGE, Pictures, read_case, read_frame, write_case, write_frame
-from algorithms.exchange.process import Command, ExecutableLimits
-from algorithms.exchange.replies import ProgramDetails
-from algorithms.exchange.stops import read_mast, read_pose, read_stop, read_target
-from algorithms.exchange.tracker import ExecutableTargetTracker
+from marsyard.algorithms.exchange.files import EXCHANGE, Pictures, read_case, read_frame, write_case, write_frame
+from marsyard.algorithms.exchange.process import Command, ExecutableLimits
+from marsyard.algorithms.exchange.replies import ProgramDetails
+from marsyard.algorithms.exchange.stops import read_mast, read_pose, read_stop, read_target
+from marsyard.algorithms.exchange.tracker import ExecutableTargetTracker
 
 __all__ = [
     "EXCHANGE",

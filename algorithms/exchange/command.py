@@ -6,7 +6,7 @@ import shlex
 import shutil
 from collections.abc import Mapping
 
-from algorithms.exchange.process import Command
+from marsyard.algorithms.exchange.process import Command
 
 #: How a program is named: whether one process answers many cases, and whether it gets pictures one by one.
 PREFIXES: Mapping[str, tuple[bool, bool]] = {

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from algorithms.answers import checked_site, checked_velocity
-from algorithms.exchange import serving
-from algorithms.exchange.files import write_case, write_frame
-from algorithms.exchange.process import KEPT_STDERR, Child, Command, ExecutableLimits, Said
-from algorithms.exchange.replies import (
+from marsyard.algorithms.answers import checked_site, checked_velocity
+from marsyard.algorithms.exchange import serving
+from marsyard.algorithms.exchange.files import write_case, write_frame
+from marsyard.algorithms.exchange.process import KEPT_STDERR, Child, Command, ExecutableLimits, Said
+from marsyard.algorithms.exchange.replies import (
     ProgramDetails,
     bad_answer,
     check_keys,
@@ -21,9 +21,9 @@ from algorithms.exchange.replies import (
     numbers,
     table_of,
 )
-from algorithms.exchange.session import Session
-from algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
-from sim.measurements import DescentFrame, DescentMeasurements, LandingMeasurements
+from marsyard.algorithms.exchange.session import Session
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
+from marsyard.sim.measurements import DescentFrame, DescentMeasurements, LandingMeasurements
 
 
 @dataclass(frozen=True)

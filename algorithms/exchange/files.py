@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt16
 from scipy.spatial.transform import Rotation
 
-from sim.camera import BODY_FRAME, read_cahvor, write_cahvor
-from sim.frames import rigid
-from sim.measurements import (
+from marsyard.sim.camera import BODY_FRAME, read_cahvor, write_cahvor
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import (
     AltitudeMeasurement,
     AttitudeMeasurement,
     DescentFrame,

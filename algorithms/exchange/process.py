@@ -20,7 +20,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.faults import AlgorithmError, Fault
 
 #: Seconds between two looks at the memory that a program has.
 _LOOK_S = 0.02

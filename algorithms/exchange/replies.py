@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from algorithms.exchange.files import ANSWER_VERSIONS
-from algorithms.exchange.process import Said, shortened
-from algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.exchange.files import ANSWER_VERSIONS
+from marsyard.algorithms.exchange.process import Said, shortened
+from marsyard.algorithms.faults import AlgorithmError, Fault
 
 Member = TypeVar("Member", bound=Enum)
 Answer = TypeVar("Answer")

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from algorithms.exchange.files import ANSWER_VERSIONS
-from algorithms.exchange.process import Child, Command, ExecutableLimits, Said, shortened
-from algorithms.exchange.replies import table_of
-from algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.exchange.files import ANSWER_VERSIONS
+from marsyard.algorithms.exchange.process import Child, Command, ExecutableLimits, Said, shortened
+from marsyard.algorithms.exchange.replies import table_of
+from marsyard.algorithms.faults import AlgorithmError, Fault
 
 
 @dataclass

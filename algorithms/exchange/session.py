@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from algorithms.exchange import serving
-from algorithms.exchange.process import Command, ExecutableLimits, Said
-from algorithms.exchange.replies import ProgramDetails
-from algorithms.faults import AlgorithmError
+from marsyard.algorithms.exchange import serving
+from marsyard.algorithms.exchange.process import Command, ExecutableLimits, Said
+from marsyard.algorithms.exchange.replies import ProgramDetails
+from marsyard.algorithms.faults import AlgorithmError
 
 
 class Session:

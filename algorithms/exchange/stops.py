@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.exchange.files import read_picture, write_picture
-from sim.camera import HEAD_FRAME, read_cahvor, write_cahvor
-from sim.frames import rigid
-from sim.measurements import (
+from marsyard.algorithms.exchange.files import read_picture, write_picture
+from marsyard.sim.camera import HEAD_FRAME, read_cahvor, write_cahvor
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import (
     MastCalibration,
     MastGeometry,
     MastImage,

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.answers import checked_aim, checked_update
-from algorithms.exchange.process import Command, ExecutableLimits
-from algorithms.exchange.replies import (
+from marsyard.algorithms.answers import checked_aim, checked_update
+from marsyard.algorithms.exchange.process import Command, ExecutableLimits
+from marsyard.algorithms.exchange.replies import (
     ProgramDetails,
     bad_answer,
     check_keys,
@@ -20,10 +20,10 @@ from algorithms.exchange.replies import (
     named,
     numbers,
 )
-from algorithms.exchange.session import Session
-from algorithms.exchange.stops import told_pose, told_target, write_mast, write_stop
-from algorithms.interface import MastAim, PixelBox, TargetLoss, TargetUpdate, TrackingState
-from sim.measurements import MastCalibration, RoverMeasurements, TargetDesignation
+from marsyard.algorithms.exchange.session import Session
+from marsyard.algorithms.exchange.stops import told_pose, told_target, write_mast, write_stop
+from marsyard.algorithms.interface import MastAim, PixelBox, TargetLoss, TargetUpdate, TrackingState
+from marsyard.sim.measurements import MastCalibration, RoverMeasurements, TargetDesignation
 
 
 class ExecutableTargetTracker:

@@ -1,13 +1,13 @@
 """Hazard detection and avoidance from one moving camera (Johnson, Montgomery & Matthies, sections II and III)."""
 
-from algorithms.hda.details import STAGES, Ground, HdaDetails, hda_products
-from algorithms.hda.elevation import ElevationMap
-from algorithms.hda.estimator import HdaEstimator
-from algorithms.hda.hazards import HazardMaps, Safety, hazard_maps, safe_site
-from algorithms.hda.motion import Motion
-from algorithms.hda.options import HdaOptions, SurfaceFrame, TrackSeed
-from algorithms.hda.structure import Fate, Matches
-from algorithms.hda.tracking import Tracks
+from marsyard.algorithms.hda.details import STAGES, Ground, HdaDetails, hda_products
+from marsyard.algorithms.hda.elevation import ElevationMap
+from marsyard.algorithms.hda.estimator import HdaEstimator
+from marsyard.algorithms.hda.hazards import HazardMaps, Safety, hazard_maps, safe_site
+from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame, TrackSeed
+from marsyard.algorithms.hda.structure import Fate, Matches
+from marsyard.algorithms.hda.tracking import Tracks
 
 __all__ = [
     "STAGES",

@@ -14,17 +14,24 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.hda.estimator import find_site, matched_structure
-from algorithms.hda.motion import Motion, assessed
-from algorithms.hda.options import HdaOptions
-from algorithms.hda.sighting import Sighting, sighting
-from algorithms.hda.structure import Fate, Matches, depth_bounds, epipolar_segments, pixel_lattice, triangulated
-from algorithms.hda.tracking import Tracks
-from algorithms.hda.view import View, pixels_of, points_at, undistorted
-from algorithms.interface import SiteEstimate
-from sim.camera import Cahv
-from sim.frames import rigid
-from sim.measurements import LandingMeasurements
+from marsyard.algorithms.hda.estimator import find_site, matched_structure
+from marsyard.algorithms.hda.motion import Motion, assessed
+from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.sighting import Sighting, sighting
+from marsyard.algorithms.hda.structure import (
+    Fate,
+    Matches,
+    depth_bounds,
+    epipolar_segments,
+    pixel_lattice,
+    triangulated,
+)
+from marsyard.algorithms.hda.tracking import Tracks
+from marsyard.algorithms.hda.view import View, pixels_of, points_at, undistorted
+from marsyard.algorithms.interface import SiteEstimate
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import LandingMeasurements
 
 #: Confidence with which the search for an essential matrix meets five right tracks.
 CONFIDENCE = 0.9999

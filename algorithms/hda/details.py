@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from algorithms.hda.elevation import ElevationMap
-from algorithms.hda.hazards import HazardMaps
-from algorithms.hda.motion import Motion
-from algorithms.hda.structure import Matches
-from algorithms.hda.tracking import Tracks
-from algorithms.hda.view import View, points_at, undistorted
+from marsyard.algorithms.hda.elevation import ElevationMap
+from marsyard.algorithms.hda.hazards import HazardMaps
+from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.structure import Matches
+from marsyard.algorithms.hda.tracking import Tracks
+from marsyard.algorithms.hda.view import View, points_at, undistorted
 
 #: The stages of Table I, in order; the scale belongs to motion, the elevation map to hazards.
 STAGES = ("tracking", "motion", "structure", "hazards")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.hda.kernels import elevation as kernels
+from marsyard.algorithms.hda.kernels import elevation as kernels
 
 #: Least sum of bilinear weights for a cell to be known: a point less than 0.9 of a cell away along an axis.
 LEAST_WEIGHT = 0.1

@@ -10,20 +10,20 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.hda.details import HdaDetails
-from algorithms.hda.features import select_features
-from algorithms.hda.footprints import map_resolution
-from algorithms.hda.landing import map_ground, site_world
-from algorithms.hda.motion import Motion, estimate_motion, plane_depths
-from algorithms.hda.options import HdaOptions, TrackSeed
-from algorithms.hda.scale import scale_factor
-from algorithms.hda.sighting import Sighting, sighting
-from algorithms.hda.structure import Matches, dense_structure
-from algorithms.hda.tracking import Tracks, track_features
-from algorithms.hda.view import points_at, undistorted
-from algorithms.interface import SiteEstimate, SiteOutcome
-from sim.frames import rigid
-from sim.measurements import LandingMeasurements
+from marsyard.algorithms.hda.details import HdaDetails
+from marsyard.algorithms.hda.features import select_features
+from marsyard.algorithms.hda.footprints import map_resolution
+from marsyard.algorithms.hda.landing import map_ground, site_world
+from marsyard.algorithms.hda.motion import Motion, estimate_motion, plane_depths
+from marsyard.algorithms.hda.options import HdaOptions, TrackSeed
+from marsyard.algorithms.hda.scale import scale_factor
+from marsyard.algorithms.hda.sighting import Sighting, sighting
+from marsyard.algorithms.hda.structure import Matches, dense_structure
+from marsyard.algorithms.hda.tracking import Tracks, track_features
+from marsyard.algorithms.hda.view import points_at, undistorted
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import LandingMeasurements
 
 #: Solves for the motion from accepted tracks: their undistorted coordinates, focal length in pixels, initial depths.
 MotionSolver = Callable[[Sighting, Tracks, HdaOptions], Motion | None]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from algorithms.hda.options import HdaOptions
-from algorithms.hda.pyramid import reach_px
-from algorithms.image.interest import structure_tensor
+from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.pyramid import reach_px
+from marsyard.algorithms.image.interest import structure_tensor
 
 
 def eigenvalue_test(

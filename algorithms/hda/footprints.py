@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from algorithms.hda.elevation import ElevationMap
-from algorithms.hda.hazards import Safety
-from algorithms.hda.kernels import elevation as kernels
-from algorithms.hda.motion import Motion
-from algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.elevation import ElevationMap
+from marsyard.algorithms.hda.hazards import Safety
+from marsyard.algorithms.hda.kernels import elevation as kernels
+from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.options import HdaOptions
 
 #: Points across a footprint through which planes are laid, and places across it that are looked at.
 ACROSS = 16

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from algorithms.hda.elevation import ElevationMap
-from algorithms.hda.kernels import elevation as kernels
-from algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.elevation import ElevationMap
+from marsyard.algorithms.hda.kernels import elevation as kernels
+from marsyard.algorithms.hda.options import HdaOptions
 
 #: Least side of the regions that planes are fitted to, cells: a median of squares needs more than a few points.
 LEAST_SIDE = 3

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.hda.details import Ground
-from algorithms.hda.elevation import elevation_map
-from algorithms.hda.footprints import Resolution, checked
-from algorithms.hda.hazards import hazard_maps, safe_site
-from algorithms.hda.options import HdaOptions
-from algorithms.hda.sighting import Sighting
-from algorithms.hda.surface import surface_from_camera, upwards, world_from_surface
+from marsyard.algorithms.hda.details import Ground
+from marsyard.algorithms.hda.elevation import elevation_map
+from marsyard.algorithms.hda.footprints import Resolution, checked
+from marsyard.algorithms.hda.hazards import hazard_maps, safe_site
+from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.sighting import Sighting
+from marsyard.algorithms.hda.surface import surface_from_camera, upwards, world_from_surface
 
 
 def map_ground(

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.hda.kernels import motion as kernels
-from algorithms.hda.options import HdaOptions
-from sim.frames import rigid
+from marsyard.algorithms.hda.kernels import motion as kernels
+from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.sim.frames import rigid
 
 #: Scales of Cauchy's cost, pixels, at which the motion is found for the depths as they are given, one after the other:
 #: wrong tracks are let go of step by step, before depths are free to take them up (graduated non-convexity, Blake &

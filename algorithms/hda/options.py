@@ -94,8 +94,8 @@ class HdaOptions:
         borders is taken as half of one: the lander would stand on ground that was not seen.
     check_footprints
         Whether places that the paper's maps call safe must also be safe for the plane of their own footprint, with a
-        margin for what the map does not see (`algorithms.hda.footprints`). The paper interpolates planes and slopes
-        between fixed squares: over curved ground the distance from that is half of the distance from a plane.
+        margin for what the map does not see (`marsyard.algorithms.hda.footprints`). The paper interpolates planes and
+        slopes between fixed squares: over curved ground the distance from that is half of the distance from a plane.
     narrowest_hazard
         Width at its foot of the narrowest hazard over its height. Rocks are up to 0.65 as tall as wide (Golombek &
         Rapp 1997: 0.5, with the spread of a third that rocks have).

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from algorithms.hda.options import HdaOptions
-from algorithms.image.normalized import halved
+from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.image.normalized import halved
 
 #: Half width of the window at all levels but the coarsest, and the least of templates and windows anywhere (Eq. 5).
 LEAST_HALF_PX = 2

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.hda.motion import Motion
-from algorithms.hda.options import HdaOptions
-from algorithms.hda.structure import depth_bounds, match_pixels
-from algorithms.hda.view import View
+from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.structure import depth_bounds, match_pixels
+from marsyard.algorithms.hda.view import View
 
 #: Pixels about the laser's spot that are matched: their median depth is the spot's.
 SPOT_OFFSETS_PX = np.arange(-4.0, 5.0, 2.0)

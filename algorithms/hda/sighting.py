@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.hda.view import View, camera_pose, view
-from sim.measurements import LandingMeasurements
+from marsyard.algorithms.hda.view import View, camera_pose, view
+from marsyard.sim.measurements import LandingMeasurements
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.hda.kernels import matching
-from algorithms.hda.options import HdaOptions
-from algorithms.hda.view import View, pixels_of, points_at, undistorted
+from marsyard.algorithms.hda.kernels import matching
+from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.view import View, pixels_of, points_at, undistorted
 
 
 class Fate(IntEnum):

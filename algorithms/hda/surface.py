@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from algorithms.hda.options import HdaOptions, SurfaceFrame
-from algorithms.hda.view import View
+from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame
+from marsyard.algorithms.hda.view import View
 
 #: Trials of the robust plane through all points.
 PLANE_TRIALS = 200

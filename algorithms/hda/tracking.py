@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 
-from algorithms.hda.kernels import matching
-from algorithms.hda.options import HdaOptions
-from algorithms.hda.pyramid import level_sizes, pyramid
-from algorithms.image.registration import Limits, registered
+from marsyard.algorithms.hda.kernels import matching
+from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.pyramid import level_sizes, pyramid
+from marsyard.algorithms.image.registration import Limits, registered
 
 #: How far an alignment may go: pictures whose heights differ by a fifth are stretched by a quarter, and the iteration's
 #: first steps overshoot that. Within the tracker's own bounds of 0.35, 1.5 px and 12 steps a fifth of the tracks that

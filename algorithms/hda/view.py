@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.image.frame_transfer import without_frame_transfer
-from sim.camera import CameraModel
-from sim.frames import rigid
-from sim.measurements import DetectorImage, PoseMeasurement
+from marsyard.algorithms.image.frame_transfer import without_frame_transfer
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DetectorImage, PoseMeasurement
 
 #: Least relative response that is divided by: less is a dead pixel's.
 LEAST_RESPONSE = 0.05

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from scipy.interpolate import BSpline
 
-from algorithms.image.kernels import quintic as kernels
+from marsyard.algorithms.image.kernels import quintic as kernels
 
 ORDER: Final = 5
 #: A step below this, pixels, ends the iteration; the one that would follow is smaller by a factor of ten or more.

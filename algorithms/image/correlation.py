@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import fft
 
-from algorithms.image.kernels import correlation as kernels
+from marsyard.algorithms.image.kernels import correlation as kernels
 
 #: Energy of a patch, relative to that of its brightest value, below which it is rounding and counts as flat.
 FLAT_ENERGY = 1e-12

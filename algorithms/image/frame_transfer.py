@@ -17,8 +17,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.image.kernels import frame_transfer as kernels
-from sim.measurements import DetectorCalibration
+from marsyard.algorithms.image.kernels import frame_transfer as kernels
+from marsyard.sim.measurements import DetectorCalibration
 
 
 def without_frame_transfer(

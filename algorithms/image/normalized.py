@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from algorithms.image.kernels import correlation as kernels
-from algorithms.image.peak import Peak
+from marsyard.algorithms.image.kernels import correlation as kernels
+from marsyard.algorithms.image.peak import Peak
 
 #: Places searched about a candidate of the level above, pixels: it is right to one pixel, and one more for sampling.
 REACH_PX = 2

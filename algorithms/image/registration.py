@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.image.alignment import SURROUND, spline_coefficients
-from algorithms.image.kernels import registration as kernels
+from marsyard.algorithms.image.alignment import SURROUND, spline_coefficients
+from marsyard.algorithms.image.kernels import registration as kernels
 
 #: What a template may have undergone: a shift; a linear map too; a quadratic map of its offsets too.
 Warp = Literal["shift", "stretch", "bend"]

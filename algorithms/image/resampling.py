@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.image.alignment import SURROUND, spline_coefficients
-from algorithms.image.kernels import quintic as kernels
+from marsyard.algorithms.image.alignment import SURROUND, spline_coefficients
+from marsyard.algorithms.image.kernels import quintic as kernels
 
 
 def similarity_patch(

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
-from sim.camera import CameraModel
+from marsyard.sim.camera import CameraModel
 
 
 def magnification(

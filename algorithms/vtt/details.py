@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from algorithms.vtt.loss import Evidence, Tolerances
-from algorithms.vtt.matching import Change, Match
-from algorithms.vtt.stereo import StereoMatch
+from marsyard.algorithms.vtt.loss import Evidence, Tolerances
+from marsyard.algorithms.vtt.matching import Change, Match
+from marsyard.algorithms.vtt.stereo import StereoMatch
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from enum import Enum
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.interface import TargetUpdate
-from algorithms.vtt.accuracy import drift_error_m, stereo_range_error_m, tracked_approach_error_m
-from algorithms.vtt.stereo import disparity_px_m
-from sim.measurements import MastCalibration
+from marsyard.algorithms.interface import TargetUpdate
+from marsyard.algorithms.vtt.accuracy import drift_error_m, stereo_range_error_m, tracked_approach_error_m
+from marsyard.algorithms.vtt.stereo import disparity_px_m
+from marsyard.sim.measurements import MastCalibration
 
 
 class HandOffOutcome(Enum):

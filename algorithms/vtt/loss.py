@@ -17,11 +17,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from algorithms.interface import TargetLoss, TrackingState
-from algorithms.vtt.accuracy import stereo_range_error_m
-from algorithms.vtt.options import VttOptions
-from algorithms.vtt.stereo import disparity_px_m
-from sim.camera import CameraModel
+from marsyard.algorithms.interface import TargetLoss, TrackingState
+from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.stereo import disparity_px_m
+from marsyard.sim.camera import CameraModel
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from algorithms.vtt.matching import Change, Match, Sighting, cut_patch, has_room, search_window
-from algorithms.vtt.options import VttOptions
-from algorithms.vtt.tracker import VisualTargetTracker
-from sim.measurements import MastImage
+from marsyard.algorithms.vtt.matching import Change, Match, Sighting, cut_patch, has_room, search_window
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.tracker import VisualTargetTracker
+from marsyard.sim.measurements import MastImage
 
 #: Pyramid levels above the full resolution: with windows of 21 px they reach about as far as the search window.
 LEVELS = 3

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from algorithms.image.registration import Warp
+from marsyard.algorithms.image.registration import Warp
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from algorithms.image.alignment import SURROUND
-from algorithms.interface import MastAim, PixelBox
-from algorithms.vtt.options import VttOptions
-from algorithms.vtt.stereo import epipolar_pixels
-from sim.camera import CameraModel
-from sim.frames import turn_matrix
-from sim.measurements import MastCalibration, MastGeometry, PixelTarget
+from marsyard.algorithms.image.alignment import SURROUND
+from marsyard.algorithms.interface import MastAim, PixelBox
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.stereo import epipolar_pixels
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import turn_matrix
+from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget
 
 #: Newton's steps, and the error before a step that makes it the last: each about squares the error of the one before.
 STEPS, TOLERANCE_PX = 12, 1e-2

@@ -8,12 +8,12 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float
 
-from algorithms.image.normalized import normalized_correlation
-from algorithms.image.peak import biquadratic_offset, highest_peak
-from algorithms.vtt.matching import Refinement, refined
-from algorithms.vtt.options import VttOptions
-from sim.camera import CameraModel
-from sim.measurements import MastImage
+from marsyard.algorithms.image.normalized import normalized_correlation
+from marsyard.algorithms.image.peak import biquadratic_offset, highest_peak
+from marsyard.algorithms.vtt.matching import Refinement, refined
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.measurements import MastImage
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
-from sim.frames import SITE_FROM_WORLD, composed
-from sim.measurements import RoverTarget, SiteTarget
+from marsyard.sim.frames import SITE_FROM_WORLD, composed
+from marsyard.sim.measurements import RoverTarget, SiteTarget
 
 
 def designated_position_world(

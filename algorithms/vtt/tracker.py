@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
-from algorithms.vtt.appearance import lever_pixels, magnification, roll_angle
-from algorithms.vtt.details import VttDetails
-from algorithms.vtt.loss import Evidence, Journey, Tolerances, losses, next_state, tolerances
-from algorithms.vtt.matching import (
+from marsyard.algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
+from marsyard.algorithms.vtt.appearance import lever_pixels, magnification, roll_angle
+from marsyard.algorithms.vtt.details import VttDetails
+from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, losses, next_state, tolerances
+from marsyard.algorithms.vtt.matching import (
     Change,
     Match,
     Matcher,
@@ -27,17 +27,17 @@ from algorithms.vtt.matching import (
     match_by_correlation,
     search_window,
 )
-from algorithms.vtt.options import VttOptions
-from algorithms.vtt.pointing import aim_at_pixel, aim_at_position
-from algorithms.vtt.stereo import nearest_point, pixels_along, point_stereo, searched_ranges
-from algorithms.vtt.target import (
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position
+from marsyard.algorithms.vtt.stereo import nearest_point, pixels_along, point_stereo, searched_ranges
+from marsyard.algorithms.vtt.target import (
     designated_position_world,
     pose_change,
     predicted_position,
 )
-from sim.camera import CameraModel
-from sim.frames import composed
-from sim.measurements import MastCalibration, PixelTarget, RoverMeasurements, TargetDesignation
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import composed
+from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasurements, TargetDesignation
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class VisualTargetTracker:
     """Follows a target by its template, scaled and rolled as the rover's motion says; see `TargetTracker`.
 
     `PURE_NCC` as options is the paper's baseline; another `matcher` replaces the search in the left picture (see
-    `algorithms.vtt.lucas_kanade`), all else remaining the same.
+    `marsyard.algorithms.vtt.lucas_kanade`), all else remaining the same.
     """
 
     def __init__(self, options: VttOptions | None = None, matcher: Matcher = match_by_correlation) -> None:

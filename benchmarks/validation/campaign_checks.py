@@ -14,11 +14,11 @@ import numpy as np
 
 from benchmarks.validation.chaos import DEEDS, ChaosParameters, deed
 from benchmarks.validation.records import Check, Measure
-from campaigns.definition.loading import load_campaign
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import run_campaign
-from campaigns.running.replay import differing_columns, replay
-from campaigns.store.table import read_rows
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import run_campaign
+from marsyard.campaigns.running.replay import differing_columns, replay
+from marsyard.campaigns.store.table import read_rows
 
 FILE = """
 name = "chaos"

@@ -9,8 +9,8 @@ import time
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from scenarios.interface import CaseResult
-from sim.streams import Streams
+from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.streams import Streams
 
 
 class ChaosParameters(BaseModel):

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from algorithms.dimes import DimesOptions
-from algorithms.dimes.threshold import ThresholdInputs
 from benchmarks.dimes_threshold import STORED, WRONG_BY_M_S
 from benchmarks.estimators import ESTIMATORS, recorded, tried
 from benchmarks.validation.imu_reference import Reference
 from benchmarks.validation.records import Check, Measure
+from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.dimes.threshold import ThresholdInputs
 
 SEED = 4002
 HARMLESS = 0.995

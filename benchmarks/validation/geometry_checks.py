@@ -27,9 +27,9 @@ from benchmarks.validation.scenes import (
     renderer,
     rock_view,
 )
-from sim.frames import rigid
-from sim.render import Scene
-from sim.terrain import Surface
+from marsyard.sim.frames import rigid
+from marsyard.sim.render import Scene
+from marsyard.sim.terrain import Surface
 
 LIBRARIES = {"osmesa": "libOSMesa.so.8", "egl": "libEGL.so.1"}
 #: By which share a pixel's range may differ from the mean of its neighbours' away from silhouettes. A smooth ground

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from scenarios.handover import Handover
-from scenarios.interface import CaseResult
-from sim.streams import Streams
+from marsyard.scenarios.handover import Handover
+from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.streams import Streams
 
 #: What outlives a case in this module, as in a user's.
 _kept: list[Any] = []

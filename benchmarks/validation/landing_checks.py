@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from algorithms.hda import HdaEstimator, HdaOptions, TrackSeed
 from benchmarks.validation.records import Check, Measure
-from scenarios.interface import Scalar
-from scenarios.landing.flight import Flight
-from scenarios.landing.measurement import measure
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.pictures import take_pictures
-from scenarios.landing.score import map_row, motion_row
-from scenarios.landing.truth import GroundTruth
-from scenarios.landing.world import World, camera_optics
-from sim.sensor import DetectorParameters, LaserParameters, preset
-from sim.streams import Streams
+from marsyard.algorithms.hda import HdaEstimator, HdaOptions, TrackSeed
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.measurement import measure
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.pictures import take_pictures
+from marsyard.scenarios.landing.score import map_row, motion_row
+from marsyard.scenarios.landing.truth import GroundTruth
+from marsyard.scenarios.landing.world import World, camera_optics
+from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
+from marsyard.sim.streams import Streams
 
 SEED = 20050107
 #: Terrains of the sites' banks, the campaigns' own.

@@ -14,10 +14,10 @@ from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, meet_triangles
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import cameras, descent_view, ground_view, renderer, rock_view
-from sim.camera import Cahv, CameraModel
-from sim.frames import direction, rigid
-from sim.render import CloudLayer, CloudParameters, DustySky, Photometry, PixelRays, Scene, Sun, Texture
-from sim.terrain import Surface
+from marsyard.sim.camera import Cahv, CameraModel
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import CloudLayer, CloudParameters, DustySky, Photometry, PixelRays, Scene, Sun, Texture
+from marsyard.sim.terrain import Surface
 
 #: Brightness is then albedo times the cosine of incidence in the sun, and 0 in shadow.
 LAMBERT = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)

@@ -18,10 +18,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.validation.raycast import Ground
 from benchmarks.validation.scenes import OVERHEAD, PAINT, cameras
-from sim.camera import CameraModel
-from sim.frames import rigid
-from sim.render import PixelRays, Renderer, Scene
-from sim.terrain import Surface
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import rigid
+from marsyard.sim.render import PixelRays, Renderer, Scene
+from marsyard.sim.terrain import Surface
 
 SIDE = 2048
 #: Size of a marker's picture: the geometric mean of its ellipse's sigmas, pixels.

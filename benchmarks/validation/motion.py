@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from benchmarks.validation.estimators import HALF, MARGIN, PATCH, SmoothPicture, peak_fits, symmetric_shifts
-from sim.camera import CameraModel
-from sim.frames import rigid
-from sim.render import Frame, PixelRays, Renderer, Scene
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import rigid
+from marsyard.sim.render import Frame, PixelRays, Renderer, Scene
 
 STEPS_PX = np.linspace(0.0, 1.0, 11)
 #: Motions within a patch may differ by this share of the motion: more, and it holds an edge.

@@ -7,9 +7,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from reports.history import FINISHED, History, NightCampaign, NightFigure
-from reports.regressions import Comparison, changes, comparisons_of
-from reports.statistics.changes import Sample
+from marsyard.reports.history import FINISHED, History, NightCampaign, NightFigure
+from marsyard.reports.regressions import Comparison, changes, comparisons_of
+from marsyard.reports.statistics.changes import Sample
 
 #: How a campaign's cases lie on terrains.
 KINDS = ("a bank of 12 terrains", "20 terrains of each night's own", "a terrain for each case")

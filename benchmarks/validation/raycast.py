@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from sim.render import Objects
-from sim.terrain import Surface
+from marsyard.sim.render import Objects
+from marsyard.sim.terrain import Surface
 
 #: Rays and steps along them that are held at a time.
 BLOCK = 2_000_000

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from benchmarks.validation.records import Check, Measure
-from campaigns.definition.loading import load_campaign
-from sim.streams import stream_key
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.sim.streams import stream_key
 
 #: NumPy's `SeedSequence`, whose algorithm is fixed: constants of numpy/random/bit_generator.pyx.
 _INIT, _MULT, _LEFT, _RIGHT, _SHIFT = 0x43B0D7E5, 0x931E8875, 0xCA01F9DD, 0x4973F715, 16

@@ -9,15 +9,15 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.validation.motion import View
-from sim.camera import Cahv, Cahvore, CameraModel, read_camera
-from sim.frames import direction, rigid
-from sim.render import Objects, Photometry, Renderer, Scene, Sun, Texture, process_renderer
-from sim.render.backend import default_backend
-from sim.sensor.presets import preset
-from sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
-from sim.terrain.imported import RealTerrain
-from sim.terrain.rocks import PlacedRock, RockField, RockParameters
-from sim.terrain.sites import Site, SiteTexture, site
+from marsyard.sim.camera import Cahv, Cahvore, CameraModel, read_camera
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Objects, Photometry, Renderer, Scene, Sun, Texture, process_renderer
+from marsyard.sim.render.backend import default_backend
+from marsyard.sim.sensor.presets import preset
+from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
+from marsyard.sim.terrain.imported import RealTerrain
+from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
+from marsyard.sim.terrain.sites import Site, SiteTexture, site
 
 #: The bank from which the checks take their terrains.
 SEED = 20

@@ -17,9 +17,9 @@ import numpy as np
 
 from benchmarks.validation.hostile import DEEDS, HostileParameters, deed
 from benchmarks.validation.records import Check, Measure
-from campaigns.definition.loading import load_campaign
-from campaigns.running.replay import differing_columns
-from campaigns.store.table import read_rows
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.running.replay import differing_columns
+from marsyard.campaigns.store.table import read_rows
 
 FILE = """
 name = "soak"

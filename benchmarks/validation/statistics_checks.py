@@ -10,12 +10,12 @@ from scipy import stats
 
 from benchmarks.validation.nights import BEFORE, CASES, KINDS, WORSE, planted_found, quiet_nights
 from benchmarks.validation.records import Check, Measure
-from reports.history import WINDOW
-from reports.statistics.clusters import clustered_evidence
-from reports.statistics.plane import error_ellipse
-from reports.statistics.proportions import proportion_lower, proportion_upper
-from reports.statistics.samples import Interval, mean_interval, quantile_bounds, spread_interval
-from reports.statistics.sequential import confidence_at, looks_of
+from marsyard.reports.history import WINDOW
+from marsyard.reports.statistics.clusters import clustered_evidence
+from marsyard.reports.statistics.plane import error_ellipse
+from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.samples import Interval, mean_interval, quantile_bounds, spread_interval
+from marsyard.reports.statistics.sequential import confidence_at, looks_of
 
 CONFIDENCE = 0.9
 #: Cases on a terrain, and what is asked and risked in simulated campaigns.

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from algorithms.vtt.accuracy import stereo_range_error_m
-from algorithms.vtt.stereo import disparity_px_m
 from benchmarks.validation.records import Check, Measure
-from campaigns.definition.loading import load_campaign
-from scenarios.interface import Scalar
-from scenarios.rover import RoverScenarioParameters
-from scenarios.rover.run import Run, run_case
-from scenarios.rover.score import fixed_conditions, run_conditions, score
-from sim.sensor.odometry import EXACT
-from sim.streams import Streams
+from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
+from marsyard.algorithms.vtt.stereo import disparity_px_m
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.rover import RoverScenarioParameters
+from marsyard.scenarios.rover.run import Run, run_case
+from marsyard.scenarios.rover.score import fixed_conditions, run_conditions, score
+from marsyard.sim.sensor.odometry import EXACT
+from marsyard.sim.streams import Streams
 
 SEED = 20061108
 DRIFT_RMS_BAR_PX, DRIFT_WORST_BAR_PX, RANGE_BAR = 1.0, 2.5, 0.15

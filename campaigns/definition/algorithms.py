@@ -12,13 +12,13 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from algorithms.exchange import command_of
-from campaigns.definition.campaign import Campaign, value_at
-from campaigns.definition.identity import chosen_algorithms, foreign_sources
-from scenarios.dotted import found_at, sources_at
-from scenarios.estimators import Task, installed
-from scenarios.interface import TakesAlgorithms
-from scenarios.offline import is_offline
+from marsyard.algorithms.exchange import command_of
+from marsyard.campaigns.definition.campaign import Campaign, value_at
+from marsyard.campaigns.definition.identity import chosen_algorithms, foreign_sources
+from marsyard.scenarios.dotted import found_at, sources_at
+from marsyard.scenarios.estimators import Task, installed
+from marsyard.scenarios.interface import TakesAlgorithms
+from marsyard.scenarios.offline import is_offline
 
 #: Digits of a source hash; as many as tell any two sources apart that a reader may hold side by side.
 _DIGITS = 16

@@ -10,14 +10,22 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from campaigns.definition.configuration import CampaignConfiguration
-from campaigns.sampling.correlation import Correlation
-from campaigns.sampling.design import SMALLEST, Layout, Place, correlated, grid_probabilities, place_of, stratified
-from campaigns.sampling.dispersion import Dispersion
-from campaigns.sampling.levels import Derived, Fixed, Grid
-from campaigns.sampling.ranges import InTurn, Normal
-from scenarios.interface import Scenario
-from sim.streams import Streams
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.sampling.correlation import Correlation
+from marsyard.campaigns.sampling.design import (
+    SMALLEST,
+    Layout,
+    Place,
+    correlated,
+    grid_probabilities,
+    place_of,
+    stratified,
+)
+from marsyard.campaigns.sampling.dispersion import Dispersion
+from marsyard.campaigns.sampling.levels import Derived, Fixed, Grid
+from marsyard.campaigns.sampling.ranges import InTurn, Normal
+from marsyard.scenarios.interface import Scenario
+from marsyard.sim.streams import Streams
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from campaigns.definition.campaign import Campaign, leaves, value_at
-from campaigns.definition.configuration import Key, key_text, problems_of
-from campaigns.errors import not_allowed
-from campaigns.sampling.dispersion import Dispersion
-from campaigns.sampling.levels import Choice, Fixed, Grid
+from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
+from marsyard.campaigns.definition.configuration import Key, key_text, problems_of
+from marsyard.campaigns.errors import not_allowed
+from marsyard.campaigns.sampling.dispersion import Dispersion
+from marsyard.campaigns.sampling.levels import Choice, Fixed, Grid
 
 #: Cases whose draws are tried together before a campaign starts; the reach of each dispersion is tried in full.
 TRIED_CASES = 32

@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from campaigns.errors import near_match
-from campaigns.sampling.correlation import Correlation
-from campaigns.sampling.design import Design
-from campaigns.sampling.dispersions import FRIENDLY, AnyDispersion
-from campaigns.sampling.levels import Grid
-from campaigns.sampling.ranges import Normal
+from marsyard.campaigns.errors import near_match
+from marsyard.campaigns.sampling.correlation import Correlation
+from marsyard.campaigns.sampling.design import Design
+from marsyard.campaigns.sampling.dispersions import FRIENDLY, AnyDispersion
+from marsyard.campaigns.sampling.levels import Grid
+from marsyard.campaigns.sampling.ranges import Normal
 
 #: A key in nested tables and lists, part by part.
 Key = tuple[str | int, ...]

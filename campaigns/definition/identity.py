@@ -16,17 +16,17 @@ from typing import Any, Self
 
 from pydantic import ValidationError
 
-from algorithms.exchange import command_of
-from campaigns.definition.campaign import leaves, value_at
-from campaigns.definition.configuration import CampaignConfiguration
-from campaigns.errors import CampaignError
-from campaigns.sampling.levels import Choice, Fixed, Grid
-from scenarios.dotted import relative_to
-from scenarios.estimators import sources_of
-from scenarios.interface import TakesAlgorithms, TakesParts
-from scenarios.offline import answers_file
-from scenarios.own_files import input_files
-from scenarios.registry import UnknownScenarioError, scenario
+from marsyard.algorithms.exchange import command_of
+from marsyard.campaigns.definition.campaign import leaves, value_at
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.sampling.levels import Choice, Fixed, Grid
+from marsyard.scenarios.dotted import relative_to
+from marsyard.scenarios.estimators import sources_of
+from marsyard.scenarios.interface import TakesAlgorithms, TakesParts
+from marsyard.scenarios.offline import answers_file
+from marsyard.scenarios.own_files import input_files
+from marsyard.scenarios.registry import UnknownScenarioError, scenario
 
 #: Folders of ours whose code rows depend on; what reports and commands do changes no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")

@@ -11,16 +11,16 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.catalogue import catalogue
-from campaigns.definition.checking import sampling_problems
-from campaigns.definition.configuration import CampaignConfiguration, Key, key_text, problems_of
-from campaigns.definition.metrics import metric_problems
-from campaigns.definition.requirements import completed
-from campaigns.errors import ConfigurationError, Problem, not_allowed
-from campaigns.sampling.correlation import KINDS
-from scenarios.interface import Scenario, TakesAlgorithms
-from scenarios.registry import UnknownScenarioError, scenario
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.catalogue import catalogue
+from marsyard.campaigns.definition.checking import sampling_problems
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, Key, key_text, problems_of
+from marsyard.campaigns.definition.metrics import metric_problems
+from marsyard.campaigns.definition.requirements import completed
+from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
+from marsyard.campaigns.sampling.correlation import KINDS
+from marsyard.scenarios.interface import Scenario, TakesAlgorithms
+from marsyard.scenarios.registry import UnknownScenarioError, scenario
 
 _TABLES = ("parameters", "dispersions", "design", "retain", "limits")
 _PLAIN = ("cases", "seed", "name", "description", "scenario", "correlations")

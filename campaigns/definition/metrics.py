@@ -6,14 +6,14 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-from campaigns.definition.campaign import Campaign, value_at
-from campaigns.definition.configuration import POPULATIONS, Key
-from campaigns.definition.identity import chosen_algorithms
-from campaigns.errors import not_allowed
-from scenarios.columns import StatedColumns, stated_columns
-from scenarios.estimators import labels
-from scenarios.interface import TakesParts
-from scenarios.parts.named import SCORE
+from marsyard.campaigns.definition.campaign import Campaign, value_at
+from marsyard.campaigns.definition.configuration import POPULATIONS, Key
+from marsyard.campaigns.definition.identity import chosen_algorithms
+from marsyard.campaigns.errors import not_allowed
+from marsyard.scenarios.columns import StatedColumns, stated_columns
+from marsyard.scenarios.estimators import labels
+from marsyard.scenarios.interface import TakesParts
+from marsyard.scenarios.parts.named import SCORE
 
 #: Columns that the engine writes.
 _ENGINE_FLAGS, _ENGINE_NUMBERS = ("answered",), ("wall_time_s", "cpu_time_s")
@@ -23,7 +23,7 @@ def metric_problems(campaign: Campaign) -> list[tuple[Key, str]]:
     """What requirements ask for that the scenario's rows do not have: keys, and what is wrong and allowed there.
 
     Columns of a user's own scores are accepted by their prefix. Of a user's own scenario nothing is known: its first
-    finished case is held against the requirements instead (`campaigns.running.engine.check_metrics`).
+    finished case is held against the requirements instead (`marsyard.campaigns.running.engine.check_metrics`).
     """
     columns = _columns(campaign)
     if columns is None:

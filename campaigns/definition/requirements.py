@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from campaigns.definition.configuration import Key, Requirement, key_text, problems_of
-from campaigns.errors import ConfigurationError, Problem, not_allowed
+from marsyard.campaigns.definition.configuration import Key, Requirement, key_text, problems_of
+from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
 
 #: The requirements that ship with Marsyard.
 REQUIREMENTS_FILE = Path(__file__).resolve().parents[2] / "scenarios" / "requirements.toml"

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
-from algorithms.faults import describe_error
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
-from campaigns.execution.state_notes import StateNotes
-from campaigns.execution.work import Work, Workers, WorkLimits
-from campaigns.execution.worker_process import (
+from marsyard.algorithms.faults import describe_error
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
+from marsyard.campaigns.execution.state_notes import StateNotes
+from marsyard.campaigns.execution.work import Work, Workers, WorkLimits
+from marsyard.campaigns.execution.worker_process import (
     LOADING_S,
     Done,
     leave_note,
@@ -26,13 +26,13 @@ from campaigns.execution.worker_process import (
     settle,
     start_clock,
 )
-from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
-from campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
-from campaigns.store.products import PackedProducts, pack_products
-from campaigns.store.retention import Keep
-from scenarios.interface import CaseResult, Scalar, conditions_recorded_by
-from scenarios.registry import scenario
-from sim.cache import CacheWarning
+from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
+from marsyard.campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
+from marsyard.campaigns.store.products import PackedProducts, pack_products
+from marsyard.campaigns.store.retention import Keep
+from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
+from marsyard.scenarios.registry import scenario
+from marsyard.sim.cache import CacheWarning
 
 #: Bits of the largest integers that are stored: all of these have a float64, whose maximum is below 2 ** 1024.
 _MAX_INT_BITS = 1023

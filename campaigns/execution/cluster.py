@@ -2,10 +2,10 @@
 
 No case runs in a Dask worker's own process. What is sent there is a watcher: it keeps worker processes like those of
 one machine, one for each of the Dask worker's threads, and runs its batch in one with the same limits
-(`campaigns.execution.workers`). A case that hangs, takes the memory or kills its process so costs that process alone,
-and is told apart as at home. Where a Dask worker itself goes, with its machine, Dask gives its batches to others; a
-batch that lost several (Dask's `allowed-failures`, by default 3) comes back, is cut into single cases, and only a case
-that does so again counts as crashed.
+(`marsyard.campaigns.execution.workers`). A case that hangs, takes the memory or kills its process so costs that process
+alone, and is told apart as at home. Where a Dask worker itself goes, with its machine, Dask gives its batches to
+others; a batch that lost several (Dask's `allowed-failures`, by default 3) comes back, is cut into single cases, and
+only a case that does so again counts as crashed.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from campaigns.definition.identity import code_hash, package_versions
-from campaigns.errors import CampaignError
-from campaigns.execution.batches import Batches
-from campaigns.execution.work import Work
-from campaigns.execution.worker_process import Done
-from campaigns.execution.workers import LocalWorkers
-from campaigns.outcomes import CRASHED, CaseEndedError
+from marsyard.campaigns.definition.identity import code_hash, package_versions
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.batches import Batches
+from marsyard.campaigns.execution.work import Work
+from marsyard.campaigns.execution.worker_process import Done
+from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.outcomes import CRASHED, CaseEndedError
 
 Result = TypeVar("Result")
 

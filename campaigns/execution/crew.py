@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from campaigns.execution.work import Workers
-from campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.execution.work import Workers
+from marsyard.campaigns.execution.workers import LocalWorkers
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def hire(crew: Crew) -> Iterator[Workers]:
         with LocalWorkers(crew.jobs) as workers:
             yield workers
         return
-    from campaigns.execution.cluster import ClusterWorkers
+    from marsyard.campaigns.execution.cluster import ClusterWorkers
 
     with ClusterWorkers(crew.cluster) as cluster:
         yield cluster

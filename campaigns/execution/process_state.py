@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from campaigns.execution.process_tree import children
+from marsyard.campaigns.execution.process_tree import children
 
 #: Seconds for threads and processes that are about to end.
 _ENDING_S = 0.2
@@ -300,7 +300,7 @@ def _other_children() -> list[str]:
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     except ChildProcessError:
         return []
-    serving: Any = sys.modules.get("algorithms.exchange.serving")
+    serving: Any = sys.modules.get("marsyard.algorithms.exchange.serving")
     waiting = serving.waiting_processes() if serving is not None else ()
     found = []
     for child in children(os.getpid()):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from campaigns.execution.worker_process import Done
+from marsyard.campaigns.execution.worker_process import Done
 
 #: Cases that are named for each part of the state.
 _NAMED = 3

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-from campaigns.execution.process_tree import adopt_orphans, end_with_parent, kill_descendants
+from marsyard.campaigns.execution.process_tree import adopt_orphans, end_with_parent, kill_descendants
 
 #: Makes a worker write down where it stands; the supervisor passes it on.
 DUMP_SIGNAL = signal.SIGUSR2

@@ -16,12 +16,12 @@ from typing import Any, TypeVar
 from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
-from campaigns.execution import worker_process
-from campaigns.execution.process_tree import descendants, kill, marked_processes, used_memory
-from campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL
-from campaigns.execution.work import WorkLimits
-from campaigns.execution.worker_process import FILES_CLOSED, BatchEnd, Board, run_batch
-from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
+from marsyard.campaigns.execution import worker_process
+from marsyard.campaigns.execution.process_tree import descendants, kill, marked_processes, used_memory
+from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL
+from marsyard.campaigns.execution.work import WorkLimits
+from marsyard.campaigns.execution.worker_process import FILES_CLOSED, BatchEnd, Board, run_batch
+from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 Result = TypeVar("Result")
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-from campaigns.execution.worker_process import Done
+from marsyard.campaigns.execution.worker_process import Done
 
 Result = TypeVar("Result")
 

@@ -16,14 +16,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from campaigns.execution.process_state import (
+from marsyard.campaigns.execution.process_state import (
     Differences,
     OpenFiles,
     ProcessState,
     generators_were_used,
     seed_generators,
 )
-from campaigns.execution.supervisor import DUMP_SIGNAL, become_supervised
+from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, become_supervised
 
 Result = TypeVar("Result")
 
@@ -156,8 +156,8 @@ def begin(parent: int, folder: str) -> None:
     """Sets a fresh worker process up.
 
     It leads a process group of its own, below a supervisor that ends with the parent and leaves nothing of what the
-    worker started (`campaigns.execution.supervisor`); a process that dies of a signal writes down where it stood; and
-    what it prints goes to a file.
+    worker started (`marsyard.campaigns.execution.supervisor`); a process that dies of a signal writes down where it
+    stood; and what it prints goes to a file.
     """
     global _place
     os.setpgid(0, 0)

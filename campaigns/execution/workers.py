@@ -20,13 +20,13 @@ from typing import Any, Self, TypeVar
 
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
-from campaigns.errors import CampaignError
-from campaigns.execution.batches import Batches
-from campaigns.execution.temporary import WorkersFolder
-from campaigns.execution.watched import LOOK_S, WatchedWorker
-from campaigns.execution.work import Work
-from campaigns.execution.worker_process import BatchEnd, Done
-from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, CaseEndedError
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.batches import Batches
+from marsyard.campaigns.execution.temporary import WorkersFolder
+from marsyard.campaigns.execution.watched import LOOK_S, WatchedWorker
+from marsyard.campaigns.execution.work import Work
+from marsyard.campaigns.execution.worker_process import BatchEnd, Done
+from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, CaseEndedError
 
 Result = TypeVar("Result")
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from scenarios.registry import SCENARIOS
-from sim.kernel_cache import compiled_functions, kernels_are_ready
+from marsyard.scenarios.registry import SCENARIOS
+from marsyard.sim.kernel_cache import compiled_functions, kernels_are_ready
 
 #: Seconds between two reports.
 REPORT_INTERVAL_S = 10.0

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 
-from campaigns.errors import CampaignError
-from campaigns.execution.work import Work, WorkLimits
-from campaigns.execution.worker_process import LOADING_S, Done, settle, start_clock
-from campaigns.execution.workers import LocalWorkers
-from campaigns.outcomes import CaseEndedError
-from scenarios.conformance import EXAMINED, Finding, Subject, check_names, check_subject, run_check, task_of
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.work import Work, WorkLimits
+from marsyard.campaigns.execution.worker_process import LOADING_S, Done, settle, start_clock
+from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.outcomes import CaseEndedError
+from marsyard.scenarios.conformance import EXAMINED, Finding, Subject, check_names, check_subject, run_check, task_of
 
 #: Output that a check may write, and memory that it may have.
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9

@@ -12,28 +12,34 @@ from typing import Any, Protocol
 
 from pydantic import ValidationError
 
-from campaigns.definition.algorithms import describe_algorithms
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.configuration import POPULATIONS, CampaignConfiguration, Limits
-from campaigns.definition.identity import Identity, identity_of
-from campaigns.errors import CampaignError, ConfigurationError, Problem, StoreError, not_allowed
-from campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, prepare_limits, run_cases
-from campaigns.execution.crew import Crew, hire
-from campaigns.execution.work import Work, Workers
-from campaigns.outcomes import RETRYABLE, UNFINISHED
-from campaigns.running.compilation import compilation_reported
-from campaigns.running.inputs import plan_inputs
-from campaigns.running.replay import replay_with
-from campaigns.running.stored import loaded_campaign
-from campaigns.store import record
-from campaigns.store.columns import Row
-from campaigns.store.lock import folder_lock
-from campaigns.store.retention import ProductStore, keep_while_running
-from campaigns.store.rows import ROWS_FILE, RowStore, create_store
-from campaigns.store.table import TABLE_FILE, write_table
-from campaigns.store.worst import showcase_case, worst_cases
-from scenarios.columns import StatedColumns, stated_columns
-from sim.kernel_cache import note_ready
+from marsyard.campaigns.definition.algorithms import describe_algorithms
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import POPULATIONS, CampaignConfiguration, Limits
+from marsyard.campaigns.definition.identity import Identity, identity_of
+from marsyard.campaigns.errors import CampaignError, ConfigurationError, Problem, StoreError, not_allowed
+from marsyard.campaigns.execution.cases import (
+    CompletedCase,
+    configuration_text,
+    prepare_input,
+    prepare_limits,
+    run_cases,
+)
+from marsyard.campaigns.execution.crew import Crew, hire
+from marsyard.campaigns.execution.work import Work, Workers
+from marsyard.campaigns.outcomes import RETRYABLE, UNFINISHED
+from marsyard.campaigns.running.compilation import compilation_reported
+from marsyard.campaigns.running.inputs import plan_inputs
+from marsyard.campaigns.running.replay import replay_with
+from marsyard.campaigns.running.stored import loaded_campaign
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.columns import Row
+from marsyard.campaigns.store.lock import folder_lock
+from marsyard.campaigns.store.retention import ProductStore, keep_while_running
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
+from marsyard.campaigns.store.table import TABLE_FILE, write_table
+from marsyard.campaigns.store.worst import showcase_case, worst_cases
+from marsyard.scenarios.columns import StatedColumns, stated_columns
+from marsyard.sim.kernel_cache import note_ready
 
 #: What a requirement without a bound, and a population, ask a column to be.
 FLAG = "column of true and false"
@@ -364,7 +370,7 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
     """Holds what requirements ask for against the columns of a finished case, before more cases are spent on them.
 
     Columns that a scenario states may be absent from a row: they are held against that statement when the campaign is
-    loaded (`campaigns.definition.metrics`).
+    loaded (`marsyard.campaigns.definition.metrics`).
 
     Raises
     ------

@@ -8,15 +8,21 @@ import time
 from dataclasses import dataclass
 from functools import partial
 
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.configuration import CampaignConfiguration
-from campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, prepare_limits, run_cases
-from campaigns.execution.crew import Crew, hire
-from campaigns.execution.work import Work, Workers
-from campaigns.outcomes import UNFINISHED
-from campaigns.running.inputs import plan_inputs
-from campaigns.store.retention import KEEP_ALL
-from scenarios.interface import SelectsInputs
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.execution.cases import (
+    CompletedCase,
+    configuration_text,
+    prepare_input,
+    prepare_limits,
+    run_cases,
+)
+from marsyard.campaigns.execution.crew import Crew, hire
+from marsyard.campaigns.execution.work import Work, Workers
+from marsyard.campaigns.outcomes import UNFINISHED
+from marsyard.campaigns.running.inputs import plan_inputs
+from marsyard.campaigns.store.retention import KEEP_ALL
+from marsyard.scenarios.interface import SelectsInputs
 
 #: Cases run on trial, at most; the first is left out of the mean as it loads what the others find.
 TRIAL_CASES = 9

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from campaigns.definition.campaign import Campaign
-from campaigns.errors import CampaignError
-from scenarios.interface import SelectsInputs
-from sim.cache import cache_directory, kept_bytes, limit_bytes
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.errors import CampaignError
+from marsyard.scenarios.interface import SelectsInputs
+from marsyard.sim.cache import cache_directory, kept_bytes, limit_bytes
 
 
 @dataclass(frozen=True)

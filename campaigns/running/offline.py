@@ -13,18 +13,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from campaigns.definition.campaign import Campaign, replaced
-from campaigns.definition.configuration import CampaignConfiguration, Retain
-from campaigns.definition.identity import configuration_hash
-from campaigns.errors import CampaignError, StoreError
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import Watch, resume_campaign, run_campaign
-from campaigns.store import record
-from campaigns.store.table import TABLE_FILE, read_rows
-from scenarios.estimators import Task
-from scenarios.interface import TakesAlgorithms
-from scenarios.offline import ANSWERS, CASES, answers_of
-from scenarios.registry import scenario
+from marsyard.campaigns.definition.campaign import Campaign, replaced
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
+from marsyard.campaigns.definition.identity import configuration_hash
+from marsyard.campaigns.errors import CampaignError, StoreError
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import Watch, resume_campaign, run_campaign
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.table import TABLE_FILE, read_rows
+from marsyard.scenarios.estimators import Task
+from marsyard.scenarios.interface import TakesAlgorithms
+from marsyard.scenarios.offline import ANSWERS, CASES, answers_of
+from marsyard.scenarios.registry import scenario
 
 #: What an exported folder says of itself, and to whoever answers.
 MANIFEST_FILE, README_FILE = "export.json", "README.md"

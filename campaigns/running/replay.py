@@ -6,19 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from campaigns.definition.configuration import CampaignConfiguration
-from campaigns.definition.identity import Identity, identity_of
-from campaigns.errors import CampaignError
-from campaigns.execution.cases import run_cases
-from campaigns.execution.work import Workers
-from campaigns.execution.workers import LocalWorkers
-from campaigns.outcomes import UNFINISHED
-from campaigns.running.stored import loaded_campaign
-from campaigns.store.columns import Row
-from campaigns.store.products import PackedProducts
-from campaigns.store.record import read, stored_configuration
-from campaigns.store.retention import KEEP_ALL
-from campaigns.store.table import stored_row
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.identity import Identity, identity_of
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.cases import run_cases
+from marsyard.campaigns.execution.work import Workers
+from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.outcomes import UNFINISHED
+from marsyard.campaigns.running.stored import loaded_campaign
+from marsyard.campaigns.store.columns import Row
+from marsyard.campaigns.store.products import PackedProducts
+from marsyard.campaigns.store.record import read, stored_configuration
+from marsyard.campaigns.store.retention import KEEP_ALL
+from marsyard.campaigns.store.table import stored_row
 
 
 @dataclass(frozen=True)

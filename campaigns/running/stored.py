@@ -6,10 +6,10 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.configuration import CampaignConfiguration, key_text, problems_of
-from campaigns.errors import ConfigurationError, Problem
-from scenarios.registry import UnknownScenarioError, scenario
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, key_text, problems_of
+from marsyard.campaigns.errors import ConfigurationError, Problem
+from marsyard.scenarios.registry import UnknownScenarioError, scenario
 
 
 def loaded_campaign(directory: Path, configuration: CampaignConfiguration) -> Campaign:

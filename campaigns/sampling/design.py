@@ -23,7 +23,7 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import ndtr, ndtri
 
-from sim.streams import Streams
+from marsyard.sim.streams import Streams
 
 #: Half the step of `Generator.random`: keeps a draw off 0, where distributions with endless tails have no value.
 SMALLEST = 2.0**-54
@@ -167,7 +167,9 @@ def stratified(layout: Layout) -> Float64[np.ndarray, "cases dispersions"]:
 def correlated(
     uniform: Float64[np.ndarray, "*cases members"], factor: Float64[np.ndarray, "members members"]
 ) -> Float64[np.ndarray, "*cases members"]:
-    """Uniform numbers of a group, from independent ones: Phi(L Phi^-1(u)); see `campaigns.sampling.correlation`."""
+    """Uniform numbers of a group, from independent ones: Phi(L Phi^-1(u)); see
+    `marsyard.campaigns.sampling.correlation`.
+    """
     mixed: Float64[np.ndarray, "*cases members"] = np.clip(ndtr(ndtri(uniform) @ factor.T), SMALLEST, GREATEST)
     return mixed
 

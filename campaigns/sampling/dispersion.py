@@ -3,8 +3,8 @@
 Every dispersion turns one uniform number into a value, by the inverse of its distribution function. A case's values so
 depend on one number a dispersion, however the numbers are laid out: drawn independently, correlated, or stratified.
 
-Numbers of a distribution may be formulas (`campaigns.sampling.formulas`) over other parameters, drawn ones among them;
-`Dispersion.given` puts a case's values in their place.
+Numbers of a distribution may be formulas (`marsyard.campaigns.sampling.formulas`) over other parameters, drawn ones
+among them; `Dispersion.given` puts a case's values in their place.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict
 
-from campaigns.sampling.formulas import Formula, formula
+from marsyard.campaigns.sampling.formulas import Formula, formula
 
 #: Probability left out on either side when the reach of a distribution is checked against what a parameter allows.
 TAIL = 1e-12

@@ -9,12 +9,12 @@ from typing import Annotated, Any, Self
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
-from campaigns.errors import near_match
-from campaigns.sampling.dispersion import Dispersion
-from campaigns.sampling.levels import Choice, Derived, Fixed, Grid
-from campaigns.sampling.ranges import Integer, InTurn, Normal, Uniform
-from campaigns.sampling.shapes import Frozen, Shape, parameters_of, scipy_distributions, truncated_quantile
-from campaigns.sampling.stated import Limits, Number, limits_of
+from marsyard.campaigns.errors import near_match
+from marsyard.campaigns.sampling.dispersion import Dispersion
+from marsyard.campaigns.sampling.levels import Choice, Derived, Fixed, Grid
+from marsyard.campaigns.sampling.ranges import Integer, InTurn, Normal, Uniform
+from marsyard.campaigns.sampling.shapes import Frozen, Shape, parameters_of, scipy_distributions, truncated_quantile
+from marsyard.campaigns.sampling.stated import Limits, Number, limits_of
 
 
 class Scipy(Dispersion):

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from campaigns.errors import near_match
+from marsyard.campaigns.errors import near_match
 
 #: Longer ones belong into a scenario.
 LONGEST = 300

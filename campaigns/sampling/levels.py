@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from campaigns.sampling.dispersion import Dispersion
-from campaigns.sampling.stated import Literally, Number, Weight, numbers_of
+from marsyard.campaigns.sampling.dispersion import Dispersion
+from marsyard.campaigns.sampling.stated import Literally, Number, Weight, numbers_of
 
 #: The most levels of one grid; a slip of the keyboard (a step of 1e-9) shows.
 MOST_LEVELS = 100_000

@@ -9,9 +9,9 @@ from typing import Any, Literal, Self
 
 from pydantic import model_validator
 
-from campaigns.sampling.dispersion import Dispersion
-from campaigns.sampling.shapes import STANDARD_NORMAL, truncated_quantile
-from campaigns.sampling.stated import Limits, Number, PositiveNumber, WholeNumber, limits_of, numbers_of
+from marsyard.campaigns.sampling.dispersion import Dispersion
+from marsyard.campaigns.sampling.shapes import STANDARD_NORMAL, truncated_quantile
+from marsyard.campaigns.sampling.stated import Limits, Number, PositiveNumber, WholeNumber, limits_of, numbers_of
 
 
 class Uniform(Dispersion):
@@ -52,7 +52,7 @@ class Uniform(Dispersion):
 class Normal(Dispersion):
     """Normal with mean `mean` and standard deviation `sd`, cut to `truncate` where given.
 
-    `sd` is left out where a group states a covariance (`campaigns.sampling.correlation`), and nowhere else.
+    `sd` is left out where a group states a covariance (`marsyard.campaigns.sampling.correlation`), and nowhere else.
     """
 
     continuous = True

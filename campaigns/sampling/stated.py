@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field, PlainValidator
 from pydantic_core import PydanticKnownError
 
-from campaigns.sampling.formulas import formula
+from marsyard.campaigns.sampling.formulas import formula
 
 
 def _number_or_formula(stated: Any) -> float | str:

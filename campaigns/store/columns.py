@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from scenarios.interface import Scalar
+from marsyard.scenarios.interface import Scalar
 
 #: One case as stored.
 Row = Mapping[str, Scalar]

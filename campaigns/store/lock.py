@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from campaigns.errors import StoreError
+from marsyard.campaigns.errors import StoreError
 
 #: Held for as long as a runner works in the folder; the file stays, the lock goes with the process however it ends.
 LOCK_FILE = "campaign.lock"

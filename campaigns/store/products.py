@@ -15,7 +15,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from campaigns.errors import StoreError
+from marsyard.campaigns.errors import StoreError
 
 #: Stands for an array in `products.json`, with the name that it has in `products.npz`.
 _ARRAY = "__array__"

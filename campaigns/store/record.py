@@ -14,10 +14,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from campaigns.definition.configuration import CampaignConfiguration
-from campaigns.definition.identity import Identity
-from campaigns.errors import StoreError
-from campaigns.store.rows import ROWS_FILE, is_empty_store
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.identity import Identity
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1
@@ -92,7 +92,7 @@ def begin(
     command
         The words of the command that runs it again, from the current folder.
     algorithms
-        The algorithms under test, as `campaigns.definition.algorithms.describe_algorithms` has them.
+        The algorithms under test, as `marsyard.campaigns.definition.algorithms.describe_algorithms` has them.
     """
     stated = configuration.model_dump(mode="json")
     write(

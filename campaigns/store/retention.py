@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from campaigns.definition.configuration import CampaignConfiguration, Requirement
-from campaigns.outcomes import UNFINISHED
-from campaigns.store.products import PackedProducts, save_packed
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
+from marsyard.campaigns.outcomes import UNFINISHED
+from marsyard.campaigns.store.products import PackedProducts, save_packed
 
 #: Products of one case each lie in a folder of its number in here.
 CASES_FOLDER = "cases"

@@ -22,9 +22,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from campaigns.errors import StoreError
-from campaigns.outcomes import UNFINISHED
-from campaigns.store.columns import Row
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.outcomes import UNFINISHED
+from marsyard.campaigns.store.columns import Row
 
 ROWS_FILE = "cases.sqlite"
 

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from campaigns.errors import StoreError
-from campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
-from campaigns.store.record import stored_configuration
-from campaigns.store.rows import ROWS_FILE, RowStore, readable_store
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
+from marsyard.campaigns.store.record import stored_configuration
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, readable_store
 
 TABLE_FILE = "cases.parquet"
 

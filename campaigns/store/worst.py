@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from campaigns.definition.configuration import CampaignConfiguration
-from campaigns.store.rows import RowStore
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.store.rows import RowStore
 
 
 def showcase_case(configuration: CampaignConfiguration, table: Path, store: RowStore) -> int | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import marsyard
-from sim.camera import read_calibrations
+from marsyard.sim.camera import read_calibrations
 
 # EuRoC's first camera in Kalibr's format
 CHAIN = """cam0:

@@ -18,9 +18,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from algorithms.exchange import read_mast, read_pose, read_stop, read_target
-from sim.camera import CameraModel
-from sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements, RoverTarget
+from marsyard.algorithms.exchange import read_mast, read_pose, read_stop, read_target
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements, RoverTarget
 
 HALF = 10  # of the template
 REACH = 70  # of its search around the expected place, and of the disparity

@@ -12,8 +12,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from algorithms.interface import VelocityEstimate, VelocityOutcome
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.sim.measurements import DescentMeasurements
 
 HALF = (20, 5)  # of a template: columns, rows
 REACH = (48, 14)  # of its search around the expected place
@@ -23,7 +23,7 @@ LEAST_VARIANCE_M2_S2 = 0.01  # what attitude errors leave even where all templat
 
 
 class MedianShift:
-    """Implements `algorithms.interface.VelocityEstimator`; made without arguments."""
+    """Implements `marsyard.algorithms.interface.VelocityEstimator`; made without arguments."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """The median velocity of the templates that were found."""

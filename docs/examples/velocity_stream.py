@@ -22,9 +22,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from algorithms.exchange import read_frame
-from algorithms.interface import VelocityEstimate, VelocityOutcome
-from sim.measurements import DescentFrame
+from marsyard.algorithms.exchange import read_frame
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.sim.measurements import DescentFrame
 
 SIDE_PX = 128  # of the square of ground that is compared
 SIDE_HEIGHTS = 0.35  # the same over the height above it
@@ -44,7 +44,7 @@ class Pair:
 
 
 class ChainedShifts:
-    """Implements `algorithms.interface.VelocityStream`; made without arguments."""
+    """Implements `marsyard.algorithms.interface.VelocityStream`; made without arguments."""
 
     def start(self) -> None:
         """Forgets the descent before."""

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from campaigns.errors import CampaignError
-from reports.algorithms import Algorithm, algorithms_of, judged_text
-from reports.campaign import TWIN_FILE, write_report
-from reports.stored import RECORD_FILE, TABLE_FILE, table
-from reports.twin import SCHEMA
+from marsyard.campaigns.errors import CampaignError
+from marsyard.reports.algorithms import Algorithm, algorithms_of, judged_text
+from marsyard.reports.campaign import TWIN_FILE, write_report
+from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
+from marsyard.reports.twin import SCHEMA
 
 #: How deep below a folder campaigns are looked for.
 _DEPTH = 3

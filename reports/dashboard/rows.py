@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from campaigns.definition.requirements import StatedRequirement
-from reports.dashboard.entries import Entry, Shown
-from reports.verdicts import ESTIMATE
-from reports.wording import NOTHING, percent
+from marsyard.campaigns.definition.requirements import StatedRequirement
+from marsyard.reports.dashboard.entries import Entry, Shown
+from marsyard.reports.verdicts import ESTIMATE
+from marsyard.reports.wording import NOTHING, percent
 
 #: Further campaigns whose latest verdicts stand beside a requirement's.
 MOST_BESIDE = 7

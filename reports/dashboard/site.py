@@ -15,10 +15,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from campaigns.definition.requirements import StatedRequirement, shipped_requirements
-from reports.campaign import PAGE_FILE, VERIFICATION_FILE, page_environment, write_whole
-from reports.dashboard.entries import Entry, find_campaigns, read_entries
-from reports.dashboard.rows import (
+from marsyard.campaigns.definition.requirements import StatedRequirement, shipped_requirements
+from marsyard.reports.campaign import PAGE_FILE, VERIFICATION_FILE, page_environment, write_whole
+from marsyard.reports.dashboard.entries import Entry, find_campaigns, read_entries
+from marsyard.reports.dashboard.rows import (
     MOST_BESIDE,
     RequirementRow,
     basis_text,
@@ -27,11 +27,11 @@ from reports.dashboard.rows import (
     margin_text,
     requirement_rows,
 )
-from reports.explorer import embedded, script_hash
-from reports.sections import replay_command
-from reports.stored import read_run
-from reports.systems import shown_case
-from reports.wording import percent
+from marsyard.reports.explorer import embedded, script_hash
+from marsyard.reports.sections import replay_command
+from marsyard.reports.stored import read_run
+from marsyard.reports.systems import shown_case
+from marsyard.reports.wording import percent
 
 INDEX = "index.html"
 #: Kept cases of a campaign that get a page.
@@ -177,7 +177,7 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
 
 def _matrix(rows: Sequence[RequirementRow]) -> str:
     """The traceability matrix of all: the latest of each campaign, and a row for what none shows."""
-    from reports.traceability import algorithm_cells, verification_csv
+    from marsyard.reports.traceability import algorithm_cells, verification_csv
 
     found: list[dict[str, Any]] = []
     for row in rows:

@@ -6,11 +6,11 @@ from dataclasses import asdict
 
 import numpy as np
 
-from reports.columns import label, numbers
-from reports.section import Block, Section, Subject
-from reports.sections import Grid, statistics_grid
-from reports.tables import error_summaries
-from reports.wording import number
+from marsyard.reports.columns import label, numbers
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid, statistics_grid
+from marsyard.reports.tables import error_summaries
+from marsyard.reports.wording import number
 
 METRIC = "firing_velocity_error_m_s"
 #: Time from the last picture to the firing: what DIMES and the computer have for their answer.

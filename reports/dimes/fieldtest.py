@@ -17,14 +17,14 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from reports.answers import CONFIDENCE, Share, share_of
-from reports.columns import axis_columns, label, numbers, split_unit
-from reports.plates import Plate, plate
-from reports.populations import is_flag, members
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.svg import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.wording import NOTHING, count, number, percent, stated
+from marsyard.reports.answers import CONFIDENCE, Share, share_of
+from marsyard.reports.columns import axis_columns, label, numbers, split_unit
+from marsyard.reports.plates import Plate, plate
+from marsyard.reports.populations import is_flag, members
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.svg import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
+from marsyard.reports.wording import NOTHING, count, number, percent, stated
 
 #: Difference from the paper that is called large, percentage points.
 LARGE_POINTS = 10.0

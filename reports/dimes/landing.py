@@ -6,15 +6,15 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from reports.answers import CONFIDENCE, share_of
-from reports.columns import numbers
-from reports.plates import plate
-from reports.populations import is_flag, members, terrain_groups
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.samples import Groups, quantile_bounds
-from reports.svg import SERIES, in_page_style, new_axes
-from reports.wording import number, percent, stated
+from marsyard.reports.answers import CONFIDENCE, share_of
+from marsyard.reports.columns import numbers
+from marsyard.reports.plates import plate
+from marsyard.reports.populations import is_flag, members, terrain_groups
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.samples import Groups, quantile_bounds
+from marsyard.reports.svg import SERIES, in_page_style, new_axes
+from marsyard.reports.wording import number, percent, stated
 
 WITH, WITHOUT = "touchdown_speed_with_m_s", "touchdown_speed_without_m_s"
 #: Column of true and false: whether the answer was there when thrusters fired.

@@ -16,13 +16,13 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy import stats
 
-from reports.columns import label, magnitude_label, numbers, split_unit
-from reports.plates import plate
-from reports.populations import terrain_groups
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.svg import MUTED, SERIES, in_page_style, new_axes
-from reports.wording import number, stated
+from marsyard.reports.columns import label, magnitude_label, numbers, split_unit
+from marsyard.reports.plates import plate
+from marsyard.reports.populations import terrain_groups
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.svg import MUTED, SERIES, in_page_style, new_axes
+from marsyard.reports.wording import number, stated
 
 #: The drivers that the paper compares: all must be there and vary for the section to be shown.
 ASKED = ("descent_rate_m_s", "altitude_1_m", "attitude_rate_max_deg_s")

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from reports.columns import label
-from reports.dimes.case_figures import (
+from marsyard.reports.columns import label
+from marsyard.reports.dimes.case_figures import (
     Track,
     delivered_pictures,
     draw_dimes_pair,
@@ -18,10 +18,10 @@ from reports.dimes.case_figures import (
     tracks,
     write_dimes_figures,
 )
-from reports.pictures import draw_pictures
-from reports.plates import plate
-from reports.shown import CaseView, System, TableRow
-from reports.wording import number
+from marsyard.reports.pictures import draw_pictures
+from marsyard.reports.plates import plate
+from marsyard.reports.shown import CaseView, System, TableRow
+from marsyard.reports.wording import number
 
 #: Columns of the tracks that the page has no room for, or says otherwise.
 _NOT_SHOWN = ("pair", "template", "valid", "ground_east_m", "ground_north_m")

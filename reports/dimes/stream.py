@@ -11,11 +11,11 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from reports.plates import plate
-from reports.products import numbers, plane
-from reports.shown import CaseView, System, TableRow
-from reports.svg import INK, MARKERS, MUTED, SERIES, in_page_style
-from reports.wording import number
+from marsyard.reports.plates import plate
+from marsyard.reports.products import numbers, plane
+from marsyard.reports.shown import CaseView, System, TableRow
+from marsyard.reports.svg import INK, MARKERS, MUTED, SERIES, in_page_style
+from marsyard.reports.wording import number
 
 #: Pictures that a row of the figure holds.
 _MOST_IN_ROW = 10

@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LightSource, LinearSegmentedColormap, ListedColormap, to_rgb
 from matplotlib.figure import Figure
 
-from reports.hda.products import (
+from marsyard.reports.hda.products import (
     EpipolarMatches,
     LandingMaps,
     SolvedMotion,
@@ -31,8 +31,8 @@ from reports.hda.products import (
     tracked_features,
     true_ground,
 )
-from reports.pictures import show_picture
-from reports.svg import MUTED, in_page_style
+from marsyard.reports.pictures import show_picture
+from marsyard.reports.svg import MUTED, in_page_style
 
 T = TypeVar("T")
 

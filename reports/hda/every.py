@@ -1,13 +1,13 @@
 """Every section about landings, in the order of the page."""
 
-from reports.hda.faults import landing_faults_section
-from reports.hda.hazards import hazards_section
-from reports.hda.limits import limits_section
-from reports.hda.map_errors import map_section
-from reports.hda.run_times import run_times_section
-from reports.hda.threshold import threshold_section
-from reports.hda.touchdown import touchdown_section
-from reports.section import SectionMaker
+from marsyard.reports.hda.faults import landing_faults_section
+from marsyard.reports.hda.hazards import hazards_section
+from marsyard.reports.hda.limits import limits_section
+from marsyard.reports.hda.map_errors import map_section
+from marsyard.reports.hda.run_times import run_times_section
+from marsyard.reports.hda.threshold import threshold_section
+from marsyard.reports.hda.touchdown import touchdown_section
+from marsyard.reports.section import SectionMaker
 
 #: Those alone appear whose columns the rows hold and whose conditions vary.
 HDA_SECTIONS: tuple[SectionMaker, ...] = (

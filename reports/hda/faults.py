@@ -10,15 +10,15 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from reports.answers import CONFIDENCE, Share, share_of
-from reports.columns import numbers
-from reports.faults import FAULT, NO_FAULT, SIZE
-from reports.hda.rows import flag, interval_text, is_landing
-from reports.plates import plate
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.svg import MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.wording import NOTHING, percent, stated
+from marsyard.reports.answers import CONFIDENCE, Share, share_of
+from marsyard.reports.columns import numbers
+from marsyard.reports.faults import FAULT, NO_FAULT, SIZE
+from marsyard.reports.hda.rows import flag, interval_text, is_landing
+from marsyard.reports.plates import plate
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.svg import MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
+from marsyard.reports.wording import NOTHING, percent, stated
 
 #: Faults in words with the unit of their size; a unit of None is one kind without sizes.
 NAMES: Mapping[str, tuple[str, str | None]] = MappingProxyType(

@@ -12,16 +12,16 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from reports.answers import CONFIDENCE, Share, share_of
-from reports.columns import numbers
-from reports.hda.rows import Rate, flag, interval_text, is_landing, rate, rate_text, share_text
-from reports.plates import plate
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.samples import quantile_bounds
-from reports.svg import MARKERS, SERIES, in_page_style, new_axes
-from reports.wording import NOTHING, number, stated
-from scenarios.landing.confusion import CLASS_NAMES, CLASSES
+from marsyard.reports.answers import CONFIDENCE, Share, share_of
+from marsyard.reports.columns import numbers
+from marsyard.reports.hda.rows import Rate, flag, interval_text, is_landing, rate, rate_text, share_text
+from marsyard.reports.plates import plate
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.samples import quantile_bounds
+from marsyard.reports.svg import MARKERS, SERIES, in_page_style, new_axes
+from marsyard.reports.wording import NOTHING, number, stated
+from marsyard.scenarios.landing.confusion import CLASS_NAMES, CLASSES
 
 #: What is true of the ground that both pictures show, best first.
 GROUNDS = ("safe place with room about it", "safe place without room", "no safe place")

@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from reports.columns import numbers
-from reports.hda.rows import Rate, flag, is_landing, rate, rate_text
-from reports.plates import plate
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.svg import MUTED, REQUIREMENT, SERIES, in_page_style
-from reports.wording import NOTHING, percent
+from marsyard.reports.columns import numbers
+from marsyard.reports.hda.rows import Rate, flag, is_landing, rate, rate_text
+from marsyard.reports.plates import plate
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.svg import MUTED, REQUIREMENT, SERIES, in_page_style
+from marsyard.reports.wording import NOTHING, percent
 
 #: Share of features below which tracking is no longer good.
 GOOD = 0.9

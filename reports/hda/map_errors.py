@@ -11,16 +11,16 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from reports.columns import numbers
-from reports.hda.rows import is_landing, varies
-from reports.plates import plate
-from reports.populations import terrain_groups
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.drivers import FEWEST_CASES
-from reports.statistics.drivers import driver as explained
-from reports.svg import SERIES, in_page_style
-from reports.wording import NOTHING, coefficient, count, number, stated
+from marsyard.reports.columns import numbers
+from marsyard.reports.hda.rows import is_landing, varies
+from marsyard.reports.plates import plate
+from marsyard.reports.populations import terrain_groups
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.drivers import FEWEST_CASES
+from marsyard.reports.statistics.drivers import driver as explained
+from marsyard.reports.svg import SERIES, in_page_style
+from marsyard.reports.wording import NOTHING, coefficient, count, number, stated
 
 #: Fewest cases with a map for the section to be shown.
 FEWEST = 8

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from reports.answers import CONFIDENCE, Share
-from reports.columns import numbers
-from reports.dimes.sensitivity import bootstrap_weights
-from reports.populations import is_flag, terrain_groups
-from reports.section import Subject
-from reports.stored import table
-from reports.wording import NOTHING, percent
+from marsyard.reports.answers import CONFIDENCE, Share
+from marsyard.reports.columns import numbers
+from marsyard.reports.dimes.sensitivity import bootstrap_weights
+from marsyard.reports.populations import is_flag, terrain_groups
+from marsyard.reports.section import Subject
+from marsyard.reports.stored import table
+from marsyard.reports.wording import NOTHING, percent
 
 #: Columns that every row of a landing case has.
 _OWN = ("site_safe", "site_reported", "no_site_reported", "truly_safe_share")

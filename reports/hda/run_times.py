@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from reports.columns import numbers
-from reports.hda.rows import is_landing
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.wording import NOTHING, count, number
+from marsyard.reports.columns import numbers
+from marsyard.reports.hda.rows import is_landing
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.wording import NOTHING, count, number
 
 
 @dataclass(frozen=True)

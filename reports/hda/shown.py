@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from reports.hda.case_figures import FIGURES, figures_reached, write_hda_figures
-from reports.hda.products import (
+from marsyard.reports.hda.case_figures import FIGURES, figures_reached, write_hda_figures
+from marsyard.reports.hda.products import (
     LandingMaps,
     SolvedMotion,
     epipolar_matches,
@@ -18,10 +18,10 @@ from reports.hda.products import (
     solved_motion,
     tracked_features,
 )
-from reports.pictures import draw_pictures
-from reports.plates import plate
-from reports.shown import CaseView, System, TableRow
-from reports.wording import number
+from marsyard.reports.pictures import draw_pictures
+from marsyard.reports.plates import plate
+from marsyard.reports.shown import CaseView, System, TableRow
+from marsyard.reports.wording import number
 
 _CAPTIONS: Mapping[str, str] = {
     "fig2-motion": "Fig. 2: motion and structure from three sides.",

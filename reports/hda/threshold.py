@@ -9,14 +9,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from reports.answers import Share, share_of
-from reports.columns import numbers
-from reports.hda.rows import Rate, flag, is_landing, rate, rate_text, stated_parameter, varies
-from reports.plates import plate
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.svg import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
-from scenarios.landing.parameters import LanderParameters
+from marsyard.reports.answers import Share, share_of
+from marsyard.reports.columns import numbers
+from marsyard.reports.hda.rows import Rate, flag, is_landing, rate, rate_text, stated_parameter, varies
+from marsyard.reports.plates import plate
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.svg import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
+from marsyard.scenarios.landing.parameters import LanderParameters
 
 #: Column of the threshold that the algorithm was given.
 THRESHOLD = "max_roughness_m"

@@ -10,17 +10,17 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from reports.answers import CONFIDENCE, share_of
-from reports.columns import numbers
-from reports.hda.rows import flag, interval_text, is_landing, share_text
-from reports.plates import plate
-from reports.populations import terrain_groups
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.proportions import Interval
-from reports.statistics.samples import mean_interval
-from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.wording import NOTHING, number, stated
+from marsyard.reports.answers import CONFIDENCE, share_of
+from marsyard.reports.columns import numbers
+from marsyard.reports.hda.rows import flag, interval_text, is_landing, share_text
+from marsyard.reports.plates import plate
+from marsyard.reports.populations import terrain_groups
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.proportions import Interval
+from marsyard.reports.statistics.samples import mean_interval
+from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
+from marsyard.reports.wording import NOTHING, number, stated
 
 #: Table II: run, position error, deviations of northing and easting (m), run time (s). Run 2 is missing there.
 TABLE_2 = ((1, 1.21, 0.70, 0.43, 1.8), (3, 1.20, 0.61, 0.47, 1.9), (4, 0.89, 0.39, 0.35, 1.7))

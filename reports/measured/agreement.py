@@ -9,12 +9,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from reports.columns import label, numbers
-from reports.plates import plate
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.svg import MARKERS, SERIES, in_page_style, new_axes
-from reports.wording import NOTHING, number
+from marsyard.reports.columns import label, numbers
+from marsyard.reports.plates import plate
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.svg import MARKERS, SERIES, in_page_style, new_axes
+from marsyard.reports.wording import NOTHING, number
 
 MEDIAN, MOST = "residual_median_px", "residual_90_percent_px"
 #: Rows of the table; further cases are counted.

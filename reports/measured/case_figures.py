@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from reports.pictures import show_picture
-from reports.products import numbers, plane
-from reports.svg import MUTED, in_page_style
-from reports.wording import number
+from marsyard.reports.pictures import show_picture
+from marsyard.reports.products import numbers, plane
+from marsyard.reports.svg import MUTED, in_page_style
+from marsyard.reports.wording import number
 
 #: Residuals are coloured from none to so many pixels.
 _REDDEST_PX = 3.0

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from reports.dimes.shown import DIMES
-from reports.hda.case_figures import FIGURES, figures_reached
-from reports.measured.case_figures import (
+from marsyard.reports.dimes.shown import DIMES
+from marsyard.reports.hda.case_figures import FIGURES, figures_reached
+from marsyard.reports.measured.case_figures import (
     MatchedPair,
     draw_pair,
     is_measured_case,
     matched_pairs,
     write_measured_figures,
 )
-from reports.plates import plate
-from reports.shown import CaseView, System, TableRow
-from reports.wording import number
+from marsyard.reports.plates import plate
+from marsyard.reports.shown import CaseView, System, TableRow
+from marsyard.reports.wording import number
 
 #: Pairs whose pictures go into the page.
 _MOST_PAIRS = 4

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from reports.statistics.proportions import Interval
+from marsyard.reports.statistics.proportions import Interval
 
 #: Above this many values (or terrains) the bootstrap's interval equals the large-sample one in what is printed.
 LARGEST_SAMPLE = 2000

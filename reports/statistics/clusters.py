@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 
 #: Fewest terrains, and fewest terrains with a failure (and with a success), for which the design effect is estimated.
 #: Chosen by simulation (`tests/reports/statistics/test_clusters.py`): with these the bounds keep their confidence.

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from reports.statistics.clusters import terrain_index
-from reports.statistics.samples import Groups, mean_interval
-from reports.statistics.shared import is_shared
+from marsyard.reports.statistics.clusters import terrain_index
+from marsyard.reports.statistics.samples import Groups, mean_interval
+from marsyard.reports.statistics.shared import is_shared
 
 
 def compared_successes(

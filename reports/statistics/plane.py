@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from reports.statistics.samples import Groups, Quantile, quantile_bounds
+from marsyard.reports.statistics.samples import Groups, Quantile, quantile_bounds
 
 #: Fewest points of an ellipse: its factor needs two degrees of freedom beyond the plane's.
 FEWEST_OF_ELLIPSE = 5

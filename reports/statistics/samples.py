@@ -5,7 +5,7 @@ sample sizes for setting tolerance limits", Ann. Math. Statist. 12, 1941; as Han
 consumer risk, NASA/TP-2010-216447). Means and spreads are bounded by the BCa bootstrap (`.bootstrap`); a spread's
 interval reaches at least as far as Bonett's ("Approximate confidence interval for standard deviation of nonnormal
 distributions", Comput. Statist. Data Anal. 50, 2006), since BCa alone covers too little in small samples.
-Where values share terrains (`groups`) all of these are by terrains: `reports.statistics.shared`. `python -m
+Where values share terrains (`groups`) all of these are by terrains: `marsyard.reports.statistics.shared`. `python -m
 benchmarks.validation --only intervals --only shared` measures their coverage.
 """
 
@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-from reports.statistics.bootstrap import LARGEST_SAMPLE, bca
-from reports.statistics.proportions import Interval, check_confidence
-from reports.statistics.shared import is_shared, shared_mean, shared_quantile, shared_spread
+from marsyard.reports.statistics.bootstrap import LARGEST_SAMPLE, bca
+from marsyard.reports.statistics.proportions import Interval, check_confidence
+from marsyard.reports.statistics.shared import is_shared, shared_mean, shared_quantile, shared_spread
 
 #: Which values are from one terrain: its number for each; None where all are independent.
 Groups = Int[np.ndarray, " n"] | None

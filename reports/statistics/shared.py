@@ -4,10 +4,10 @@ Values on one terrain are alike, so that the terrain is what was drawn. Mean and
 whole terrains (Davison & Hinkley, "Bootstrap methods and their application", 1997, section 3.8), widened for few of
 them as that of single values is, and reaching at least as far as Student's interval with the variance over terrains
 (Taylor linearisation; Cochran, "Sampling techniques", 1977, section 6), since a bootstrap of few terrains covers too
-little. Quantiles: order statistics, counted as success rates of shared terrains are (`reports.statistics.clusters`):
-by the effective number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952, with Korn & Graubard's number), or by
-whole terrains where too few of them lie on either side. `python -m benchmarks.validation --only shared` measures
-their coverage.
+little. Quantiles: order statistics, counted as success rates of shared terrains are
+(`marsyard.reports.statistics.clusters`): by the effective number of values (Woodruff, J. Amer. Statist. Assoc. 47,
+1952, with Korn & Graubard's number), or by whole terrains where too few of them lie on either side. `python -m
+benchmarks.validation --only shared` measures their coverage.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-from reports.statistics.bootstrap import LARGEST_SAMPLE, bca
-from reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
-from reports.statistics.proportions import Interval, proportion_lower
+from marsyard.reports.statistics.bootstrap import LARGEST_SAMPLE, bca
+from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
+from marsyard.reports.statistics.proportions import Interval, proportion_lower
 
 #: Fewest terrains that say anything of the spread between them.
 FEWEST_TERRAINS = 5

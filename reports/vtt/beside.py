@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from reports.columns import numbers
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.vtt.rows import flag_share, holds, is_tracking, known, legs, share_text, spread_text
-from reports.wording import NOTHING
+from marsyard.reports.columns import numbers
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.vtt.rows import flag_share, holds, is_tracking, known, legs, share_text, spread_text
+from marsyard.reports.wording import NOTHING
 
 Ours = Callable[[pd.DataFrame], str]
 

@@ -22,8 +22,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Rectangle
 from scipy import ndimage
 
-from reports.svg import GRID, INK, MUTED, SERIES, in_page_style
-from reports.vtt.products import StopPictures, Way, stops_of, template_px, way_of
+from marsyard.reports.svg import GRID, INK, MUTED, SERIES, in_page_style
+from marsyard.reports.vtt.products import StopPictures, Way, stops_of, template_px, way_of
 
 #: Orange and blue of Okabe and Ito; the true place is a white cross with a dark rim. No colour is alone in its meaning:
 #: the target's square is drawn whole, the window with dashes.

@@ -10,18 +10,18 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
-from reports.answers import CONFIDENCE, Share, share_of
-from reports.columns import numbers
-from reports.figures import axis_edge, note_beyond
-from reports.plates import plate
-from reports.populations import terrain_groups
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.statistics.samples import quantile_bounds
-from reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
-from reports.vtt.rows import flag_share, interval_text, is_closed_loop, known, selectable, share_text
-from reports.wording import NOTHING, number, stated
+from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
+from marsyard.reports.answers import CONFIDENCE, Share, share_of
+from marsyard.reports.columns import numbers
+from marsyard.reports.figures import axis_edge, note_beyond
+from marsyard.reports.plates import plate
+from marsyard.reports.populations import terrain_groups
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.statistics.samples import quantile_bounds
+from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
+from marsyard.reports.vtt.rows import flag_share, interval_text, is_closed_loop, known, selectable, share_text
+from marsyard.reports.wording import NOTHING, number, stated
 
 #: The instrument placement's requirement of section 4.2, metres, and the share of runs that shall keep it.
 WITHIN_M = 0.03

@@ -10,13 +10,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from reports.answers import CONFIDENCE, Share
-from reports.columns import numbers
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.vtt.goal import losses_grid
-from reports.vtt.rows import flag_share, interval_text, is_closed_loop, known, selectable, share_text, spread_text
-from reports.wording import NOTHING, percent, stated
+from marsyard.reports.answers import CONFIDENCE, Share
+from marsyard.reports.columns import numbers
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.vtt.goal import losses_grid
+from marsyard.reports.vtt.rows import (
+    flag_share,
+    interval_text,
+    is_closed_loop,
+    known,
+    selectable,
+    share_text,
+    spread_text,
+)
+from marsyard.reports.wording import NOTHING, percent, stated
 
 
 @dataclass(frozen=True)

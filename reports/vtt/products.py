@@ -1,4 +1,6 @@
-"""What a case of visual target tracking keeps, read for figures: its stops and its way, see `scenarios.rover.score`."""
+"""What a case of visual target tracking keeps, read for figures: its stops and its way, see
+`marsyard.scenarios.rover.score`.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from reports.products import numbers, plane
+from marsyard.reports.products import numbers, plane
 
 #: Numbers that stops may have.
 _STOPS = range(1, 1000)

@@ -6,12 +6,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from reports.answers import Share, share_of
-from reports.columns import numbers
-from reports.populations import is_flag
-from reports.section import Subject
-from reports.stored import table
-from reports.wording import NOTHING, number, percent
+from marsyard.reports.answers import Share, share_of
+from marsyard.reports.columns import numbers
+from marsyard.reports.populations import is_flag
+from marsyard.reports.section import Subject
+from marsyard.reports.stored import table
+from marsyard.reports.wording import NOTHING, number, percent
 
 #: Columns that every row of a tracking case has.
 _OWN = ("tracked", "drift_px", "position_error_m", "losses")

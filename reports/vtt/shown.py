@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from reports.columns import label
-from reports.plates import plate
-from reports.shown import CaseView, System, TableRow
-from reports.vtt.case_figures import draw_stops, draw_way, write_vtt_figures
-from reports.vtt.products import is_vtt_case, stops_of, way_of
-from reports.wording import NOTHING, count, number
+from marsyard.reports.columns import label
+from marsyard.reports.plates import plate
+from marsyard.reports.shown import CaseView, System, TableRow
+from marsyard.reports.vtt.case_figures import draw_stops, draw_way, write_vtt_figures
+from marsyard.reports.vtt.products import is_vtt_case, stops_of, way_of
+from marsyard.reports.wording import NOTHING, count, number
 
 #: Stops whose pictures go into the page.
 _MOST_STOPS = 8

@@ -12,13 +12,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from reports.answers import CONFIDENCE, Share
-from reports.plates import plate
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.svg import MARKERS, SERIES, in_page_style, new_axes
-from reports.vtt.rows import flag_share, holds, interval_text, is_tracking, legs, selectable, share_text
-from reports.wording import NOTHING, number, stated
+from marsyard.reports.answers import CONFIDENCE, Share
+from marsyard.reports.plates import plate
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.svg import MARKERS, SERIES, in_page_style, new_axes
+from marsyard.reports.vtt.rows import flag_share, holds, interval_text, is_tracking, legs, selectable, share_text
+from marsyard.reports.wording import NOTHING, number, stated
 
 #: What tells the lines of a figure apart, where it varies.
 _SERIES = ("algorithm", "search_px")

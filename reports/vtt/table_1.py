@@ -9,12 +9,12 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from algorithms.vtt.accuracy import GOAL_M, START_M, AccuracyRow, table_1, tracked_approach_error_m
-from reports.columns import numbers
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.vtt.rows import is_closed_loop, selectable
-from reports.wording import number
+from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, AccuracyRow, table_1, tracked_approach_error_m
+from marsyard.reports.columns import numbers
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.vtt.rows import is_closed_loop, selectable
+from marsyard.reports.wording import number
 
 #: The table's own digits: designation and untracked error, and the two numbers of its last column; centimetres.
 PRINTED: Mapping[str, AccuracyRow] = MappingProxyType(

@@ -9,10 +9,10 @@ from typing import Any
 
 import pandas as pd
 
-from reports.section import Block, Section, Subject
-from reports.sections import Grid
-from reports.vtt.rows import is_tracking, known, spread_text
-from reports.wording import NOTHING
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.sections import Grid
+from marsyard.reports.vtt.rows import is_tracking, known, spread_text
+from marsyard.reports.wording import NOTHING
 
 #: What the table tells of an update: its heading, the column's ending, digits.
 QUANTITIES: tuple[tuple[str, str, int], ...] = (

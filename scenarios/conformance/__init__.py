@@ -5,7 +5,7 @@ says; `estimators`, `streams`, `trackers` and `parts` hold the checks, `process`
 them together.
 """
 
-from scenarios.conformance.findings import Finding
-from scenarios.conformance.suite import EXAMINED, Subject, check_names, check_subject, run_check, task_of
+from marsyard.scenarios.conformance.findings import Finding
+from marsyard.scenarios.conformance.suite import EXAMINED, Subject, check_names, check_subject, run_check, task_of
 
 __all__ = ["EXAMINED", "Finding", "Subject", "check_names", "check_subject", "run_check", "task_of"]

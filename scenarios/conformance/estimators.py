@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from algorithms.answers import checked_site, checked_velocity
-from algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
-from scenarios.conformance import inputs
-from scenarios.conformance.findings import BreachError, Check
-from scenarios.conformance.process import fingerprint, own_copy
-from scenarios.conformance.shared import COPIES, process_checks, seed_global_generators
-from sim.measurements import LandingMeasurements
+from marsyard.algorithms.answers import checked_site, checked_velocity
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
+from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.conformance.findings import BreachError, Check
+from marsyard.scenarios.conformance.process import fingerprint, own_copy
+from marsyard.scenarios.conformance.shared import COPIES, process_checks, seed_global_generators
+from marsyard.sim.measurements import LandingMeasurements
 
 
 @dataclass(frozen=True)

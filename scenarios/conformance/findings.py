@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from algorithms.faults import AlgorithmError
+from marsyard.algorithms.faults import AlgorithmError
 
 _OURS = Path(__file__).resolve().parents[2]
 

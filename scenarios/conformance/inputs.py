@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenarios.conformance.surfaces import TexturedPlane
-from sim.frames import direction, rigid
-from sim.measurements import (
+from marsyard.scenarios.conformance.surfaces import TexturedPlane
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.measurements import (
     AltitudeMeasurement,
     AttitudeMeasurement,
     DescentMeasurements,
@@ -21,8 +21,8 @@ from sim.measurements import (
     LandingMeasurements,
     PoseMeasurement,
 )
-from sim.sensor import Detector, natural_fall_off, preset
-from sim.sensor.presets import Preset
+from marsyard.sim.sensor import Detector, natural_fall_off, preset
+from marsyard.sim.sensor.presets import Preset
 
 Measurements = TypeVar("Measurements", DescentMeasurements, LandingMeasurements)
 

@@ -1,4 +1,4 @@
-"""The checks of a user's own parts: motions, instruments, scores (`scenarios.parts`)."""
+"""The checks of a user's own parts: motions, instruments, scores (`marsyard.scenarios.parts`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from algorithms.interface import (
+from marsyard.algorithms.interface import (
     SiteEstimate,
     SiteOutcome,
     TargetUpdate,
@@ -20,16 +20,16 @@ from algorithms.interface import (
     VelocityEstimate,
     VelocityOutcome,
 )
-from scenarios.conformance import inputs, trackers
-from scenarios.conformance.findings import BreachError, Check
-from scenarios.conformance.process import fingerprint, own_copy
-from scenarios.conformance.shared import COPIES, process_check, seed_global_generators
-from scenarios.landing.relief import Footprints, Limits, Relief
-from scenarios.landing.truth import GroundTruth
-from scenarios.parts.instruments import InstrumentTruth, checked_readings
-from scenarios.parts.motions import DescentPlace, Poses, checked_poses
-from scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, Kind, checked_columns, installed
-from scenarios.parts.scores import (
+from marsyard.scenarios.conformance import inputs, trackers
+from marsyard.scenarios.conformance.findings import BreachError, Check
+from marsyard.scenarios.conformance.process import fingerprint, own_copy
+from marsyard.scenarios.conformance.shared import COPIES, process_check, seed_global_generators
+from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
+from marsyard.scenarios.landing.truth import GroundTruth
+from marsyard.scenarios.parts.instruments import InstrumentTruth, checked_readings
+from marsyard.scenarios.parts.motions import DescentPlace, Poses, checked_poses
+from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, Kind, checked_columns, installed
+from marsyard.scenarios.parts.scores import (
     SCORED,
     ScoredCase,
     ScoredDescent,
@@ -41,8 +41,8 @@ from scenarios.parts.scores import (
     score_of,
     taken_by,
 )
-from sim.dynamics.recorded import RecordedMotion
-from sim.frames import rigid
+from marsyard.sim.dynamics.recorded import RecordedMotion
+from marsyard.sim.frames import rigid
 
 _GRAVITY_M_S2 = 3.72
 #: How steep the suite's ground is, and its normal.

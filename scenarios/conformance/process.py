@@ -18,13 +18,12 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from scenarios.estimators import sources_of
+from marsyard.scenarios.estimators import sources_of
 
 Thing = TypeVar("Thing")
 
-#: Of `sim`, what an algorithm may know (docs/architecture.md); of our other packages only `algorithms`.
-OPEN = ("sim.frames", "sim.camera", "sim.measurements")
-_CLOSED = ("sim", "scenarios", "campaigns", "reports", "marsyard")
+#: Of `sim`, what an algorithm may know (docs/architecture.md), and of the other packages.
+OPEN = ("marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements", "marsyard.algorithms")
 
 _HOME = Path(__file__).resolve().parents[2]
 #: Files that hold truth, by their names, and by the folder that they lie in.
@@ -115,7 +114,7 @@ def _imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def _is_closed(module: str) -> bool:
-    return module.partition(".")[0] in _CLOSED and not any(f"{module}.".startswith(f"{one}.") for one in OPEN)
+    return module.partition(".")[0] == "marsyard" and not any(f"{module}.".startswith(f"{one}.") for one in OPEN)
 
 
 class _Watcher:

@@ -8,9 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from scenarios.conformance.findings import BreachError, Check
-from scenarios.conformance.process import OPEN, WATCHER, closed_imports, surroundings
-from scenarios.estimators import sources_of
+from marsyard.scenarios.conformance.findings import BreachError, Check
+from marsyard.scenarios.conformance.process import OPEN, WATCHER, closed_imports, surroundings
+from marsyard.scenarios.estimators import sources_of
 
 _ADVICE_PROCESS = "put back what you change, or do not change it: later cases run in the same process"
 COPIES = "work on copies: counts.astype(...), array.copy()"

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from algorithms.interface import VelocityEstimate
-from scenarios.conformance import inputs
-from scenarios.conformance.estimators import VELOCITY, EstimatorSuite
-from scenarios.conformance.findings import BreachError, Check
-from scenarios.conformance.process import fingerprint, own_copy
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.conformance.estimators import VELOCITY, EstimatorSuite
+from marsyard.scenarios.conformance.findings import BreachError, Check
+from marsyard.scenarios.conformance.process import fingerprint, own_copy
+from marsyard.sim.measurements import DescentMeasurements
 
 #: Pictures of an ordinary descent, of which some checks take the first ones alone, and of a long one.
 PICTURES, MANY = 5, 10

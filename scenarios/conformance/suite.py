@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from algorithms.exchange import PREFIXES, ExecutableLimits
-from scenarios.conformance import estimators, inputs, parts, streams, surfaces, trackers
-from scenarios.conformance.findings import Check, Finding
-from scenarios.dotted import found_at
-from scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
-from scenarios.parts.named import KINDS
+from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
+from marsyard.scenarios.conformance import estimators, inputs, parts, streams, surfaces, trackers
+from marsyard.scenarios.conformance.findings import Check, Finding
+from marsyard.scenarios.dotted import found_at
+from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
+from marsyard.scenarios.parts.named import KINDS
 
 _INPUTS: Mapping[str, Sequence[Callable[[], object]]] = {
     "velocity": [inputs.descent, streams.STREAM.measurements],
@@ -28,7 +28,7 @@ class Subject:
     Attributes
     ----------
     spec
-        How it is named; see `scenarios.estimators`, `scenarios.parts`.
+        How it is named; see `marsyard.scenarios.estimators`, `marsyard.scenarios.parts`.
     task
         The name of its task, or of its kind.
     limit_s

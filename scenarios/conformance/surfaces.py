@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64
 from scipy import fft
 from scipy.ndimage import map_coordinates
 
-from sim.camera import CameraModel
+from marsyard.sim.camera import CameraModel
 
 #: Radiance factor of the plane's mean, and of what lies beyond it.
 MEAN, BEYOND = 0.2, 0.1

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.answers import checked_aim, checked_update
-from algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
-from algorithms.vtt.pointing import mast_angles
-from scenarios.conformance.findings import BreachError, Check
-from scenarios.conformance.process import fingerprint, own_copy
-from scenarios.conformance.shared import COPIES, process_checks, seed_global_generators
-from scenarios.conformance.surfaces import MEAN, TexturedPlane
-from sim.camera import CameraModel
-from sim.frames import rigid
-from sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements
-from sim.sensor import stereo_mast
+from marsyard.algorithms.answers import checked_aim, checked_update
+from marsyard.algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
+from marsyard.algorithms.vtt.pointing import mast_angles
+from marsyard.scenarios.conformance.findings import BreachError, Check
+from marsyard.scenarios.conformance.process import fingerprint, own_copy
+from marsyard.scenarios.conformance.shared import COPIES, process_checks, seed_global_generators
+from marsyard.scenarios.conformance.surfaces import MEAN, TexturedPlane
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements
+from marsyard.sim.sensor import stereo_mast
 
 FULL_SCALE_DN = 4095
 _LEVEL_DN = 1500.0

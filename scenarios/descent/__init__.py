@@ -4,10 +4,10 @@ Read it in the order of a case: `parameters`, `world`, `flight`, `optics`, `expo
 `scenario` runs them one after the other.
 """
 
-from scenarios.descent.flight import flown_descent
-from scenarios.descent.optics import camera_optics
-from scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
-from scenarios.descent.scenario import DescentScenario
+from marsyard.scenarios.descent.flight import flown_descent
+from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
+from marsyard.scenarios.descent.scenario import DescentScenario
 
 __all__ = [
     "CameraParameters",

@@ -9,16 +9,16 @@ import numpy as np
 from jaxtyping import Float32, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from scenarios.descent.faults import clouds_over, delivered
-from scenarios.descent.haze import veiled
-from scenarios.descent.heat_shield import HeatShield
-from scenarios.descent.parameters import DescentScenarioParameters
-from scenarios.descent.world import World
-from scenarios.optics import Optics
-from sim.dynamics import State
-from sim.render import Frame, Scene, process_renderer
-from sim.sensor import Detector, ImageMotion
-from sim.streams import Streams
+from marsyard.scenarios.descent.faults import clouds_over, delivered
+from marsyard.scenarios.descent.haze import veiled
+from marsyard.scenarios.descent.heat_shield import HeatShield
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.world import World
+from marsyard.scenarios.optics import Optics
+from marsyard.sim.dynamics import State
+from marsyard.sim.render import Frame, Scene, process_renderer
+from marsyard.sim.sensor import Detector, ImageMotion
+from marsyard.sim.streams import Streams
 
 
 def expose(

@@ -13,12 +13,12 @@ from jaxtyping import UInt16
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from scenarios.faults import Size, SizedFaults, ailing
-from sim.measurements import AltitudeMeasurement, AttitudeMeasurement
-from sim.render.clouds import CloudLayer, CloudParameters
-from sim.sensor import DetectorParameters
-from sim.terrain import TerrainParameters
-from sim.terrain.landforms import Dunes
+from marsyard.scenarios.faults import Size, SizedFaults, ailing
+from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
+from marsyard.sim.render.clouds import CloudLayer, CloudParameters
+from marsyard.sim.sensor import DetectorParameters
+from marsyard.sim.terrain import TerrainParameters
+from marsyard.sim.terrain.landforms import Dunes
 
 #: Noise in a burst on the cable and its length: a third of the picture's signal, over two delivered rows.
 BURST_DN, BURST_PX = 300.0, 2048.0

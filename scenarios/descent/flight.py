@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from scenarios.descent.faults import faulty_times
-from scenarios.descent.parameters import DescentScenarioParameters
-from scenarios.descent.recorded import AFTER_S, FlightFile, check_looks_down
-from scenarios.interface import Scalar
-from scenarios.parts.motions import DescentPlace, OwnMotion
-from sim.dynamics import State, SwingDescent, Trajectory
-from sim.dynamics.recorded_files import TrajectoryFileError
-from sim.streams import Streams
-from sim.terrain import Surface
+from marsyard.scenarios.descent.faults import faulty_times
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.recorded import AFTER_S, FlightFile, check_looks_down
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.parts.motions import DescentPlace, OwnMotion
+from marsyard.sim.dynamics import State, SwingDescent, Trajectory
+from marsyard.sim.dynamics.recorded_files import TrajectoryFileError
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import Surface
 
 #: Gravity over a plain terrain: Mars.
 MARS_GRAVITY_M_S2 = 3.72

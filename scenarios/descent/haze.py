@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
-from sim.render import Frame, Sun
-from sim.terrain import Environment
+from marsyard.sim.render import Frame, Sun
+from marsyard.sim.terrain import Environment
 
 #: Height over which the optical depth is stated, m: that of the first picture.
 HEIGHT_M = 2000.0

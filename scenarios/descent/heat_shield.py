@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
-from sim.dynamics import State
-from sim.render import Frame, Sun
+from marsyard.sim.dynamics import State
+from marsyard.sim.render import Frame, Sun
 
 #: MER's aeroshell (Desai & Knocke 2004), m.
 DIAMETER_M = 2.65

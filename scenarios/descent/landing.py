@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from scenarios.descent.parameters import LandingParameters
+from marsyard.scenarios.descent.parameters import LandingParameters
 
 Horizontal = Float64[np.ndarray, "2"]
 

@@ -9,24 +9,24 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
-from scenarios.descent.faults import faulty_altitudes, faulty_attitudes
-from scenarios.descent.flight import MARGIN_S, Flown, gravity_m_s2
-from scenarios.descent.optics import calibrated_camera
-from scenarios.descent.parameters import DescentScenarioParameters
-from scenarios.descent.world import World
-from scenarios.interface import Scalar
-from scenarios.parts.instruments import (
+from marsyard.scenarios.descent.faults import faulty_altitudes, faulty_attitudes
+from marsyard.scenarios.descent.flight import MARGIN_S, Flown, gravity_m_s2
+from marsyard.scenarios.descent.optics import calibrated_camera
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.world import World
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.parts.instruments import (
     InstrumentReadings,
     InstrumentTruth,
     OwnAltimeter,
     OwnAttitudeSource,
     attitudes_of,
 )
-from sim.dynamics import Trajectory
-from sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
-from sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter, Readings
-from sim.sensor.radar import first_return
-from sim.streams import Streams
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
+from marsyard.sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter, Readings
+from marsyard.sim.sensor.radar import first_return
+from marsyard.sim.streams import Streams
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float64
 
-from scenarios.descent.parameters import CameraParameters
-from scenarios.optics import Optics, calibrated
-from sim.camera import Cahv, Cahvor, CameraModel
+from marsyard.scenarios.descent.parameters import CameraParameters
+from marsyard.scenarios.optics import Optics, calibrated
+from marsyard.sim.camera import Cahv, Cahvor, CameraModel
 
 
 @cache

@@ -7,20 +7,20 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, Tag, field_validator, model_validator
 
-from algorithms.dimes import DimesOptions
-from scenarios.chosen import ChosenAlgorithms
-from scenarios.descent.faults import Faults, faulty_times
-from scenarios.descent.recorded import FlightFile
-from scenarios.estimators import VELOCITY
-from scenarios.meshes import MeshParameters
-from scenarios.parts.instruments import OwnAltimeter, OwnAttitudeSource
-from scenarios.parts.motions import OwnMotion
-from scenarios.parts.named import usual_or
-from scenarios.parts.scores import OwnScores, ScoredDescent
-from scenarios.terrain_files import check_terrain
-from sim.dynamics import SwingParameters
-from sim.render.backend import Backend, default_backend
-from sim.sensor import (
+from marsyard.algorithms.dimes import DimesOptions
+from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.descent.faults import Faults, faulty_times
+from marsyard.scenarios.descent.recorded import FlightFile
+from marsyard.scenarios.estimators import VELOCITY
+from marsyard.scenarios.meshes import MeshParameters
+from marsyard.scenarios.parts.instruments import OwnAltimeter, OwnAttitudeSource
+from marsyard.scenarios.parts.motions import OwnMotion
+from marsyard.scenarios.parts.named import usual_or
+from marsyard.scenarios.parts.scores import OwnScores, ScoredDescent
+from marsyard.scenarios.terrain_files import check_terrain
+from marsyard.sim.dynamics import SwingParameters
+from marsyard.sim.render.backend import Backend, default_backend
+from marsyard.sim.sensor import (
     ApproachParameters,
     ClockParameters,
     DetectorChoice,
@@ -30,7 +30,7 @@ from sim.sensor import (
     OwnCameraChoice,
     RadarParameters,
 )
-from sim.terrain import Site, TerrainParameters, site, sites
+from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 
 #: Pictures of a descent as flown, which estimators without a stream take.
 PICTURES = 3
@@ -81,7 +81,7 @@ class LanderParameters(BaseModel):
 
 
 class LandingParameters(BaseModel):
-    """From the answer to the ground: see `scenarios.descent.landing`. All but the burn are assumed."""
+    """From the answer to the ground: see `marsyard.scenarios.descent.landing`. All but the burn are assumed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -10,10 +10,10 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from scenarios.own_axes import RecordedAxes
-from scenarios.own_files import OwnFile
-from sim.dynamics.recorded import RecordedMotion
-from sim.dynamics.recorded_files import RecordedPoses, TrajectoryFileError, read_poses
+from marsyard.scenarios.own_axes import RecordedAxes
+from marsyard.scenarios.own_files import OwnFile
+from marsyard.sim.dynamics.recorded import RecordedMotion
+from marsyard.sim.dynamics.recorded_files import RecordedPoses, TrajectoryFileError, read_poses
 
 #: How long after the last picture the flight must be known, s.
 AFTER_S = 0.5

@@ -8,13 +8,13 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float64
 
-from algorithms.dimes import DimesOptions
-from algorithms.dimes.binning import View, bin_factors, placed_camera
-from algorithms.dimes.overlap import search_geometry, template_candidates
-from sim.camera import CameraModel
-from sim.dynamics import State
-from sim.measurements import DetectorCalibration
-from sim.terrain import Surface
+from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.dimes.binning import View, bin_factors, placed_camera
+from marsyard.algorithms.dimes.overlap import search_geometry, template_candidates
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics import State
+from marsyard.sim.measurements import DetectorCalibration
+from marsyard.sim.terrain import Surface
 
 #: Width of the ground patch whose mean height is the ground's, m.
 PATCH_M = 200.0

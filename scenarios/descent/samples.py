@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from scenarios.descent.exposure import Exposure, exposures
-from scenarios.descent.faults import faulty_detector
-from scenarios.descent.flight import flown_descent, picture_states
-from scenarios.descent.optics import camera_optics
-from scenarios.descent.parameters import DescentScenarioParameters
-from scenarios.descent.world import World
-from scenarios.samples import Sample, summed_rows
-from sim.camera import CameraModel
-from sim.dynamics import State
-from sim.sensor import Detector
-from sim.streams import Streams
+from marsyard.scenarios.descent.exposure import Exposure, exposures
+from marsyard.scenarios.descent.faults import faulty_detector
+from marsyard.scenarios.descent.flight import flown_descent, picture_states
+from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.world import World
+from marsyard.scenarios.samples import Sample, summed_rows
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics import State
+from marsyard.sim.sensor import Detector
+from marsyard.sim.streams import Streams
 
 
 def descent_samples(p: DescentScenarioParameters, streams: Streams) -> Iterator[Sample]:

@@ -7,16 +7,16 @@ from functools import partial
 
 from pydantic import BaseModel
 
-from scenarios.descent.exposure import expose
-from scenarios.descent.faults import faulty_detector, faulty_terrain
-from scenarios.descent.flight import flown_descent, picture_states, true_velocity
-from scenarios.descent.landing import touchdown
-from scenarios.descent.measurement import Instruments, measure
-from scenarios.descent.optics import camera_optics
-from scenarios.descent.parameters import DescentScenarioParameters
-from scenarios.descent.room import room
-from scenarios.descent.samples import descent_samples
-from scenarios.descent.score import (
+from marsyard.scenarios.descent.exposure import expose
+from marsyard.scenarios.descent.faults import faulty_detector, faulty_terrain
+from marsyard.scenarios.descent.flight import flown_descent, picture_states, true_velocity
+from marsyard.scenarios.descent.landing import touchdown
+from marsyard.scenarios.descent.measurement import Instruments, measure
+from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.room import room
+from marsyard.scenarios.descent.samples import descent_samples
+from marsyard.scenarios.descent.score import (
     carried_to_firing,
     conditions,
     instrument_conditions,
@@ -25,15 +25,15 @@ from scenarios.descent.score import (
     room_row,
     shown,
 )
-from scenarios.descent.world import World
-from scenarios.estimators import VELOCITY
-from scenarios.interface import CaseResult
-from scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
-from scenarios.parts.scores import ScoredDescent, scored
-from scenarios.provenance import rendered
-from scenarios.samples import Sample
-from scenarios.trial import Judged, case_result
-from scenarios.velocity import (
+from marsyard.scenarios.descent.world import World
+from marsyard.scenarios.estimators import VELOCITY
+from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
+from marsyard.scenarios.parts.scores import ScoredDescent, scored
+from marsyard.scenarios.provenance import rendered
+from marsyard.scenarios.samples import Sample
+from marsyard.scenarios.trial import Judged, case_result
+from marsyard.scenarios.velocity import (
     Horizontal,
     Span,
     asked,
@@ -43,9 +43,9 @@ from scenarios.velocity import (
     velocity_products,
     velocity_row,
 )
-from sim.sensor import Detector
-from sim.streams import Streams
-from sim.terrain import TerrainBank
+from marsyard.sim.sensor import Detector
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import TerrainBank
 
 
 class DescentScenario:

@@ -7,18 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from algorithms.dimes import DimesDetails, propagated
-from algorithms.dimes.binning import altitudes_at_images
-from algorithms.interface import VelocityEstimate
-from scenarios.descent.flight import mean_velocities, off_nadir_deg
-from scenarios.descent.landing import Touchdown, is_in_time
-from scenarios.descent.measurement import Instruments
-from scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
-from scenarios.descent.world import World
-from scenarios.interface import Scalar
-from sim.dynamics import State
-from sim.measurements import DescentMeasurements
-from sim.sensor import height_above_ground
+from marsyard.algorithms.dimes import DimesDetails, propagated
+from marsyard.algorithms.dimes.binning import altitudes_at_images
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.scenarios.descent.flight import mean_velocities, off_nadir_deg
+from marsyard.scenarios.descent.landing import Touchdown, is_in_time
+from marsyard.scenarios.descent.measurement import Instruments
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
+from marsyard.scenarios.descent.world import World
+from marsyard.scenarios.interface import Scalar
+from marsyard.sim.dynamics import State
+from marsyard.sim.measurements import DescentMeasurements
+from marsyard.sim.sensor import height_above_ground
 
 Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
 Horizontal = Float64[np.ndarray, "2"]

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenarios.descent.faults import faulty_terrain
-from scenarios.descent.parameters import DescentScenarioParameters
-from scenarios.meshes import MeshParameters, standing
-from scenarios.views import Eye, SiteGround, site_scene
-from sim.frames import direction
-from sim.render import Objects, Photometry, Scene, Sun
-from sim.render.clouds import CloudLayer
-from sim.terrain import Environment, Surface, TerrainBank
+from marsyard.scenarios.descent.faults import faulty_terrain
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.meshes import MeshParameters, standing
+from marsyard.scenarios.views import Eye, SiteGround, site_scene
+from marsyard.sim.frames import direction
+from marsyard.sim.render import Objects, Photometry, Scene, Sun
+from marsyard.sim.render.clouds import CloudLayer
+from marsyard.sim.terrain import Environment, Surface, TerrainBank
 
 #: Finest spacing of a plain terrain's mesh: that of pictures from 1200 m and more, and its share of a lower height.
 MESH_FINEST_M, MESH_FINEST_HEIGHTS = 12.0, 0.01

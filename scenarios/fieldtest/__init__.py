@@ -4,7 +4,7 @@ Read it in the order of the paper: `parameters`; a `run` with its flight, `targe
 and `ephemeris`; its `triples`; the `pictures` of one of them; and the `scenario`, whose case i is one triple.
 """
 
-from scenarios.fieldtest.parameters import FieldTestParameters
-from scenarios.fieldtest.scenario import FieldTestScenario
+from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
+from marsyard.scenarios.fieldtest.scenario import FieldTestScenario
 
 __all__ = ["FieldTestParameters", "FieldTestScenario"]

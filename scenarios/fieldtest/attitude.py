@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from sim.sensor.imu import ImuIncrements
-from sim.sensor.inertial import InertialSolution
+from marsyard.sim.sensor.imu import ImuIncrements
+from marsyard.sim.sensor.inertial import InertialSolution
 
 _ITERATIONS = 3
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from scenarios.fieldtest.parameters import DriftParameters
-from sim.dynamics.helicopter import HelicopterFlight
-from sim.sensor.imu import DEG_H, ImuIncrements
+from marsyard.scenarios.fieldtest.parameters import DriftParameters
+from marsyard.sim.dynamics.helicopter import HelicopterFlight
+from marsyard.sim.sensor.imu import DEG_H, ImuIncrements
 
 
 def temperature_k(

@@ -9,8 +9,8 @@ from jaxtyping import Float64
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 
-from scenarios.fieldtest.parameters import ElevationParameters
-from sim.terrain import Surface
+from marsyard.scenarios.fieldtest.parameters import ElevationParameters
+from marsyard.sim.terrain import Surface
 
 #: Posts beyond the places that are asked for.
 _MARGIN = 2

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 import numpy as np
 from jaxtyping import Float64
 
-from sim.frames import direction
+from marsyard.sim.frames import direction
 
 #: Noon of 1 January 2000, and terrestrial less universal time in 2002, s.
 _J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)

@@ -6,18 +6,18 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from scenarios.chosen import ChosenAlgorithms
-from scenarios.estimators import VELOCITY, Task
-from scenarios.optics import CalibrationParameters
-from scenarios.parts.scores import OwnScores, ScoredFlight
-from sim.dynamics.helicopter import HelicopterParameters
-from sim.render import CloudParameters
-from sim.render.backend import Backend, default_backend
-from sim.sensor import DetectorChoice, preset
-from sim.sensor.clock import ClockParameters
-from sim.sensor.gps import POST_PROCESSED, GpsParameters
-from sim.sensor.imu import ImuParameters
-from sim.terrain import TerrainParameters, site, sites
+from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.estimators import VELOCITY, Task
+from marsyard.scenarios.optics import CalibrationParameters
+from marsyard.scenarios.parts.scores import OwnScores, ScoredFlight
+from marsyard.sim.dynamics.helicopter import HelicopterParameters
+from marsyard.sim.render import CloudParameters
+from marsyard.sim.render.backend import Backend, default_backend
+from marsyard.sim.sensor import DetectorChoice, preset
+from marsyard.sim.sensor.clock import ClockParameters
+from marsyard.sim.sensor.gps import POST_PROCESSED, GpsParameters
+from marsyard.sim.sensor.imu import ImuParameters
+from marsyard.sim.terrain import TerrainParameters, site, sites
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -140,7 +140,9 @@ class FieldTestParameters(ChosenAlgorithms, OwnScores):
     task: ClassVar[Task[Any, Any]] = VELOCITY
     scored = ScoredFlight
 
-    algorithm: Annotated[str, Field(description="velocity estimator under test, see `scenarios.estimators`")] = "dimes"
+    algorithm: Annotated[
+        str, Field(description="velocity estimator under test, see `marsyard.scenarios.estimators`")
+    ] = "dimes"
     runs: Annotated[tuple[RunParameters, ...], Field(min_length=1, description="in the report's order")]
     bank_seed: Annotated[int, Field(ge=0, description="seed of the sites' terrains; each site has one")] = 1
     samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side of a terrain")] = 4096

@@ -9,13 +9,13 @@ from functools import cache, lru_cache
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from scenarios.fieldtest.run import Run, RunKey, field_camera, worked_out
-from scenarios.optics import Optics
-from scenarios.views import Eye, SiteGround, site_scene
-from sim.dynamics import State
-from sim.render import Scene, Sun, process_renderer
-from sim.sensor import Detector, ImageMotion
-from sim.terrain import TerrainBank, site
+from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera, worked_out
+from marsyard.scenarios.optics import Optics
+from marsyard.scenarios.views import Eye, SiteGround, site_scene
+from marsyard.sim.dynamics import State
+from marsyard.sim.render import Scene, Sun, process_renderer
+from marsyard.sim.sensor import Detector, ImageMotion
+from marsyard.sim.terrain import TerrainBank, site
 
 #: Distance of the pixels whose ground points are kept.
 GRID_PX = 32

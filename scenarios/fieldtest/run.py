@@ -14,23 +14,23 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from scenarios.fieldtest.attitude import AttitudeSolution, Sightings, solve_attitude
-from scenarios.fieldtest.drift import with_drift
-from scenarios.fieldtest.elevation import ElevationModel
-from scenarios.fieldtest.ephemeris import sun_direction
-from scenarios.fieldtest.parameters import CAMERA, FieldTestParameters, RunParameters
-from scenarios.fieldtest.targets import Targets, sight_targets
-from scenarios.fieldtest.triples import Pictures, Triple, make_triples
-from sim.camera import CameraModel
-from sim.dynamics import Motion
-from sim.dynamics.helicopter import HelicopterFlight, helicopter_flight
-from sim.render import CloudLayer
-from sim.sensor import preset
-from sim.sensor.clock import Clock
-from sim.sensor.gps import Gps
-from sim.sensor.imu import DEG_H, Imu
-from sim.streams import Streams
-from sim.terrain import Surface, TerrainBank, site
+from marsyard.scenarios.fieldtest.attitude import AttitudeSolution, Sightings, solve_attitude
+from marsyard.scenarios.fieldtest.drift import with_drift
+from marsyard.scenarios.fieldtest.elevation import ElevationModel
+from marsyard.scenarios.fieldtest.ephemeris import sun_direction
+from marsyard.scenarios.fieldtest.parameters import CAMERA, FieldTestParameters, RunParameters
+from marsyard.scenarios.fieldtest.targets import Targets, sight_targets
+from marsyard.scenarios.fieldtest.triples import Pictures, Triple, make_triples
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics import Motion
+from marsyard.sim.dynamics.helicopter import HelicopterFlight, helicopter_flight
+from marsyard.sim.render import CloudLayer
+from marsyard.sim.sensor import preset
+from marsyard.sim.sensor.clock import Clock
+from marsyard.sim.sensor.gps import Gps
+from marsyard.sim.sensor.imu import DEG_H, Imu
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import Surface, TerrainBank, site
 
 #: Points of the line whose mean ground is the level above which heights of the flight count.
 _LEVEL_POINTS = 256

@@ -10,26 +10,26 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from pydantic import BaseModel
 
-from algorithms.dimes import DimesOptions
-from scenarios.estimators import VELOCITY
-from scenarios.fieldtest.parameters import FieldTestParameters
-from scenarios.fieldtest.pictures import cloud_transmittances, field_optics, take_picture
-from scenarios.fieldtest.run import Run, RunKey, field_camera, worked_out
-from scenarios.fieldtest.triples import Category, Triple
-from scenarios.interface import CaseResult, Scalar
-from scenarios.optics import draw_calibrated
-from scenarios.parts.named import SCORE, Kind
-from scenarios.parts.scores import ScoredFlight, scored
-from scenarios.provenance import rendered
-from scenarios.trial import Judged, attempted_with, case_result
-from scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
-from sim.camera import CameraModel
-from sim.dynamics import State
-from sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
-from sim.sensor import Detector
-from sim.sensor.ranging import height_above_ground
-from sim.streams import Streams
-from sim.terrain import TerrainBank
+from marsyard.algorithms.dimes import DimesOptions
+from marsyard.scenarios.estimators import VELOCITY
+from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
+from marsyard.scenarios.fieldtest.pictures import cloud_transmittances, field_optics, take_picture
+from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera, worked_out
+from marsyard.scenarios.fieldtest.triples import Category, Triple
+from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.optics import draw_calibrated
+from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.parts.scores import ScoredFlight, scored
+from marsyard.scenarios.provenance import rendered
+from marsyard.scenarios.trial import Judged, attempted_with, case_result
+from marsyard.scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics import State
+from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
+from marsyard.sim.sensor import Detector
+from marsyard.sim.sensor.ranging import height_above_ground
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import TerrainBank
 
 PICTURES = 3
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from scenarios.fieldtest.attitude import Sightings
-from scenarios.fieldtest.parameters import TargetParameters
-from sim.camera import CameraModel
-from sim.dynamics import Motion
-from sim.terrain import Surface
+from marsyard.scenarios.fieldtest.attitude import Sightings
+from marsyard.scenarios.fieldtest.parameters import TargetParameters
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics import Motion
+from marsyard.sim.terrain import Surface
 
 #: How far inside the picture a target must lie to be measured, pixels.
 _BORDER_PX = 4.0

@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from scenarios.fieldtest.parameters import RunParameters, TripleParameters
+from marsyard.scenarios.fieldtest.parameters import RunParameters, TripleParameters
 
 
 class Category(StrEnum):

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from algorithms.hda import Ground, Safety
-from scenarios.interface import Scalar
-from scenarios.landing.flight import Flight
-from scenarios.landing.truth import GroundTruth
+from marsyard.algorithms.hda import Ground, Safety
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.truth import GroundTruth
 
 #: Bounds of the classes of hazards, in units of the limit: below, up to half above, up to twice, thrice, and beyond.
 CLASSES = (1.0, 1.5, 2.0, 3.0)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from algorithms.interface import SiteEstimate
-from scenarios.interface import Scalar
-from scenarios.landing.faults import stuck_range_m
-from scenarios.landing.flight import Flight
-from scenarios.landing.helicopter import Touchdown, land
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.score import place_row
-from scenarios.landing.truth import GroundTruth
-from sim.dynamics.rotorcraft import GroundPatch
-from sim.sensor.ranging import RangingUnit
-from sim.streams import Streams
+from marsyard.algorithms.interface import SiteEstimate
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.landing.faults import stuck_range_m
+from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.helicopter import Touchdown, land
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.score import place_row
+from marsyard.scenarios.landing.truth import GroundTruth
+from marsyard.sim.dynamics.rotorcraft import GroundPatch
+from marsyard.sim.sensor.ranging import RangingUnit
+from marsyard.sim.streams import Streams
 
 NAN = float("nan")
 

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt16
 from pydantic import Field
 
-from scenarios.faults import Size, SizedFaults, ailing
-from scenarios.landing.helicopter import HelicopterParameters
-from sim.sensor import DetectorParameters
-from sim.sensor.rtk import Outage
+from marsyard.scenarios.faults import Size, SizedFaults, ailing
+from marsyard.scenarios.landing.helicopter import HelicopterParameters
+from marsyard.sim.sensor import DetectorParameters
+from marsyard.sim.sensor.rtk import Outage
 
 Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
 

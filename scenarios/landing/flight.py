@@ -8,20 +8,20 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from scenarios.landing.faults import arrived_numbers, faulty_helicopter, faulty_ranges
-from scenarios.landing.helicopter import HelicopterParameters, Transit
-from scenarios.landing.pair_choice import choose_pair
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.optics import draw_calibrated
-from scenarios.views import nadir_pose
-from sim.camera import CameraModel
-from sim.dynamics import State
-from sim.frames import rigid
-from sim.measurements import PoseMeasurement
-from sim.sensor.laser import range_along
-from sim.sensor.ranging import DOWN, RangingUnit
-from sim.streams import Streams
-from sim.terrain import Surface
+from marsyard.scenarios.landing.faults import arrived_numbers, faulty_helicopter, faulty_ranges
+from marsyard.scenarios.landing.helicopter import HelicopterParameters, Transit
+from marsyard.scenarios.landing.pair_choice import choose_pair
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.optics import draw_calibrated
+from marsyard.scenarios.views import nadir_pose
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics import State
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import PoseMeasurement
+from marsyard.sim.sensor.laser import range_along
+from marsyard.sim.sensor.ranging import DOWN, RangingUnit
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import Surface
 
 #: Shortest time between pictures, for a camera that stands still, s.
 LEAST_INTERVAL_S = 0.1

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.dynamics import Resting, State, Trajectory
-from sim.dynamics.rotorcraft import (
+from marsyard.sim.dynamics import Resting, State, Trajectory
+from marsyard.sim.dynamics.rotorcraft import (
     Air,
     AirParameters,
     FlownPath,
@@ -31,14 +31,14 @@ from sim.dynamics.rotorcraft import (
     landing_flight,
     transit_flight,
 )
-from sim.measurements import PoseMeasurement
-from sim.sensor.clock import Clock, ClockParameters
-from sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
-from sim.sensor.navigation import FilterParameters, FilterState, NavigationFilter, NavigationSolution
-from sim.sensor.ranging import RangingUnit
-from sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
-from sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
-from sim.streams import Streams
+from marsyard.sim.measurements import PoseMeasurement
+from marsyard.sim.sensor.clock import Clock, ClockParameters
+from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
+from marsyard.sim.sensor.navigation import FilterParameters, FilterState, NavigationFilter, NavigationSolution
+from marsyard.sim.sensor.ranging import RangingUnit
+from marsyard.sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
+from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
+from marsyard.sim.streams import Streams
 
 #: Turns of the landing's iteration at most, and how little a turn may still move the path for it to be the last, m.
 MOST_TURNS, STILL_M = 8, 1e-3

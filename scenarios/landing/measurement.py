@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from scenarios.landing.faults import faulty_ranges
-from scenarios.landing.flight import Flight, calibrated_camera
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.pictures import Pair
-from sim.measurements import LandingMeasurements
-from sim.sensor.ranging import RangingUnit
-from sim.streams import Streams
+from marsyard.scenarios.landing.faults import faulty_ranges
+from marsyard.scenarios.landing.flight import Flight, calibrated_camera
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.pictures import Pair
+from marsyard.sim.measurements import LandingMeasurements
+from marsyard.sim.sensor.ranging import RangingUnit
+from marsyard.sim.streams import Streams
 
 
 def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: Streams) -> LandingMeasurements:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.hda import Fate, HdaDetails
-from scenarios.interface import Scalar
+from marsyard.algorithms.hda import Fate, HdaDetails
+from marsyard.scenarios.interface import Scalar
 
 NAN = float("nan")
 #: Why matches are dropped.

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.camera import CameraModel
-from sim.measurements import PoseMeasurement
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.measurements import PoseMeasurement
 
 
 class PairParameters(BaseModel):

@@ -8,20 +8,20 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from algorithms.hda import HdaOptions, TrackSeed
-from scenarios.chosen import ChosenAlgorithms
-from scenarios.descent.parameters import Place, RenderParameters, SunParameters
-from scenarios.estimators import LANDING
-from scenarios.landing.faults import Faults
-from scenarios.landing.helicopter import HelicopterParameters
-from scenarios.landing.pair_choice import PairParameters
-from scenarios.landing.relief import Limits
-from scenarios.meshes import MeshParameters
-from scenarios.optics import CalibrationParameters
-from scenarios.parts.scores import OwnScores, ScoredLanding
-from scenarios.terrain_files import check_terrain
-from sim.camera import CameraModel
-from sim.sensor import (
+from marsyard.algorithms.hda import HdaOptions, TrackSeed
+from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.descent.parameters import Place, RenderParameters, SunParameters
+from marsyard.scenarios.estimators import LANDING
+from marsyard.scenarios.landing.faults import Faults
+from marsyard.scenarios.landing.helicopter import HelicopterParameters
+from marsyard.scenarios.landing.pair_choice import PairParameters
+from marsyard.scenarios.landing.relief import Limits
+from marsyard.scenarios.meshes import MeshParameters
+from marsyard.scenarios.optics import CalibrationParameters
+from marsyard.scenarios.parts.scores import OwnScores, ScoredLanding
+from marsyard.scenarios.terrain_files import check_terrain
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.sensor import (
     PRESETS,
     AutoExposureParameters,
     DetectorChoice,
@@ -30,7 +30,7 @@ from sim.sensor import (
     OwnCamera,
     preset,
 )
-from sim.terrain import Site, TerrainParameters, site, sites
+from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 
 Size = Annotated[float, Field(ge=0.0)]
 Angle = Annotated[float, Field(ge=-720.0, le=720.0)]

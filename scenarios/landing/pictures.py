@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from scenarios.landing.faults import delivered, faulty_detector
-from scenarios.landing.flight import Flight
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.world import World
-from scenarios.optics import Optics
-from scenarios.views import Eye
-from sim.measurements import DetectorImage
-from sim.render import Frame, process_renderer
-from sim.sensor import Detector, ImageMotion, auto_expose
-from sim.streams import Streams
+from marsyard.scenarios.landing.faults import delivered, faulty_detector
+from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.world import World
+from marsyard.scenarios.optics import Optics
+from marsyard.scenarios.views import Eye
+from marsyard.sim.measurements import DetectorImage
+from marsyard.sim.render import Frame, process_renderer
+from marsyard.sim.sensor import Detector, ImageMotion, auto_expose
+from marsyard.sim.streams import Streams
 
 
 @dataclass(frozen=True)

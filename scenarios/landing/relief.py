@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from scenarios.landing import kernels
-from scenarios.meshes import MeshParameters
-from scenarios.views import SiteGround
+from marsyard.scenarios.landing import kernels
+from marsyard.scenarios.meshes import MeshParameters
+from marsyard.scenarios.views import SiteGround
 
 #: Spacing of the exact heights, in footprints' diameters: 80 points across a footprint, 2.5 cm for one of 2 m.
 SPACING_DIAMETERS = 1.0 / 80.0

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from scenarios.landing.flight import Flight
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.pictures import Pair, take_pictures
-from scenarios.landing.truth import GroundTruth
-from scenarios.landing.world import World, camera_optics
-from scenarios.samples import Sample, summed_rows
-from sim.streams import Streams
+from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.pictures import Pair, take_pictures
+from marsyard.scenarios.landing.truth import GroundTruth
+from marsyard.scenarios.landing.world import World, camera_optics
+from marsyard.scenarios.samples import Sample, summed_rows
+from marsyard.sim.streams import Streams
 
 #: Values of a hazard map: a lander's footprint about the pixel's point is safe, is not, or is not all in sight.
 SAFE, UNSAFE, UNKNOWN = 0, 1, 255

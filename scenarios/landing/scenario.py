@@ -6,27 +6,27 @@ from collections.abc import Iterator, Mapping
 
 from pydantic import BaseModel
 
-from algorithms.answers import checked_site
-from algorithms.interface import SiteEstimate, SiteOutcome
-from scenarios.estimators import LANDING
-from scenarios.interface import CaseResult
-from scenarios.landing.descent import landing_row
-from scenarios.landing.flight import Flight
-from scenarios.landing.measurement import measure
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.pictures import take_pictures
-from scenarios.landing.samples import landing_samples
-from scenarios.landing.score import conditions, map_row, motion_row, outcome_row, products, site_row, times_row
-from scenarios.landing.truth import GroundTruth
-from scenarios.landing.world import KEPT_GROUNDS, World, camera_optics
-from scenarios.parts.named import SCORE, Kind
-from scenarios.parts.scores import ScoredLanding, scored
-from scenarios.provenance import rendered
-from scenarios.samples import Sample
-from scenarios.trial import Judged, attempted_with, case_result
-from sim.frames import rigid
-from sim.streams import Streams
-from sim.terrain import TerrainBank
+from marsyard.algorithms.answers import checked_site
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
+from marsyard.scenarios.estimators import LANDING
+from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.landing.descent import landing_row
+from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.measurement import measure
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.pictures import take_pictures
+from marsyard.scenarios.landing.samples import landing_samples
+from marsyard.scenarios.landing.score import conditions, map_row, motion_row, outcome_row, products, site_row, times_row
+from marsyard.scenarios.landing.truth import GroundTruth
+from marsyard.scenarios.landing.world import KEPT_GROUNDS, World, camera_optics
+from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.parts.scores import ScoredLanding, scored
+from marsyard.scenarios.provenance import rendered
+from marsyard.scenarios.samples import Sample
+from marsyard.scenarios.trial import Judged, attempted_with, case_result
+from marsyard.sim.frames import rigid
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import TerrainBank
 
 
 class LandingScenario:

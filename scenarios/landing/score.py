@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.hda import STAGES, HdaDetails, hda_products
-from algorithms.hda.view import camera_pose
-from algorithms.interface import SiteEstimate, SiteOutcome
-from scenarios.interface import Scalar
-from scenarios.landing.confusion import MapAtPlaces, hazard_counts, map_errors
-from scenarios.landing.flight import Flight
-from scenarios.landing.motion import motion_errors, solved_row
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.pictures import Pair
-from scenarios.landing.truth import GroundTruth
-from scenarios.landing.world import World
-from sim.measurements import LandingMeasurements
-from sim.sensor import height_above_ground
+from marsyard.algorithms.hda import STAGES, HdaDetails, hda_products
+from marsyard.algorithms.hda.view import camera_pose
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.landing.confusion import MapAtPlaces, hazard_counts, map_errors
+from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.motion import motion_errors, solved_row
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.pictures import Pair
+from marsyard.scenarios.landing.truth import GroundTruth
+from marsyard.scenarios.landing.world import World
+from marsyard.sim.measurements import LandingMeasurements
+from marsyard.sim.sensor import height_above_ground
 
 NAN = float("nan")
 #: Pixels that a track may be off the true place and still count as right.
@@ -240,7 +240,7 @@ def products(
 ) -> dict[str, Any]:
     """Arrays from which the case's figures are drawn.
 
-    Those of `algorithms.hda.hda_products` (Figs. 1-5 and 7), and
+    Those of `marsyard.algorithms.hda.hda_products` (Figs. 1-5 and 7), and
 
     - `image_1`, `image_2`: the pictures;
     - `true_rotation`, `true_translation`: of the second from the first camera;

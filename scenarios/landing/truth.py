@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from scenarios.landing.flight import Flight
-from scenarios.landing.pictures import Pair, seen_by_both
-from scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
-from scenarios.landing.world import World
+from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.pictures import Pair, seen_by_both
+from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
+from marsyard.scenarios.landing.world import World
 
 #: Distance of the places at which the truth is asked for, in diameters of the footprint: 20 cm for 2 m.
 STEP_DIAMETERS = 0.1

@@ -7,16 +7,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from scenarios.landing.faults import faulty_sun_deg
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.meshes import MeshParameters, standing
-from scenarios.optics import Optics
-from scenarios.views import Eye, SiteGround, site_scene
-from sim.camera import CameraModel
-from sim.frames import direction
-from sim.render import Objects, Scene, Sun
-from sim.terrain import TerrainBank, TerrainParameters, site
-from sim.terrain.sites import SiteTexture
+from marsyard.scenarios.landing.faults import faulty_sun_deg
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.meshes import MeshParameters, standing
+from marsyard.scenarios.optics import Optics
+from marsyard.scenarios.views import Eye, SiteGround, site_scene
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import direction
+from marsyard.sim.render import Objects, Scene, Sun
+from marsyard.sim.terrain import TerrainBank, TerrainParameters, site
+from marsyard.sim.terrain.sites import SiteTexture
 
 #: Grounds that a worker keeps: their rocks take a second or two to place.
 KEPT_GROUNDS = 64

@@ -12,13 +12,13 @@ from jaxtyping import Float
 from pydantic import BaseModel
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.hda.view import camera_pose
-from scenarios.chosen import ChosenAlgorithms
-from scenarios.interface import Scalar
-from scenarios.measured.parameters import MeasuredParameters
-from scenarios.measured.store import StoredPicture, pose_of
-from scenarios.trial import Attempt, attempted_with
-from sim.measurements import DetectorImage
+from marsyard.algorithms.hda.view import camera_pose
+from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.measured.parameters import MeasuredParameters
+from marsyard.scenarios.measured.store import StoredPicture, pose_of
+from marsyard.scenarios.trial import Attempt, attempted_with
+from marsyard.sim.measurements import DetectorImage
 
 Answer = TypeVar("Answer")
 Parameters = TypeVar("Parameters", bound=BaseModel)

@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 from scipy.spatial.transform import RigidTransform
 
-from scenarios.interface import Scalar
-from sim.camera import CameraModel
-from sim.measurements import DetectorImage
+from marsyard.scenarios.interface import Scalar
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.measurements import DetectorImage
 
 #: Features of a picture, the strongest; the ratio of Lowe's Fig. 11.
 _MOST_FEATURES, _RATIO = 4000, 0.8

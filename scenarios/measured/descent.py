@@ -9,21 +9,21 @@ from jaxtyping import Float64
 from pydantic import BaseModel
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.dimes import DimesDetails
-from algorithms.interface import VelocityEstimate
-from scenarios.estimators import VELOCITY
-from scenarios.interface import CaseResult, Scalar, record_conditions
-from scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, tried
-from scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
-from scenarios.measured.parameters import MeasuredVelocityParameters
-from scenarios.measured.store import StoredCase, descent_measurements, images_of
-from scenarios.parts.named import SCORE, Kind
-from scenarios.parts.scores import ScoredVelocity, scored
-from scenarios.trial import Judged, case_result
-from scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
-from sim.frames import rigid
-from sim.measurements import DescentMeasurements
-from sim.streams import Streams
+from marsyard.algorithms.dimes import DimesDetails
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.scenarios.estimators import VELOCITY
+from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
+from marsyard.scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, tried
+from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
+from marsyard.scenarios.measured.parameters import MeasuredVelocityParameters
+from marsyard.scenarios.measured.store import StoredCase, descent_measurements, images_of
+from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.parts.scores import ScoredVelocity, scored
+from marsyard.scenarios.trial import Judged, case_result
+from marsyard.scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DescentMeasurements
+from marsyard.sim.streams import Streams
 
 
 class MeasuredVelocityScenario(MeasuredScenario):

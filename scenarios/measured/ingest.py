@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
-from scenarios.measured.layout import (
+from marsyard.scenarios.measured.layout import (
     INGEST_FILE,
     LANDING,
     TABLE_FILE,
@@ -21,8 +21,8 @@ from scenarios.measured.layout import (
     SunTable,
     read_ingest_file,
 )
-from scenarios.measured.picture_files import file_head, picture_size, read_counts
-from scenarios.measured.store import (
+from marsyard.scenarios.measured.picture_files import file_head, picture_size, read_counts
+from marsyard.scenarios.measured.store import (
     SCHEMA,
     Named,
     Quaternion,
@@ -37,12 +37,12 @@ from scenarios.measured.store import (
     put_picture,
     write_cases,
 )
-from scenarios.measured.table import CaseRows, PictureRow, read_table
-from scenarios.own_files import listed
-from sim.camera import CameraModel, Pds3Product, looking_down, read_cameras, read_pds3_product
-from sim.camera.pds_labels import is_pds3
-from sim.files import npy_header
-from sim.frames import SITE_FROM_WORLD
+from marsyard.scenarios.measured.table import CaseRows, PictureRow, read_table
+from marsyard.scenarios.own_files import listed
+from marsyard.sim.camera import CameraModel, Pds3Product, looking_down, read_cameras, read_pds3_product
+from marsyard.sim.camera.pds_labels import is_pds3
+from marsyard.sim.files import npy_header
+from marsyard.sim.frames import SITE_FROM_WORLD
 
 POSITION = ("x_m", "y_m", "z_m")
 #: Relative response of the brightest pixel, at most: noise makes it a little more than 1.

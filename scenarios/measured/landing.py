@@ -9,22 +9,22 @@ from jaxtyping import Float
 from pydantic import BaseModel
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.answers import checked_site
-from algorithms.hda import HdaDetails, hda_products
-from algorithms.hda.view import camera_pose
-from algorithms.interface import SiteEstimate, SiteOutcome
-from scenarios.estimators import LANDING
-from scenarios.interface import CaseResult, Scalar, record_conditions
-from scenarios.landing.motion import motion_errors, solved_row
-from scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, pose, tried
-from scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
-from scenarios.measured.parameters import MeasuredLandingParameters
-from scenarios.measured.store import StoredCase, images_of, landing_measurements, pose_of
-from scenarios.parts.named import SCORE, Kind
-from scenarios.parts.scores import ScoredSite, scored
-from scenarios.trial import Judged, case_result
-from sim.measurements import LandingMeasurements
-from sim.streams import Streams
+from marsyard.algorithms.answers import checked_site
+from marsyard.algorithms.hda import HdaDetails, hda_products
+from marsyard.algorithms.hda.view import camera_pose
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
+from marsyard.scenarios.estimators import LANDING
+from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
+from marsyard.scenarios.landing.motion import motion_errors, solved_row
+from marsyard.scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, pose, tried
+from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
+from marsyard.scenarios.measured.parameters import MeasuredLandingParameters
+from marsyard.scenarios.measured.store import StoredCase, images_of, landing_measurements, pose_of
+from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.parts.scores import ScoredSite, scored
+from marsyard.scenarios.trial import Judged, case_result
+from marsyard.sim.measurements import LandingMeasurements
+from marsyard.sim.streams import Streams
 
 
 class MeasuredLandingScenario(MeasuredScenario):

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from scenarios.own_axes import RecordedAxes
-from sim.files import check_regular
-from sim.frames import direction
+from marsyard.scenarios.own_axes import RecordedAxes
+from marsyard.sim.files import check_regular
+from marsyard.sim.frames import direction
 
 #: The two files of every folder.
 INGEST_FILE, TABLE_FILE = "ingest.toml", "pictures.csv"

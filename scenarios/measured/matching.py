@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pydantic import BaseModel
 
-from scenarios.interface import CaseResult
-from scenarios.measured.case import MeasuredScenario, about, checked, pose
-from scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
-from scenarios.measured.parameters import MatchingParameters
-from scenarios.measured.store import images_of
-from sim.streams import Streams
+from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.measured.case import MeasuredScenario, about, checked, pose
+from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
+from marsyard.scenarios.measured.parameters import MatchingParameters
+from marsyard.scenarios.measured.store import images_of
+from marsyard.sim.streams import Streams
 
 #: Outcomes.
 MATCHED, TOO_FEW = "MATCHED", "TOO_FEW_MATCHES"

@@ -6,14 +6,14 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from algorithms.dimes import DimesOptions
-from algorithms.hda import HdaOptions
-from scenarios.chosen import ChosenAlgorithms
-from scenarios.descent.parameters import check_binning
-from scenarios.estimators import LANDING, VELOCITY
-from scenarios.measured.layout import TaskName
-from scenarios.measured.store import CasesFile, StoredCase
-from scenarios.parts.scores import OwnScores, ScoredSite, ScoredVelocity
+from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.hda import HdaOptions
+from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.descent.parameters import check_binning
+from marsyard.scenarios.estimators import LANDING, VELOCITY
+from marsyard.scenarios.measured.layout import TaskName
+from marsyard.scenarios.measured.store import CasesFile, StoredCase
+from marsyard.scenarios.parts.scores import OwnScores, ScoredSite, ScoredVelocity
 
 
 class MeasuredParameters(BaseModel):

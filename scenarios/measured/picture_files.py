@@ -1,4 +1,6 @@
-"""Pictures as they come: PNG, PGM and TIFF of one band with 8 or 16 bits. PDS3 products are read by `sim.camera`."""
+"""Pictures as they come: PNG, PGM and TIFF of one band with 8 or 16 bits. PDS3 products are read by
+`marsyard.sim.camera`.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt16
 
-from scenarios.measured.layout import IngestError
-from sim.files import open_regular
+from marsyard.scenarios.measured.layout import IngestError
+from marsyard.sim.files import open_regular
 
 #: A header of a PGM with comments is shorter.
 _HEAD = 4096

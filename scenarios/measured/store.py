@@ -16,13 +16,13 @@ from jaxtyping import Float64, UInt16
 from pydantic import BaseModel, ConfigDict, ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.exchange.files import read_picture, write_picture
-from scenarios.measured.layout import TaskName
-from scenarios.own_files import OwnFile
-from sim.camera import BODY_FRAME, CameraModel, read_cahvor, write_cahvor
-from sim.files import check_regular
-from sim.frames import rigid
-from sim.measurements import (
+from marsyard.algorithms.exchange.files import read_picture, write_picture
+from marsyard.scenarios.measured.layout import TaskName
+from marsyard.scenarios.own_files import OwnFile
+from marsyard.sim.camera import BODY_FRAME, CameraModel, read_cahvor, write_cahvor
+from marsyard.sim.files import check_regular
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import (
     AltitudeMeasurement,
     AttitudeMeasurement,
     DescentMeasurements,

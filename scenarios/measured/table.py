@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems
-from scenarios.measured.layout import COLUMNS, PICTURES, TEXTS, IngestError
-from scenarios.own_files import listed
-from sim.files import check_regular
+from marsyard.scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems
+from marsyard.scenarios.measured.layout import COLUMNS, PICTURES, TEXTS, IngestError
+from marsyard.scenarios.own_files import listed
+from marsyard.sim.files import check_regular
 
 #: A quaternion's length may be off 1 by this, as written with three digits.
 UNIT_TOLERANCE = 5e-3

@@ -4,9 +4,9 @@ Read `named` first: how a part is named, found and made from its options. `motio
 what each kind is handed and what it gives.
 """
 
-from scenarios.parts.instruments import InstrumentReadings, InstrumentTruth
-from scenarios.parts.motions import DescentPlace, Poses
-from scenarios.parts.scores import (
+from marsyard.scenarios.parts.instruments import InstrumentReadings, InstrumentTruth
+from marsyard.scenarios.parts.motions import DescentPlace, Poses
+from marsyard.scenarios.parts.scores import (
     ScoredDescent,
     ScoredFlight,
     ScoredLanding,

@@ -20,11 +20,11 @@ from jaxtyping import Float, Float64
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from scenarios.interface import Scalar
-from scenarios.parts.motions import UNIT_TOLERANCE
-from scenarios.parts.named import INSTRUMENT, OwnPart
-from sim.dynamics import Trajectory
-from sim.sensor.ranging import DOWN
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.parts.motions import UNIT_TOLERANCE
+from marsyard.scenarios.parts.named import INSTRUMENT, OwnPart
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.sensor.ranging import DOWN
 
 #: Quantities that an instrument can measure, and the shape of one reading.
 QUANTITIES: Mapping[str, tuple[int, ...]] = {"altitude": (), "attitude": (4,)}
@@ -121,7 +121,7 @@ class _OwnInstrument(OwnPart):
 
 
 class OwnAltimeter(_OwnInstrument):
-    """An altimeter of a user's own (see `scenarios.parts.instruments`)."""
+    """An altimeter of a user's own (see `marsyard.scenarios.parts.instruments`)."""
 
     quantity = "altitude"
 
@@ -135,7 +135,9 @@ class OwnAttitudeSource(_OwnInstrument):
 def checked_readings(spec: str, readings: object, quantity: str, count: int) -> InstrumentReadings:
     """The readings that an instrument gave, as arrays of 64 bits. Raises ValueError where they are wrong."""
     if not isinstance(readings, InstrumentReadings):
-        raise ValueError(f"'{spec}' reads a {type(readings).__name__}; allowed: scenarios.parts.InstrumentReadings")
+        raise ValueError(
+            f"'{spec}' reads a {type(readings).__name__}; allowed: marsyard.scenarios.parts.InstrumentReadings"
+        )
     times, values = (np.array(one, dtype=np.float64) for one in (readings.times_s, readings.values))
     for name, given, allowed in (("times_s", times, (count,)), ("values", values, (count, *QUANTITIES[quantity]))):
         if given.shape != allowed:

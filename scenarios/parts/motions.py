@@ -6,8 +6,8 @@ A class that has
 - ``random``, whether its poses depend on the random stream;
 - ``fly(place: DescentPlace, rng: numpy.random.Generator) -> Poses``, the poses of one case.
 
-Poses are continued between their instants as those of a recorded flight are (`sim.dynamics.recorded`), and every
-instrument measures the motion as it would a simulated one.
+Poses are continued between their instants as those of a recorded flight are (`marsyard.sim.dynamics.recorded`), and
+every instrument measures the motion as it would a simulated one.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from scenarios.interface import Scalar
-from scenarios.own_axes import RecordedAxes
-from scenarios.parts.named import DYNAMICS, OwnPart
-from sim.dynamics.recorded import RecordedMotion
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.own_axes import RecordedAxes
+from marsyard.scenarios.parts.named import DYNAMICS, OwnPart
+from marsyard.sim.dynamics.recorded import RecordedMotion
 
 #: A quaternion's length may be off 1 by this.
 UNIT_TOLERANCE = 1e-6
@@ -90,7 +90,7 @@ class Dynamics(Protocol):
 
 
 class OwnMotion(OwnPart, RecordedAxes):
-    """A motion that a class of a user's own computes (see `scenarios.parts.motions`).
+    """A motion that a class of a user's own computes (see `marsyard.scenarios.parts.motions`).
 
     Positions count from the ground at `place`; they are the camera's, unless `lever_m` says where the camera is.
     """
@@ -129,7 +129,7 @@ class OwnMotion(OwnPart, RecordedAxes):
 def checked_poses(spec: str, poses: object, place: DescentPlace) -> Poses:
     """The poses that a motion gave, as arrays of 64 bits. Raises ValueError where they are not as they should be."""
     if not isinstance(poses, Poses):
-        raise ValueError(f"'{spec}' flies a {type(poses).__name__}; allowed: scenarios.parts.Poses")
+        raise ValueError(f"'{spec}' flies a {type(poses).__name__}; allowed: marsyard.scenarios.parts.Poses")
     times = np.array(poses.times_s, dtype=np.float64)
     positions = np.array(poses.positions_m, dtype=np.float64)
     quaternions = np.array(poses.quaternions_xyzw, dtype=np.float64)

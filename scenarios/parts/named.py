@@ -17,8 +17,8 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, JsonValue, ValidationError, model_validator
 
-from scenarios.dotted import found_at
-from scenarios.interface import Scalar
+from marsyard.scenarios.dotted import found_at
+from marsyard.scenarios.interface import Scalar
 
 Options = Mapping[str, Any]
 

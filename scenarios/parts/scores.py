@@ -21,15 +21,15 @@ from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.interface import SiteEstimate, TargetUpdate, VelocityEstimate
-from scenarios.estimators import labels
-from scenarios.interface import Scalar
-from scenarios.parts.named import SCORE, checked_columns
-from sim.dynamics import State, Trajectory
-from sim.measurements import DescentMeasurements, LandingMeasurements, RoverMeasurements
+from marsyard.algorithms.interface import SiteEstimate, TargetUpdate, VelocityEstimate
+from marsyard.scenarios.estimators import labels
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.parts.named import SCORE, checked_columns
+from marsyard.sim.dynamics import State, Trajectory
+from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, RoverMeasurements
 
 if TYPE_CHECKING:
-    from scenarios.landing.truth import GroundTruth
+    from marsyard.scenarios.landing.truth import GroundTruth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +112,7 @@ class ScoredLanding(ScoredSite):
     states
         True states at the two pictures.
     ground
-        The true ground: where a lander would stand safely (`scenarios.landing.truth.GroundTruth`).
+        The true ground: where a lander would stand safely (`marsyard.scenarios.landing.truth.GroundTruth`).
     """
 
     states: tuple[State, State]
@@ -126,7 +126,7 @@ class ScoredRun:
     Attributes
     ----------
     outcome
-        How the run ended: a name of `scenarios.rover.stops.RunOutcome`.
+        How the run ended: a name of `marsyard.scenarios.rover.stops.RunOutcome`.
     target_world
         The designated point, metres.
     world_from_rover

@@ -5,11 +5,11 @@ Read it in the order of a run: `parameters`, `world`, `rig`, `vehicle`, `target`
 the pictures of one drive.
 """
 
-from scenarios.rover.parameters import RoverScenarioParameters
-from scenarios.rover.run import Run, run_case
-from scenarios.rover.scenario import RoverScenario
-from scenarios.rover.shared import SharedDriveParameters, SharedDriveScenario
-from scenarios.rover.stops import RunOutcome
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.run import Run, run_case
+from marsyard.scenarios.rover.scenario import RoverScenario
+from marsyard.scenarios.rover.shared import SharedDriveParameters, SharedDriveScenario
+from marsyard.scenarios.rover.stops import RunOutcome
 
 __all__ = [
     "RoverScenario",

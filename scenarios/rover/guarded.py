@@ -6,12 +6,12 @@ import time
 
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.answers import checked_aim, checked_update
-from algorithms.interface import MastAim, TargetTracker, TargetUpdate
-from scenarios.handover import Handover
-from scenarios.rover.pictures import StereoPictures
-from scenarios.trial import answer_time_s
-from sim.measurements import MastCalibration, RoverMeasurements, TargetDesignation
+from marsyard.algorithms.answers import checked_aim, checked_update
+from marsyard.algorithms.interface import MastAim, TargetTracker, TargetUpdate
+from marsyard.scenarios.handover import Handover
+from marsyard.scenarios.rover.pictures import StereoPictures
+from marsyard.scenarios.trial import answer_time_s
+from marsyard.sim.measurements import MastCalibration, RoverMeasurements, TargetDesignation
 
 
 class GuardedTracker:

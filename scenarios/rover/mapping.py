@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.navigation import (
+from marsyard.algorithms.navigation import (
     NavigationOptions,
     NavigationPlan,
     Obstacle,
@@ -16,10 +16,10 @@ from algorithms.navigation import (
     Wedge,
     navigate,
 )
-from scenarios.rover.parameters import LegParameters
-from scenarios.rover.route import Belief, goal, step_length_m
-from scenarios.rover.world import TARGET, RunWorld
-from sim.dynamics import RoverParameters, Stance
+from marsyard.scenarios.rover.parameters import LegParameters
+from marsyard.scenarios.rover.route import Belief, goal, step_length_m
+from marsyard.scenarios.rover.world import TARGET, RunWorld
+from marsyard.sim.dynamics import RoverParameters, Stance
 
 #: Wedges of the mast's cameras: half the 45 deg of a navcam, between where the rover's own deck ends and where stereo
 #: still ranges rocks; neighbours overlap by 5 deg. Of the body's: half of 120 deg, from the front wheels on (hazcams).

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from scenarios.rover.points import distances, sight_axes
-from sim.dynamics import RoverParameters, Stance
-from sim.measurements import MastGeometry
-from sim.render import may_shade, rover_objects, rover_sphere
+from marsyard.scenarios.rover.points import distances, sight_axes
+from marsyard.sim.dynamics import RoverParameters, Stance
+from marsyard.sim.measurements import MastGeometry
+from marsyard.sim.render import may_shade, rover_objects, rover_sphere
 
 #: Directions about a point's own in which its template is looked at, and shares of the way to its corners.
 _AROUND, _SHARES = 8, (0.5, 1.0)

@@ -8,16 +8,16 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from algorithms.vtt import VttOptions
-from scenarios.chosen import ChosenAlgorithms
-from scenarios.estimators import TRACKING
-from scenarios.parts.scores import OwnScores, ScoredRun
-from sim.camera import CameraModel
-from sim.dynamics import SlipParameters
-from sim.measurements import MastCalibration
-from sim.render import CloudParameters
-from sim.render.backend import Backend, default_backend
-from sim.sensor import (
+from marsyard.algorithms.vtt import VttOptions
+from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.estimators import TRACKING
+from marsyard.scenarios.parts.scores import OwnScores, ScoredRun
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics import SlipParameters
+from marsyard.sim.measurements import MastCalibration
+from marsyard.sim.render import CloudParameters
+from marsyard.sim.render.backend import Backend, default_backend
+from marsyard.sim.sensor import (
     MASTS,
     AutoExposureParameters,
     DetectorChoice,
@@ -30,7 +30,7 @@ from sim.sensor import (
     preset,
     stereo_mast,
 )
-from sim.terrain import site, sites
+from marsyard.sim.terrain import site, sites
 
 Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -249,7 +249,7 @@ class CameraParameters(_Parameters):
     """The stereo pair on the mast."""
 
     preset: Annotated[
-        str, Field(description="a pair of `sim.sensor.mast.MASTS`, with the mast and the rover that carry it")
+        str, Field(description="a pair of `marsyard.sim.sensor.mast.MASTS`, with the mast and the rover that carry it")
     ] = "mer-navcam"
     own: Annotated[OwnPair | None, Field(description="an own pair, on that mast in place of the preset's")] = None
     detector: Annotated[

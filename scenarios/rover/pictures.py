@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.interface import PixelBox
-from scenarios.rover.parameters import CameraParameters, ExposureParameters
-from sim.camera import CameraModel
-from sim.measurements import MastImage
-from sim.render import Objects, PixelRays, Scene, process_renderer
-from sim.render.backend import Backend
-from sim.sensor import Detector, auto_expose, natural_fall_off
+from marsyard.algorithms.interface import PixelBox
+from marsyard.scenarios.rover.parameters import CameraParameters, ExposureParameters
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.measurements import MastImage
+from marsyard.sim.render import Objects, PixelRays, Scene, process_renderer
+from marsyard.sim.render.backend import Backend
+from marsyard.sim.sensor import Detector, auto_expose, natural_fall_off
 
 #: The full frame is judged for its exposure in a picture so many times smaller.
 _BINNED = 16

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.vtt.accuracy import GOAL_M, START_M
-from scenarios.interface import Scalar
-from scenarios.rover.parameters import RoverScenarioParameters
-from sim.camera import CameraModel
-from sim.measurements import MastCalibration
-from sim.sensor import Mast, MastState, StereoHead
-from sim.streams import Streams
+from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.measurements import MastCalibration
+from marsyard.sim.sensor import Mast, MastState, StereoHead
+from marsyard.sim.streams import Streams
 
 
 @dataclass

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from scenarios.rover.parameters import LegParameters
-from sim.measurements import DriveCommand
+from marsyard.scenarios.rover.parameters import LegParameters
+from marsyard.sim.measurements import DriveCommand
 
 #: An approach or retreat ends this near to its goal, metres.
 GOAL_TOLERANCE_M = 0.03

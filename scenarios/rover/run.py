@@ -7,24 +7,24 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from algorithms.interface import MastAim, TrackingState
-from algorithms.navigation import NavigationOutcome
-from algorithms.vtt import GoalReached, HandOffOutcome, hand_off
-from scenarios.estimators import TRACKING
-from scenarios.rover.guarded import GuardedTracker
-from scenarios.rover.mapping import Mapper
-from scenarios.rover.parameters import LegParameters, RoverScenarioParameters
-from scenarios.rover.pictures import Detectors, Photographer
-from scenarios.rover.rig import Rig
-from scenarios.rover.route import GOAL_TOLERANCE_M, Belief, commands, finished
-from scenarios.rover.stops import RunOutcome, Stop
-from scenarios.rover.target import ChosenTarget, choose_target
-from scenarios.rover.vehicle import Vehicle
-from scenarios.rover.world import RunWorld
-from sim.dynamics.driving import Drive
-from sim.frames import composed
-from sim.measurements import DriveCommand
-from sim.streams import Streams
+from marsyard.algorithms.interface import MastAim, TrackingState
+from marsyard.algorithms.navigation import NavigationOutcome
+from marsyard.algorithms.vtt import GoalReached, HandOffOutcome, hand_off
+from marsyard.scenarios.estimators import TRACKING
+from marsyard.scenarios.rover.guarded import GuardedTracker
+from marsyard.scenarios.rover.mapping import Mapper
+from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.pictures import Detectors, Photographer
+from marsyard.scenarios.rover.rig import Rig
+from marsyard.scenarios.rover.route import GOAL_TOLERANCE_M, Belief, commands, finished
+from marsyard.scenarios.rover.stops import RunOutcome, Stop
+from marsyard.scenarios.rover.target import ChosenTarget, choose_target
+from marsyard.scenarios.rover.vehicle import Vehicle
+from marsyard.scenarios.rover.world import RunWorld
+from marsyard.sim.dynamics.driving import Drive
+from marsyard.sim.frames import composed
+from marsyard.sim.measurements import DriveCommand
+from marsyard.sim.streams import Streams
 
 
 @dataclass

@@ -8,13 +8,13 @@ from typing import cast
 
 from pydantic import BaseModel
 
-from scenarios.estimators import TRACKING
-from scenarios.interface import CaseResult, Scalar
-from scenarios.parts.named import SCORE, Kind
-from scenarios.parts.scores import scored
-from scenarios.rover.parameters import RoverScenarioParameters
-from scenarios.rover.run import Run, prepare_run, track_target
-from scenarios.rover.score import (
+from marsyard.scenarios.estimators import TRACKING
+from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.parts.scores import scored
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.run import Run, prepare_run, track_target
+from marsyard.scenarios.rover.score import (
     fixed_conditions,
     products,
     provenance,
@@ -25,11 +25,11 @@ from scenarios.rover.score import (
     stored_updates,
     tracking,
 )
-from scenarios.rover.stops import RunOutcome
-from scenarios.rover.world import terrain_parameters
-from scenarios.trial import Judged, attempted, case_result
-from sim.streams import Streams
-from sim.terrain import TerrainBank
+from marsyard.scenarios.rover.stops import RunOutcome
+from marsyard.scenarios.rover.world import terrain_parameters
+from marsyard.scenarios.trial import Judged, attempted, case_result
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import TerrainBank
 
 #: Terrains of a bank that are built before its runs; a larger bank's are built by the runs that need them.
 PREPARED_TERRAINS = 64

@@ -8,17 +8,17 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from algorithms.vtt.accuracy import stereo_range_error_m
-from algorithms.vtt.stereo import disparity_px_m
-from scenarios.interface import Scalar
-from scenarios.parts.scores import ScoredRun
-from scenarios.provenance import rendered_as
-from scenarios.rover.own_shadow import shades, template_patch
-from scenarios.rover.parameters import RoverScenarioParameters
-from scenarios.rover.run import Run
-from scenarios.rover.stops import RunOutcome, Stop
-from scenarios.rover.target import sightings
-from sim.measurements import RoverMeasurements
+from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
+from marsyard.algorithms.vtt.stereo import disparity_px_m
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.parts.scores import ScoredRun
+from marsyard.scenarios.provenance import rendered_as
+from marsyard.scenarios.rover.own_shadow import shades, template_patch
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.run import Run
+from marsyard.scenarios.rover.stops import RunOutcome, Stop
+from marsyard.scenarios.rover.target import sightings
+from marsyard.sim.measurements import RoverMeasurements
 
 _FULL_TURN_DEG = 360.0
 

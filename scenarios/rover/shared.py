@@ -20,20 +20,20 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.interface import PixelBox, TrackingState
-from algorithms.vtt import VttOptions
-from algorithms.vtt.pointing import box_around, mast_angles
-from scenarios.estimators import TRACKING
-from scenarios.interface import CaseResult, Scalar
-from scenarios.parts.named import SCORE, Kind
-from scenarios.parts.scores import scored
-from scenarios.rover.guarded import GuardedTracker
-from scenarios.rover.parameters import LegParameters, RoverScenarioParameters
-from scenarios.rover.pictures import Detectors, Photographer, StereoPictures
-from scenarios.rover.rig import Rig
-from scenarios.rover.route import Belief, commands, finished
-from scenarios.rover.run import Run
-from scenarios.rover.score import (
+from marsyard.algorithms.interface import PixelBox, TrackingState
+from marsyard.algorithms.vtt import VttOptions
+from marsyard.algorithms.vtt.pointing import box_around, mast_angles
+from marsyard.scenarios.estimators import TRACKING
+from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.parts.scores import scored
+from marsyard.scenarios.rover.guarded import GuardedTracker
+from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.pictures import Detectors, Photographer, StereoPictures
+from marsyard.scenarios.rover.rig import Rig
+from marsyard.scenarios.rover.route import Belief, commands, finished
+from marsyard.scenarios.rover.run import Run
+from marsyard.scenarios.rover.score import (
     fixed_conditions,
     products,
     provenance,
@@ -43,15 +43,15 @@ from scenarios.rover.score import (
     stored_updates,
     tracking,
 )
-from scenarios.rover.stops import RunOutcome, Stop
-from scenarios.rover.target import Sightings, point_on, rock_of, sightings, told_by_pixel
-from scenarios.rover.vehicle import Vehicle
-from scenarios.rover.world import RunWorld, terrain_parameters
-from scenarios.trial import Judged, attempted, case_result
-from sim.camera import CameraModel
-from sim.dynamics import Stance
-from sim.streams import Streams
-from sim.terrain import TerrainBank
+from marsyard.scenarios.rover.stops import RunOutcome, Stop
+from marsyard.scenarios.rover.target import Sightings, point_on, rock_of, sightings, told_by_pixel
+from marsyard.scenarios.rover.vehicle import Vehicle
+from marsyard.scenarios.rover.world import RunWorld, terrain_parameters
+from marsyard.scenarios.trial import Judged, attempted, case_result
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics import Stance
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import TerrainBank
 
 
 class _Parameters(BaseModel):
@@ -71,7 +71,9 @@ class VariantParameters(_Parameters):
 
 
 class PointParameters(_Parameters):
-    """A target on the rock's face, see `scenarios.rover.TargetParameters`; of a circle as seen from its middle."""
+    """A target on the rock's face, see `marsyard.scenarios.rover.TargetParameters`; of a circle as seen from its
+    middle.
+    """
 
     across: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
     up: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5

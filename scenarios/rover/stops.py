@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.interface import TargetUpdate
-from algorithms.vtt import VttDetails
-from scenarios.rover.pictures import StereoPictures
-from sim.camera import CameraModel
-from sim.dynamics.driving import Drive
-from sim.dynamics.rover import Stance
-from sim.measurements import MastCalibration
+from marsyard.algorithms.interface import TargetUpdate
+from marsyard.algorithms.vtt import VttDetails
+from marsyard.scenarios.rover.pictures import StereoPictures
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics.driving import Drive
+from marsyard.sim.dynamics.rover import Stance
+from marsyard.sim.measurements import MastCalibration
 
 
 class RunOutcome(Enum):

@@ -9,17 +9,17 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.vtt import VttOptions
-from algorithms.vtt.pointing import mast_angles
-from algorithms.vtt.stereo import triangulated
-from scenarios.rover.parameters import RoverScenarioParameters
-from scenarios.rover.points import Sight, about_line, distances, facing, hidden, shaded, sight_axes
-from scenarios.rover.rig import Rig
-from scenarios.rover.world import RunWorld
-from sim.camera import CameraModel
-from sim.dynamics.rover import Stance
-from sim.frames import SITE_FROM_WORLD
-from sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
+from marsyard.algorithms.vtt import VttOptions
+from marsyard.algorithms.vtt.pointing import mast_angles
+from marsyard.algorithms.vtt.stereo import triangulated
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.points import Sight, about_line, distances, facing, hidden, shaded, sight_axes
+from marsyard.scenarios.rover.rig import Rig
+from marsyard.scenarios.rover.world import RunWorld
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics.rover import Stance
+from marsyard.sim.frames import SITE_FROM_WORLD
+from marsyard.sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
 
 #: Directions about a point's own in which the rock, or what lies just behind it, must be seen too, lest the point is on
 #: an occluding edge.

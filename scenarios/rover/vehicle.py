@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from scenarios.rover.parameters import RoverScenarioParameters
-from scenarios.rover.rig import Rig
-from scenarios.rover.world import RunWorld
-from sim.dynamics import MER, ROCKY_8, Drive, Ground, RockyGround, RoverParameters, Soil, Stance, drive, settle
-from sim.measurements import DriveCommand
-from sim.sensor.odometry import Odometer, PoseEstimate
-from sim.streams import Streams
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.rig import Rig
+from marsyard.scenarios.rover.world import RunWorld
+from marsyard.sim.dynamics import MER, ROCKY_8, Drive, Ground, RockyGround, RoverParameters, Soil, Stance, drive, settle
+from marsyard.sim.measurements import DriveCommand
+from marsyard.sim.sensor.odometry import Odometer, PoseEstimate
+from marsyard.sim.streams import Streams
 
 #: Rocks are felt by the wheels within this of the way, metres.
 FELT_M = 1.5
@@ -84,7 +84,7 @@ class Vehicle:
 
 
 def rover_of(camera: str) -> RoverParameters:
-    """The rover that carries a camera of `sim.sensor.PRESETS`."""
+    """The rover that carries a camera of `marsyard.sim.sensor.PRESETS`."""
     return MER if camera.startswith("mer") else ROCKY_8
 
 

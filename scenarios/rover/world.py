@@ -9,16 +9,25 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
-from scenarios.rover.points import Sight
-from scenarios.views import Eye, SiteGround, site_scene
-from sim.dynamics import RoverParameters, Stance
-from sim.frames import direction
-from sim.measurements import MastGeometry
-from sim.render import CloudLayer, Objects, Scene, Sun, may_shade, rover_objects, rover_sphere
-from sim.streams import Streams
-from sim.terrain import PlacedRock, RockField, RockParameters, Site, Surface, TerrainBank, TerrainParameters, site
-from sim.terrain.landforms import Ramp
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
+from marsyard.scenarios.rover.points import Sight
+from marsyard.scenarios.views import Eye, SiteGround, site_scene
+from marsyard.sim.dynamics import RoverParameters, Stance
+from marsyard.sim.frames import direction
+from marsyard.sim.measurements import MastGeometry
+from marsyard.sim.render import CloudLayer, Objects, Scene, Sun, may_shade, rover_objects, rover_sphere
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import (
+    PlacedRock,
+    RockField,
+    RockParameters,
+    Site,
+    Surface,
+    TerrainBank,
+    TerrainParameters,
+    site,
+)
+from marsyard.sim.terrain.landforms import Ramp
 
 #: Name of the target's rock.
 TARGET = "target"

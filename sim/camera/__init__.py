@@ -5,19 +5,19 @@ are immutable, take arrays of any leading dimensions and share the interface `Ca
 and row, with the centre of the upper left pixel at (0, 0).
 """
 
-from sim.camera.assembly import CameraFileError
-from sim.camera.base import CameraModel
-from sim.camera.cahv import Cahv
-from sim.camera.cahvor import Cahvor
-from sim.camera.cahvore import Cahvore
-from sim.camera.calibrations import Calibration, read_calibrations
-from sim.camera.files import read_camera, read_cameras
-from sim.camera.mounting import looking_down
-from sim.camera.opencv import OpenCVIntrinsics, Residual, from_opencv, from_opencv_fisheye, to_opencv
-from sim.camera.pds4_labels import read_pds4
-from sim.camera.pds_labels import read_pds3
-from sim.camera.pds_products import Pds3Product, read_pds3_product
-from sim.camera.text_files import BODY_FRAME, HEAD_FRAME, read_cahvor, write_cahvor
+from marsyard.sim.camera.assembly import CameraFileError
+from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.cahv import Cahv
+from marsyard.sim.camera.cahvor import Cahvor
+from marsyard.sim.camera.cahvore import Cahvore
+from marsyard.sim.camera.calibrations import Calibration, read_calibrations
+from marsyard.sim.camera.files import read_camera, read_cameras
+from marsyard.sim.camera.mounting import looking_down
+from marsyard.sim.camera.opencv import OpenCVIntrinsics, Residual, from_opencv, from_opencv_fisheye, to_opencv
+from marsyard.sim.camera.pds4_labels import read_pds4
+from marsyard.sim.camera.pds_labels import read_pds3
+from marsyard.sim.camera.pds_products import Pds3Product, read_pds3_product
+from marsyard.sim.camera.text_files import BODY_FRAME, HEAD_FRAME, read_cahvor, write_cahvor
 
 __all__ = [
     "BODY_FRAME",

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.camera.base import CameraModel
-from sim.camera.cahv import Cahv
-from sim.camera.cahvor import Cahvor
-from sim.camera.cahvore import Cahvore
-from sim.camera.vectors import Real
-from sim.files import open_regular
+from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.cahv import Cahv
+from marsyard.sim.camera.cahvor import Cahvor
+from marsyard.sim.camera.cahvore import Cahvore
+from marsyard.sim.camera.vectors import Real
+from marsyard.sim.files import open_regular
 
 #: Labels of several megabytes are there; camera files are small.
 _MOST_BYTES = 1 << 23

@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from sim.camera.vectors import Gradient, Real, Vector, blocks, checked_size, cross, frozen_vector, unit
+from marsyard.sim.camera.vectors import Gradient, Real, Vector, blocks, checked_size, cross, frozen_vector, unit
 
 #: Labels round A and O to six digits or fewer.
 UNIT_TOLERANCE = 1e-4
@@ -256,7 +256,7 @@ class CameraModel(ABC):
     def linearized(self, *, inside: bool = False) -> CameraModel:
         """A `Cahv` of the same size that covers the whole view, or with `inside` only what fills its frame.
 
-        Its axes are square; A is the mean direction of the frame's pixels (see `sim.camera.linearisation`).
+        Its axes are square; A is the mean direction of the frame's pixels (see `marsyard.sim.camera.linearisation`).
 
         Raises
         ------

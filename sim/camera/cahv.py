@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from sim.camera.base import CameraModel
-from sim.camera.vectors import Gradient, Real, Triple, Vector, dot
+from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.vectors import Gradient, Real, Triple, Vector, dot
 
 _ORIGIN = (0.0, 0.0, 0.0)
 

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from sim.camera import kernels
-from sim.camera.base import UNIT_TOLERANCE, CameraModel
-from sim.camera.cahv import Cahv
-from sim.camera.linearisation import linearised
-from sim.camera.radial import RadialPolynomial
-from sim.camera.vectors import Gradient, Triple, Vector, dot
+from marsyard.sim.camera import kernels
+from marsyard.sim.camera.base import UNIT_TOLERANCE, CameraModel
+from marsyard.sim.camera.cahv import Cahv
+from marsyard.sim.camera.linearisation import linearised
+from marsyard.sim.camera.radial import RadialPolynomial
+from marsyard.sim.camera.vectors import Gradient, Triple, Vector, dot
 
 
 class RadialModel(CameraModel):

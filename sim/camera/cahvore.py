@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from sim.camera.cahv import Cahv
-from sim.camera.cahvor import RadialModel
-from sim.camera.vectors import Gradient, Real, Triple, Vector, dot
+from marsyard.sim.camera.cahv import Cahv
+from marsyard.sim.camera.cahvor import RadialModel
+from marsyard.sim.camera.vectors import Gradient, Real, Triple, Vector, dot
 
 _NEWTON_STEPS = 30
 #: A linearity nearer to 0 than this is 0, as in cmod.

@@ -21,9 +21,9 @@ import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from sim.camera.assembly import Source
-from sim.camera.base import CameraModel
-from sim.camera.opencv import Residual, from_opencv, from_opencv_fisheye
+from marsyard.sim.camera.assembly import Source
+from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.opencv import Residual, from_opencv, from_opencv_fisheye
 
 #: Farthest that a fitted camera may be from the calibrated one: RMS over the frame, pixels, less than calibrations
 #: themselves leave of their points (0.1 to 0.5 px); and anywhere, which is in a corner.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sim.camera.assembly import CameraFileError, Source
-from sim.camera.base import CameraModel
-from sim.camera.calibrations import is_calibration, read_calibrations
-from sim.camera.pds4_labels import is_xml, read_pds4
-from sim.camera.pds_labels import is_pds3, read_pds3
-from sim.camera.text_files import read_cahvor
+from marsyard.sim.camera.assembly import CameraFileError, Source
+from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.calibrations import is_calibration, read_calibrations
+from marsyard.sim.camera.pds4_labels import is_xml, read_pds4
+from marsyard.sim.camera.pds_labels import is_pds3, read_pds3
+from marsyard.sim.camera.text_files import read_cahvor
 
 __all__ = ["CameraFileError", "read_camera", "read_cameras"]
 

@@ -32,7 +32,8 @@ def radial_image(
     r: Array,
     tau_limit: float,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Columns and rows of points, and whether the optics can image them: `sim.camera.Cahvor` says by what model.
+    """Columns and rows of points, and whether the optics can image them: `marsyard.sim.camera.Cahvor` says by what
+    model.
 
     Parameters
     ----------
@@ -110,7 +111,7 @@ def _undistortion(polynomial: Triple, limits: tuple[float, float], tau: float) -
 
 @njit(cache=True, error_model="numpy")
 def undistortion(polynomial: Triple, limits: tuple[float, float], distorted_tau: Array) -> Array:
-    """The ratio chi / f(chi) of each f(chi)^2: `sim.camera.radial` says how it is solved for.
+    """The ratio chi / f(chi) of each f(chi)^2: `marsyard.sim.camera.radial` says how it is solved for.
 
     Parameters
     ----------
@@ -136,7 +137,8 @@ def radial_sight(
     polynomial: Triple,
     limits: tuple[float, float],
 ) -> tuple[Array, Array, Array]:
-    """Directions of pixels, of any length; NaN where no ray reaches one: `sim.camera.Cahvor` says by what model.
+    """Directions of pixels, of any length; NaN where no ray reaches one: `marsyard.sim.camera.Cahvor` says by what
+    model.
 
     Parameters
     ----------

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.camera.base import CameraModel
-from sim.camera.cahv import Cahv
+from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.cahv import Cahv
 
 #: Border samples on each side of the frame.
 _STEPS = 256

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.camera.base import CameraModel
+from marsyard.sim.camera.base import CameraModel
 
 
 def looking_down(camera: CameraModel) -> CameraModel:

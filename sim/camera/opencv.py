@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.camera.base import CameraModel
-from sim.camera.cahv import Cahv
-from sim.camera.cahvor import Cahvor
-from sim.camera.cahvore import Cahvore
+from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.cahv import Cahv
+from marsyard.sim.camera.cahvor import Cahvor
+from marsyard.sim.camera.cahvore import Cahvore
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree
 
-from sim.camera.assembly import MODELS, Source, assembled, linearity_of_type
-from sim.camera.base import CameraModel
+from marsyard.sim.camera.assembly import MODELS, Source, assembled, linearity_of_type
+from marsyard.sim.camera.base import CameraModel
 
 _START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|[A-Za-z_][\w:.-]*[\s>])")
 _PARAMETERS = "Camera_Model_Parameters"

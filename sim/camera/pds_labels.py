@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sim.camera.assembly import MODELS, Source, assembled, linearity_of_type
-from sim.camera.base import CameraModel
+from marsyard.sim.camera.assembly import MODELS, Source, assembled, linearity_of_type
+from marsyard.sim.camera.base import CameraModel
 
 _GROUP = "GEOMETRIC_CAMERA_MODEL"
 _FIRST_BYTES = 1 << 16

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.camera.assembly import Source
-from sim.camera.pds_labels import label_text, parsed_blocks, picture_size
-from sim.files import check_regular
-from sim.frames import rigid
+from marsyard.sim.camera.assembly import Source
+from marsyard.sim.camera.pds_labels import label_text, parsed_blocks, picture_size
+from marsyard.sim.files import check_regular
+from marsyard.sim.frames import rigid
 
 #: The rover's pose; the second is Curiosity's.
 _ROVERS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")

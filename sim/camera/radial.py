@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.camera import kernels
+from marsyard.sim.camera import kernels
 
 Vector = NDArray[np.float64]
 

@@ -16,9 +16,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim.camera.assembly import Source, assembled, linearity_of_type
-from sim.camera.base import CameraModel
-from sim.camera.cahvore import Cahvore
+from marsyard.sim.camera.assembly import Source, assembled, linearity_of_type
+from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.cahvore import Cahvore
 
 #: Frames of the cameras that Marsyard writes, as their files state them.
 BODY_FRAME = "body (metres); the body's pose in the world, where it is known, is stated beside this file"

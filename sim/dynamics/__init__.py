@@ -1,13 +1,13 @@
 """How vehicles move: truth states over time."""
 
-from sim.dynamics.chain import SwingParameters
-from sim.dynamics.driving import FIRM, NO_SLIP, Drive, DrivenPart, SlipParameters, Soil, drive
-from sim.dynamics.relief import RockyGround
-from sim.dynamics.rover import MER, ROCKY_8, Ground, RoverParameters, Stance, settle
-from sim.dynamics.state import State
-from sim.dynamics.swing import SwingDescent
-from sim.dynamics.trajectory import Motion, Resting, Trajectory
-from sim.dynamics.wind import Wind, WindParameters
+from marsyard.sim.dynamics.chain import SwingParameters
+from marsyard.sim.dynamics.driving import FIRM, NO_SLIP, Drive, DrivenPart, SlipParameters, Soil, drive
+from marsyard.sim.dynamics.relief import RockyGround
+from marsyard.sim.dynamics.rover import MER, ROCKY_8, Ground, RoverParameters, Stance, settle
+from marsyard.sim.dynamics.state import State
+from marsyard.sim.dynamics.swing import SwingDescent
+from marsyard.sim.dynamics.trajectory import Motion, Resting, Trajectory
+from marsyard.sim.dynamics.wind import Wind, WindParameters
 
 __all__ = [
     "FIRM",

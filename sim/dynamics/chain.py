@@ -1,6 +1,6 @@
 """The hanging chain of canopy, backshell and lander: its parameters, its constants and its linear theory.
 
-`sim.dynamics.swing` has the equations and says what the symbols mean.
+`marsyard.sim.dynamics.swing` has the equations and says what the symbols mean.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, model_validator
 
-from sim.dynamics.kernels.swing import Chain
-from sim.dynamics.wind import WindParameters
+from marsyard.sim.dynamics.kernels.swing import Chain
+from marsyard.sim.dynamics.wind import WindParameters
 
 #: Greatest tilt of a coning lander over the line's tilt for which the start of a flight is known well enough.
 MOST_LANDER_SHARE = 1.5

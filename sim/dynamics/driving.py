@@ -26,9 +26,9 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
-from sim.dynamics.rover import Ground, RoverParameters, Stance, settle
-from sim.frames import composed, turn_matrix
-from sim.measurements import DriveCommand
+from marsyard.sim.dynamics.rover import Ground, RoverParameters, Stance, settle
+from marsyard.sim.frames import composed, turn_matrix
+from marsyard.sim.measurements import DriveCommand
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 

@@ -21,9 +21,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
-from sim.dynamics.angles import turning
-from sim.dynamics.state import State
-from sim.dynamics.trajectory import Motion
+from marsyard.sim.dynamics.angles import turning
+from marsyard.sim.dynamics.state import State
+from marsyard.sim.dynamics.trajectory import Motion
 
 Positive = Annotated[float, Field(gt=0.0)]
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.integrate import DOP853, DenseOutput, OdeSolution, solve_ivp
 
-from sim.dynamics.kernels.swing import Chain, WindField, interpolated, packed, slope, step, terms
+from marsyard.sim.dynamics.kernels.swing import Chain, WindField, interpolated, packed, slope, step, terms
 
 StateVector = Float64[np.ndarray, "22"]
 #: What `solve_ivp` asks of an event.
@@ -95,7 +95,7 @@ class Path:
     starts_s, lengths_s, states
         Time and state from which each step was taken, and its length, negative backwards.
     polynomials
-        Their terms (`sim.dynamics.kernels.swing.terms`).
+        Their terms (`marsyard.sim.dynamics.kernels.swing.terms`).
     """
 
     span_s: tuple[float, float]
@@ -127,7 +127,7 @@ class Path:
         )
 
     def at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 22"]:
-        """State vectors of the chain (`sim.dynamics.kernels.swing`). Raises ValueError outside of the span."""
+        """State vectors of the chain (`marsyard.sim.dynamics.kernels.swing`). Raises ValueError outside of the span."""
         first, last = self.span_s
         outside = times_s[(times_s < first) | (times_s > last)]
         if outside.size:

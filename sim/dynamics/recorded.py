@@ -15,8 +15,8 @@ from jaxtyping import Float64
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from sim.dynamics.state import State
-from sim.dynamics.trajectory import Motion
+from marsyard.sim.dynamics.state import State
+from marsyard.sim.dynamics.trajectory import Motion
 
 #: Fewest instants from which acceleration can be told.
 LEAST_INSTANTS = 4

@@ -3,7 +3,7 @@
 CSV and Parquet have the columns time_s, x_m, y_m, z_m, qx, qy, qz, qw, in any order and among others. TUM's lines are
 ``timestamp tx ty tz qx qy qz qw``, seconds and metres, those with # left out; EuRoC's files begin with ``#timestamp``,
 in nanoseconds, then position, then the quaternion with its scalar part first. Kernels are named in a file that ends in
-``.spice.toml`` (`sim.dynamics.spice`). Quaternions turn the recorded body's axes
+``.spice.toml`` (`marsyard.sim.dynamics.spice`). Quaternions turn the recorded body's axes
 into those of the world; what axes these are no format says, and whoever uses the poses states it.
 """
 
@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from sim.dynamics.recorded import LEAST_INSTANTS
-from sim.dynamics.spice import SUFFIX, is_spice, spice_poses
-from sim.files import check_regular
+from marsyard.sim.dynamics.recorded import LEAST_INSTANTS
+from marsyard.sim.dynamics.spice import SUFFIX, is_spice, spice_poses
+from marsyard.sim.files import check_regular
 
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 #: A quaternion's length may be off 1 by this, as written with three digits.

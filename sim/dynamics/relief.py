@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.ndimage import map_coordinates
 
-from sim.dynamics.rover import Ground
+from marsyard.sim.dynamics.rover import Ground
 
 #: Side of the grid's cells, metres: a tenth of a wheel's radius.
 CELL_M = 0.0125
@@ -47,7 +47,7 @@ class RockyGround:
     ) -> RockyGround:
         """Ground with bodies given by their triangles (world axes, metres) within `half_m` of a centre, each way.
 
-        ``mesh.vertices[mesh.faces]`` of a `sim.terrain.RockMesh` gives a field's rocks.
+        ``mesh.vertices[mesh.faces]`` of a `marsyard.sim.terrain.RockMesh` gives a field's rocks.
         """
         cells = 2 * int(np.ceil(half_m / CELL_M)) + 1
         corner = np.array(centre_m) - 0.5 * (cells - 1) * CELL_M

@@ -28,8 +28,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.dynamics.kernels import suspension
-from sim.frames import rigid, turn_matrix
+from marsyard.sim.dynamics.kernels import suspension
+from marsyard.sim.frames import rigid, turn_matrix
 
 Metres = Annotated[float, Field(gt=0.0, le=5.0)]
 
@@ -48,7 +48,9 @@ _NEWTON_STEPS, _CLOSED_M = 12, 1e-10
 
 @runtime_checkable
 class Ground(Protocol):
-    """What wheels stand on: `sim.terrain.Surface`, or one with rocks (`sim.dynamics.relief.RockyGround`)."""
+    """What wheels stand on: `marsyard.sim.terrain.Surface`, or one with rocks
+    (`marsyard.sim.dynamics.relief.RockyGround`).
+    """
 
     def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         """Height of the ground at world positions, metres."""

@@ -24,7 +24,7 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from sim.files import check_regular
+from marsyard.sim.files import check_regular
 
 #: How such a file's name ends.
 SUFFIX = ".spice.toml"

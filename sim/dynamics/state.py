@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.frames import rigid
+from marsyard.sim.frames import rigid
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ mass, S = m_b L_b + m_l L, J = m_b L_b^2 + m_l L^2 and P_x the part across x, La
 
 g downwards, w the lander's spin about its axis, s = P_n (e x e' + w e) - n x n' its rate against the line, which rolls
 with it, damped by c in the bridle. (1) gives r''; (2) and (3) are then two equations for n'' and e'', solved in closed
-form (`sim.dynamics.kernels.swing`). F is the air's force on the canopy, at velocity v through it,
+form (`marsyard.sim.dynamics.kernels.swing`). F is the air's force on the canopy, at velocity v through it,
 
     F = -rho/2 A |v| (C_T |v| n + C_N P_n v),      rho falling off exponentially with height:
 
@@ -47,12 +47,12 @@ from jaxtyping import Float64
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from sim.dynamics.chain import Modes, SwingParameters, chain_of
-from sim.dynamics.integration import Path, StateVector
-from sim.dynamics.kernels.swing import AXIS, CANOPY, LINE, Chain, truth
-from sim.dynamics.state import State
-from sim.dynamics.trajectory import Motion
-from sim.dynamics.wind import Wind
+from marsyard.sim.dynamics.chain import Modes, SwingParameters, chain_of
+from marsyard.sim.dynamics.integration import Path, StateVector
+from marsyard.sim.dynamics.kernels.swing import AXIS, CANOPY, LINE, Chain, truth
+from marsyard.sim.dynamics.state import State
+from marsyard.sim.dynamics.trajectory import Motion
+from marsyard.sim.dynamics.wind import Wind
 
 Vector = Float64[np.ndarray, "3"]
 

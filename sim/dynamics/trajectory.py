@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from sim.dynamics.state import State
+from marsyard.sim.dynamics.state import State
 
 
 @dataclass(frozen=True)

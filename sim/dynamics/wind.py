@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.dynamics.kernels.swing import WindField, winds
+from marsyard.sim.dynamics.kernels.swing import WindField, winds
 
 #: Shortest gusts, m: two diameters of the canopy, which feels the mean over its own width.
 SHORTEST_WAVE_M = 30.0

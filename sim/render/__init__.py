@@ -1,12 +1,12 @@
 """Pictures of the terrain through exact camera models, and their truth pixel by pixel."""
 
-from sim.render.clouds import CloudLayer, CloudParameters
-from sim.render.objects import Objects
-from sim.render.photometry import DustySky, Photometry, Sun, Texture
-from sim.render.rays import PixelRays
-from sim.render.renderer import Frame, Renderer, process_renderer
-from sim.render.rover import may_shade, rover_objects, rover_sphere
-from sim.render.scene import Scene
+from marsyard.sim.render.clouds import CloudLayer, CloudParameters
+from marsyard.sim.render.objects import Objects
+from marsyard.sim.render.photometry import DustySky, Photometry, Sun, Texture
+from marsyard.sim.render.rays import PixelRays
+from marsyard.sim.render.renderer import Frame, Renderer, process_renderer
+from marsyard.sim.render.rover import may_shade, rover_objects, rover_sphere
+from marsyard.sim.render.scene import Scene
 
 __all__ = [
     "CloudLayer",

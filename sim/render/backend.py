@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt32
 from numpy.typing import NDArray
 
-from sim.render.kernels.depth import metres
+from marsyard.sim.render.kernels.depth import metres
 
 if TYPE_CHECKING:
     import trimesh

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtri
 
-from sim.render.photometry import Sun
+from marsyard.sim.render.photometry import Sun
 
 #: Cells along each side of the periodic layer, and its period in mean sizes of a cloud.
 CELLS, PERIOD_SIZES = 1024, 32.0

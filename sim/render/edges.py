@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int32, Int64
 
-from sim.render.kernels.edges import look_closely, mark_edges, split_rays
-from sim.render.kernels.ground import Extent
-from sim.render.objects import Objects
-from sim.render.pyramid import Ceilings, pyramid
-from sim.render.rays import PixelRays, RayBundle
-from sim.terrain import Surface
+from marsyard.sim.render.kernels.edges import look_closely, mark_edges, split_rays
+from marsyard.sim.render.kernels.ground import Extent
+from marsyard.sim.render.objects import Objects
+from marsyard.sim.render.pyramid import Ceilings, pyramid
+from marsyard.sim.render.rays import PixelRays, RayBundle
+from marsyard.sim.terrain import Surface
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ def look_within(
     Parameters
     ----------
     surface, tops, extent_m, objects
-        The ground, bounds of its height (`sim.render.pyramid.ceilings`), where it ends (`Scene.extent_m`), and what
-        stands on it.
+        The ground, bounds of its height (`marsyard.sim.render.pyramid.ceilings`), where it ends (`Scene.extent_m`), and
+        what stands on it.
     rotation, position
         Pose of the camera: rotation matrix of the body, world position of its centre of projection.
     columns

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from sim.render.kernels.ground import Bounds, greatest_rises
-from sim.render.kernels.sun import Shadow, heights_in_rows, sweep_shadow
-from sim.render.photometry import Sun
-from sim.render.reach import Cone
-from sim.terrain import Surface
+from marsyard.sim.render.kernels.ground import Bounds, greatest_rises
+from marsyard.sim.render.kernels.sun import Shadow, heights_in_rows, sweep_shadow
+from marsyard.sim.render.photometry import Sun
+from marsyard.sim.render.reach import Cone
+from marsyard.sim.terrain import Surface
 
 #: Most posts along a side of the grid on which the shadow is swept.
 SHADOW_SIDE = 4096

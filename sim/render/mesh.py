@@ -9,9 +9,9 @@ from jaxtyping import Float, Int
 from scipy.optimize import brentq
 from scipy.spatial import ConvexHull
 
-from sim.render.kernels.mesh import lay_out, spans_in_hull
-from sim.render.pyramid import pyramid
-from sim.terrain import Surface
+from marsyard.sim.render.kernels.mesh import lay_out, spans_in_hull
+from marsyard.sim.render.pyramid import pyramid
+from marsyard.sim.terrain import Surface
 
 if TYPE_CHECKING:
     import trimesh

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
-from sim.render.kernels.bodies import body_spheres, facing, triangles_of
-from sim.render.kernels.hierarchy import Hierarchy, morton_codes, node_boxes
+from marsyard.sim.render.kernels.bodies import body_spheres, facing, triangles_of
+from marsyard.sim.render.kernels.hierarchy import Hierarchy, morton_codes, node_boxes
 
 #: Triangle numbers are drawn as colours of 24 bits, of which 0 is the ground.
 MOST_TRIANGLES = 2**24 - 2

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, Float64
 
-from sim.render.kernels.sky import scattered_irradiance
+from marsyard.sim.render.kernels.sky import scattered_irradiance
 
 #: Angular radius of the sun seen from Mars at 1.52 AU, radians (0.35 deg across).
 SUN_RADIUS_AT_MARS_RAD = 0.00305

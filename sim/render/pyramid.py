@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
-from sim.terrain import Surface
+from marsyard.sim.terrain import Surface
 
 #: Levels that kernels take. They are compiled for a number of arrays: for every other one they would be compiled anew,
 #: which takes a minute. Terrains of 2**15 samples along a side have as many.

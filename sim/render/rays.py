@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 from scipy.spatial.transform import RigidTransform
 
-from sim.camera import CameraModel
-from sim.frames import turn_matrix
-from sim.render.backend import RenderingError
-from sim.render.kernels.rays import extent, least_along, pixel_angles, summed
-from sim.render.reach import Cone
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import turn_matrix
+from marsyard.sim.render.backend import RenderingError
+from marsyard.sim.render.kernels.rays import extent, least_along, pixel_angles, summed
+from marsyard.sim.render.reach import Cone
 
 #: Samples along each side of the pinhole views: a camera takes the first that leaves `_SPARE_PX` of them beside its own
 #: pixels, and the last where none does (full frames of 1024 x 1024 and 45 deg are drawn at about their own resolution).

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation
 
-from sim.render.kernels.casters import Casters, listed_casters
-from sim.render.kernels.shading import Reach
-from sim.render.objects import Objects, spheres_in_cone
-from sim.render.photometry import Sun
+from marsyard.sim.render.kernels.casters import Casters, listed_casters
+from marsyard.sim.render.kernels.shading import Reach
+from marsyard.sim.render.objects import Objects, spheres_in_cone
+from marsyard.sim.render.photometry import Sun
 
 #: A cone: where its tip is, the unit vector along its middle, and its half angle in radians.
 Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]

@@ -15,17 +15,17 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 from scipy.spatial.transform import RigidTransform
 
-from sim.frames import turn_matrix
-from sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
-from sim.render.edges import Sight, edge_pixels, look_within, rays_within
-from sim.render.heap import keep_freed_memory, return_freed_memory
-from sim.render.kernels.shading import shade
-from sim.render.kernels.sight import GRAZING, look
-from sim.render.mesh import cells_in_hull, ground_mesh, lines_in_view
-from sim.render.pyramid import ceilings, pyramid
-from sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
-from sim.render.scene import Light, Scene
-from sim.render.threads import in_parts
+from marsyard.sim.frames import turn_matrix
+from marsyard.sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
+from marsyard.sim.render.edges import Sight, edge_pixels, look_within, rays_within
+from marsyard.sim.render.heap import keep_freed_memory, return_freed_memory
+from marsyard.sim.render.kernels.shading import shade
+from marsyard.sim.render.kernels.sight import GRAZING, look
+from marsyard.sim.render.mesh import cells_in_hull, ground_mesh, lines_in_view
+from marsyard.sim.render.pyramid import ceilings, pyramid
+from marsyard.sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
+from marsyard.sim.render.scene import Light, Scene
+from marsyard.sim.render.threads import in_parts
 
 
 @dataclass(frozen=True)

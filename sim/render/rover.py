@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
-from sim.dynamics.rover import RoverParameters, Stance, bogie_pivots, wheel_centres
-from sim.measurements import MastGeometry
-from sim.render.objects import Objects
+from marsyard.sim.dynamics.rover import RoverParameters, Stance, bogie_pivots, wheel_centres
+from marsyard.sim.measurements import MastGeometry
+from marsyard.sim.render.objects import Objects
 
 #: Albedo of everything: bright metal and glass under dust. Assumed.
 ALBEDO = 0.25

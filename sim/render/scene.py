@@ -9,17 +9,17 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float64
 
-from sim.render.clouds import CloudLayer, no_cover
-from sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
-from sim.render.kernels.casters import Casters
-from sim.render.kernels.ground import Bounds, Extent, height_range
-from sim.render.kernels.shading import Clouds, Reach
-from sim.render.kernels.sun import Shadow
-from sim.render.mesh import graded_offsets
-from sim.render.objects import Objects
-from sim.render.photometry import Photometry, Sun, Texture
-from sim.render.reach import EVERYWHERE, Cone, casters_towards, concerned, shade_reach
-from sim.terrain import Surface
+from marsyard.sim.render.clouds import CloudLayer, no_cover
+from marsyard.sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
+from marsyard.sim.render.kernels.casters import Casters
+from marsyard.sim.render.kernels.ground import Bounds, Extent, height_range
+from marsyard.sim.render.kernels.shading import Clouds, Reach
+from marsyard.sim.render.kernels.sun import Shadow
+from marsyard.sim.render.mesh import graded_offsets
+from marsyard.sim.render.objects import Objects
+from marsyard.sim.render.photometry import Photometry, Sun, Texture
+from marsyard.sim.render.reach import EVERYWHERE, Cone, casters_towards, concerned, shade_reach
+from marsyard.sim.terrain import Surface
 
 #: By how much a mean of heights may stand above the highest of them, metres: single precision rounds at a few km.
 ROUNDING_M = 0.01
@@ -56,9 +56,11 @@ class Scene:
         Spacing of the mesh at the centre, how far it reaches to each side, and the number of its lines.
     among_objects
         Whether pictures are taken from among the objects, whose shadows may then fall nearly anywhere in them. Without
-        it the places where they may fall are found before, which spares all others the search (`sim.render.reach`).
+        it the places where they may fall are found before, which spares all others the search
+        (`marsyard.sim.render.reach`).
     edge_rays
-        Rays along each side of a pixel that holds an edge (`sim.render.edges`); 1 draws every pixel by one ray.
+        Rays along each side of a pixel that holds an edge (`marsyard.sim.render.edges`); 1 draws every pixel by one
+        ray.
     shown_m
         Least and greatest x, least and greatest y of what pictures show; None where they may show anything.
     """

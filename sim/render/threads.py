@@ -8,7 +8,7 @@ from functools import cache
 
 from numba import config
 
-from sim.render.kernels.strips import STRIP
+from marsyard.sim.render.kernels.strips import STRIP
 
 #: Pixels below which the threads' start costs more than they save.
 FEWEST = 20_000

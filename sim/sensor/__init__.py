@@ -1,16 +1,16 @@
 """Instruments: how truth becomes measurements."""
 
-from sim.sensor.approach import Approach, ApproachParameters
-from sim.sensor.clock import Clock, ClockParameters
-from sim.sensor.datasheet import Datasheet, read_datasheet
-from sim.sensor.detector import Detector, DetectorParameters
-from sim.sensor.exposure import AutoExposure, AutoExposureParameters, auto_expose
-from sim.sensor.gps import POST_PROCESSED, RTK, STANDALONE, Gps, GpsParameters
-from sim.sensor.imu import SMALL_UNIT, Imu, ImuIncrements, ImuParameters, WarmUp
-from sim.sensor.inertial import InertialSolution, NavigationErrors
-from sim.sensor.instrument import Instrument, Readings, Sampling
-from sim.sensor.laser import LaserAltimeter, LaserParameters
-from sim.sensor.mast import (
+from marsyard.sim.sensor.approach import Approach, ApproachParameters
+from marsyard.sim.sensor.clock import Clock, ClockParameters
+from marsyard.sim.sensor.datasheet import Datasheet, read_datasheet
+from marsyard.sim.sensor.detector import Detector, DetectorParameters
+from marsyard.sim.sensor.exposure import AutoExposure, AutoExposureParameters, auto_expose
+from marsyard.sim.sensor.gps import POST_PROCESSED, RTK, STANDALONE, Gps, GpsParameters
+from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuIncrements, ImuParameters, WarmUp
+from marsyard.sim.sensor.inertial import InertialSolution, NavigationErrors
+from marsyard.sim.sensor.instrument import Instrument, Readings, Sampling
+from marsyard.sim.sensor.laser import LaserAltimeter, LaserParameters
+from marsyard.sim.sensor.mast import (
     MASTS,
     Mast,
     MastState,
@@ -20,15 +20,15 @@ from sim.sensor.mast import (
     on_head,
     stereo_mast,
 )
-from sim.sensor.motion import ImageMotion
-from sim.sensor.odometry import Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
-from sim.sensor.optics import natural_fall_off
-from sim.sensor.own_camera import NamedOrOwnCamera, OwnCamera, OwnCameraChoice
-from sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, Preset, preset
-from sim.sensor.radar import RadarAltimeter, RadarParameters
-from sim.sensor.ranging import height_above_ground
-from sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
-from sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
+from marsyard.sim.sensor.motion import ImageMotion
+from marsyard.sim.sensor.odometry import Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
+from marsyard.sim.sensor.optics import natural_fall_off
+from marsyard.sim.sensor.own_camera import NamedOrOwnCamera, OwnCamera, OwnCameraChoice
+from marsyard.sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, Preset, preset
+from marsyard.sim.sensor.radar import RadarAltimeter, RadarParameters
+from marsyard.sim.sensor.ranging import height_above_ground
+from marsyard.sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
+from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 
 __all__ = [
     "MASTS",

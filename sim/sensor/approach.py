@@ -21,9 +21,9 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
-from sim.sensor.imu import Imu
-from sim.sensor.inertial import NavigationErrors
-from sim.sensor.quaternions import products
+from marsyard.sim.sensor.imu import Imu
+from marsyard.sim.sensor.inertial import NavigationErrors
+from marsyard.sim.sensor.quaternions import products
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]

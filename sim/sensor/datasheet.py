@@ -28,10 +28,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from sim.files import open_regular
-from sim.sensor.optics import OpticsParameters
-from sim.sensor.parameters import DetectorParameters
-from sim.sensor.radiometry import LENS_TRANSMISSION, LightPath, bright_exposure_s
+from marsyard.sim.files import open_regular
+from marsyard.sim.sensor.optics import OpticsParameters
+from marsyard.sim.sensor.parameters import DetectorParameters
+from marsyard.sim.sensor.radiometry import LENS_TRANSMISSION, LightPath, bright_exposure_s
 
 Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]

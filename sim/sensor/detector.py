@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt16
 
-from sim.measurements import DetectorCalibration
-from sim.sensor.companding import compand, expand
-from sim.sensor.defects import add_bursts, dead_pixels, filled, hot_currents
-from sim.sensor.motion import ImageMotion, moving_exposure
-from sim.sensor.optics import dust_transmission, natural_fall_off, spread
-from sim.sensor.parameters import DetectorParameters
+from marsyard.sim.measurements import DetectorCalibration
+from marsyard.sim.sensor.companding import compand, expand
+from marsyard.sim.sensor.defects import add_bursts, dead_pixels, filled, hot_currents
+from marsyard.sim.sensor.motion import ImageMotion, moving_exposure
+from marsyard.sim.sensor.optics import dust_transmission, natural_fall_off, spread
+from marsyard.sim.sensor.parameters import DetectorParameters
 
 __all__ = ["Detector", "DetectorParameters", "dark_seconds", "natural_fall_off"]
 

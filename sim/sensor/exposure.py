@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float32, UInt16
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from sim.sensor.detector import Detector
-from sim.sensor.motion import ImageMotion
+from marsyard.sim.sensor.detector import Detector
+from marsyard.sim.sensor.motion import ImageMotion
 
 
 class AutoExposureParameters(BaseModel):

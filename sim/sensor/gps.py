@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.dynamics import Trajectory
-from sim.sensor.clock import Clock, ClockParameters
-from sim.sensor.instrument import Readings, Sampling
-from sim.sensor.stochastic import GaussMarkov
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.sensor.clock import Clock, ClockParameters
+from marsyard.sim.sensor.instrument import Readings, Sampling
+from marsyard.sim.sensor.stochastic import GaussMarkov
 
 NonNegative = Annotated[float, Field(ge=0.0, le=1000.0)]
 

@@ -19,10 +19,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from sim.dynamics import Trajectory
-from sim.sensor.clock import Clock, ClockParameters
-from sim.sensor.quaternions import products
-from sim.sensor.stochastic import GaussMarkov
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.sensor.clock import Clock, ClockParameters
+from marsyard.sim.sensor.quaternions import products
+from marsyard.sim.sensor.stochastic import GaussMarkov
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from sim.sensor.imu import ImuIncrements
-from sim.sensor.quaternions import running_products
+from marsyard.sim.sensor.imu import ImuIncrements
+from marsyard.sim.sensor.quaternions import running_products
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64
 
-from sim.dynamics import Trajectory
+from marsyard.sim.dynamics import Trajectory
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.optimize import brentq
 
-from sim.dynamics import Trajectory
-from sim.sensor.clock import ClockParameters
-from sim.sensor.instrument import Readings, Sampling
-from sim.sensor.ranging import DOWN, RangingParameters, RangingUnit
-from sim.terrain import Surface
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.sensor.clock import ClockParameters
+from marsyard.sim.sensor.instrument import Readings, Sampling
+from marsyard.sim.sensor.ranging import DOWN, RangingParameters, RangingUnit
+from marsyard.sim.terrain import Surface
 
 #: Points along the ray at which the ground is first compared with it, at least.
 LEAST_POINTS = 64

@@ -21,10 +21,10 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.camera import CameraModel
-from sim.frames import rigid
-from sim.measurements import MastCalibration, MastGeometry
-from sim.sensor.presets import preset
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import MastCalibration, MastGeometry
+from marsyard.sim.sensor.presets import preset
 
 Degrees = Annotated[float, Field(ge=0.0, le=10.0)]
 Pixels = Annotated[float, Field(ge=0.0, le=50.0)]
@@ -213,7 +213,8 @@ _HEAD_FROM_DOWN = Rotation.from_matrix(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0
 def on_head(
     left: CameraModel, right: CameraModel, baseline_m: float, toe_in_deg: float
 ) -> tuple[CameraModel, CameraModel]:
-    """Two cameras at a body's origin that look down (`sim.camera.looking_down`), put onto a head as a stereo pair.
+    """Two cameras at a body's origin that look down (`marsyard.sim.camera.looking_down`), put onto a head as a stereo
+    pair.
 
     Both look forwards, half the baseline to either side of the head's origin, each turned towards the other by the
     toe-in.

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import RigidTransform
 
-from sim.camera import CameraModel
-from sim.sensor.kernels import add_passed, block_means, blur, passed_blocks, sums_before
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.sensor.kernels import add_passed, block_means, blur, passed_blocks, sums_before
 
 #: Distance of the grid's nodes, pixels.
 GRID_STEP_PX = 32.0

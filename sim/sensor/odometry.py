@@ -31,9 +31,9 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.dynamics import Drive
-from sim.frames import rigid
-from sim.measurements import DriveCommand
+from marsyard.sim.dynamics import Drive
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DriveCommand
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Degrees = Annotated[float, Field(ge=0.0, le=30.0)]
@@ -62,7 +62,7 @@ class OdometryParameters(BaseModel):
     """Wheel odometry with an inertial unit, and the visual odometry that may be added.
 
     Spreads are one standard deviation. The unit is of the class of MER's LN-200; all numbers are assumed. On flat, hard
-    ground they make 1.1 % of 8 m: slip, which comes on top, is the motion's (`sim.dynamics.driving`).
+    ground they make 1.1 % of 8 m: slip, which comes on top, is the motion's (`marsyard.sim.dynamics.driving`).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

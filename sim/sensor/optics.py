@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.camera import Cahvore, CameraModel
+from marsyard.sim.camera import Cahvore, CameraModel
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 #: Half size of the point spread's kernel, pixels.

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from sim.camera import Cahv, Cahvor, Cahvore, CameraModel, looking_down, read_cameras
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel, looking_down, read_cameras
 
 Vector = tuple[float, float, float]
 _FILES = ("file", "number", "subframe_folded_in", "size")
@@ -23,8 +23,8 @@ _FILES = ("file", "number", "subframe_folded_in", "size")
 class OwnCamera(BaseModel):
     """A camera of the CAHV family in the body frame: at its origin, looking along -z, columns along +x.
 
-    Stated as ``{ file = "camera.yaml" }`` (any file that `sim.camera.read_cameras` reads), or the path alone; all else
-    is then filled in. Where a file puts a camera does not matter: it is mounted so that A looks down.
+    Stated as ``{ file = "camera.yaml" }`` (any file that `marsyard.sim.camera.read_cameras` reads), or the path alone;
+    all else is then filled in. Where a file puts a camera does not matter: it is mounted so that A looks down.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

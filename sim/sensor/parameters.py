@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.sensor.defects import BurstParameters, DefectParameters
-from sim.sensor.optics import OpticsParameters
+from marsyard.sim.sensor.defects import BurstParameters, DefectParameters
+from marsyard.sim.sensor.optics import OpticsParameters
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 
@@ -16,7 +16,7 @@ class DetectorParameters(BaseModel):
     """An image detector without shutter. The defaults are those of the MER descent camera as flown.
 
     Full well, gain, read noise and readout rate: Maki et al. 2003. Responsivity and dark current are calibrations (see
-    `sim.sensor.radiometry`). How fast the detector is cleared is assumed.
+    `marsyard.sim.sensor.radiometry`). How fast the detector is cleared is assumed.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

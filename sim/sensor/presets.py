@@ -21,11 +21,11 @@ import numpy as np
 from pydantic import BeforeValidator
 from scipy.spatial.transform import Rotation
 
-from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
-from sim.sensor.datasheet import read_datasheet
-from sim.sensor.optics import OpticsParameters
-from sim.sensor.parameters import DetectorParameters
-from sim.sensor.radiometry import DARK_E_S, NG3_FIELD, NG4_FLIGHT, LightPath, bright_exposure_s
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from marsyard.sim.sensor.datasheet import read_datasheet
+from marsyard.sim.sensor.optics import OpticsParameters
+from marsyard.sim.sensor.parameters import DetectorParameters
+from marsyard.sim.sensor.radiometry import DARK_E_S, NG3_FIELD, NG4_FLIGHT, LightPath, bright_exposure_s
 
 #: Distance of Mars from the sun at the MER landings (the paper's "1.5 AU": 44 % of Earth's sunlight), AU.
 MARS_AU = 1.5
@@ -247,5 +247,5 @@ def _chosen(settings: object) -> object:
 
 #: Detector parameters that a campaign may also state by a preset's name or a datasheet's file, with what differs:
 #: ``[parameters.detector]`` with ``preset = "mer-descent-field"`` and, say, ``temperature_c = 23.0``; or
-#: ``file = "sensor.toml"`` (`sim.sensor.datasheet`).
+#: ``file = "sensor.toml"`` (`marsyard.sim.sensor.datasheet`).
 DetectorChoice = Annotated[DetectorParameters, BeforeValidator(_chosen)]

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
-from sim.dynamics import Trajectory
-from sim.sensor.clock import ClockParameters
-from sim.sensor.instrument import Readings, Sampling
-from sim.sensor.ranging import DOWN, RangingParameters, RangingUnit
-from sim.terrain import Surface
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.sensor.clock import ClockParameters
+from marsyard.sim.sensor.instrument import Readings, Sampling
+from marsyard.sim.sensor.ranging import DOWN, RangingParameters, RangingUnit
+from marsyard.sim.terrain import Surface
 
 #: The ground is first scanned in steps of this share of the height, then about its nearest points in smaller ones.
 COARSEST_STEP = 1.0 / 64.0

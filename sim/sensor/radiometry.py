@@ -26,8 +26,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from sim.sensor.detector import dark_seconds
-from sim.sensor.parameters import DetectorParameters
+from marsyard.sim.sensor.detector import dark_seconds
+from marsyard.sim.sensor.parameters import DetectorParameters
 
 _PLANCK, _LIGHT, _BOLTZMANN = 6.62607015e-34, 2.99792458e8, 1.380649e-23
 _SUN_K, _SUN_RADIUS_M, _AU_M = 5772.0, 6.957e8, 1.495978707e11

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from sim.sensor.clock import Clock, ClockParameters
-from sim.sensor.instrument import Readings, Sampling
-from sim.terrain import Surface
+from marsyard.sim.sensor.clock import Clock, ClockParameters
+from marsyard.sim.sensor.instrument import Readings, Sampling
+from marsyard.sim.terrain import Surface
 
 #: Where an altimeter points in body axes, down at the identity attitude, as the descent camera does.
 DOWN = np.array([0.0, 0.0, -1.0])

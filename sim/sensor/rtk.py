@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from sim.dynamics import Trajectory
-from sim.sensor.clock import Clock, ClockParameters
-from sim.sensor.instrument import Sampling
-from sim.sensor.stochastic import GaussMarkov
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.sensor.clock import Clock, ClockParameters
+from marsyard.sim.sensor.instrument import Sampling
+from marsyard.sim.sensor.stochastic import GaussMarkov
 
 NonNegative = Annotated[float, Field(ge=0.0, le=1000.0)]
 Positive = Annotated[float, Field(gt=0.0)]

@@ -16,9 +16,9 @@ import scipy  # its signal is slow to import, and so left until it is called
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.dynamics import Trajectory
-from sim.sensor.clock import Clock, ClockParameters
-from sim.sensor.instrument import Sampling
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.sensor.clock import Clock, ClockParameters
+from marsyard.sim.sensor.instrument import Sampling
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Degrees = Annotated[NonNegative, Field(le=90.0)]

@@ -12,13 +12,13 @@ from weakref import WeakValueDictionary
 import numpy as np
 from jaxtyping import Float32
 
-from sim.cache import CacheWarning, cache_directory, load_array, make_room, save_array, touch
-from sim.terrain.embedding import RealExtent, embed
-from sim.terrain.parameters import TerrainParameters
-from sim.terrain.rocks.field import RockField
-from sim.terrain.substreams import substream
-from sim.terrain.surface import SMALLEST_LEVEL, Surface
-from sim.terrain.synthesis import synthesise
+from marsyard.sim.cache import CacheWarning, cache_directory, load_array, make_room, save_array, touch
+from marsyard.sim.terrain.embedding import RealExtent, embed
+from marsyard.sim.terrain.parameters import TerrainParameters
+from marsyard.sim.terrain.rocks.field import RockField
+from marsyard.sim.terrain.substreams import substream
+from marsyard.sim.terrain.surface import SMALLEST_LEVEL, Surface
+from marsyard.sim.terrain.synthesis import synthesise
 
 #: What a terrain's samples do not depend on but through its parameters: sites, figures, and the rocks upon it.
 NOT_OF_THE_SAMPLES = ("environment.py", "presets.py", "rocks", "sites.py", "statistics.py")
@@ -42,7 +42,8 @@ class TerrainBank:
     """Numbered terrains of one kind.
 
     Terrain k is a pure function of the parameters, the seed and k. On disk it is one array of all levels, memory-mapped
-    by every worker that uses it, so workers share its pages. The disk's share is bounded: see `sim.cache.make_room`.
+    by every worker that uses it, so workers share its pages. The disk's share is bounded: see
+    `marsyard.sim.cache.make_room`.
     """
 
     parameters: TerrainParameters

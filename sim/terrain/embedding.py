@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float32, Float64
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import binary_dilation, gaussian_filter, spline_filter
 
-from sim.terrain.imported import Raster, RealTerrain, TerrainFileError, filled, read_rasters
-from sim.terrain.landforms.ground import Ground, finer
+from marsyard.sim.terrain.imported import Raster, RealTerrain, TerrainFileError, filled, read_rasters
+from marsyard.sim.terrain.landforms.ground import Ground, finer
 
 #: Side of the grid on which the surround is bent to meet the real terrain.
 BENDING_SIDE = 128

@@ -7,9 +7,9 @@ from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from sim.terrain.imported import RealTerrain
-from sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
-from sim.terrain.rocks.population import RockParameters
+from marsyard.sim.terrain.imported import RealTerrain
+from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
+from marsyard.sim.terrain.rocks.population import RockParameters
 
 Positive = Annotated[float, Field(gt=0.0)]
 

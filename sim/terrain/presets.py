@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from sim.terrain.environment import Environment
-from sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Swell
-from sim.terrain.parameters import TerrainParameters
-from sim.terrain.rocks import RockParameters
-from sim.terrain.sites import Site, SitePhotometry, texture
+from marsyard.sim.terrain.environment import Environment
+from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Swell
+from marsyard.sim.terrain.parameters import TerrainParameters
+from marsyard.sim.terrain.rocks import RockParameters
+from marsyard.sim.terrain.sites import Site, SitePhotometry, texture
 
 #: Optical depth 0.9 at both MER landings (Lemmon et al. 2004); single-scattering albedo and asymmetry of Martian dust
 #: in red light after Ockert-Bell et al. (1997).

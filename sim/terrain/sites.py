@@ -12,12 +12,12 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.terrain.environment import Environment
-from sim.terrain.parameters import TerrainParameters
+from marsyard.sim.terrain.environment import Environment
+from marsyard.sim.terrain.parameters import TerrainParameters
 
 
 class SitePhotometry(BaseModel):
-    """Parameters of the Lunar-Lambert law with an opposition surge, as `sim.render.Photometry` takes them."""
+    """Parameters of the Lunar-Lambert law with an opposition surge, as `marsyard.sim.render.Photometry` takes them."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -29,7 +29,7 @@ class SitePhotometry(BaseModel):
 
 
 class SiteTexture(BaseModel):
-    """Albedo finer than the terrain's posts: octaves of noise, as `sim.render.Texture` takes them.
+    """Albedo finer than the terrain's posts: octaves of noise, as `marsyard.sim.render.Texture` takes them.
 
     Amplitudes are of the natural logarithm of albedo, the coarsest octave first; each octave is half as large as the
     one before.
@@ -111,7 +111,7 @@ PAPER: dict[str, PaperFigures] = {
 @cache
 def sites() -> dict[str, Site]:
     """All presets by name."""
-    from sim.terrain.presets import PRESETS
+    from marsyard.sim.terrain.presets import PRESETS
 
     return {site.name: site for site in PRESETS}
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from scipy.ndimage import correlate1d
 
-from sim.terrain.surface import ALBEDO, HEIGHT, Surface
+from marsyard.sim.terrain.surface import ALBEDO, HEIGHT, Surface
 
 #: Light under which contrast is stated: the sun's elevation, and the share of diffuse light.
 CONTRAST_SUN_ELEVATION_DEG = 45.0

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sim.terrain.kernels import ceiling_of, evaluate_field, reduce_level
+from marsyard.sim.terrain.kernels import ceiling_of, evaluate_field, reduce_level
 
 #: Channels of the stored samples.
 HEIGHT, ALBEDO = 0, 1

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
-from sim.terrain.embedding import detail_below, embed, lay_in
-from sim.terrain.landforms.craters import EJECTA_REACH_RADII, draw_craters
-from sim.terrain.landforms.ground import Ground
-from sim.terrain.landforms.kernels import pack, stamp_craters
-from sim.terrain.parameters import LANDFORMS, TerrainParameters
-from sim.terrain.spectrum import Spectrum
-from sim.terrain.substreams import substream
-from sim.terrain.surface import Surface
+from marsyard.sim.terrain.embedding import detail_below, embed, lay_in
+from marsyard.sim.terrain.landforms.craters import EJECTA_REACH_RADII, draw_craters
+from marsyard.sim.terrain.landforms.ground import Ground
+from marsyard.sim.terrain.landforms.kernels import pack, stamp_craters
+from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
+from marsyard.sim.terrain.spectrum import Spectrum
+from marsyard.sim.terrain.substreams import substream
+from marsyard.sim.terrain.surface import Surface
 
 
 def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surface:

@@ -14,9 +14,9 @@ import numpy as np
 from scipy import fft
 from scipy.spatial.transform import Rotation
 
-from sim.camera import Cahv, Cahvor
-from sim.frames import direction
-from sim.measurements import (
+from marsyard.sim.camera import Cahv, Cahvor
+from marsyard.sim.frames import direction
+from marsyard.sim.measurements import (
     AltitudeMeasurement,
     AttitudeMeasurement,
     DescentMeasurements,

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from synthetic_descent import INTERVAL_S, Flight, flight, render, terrain, tilted, waves
 
-from algorithms.baselines import BaselineDetails, HomographyEstimator, PairPatches, PhaseCorrelationEstimator
-from algorithms.baselines.homography import distortion
-from algorithms.baselines.pairs import COMMON, common_square, pair_patches
-from algorithms.dimes import DimesOptions
-from algorithms.dimes.binning import usable_views
-from algorithms.dimes.ground import inside_frame, square
-from algorithms.interface import VelocityEstimator, VelocityOutcome
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.baselines import BaselineDetails, HomographyEstimator, PairPatches, PhaseCorrelationEstimator
+from marsyard.algorithms.baselines.homography import distortion
+from marsyard.algorithms.baselines.pairs import COMMON, common_square, pair_patches
+from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.dimes.binning import usable_views
+from marsyard.algorithms.dimes.ground import inside_frame, square
+from marsyard.algorithms.interface import VelocityEstimator, VelocityOutcome
+from marsyard.sim.measurements import DescentMeasurements
 
 ESTIMATORS: dict[str, VelocityEstimator] = {"phase": PhaseCorrelationEstimator(), "homography": HomographyEstimator()}
 both = pytest.mark.parametrize("name", ESTIMATORS)

@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_descent import CAMERA, ROWS_SUMMED, calibration
 
-from algorithms.dimes.binning import View, view
-from algorithms.dimes.consistency import combinations, propagated
-from algorithms.dimes.details import PairDetails, Track
-from algorithms.dimes.estimator import conclude
-from algorithms.dimes.options import DimesOptions
-from algorithms.dimes.validity import TrackMetrics, ValidityCheck, failed_checks
-from algorithms.interface import VelocityEstimate, VelocityOutcome
-from sim.measurements import DetectorImage
+from marsyard.algorithms.dimes.binning import View, view
+from marsyard.algorithms.dimes.consistency import combinations, propagated
+from marsyard.algorithms.dimes.details import PairDetails, Track
+from marsyard.algorithms.dimes.estimator import conclude
+from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.validity import TrackMetrics, ValidityCheck, failed_checks
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.sim.measurements import DetectorImage
 
 THRESHOLD = DimesOptions().imu_threshold_m_s
 METRICS = TrackMetrics(contrast=0.02, peak=0.9, peak_width_px=4.0, second_peak_ratio=0.3, on_border=False)

@@ -24,10 +24,10 @@ from synthetic_descent import (
     waves,
 )
 
-from algorithms.dimes import DimesDetails, DimesEstimator, DimesOptions, ValidityCheck, dimes_products
-from algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
-from sim.frames import direction
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesOptions, ValidityCheck, dimes_products
+from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
+from marsyard.sim.frames import direction
+from marsyard.sim.measurements import DescentMeasurements
 
 ESTIMATOR: VelocityEstimator = DimesEstimator()
 LEVEL_FLIGHT = (tilted(0.0, 0.0, 0.0), tilted(0.0, 0.0, 0.0), tilted(0.0, 0.0, 0.0))

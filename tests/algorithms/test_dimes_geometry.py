@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_descent import CAMERA, INTERVAL_S, ROWS_SUMMED, Texture, calibration, delivered, scene, tilted
 
-from algorithms.dimes.binning import View, view
-from algorithms.dimes.ground import (
+from marsyard.algorithms.dimes.binning import View, view
+from marsyard.algorithms.dimes.ground import (
     ground_from_pixels,
     inside_frame,
     pixel_angle_rad,
@@ -17,8 +17,8 @@ from algorithms.dimes.ground import (
     square,
     square_outline,
 )
-from algorithms.dimes.options import DimesOptions
-from algorithms.dimes.overlap import (
+from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.overlap import (
     Candidates,
     border_pixels,
     grid_pixels,
@@ -27,10 +27,10 @@ from algorithms.dimes.overlap import (
     template_candidates,
     zero_phase_pixel,
 )
-from algorithms.dimes.rectification import ground_lattice, rectified_patch
-from algorithms.dimes.selection import best_candidates, contrasts, select_templates
-from sim.frames import direction
-from sim.measurements import DetectorImage
+from marsyard.algorithms.dimes.rectification import ground_lattice, rectified_patch
+from marsyard.algorithms.dimes.selection import best_candidates, contrasts, select_templates
+from marsyard.sim.frames import direction
+from marsyard.sim.measurements import DetectorImage
 
 OPTIONS = DimesOptions()
 LIMIT = OPTIONS.max_off_nadir_rad

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import algorithms.dimes.threshold as derivation
-from algorithms.dimes.options import DimesOptions
-from algorithms.dimes.threshold import ThresholdInputs, discrepancies, harm, right_track_errors, threshold_m_s
+import marsyard.algorithms.dimes.threshold as derivation
+from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.threshold import ThresholdInputs, discrepancies, harm, right_track_errors, threshold_m_s
 
 STORED = json.loads(Path(derivation.__file__).with_name("imu_threshold.json").read_text())
 EXACT = ThresholdInputs(

@@ -12,8 +12,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from synthetic_descent import Flight, render, tilted
 
-from algorithms.answers import checked_site, checked_velocity
-from algorithms.exchange import (
+from marsyard.algorithms.answers import checked_site, checked_velocity
+from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableVelocityEstimator,
     ProgramDetails,
@@ -21,10 +21,10 @@ from algorithms.exchange import (
     read_case,
     write_case,
 )
-from algorithms.exchange.serving import end_persistent
-from algorithms.faults import AlgorithmError, Fault
-from algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
-from sim.measurements import DescentMeasurements, LandingMeasurements, PoseMeasurement
+from marsyard.algorithms.exchange.serving import end_persistent
+from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
+from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, PoseMeasurement
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 TRUE = np.array([12.0, -7.0])
@@ -308,8 +308,8 @@ def test_the_example_in_c(measured: DescentMeasurements, tmp_path: Path) -> None
 
 
 def test_the_example_in_python(measured: DescentMeasurements, monkeypatch: pytest.MonkeyPatch) -> None:
-    from algorithms.dimes import DimesOptions
-    from scenarios.estimators import VELOCITY
+    from marsyard.algorithms.dimes import DimesOptions
+    from marsyard.scenarios.estimators import VELOCITY
 
     monkeypatch.chdir(EXAMPLES)
     estimator = VELOCITY.make("velocity_estimator:MedianShift", DimesOptions(), ExecutableLimits())

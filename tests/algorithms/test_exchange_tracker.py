@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.exchange import (
+from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableTargetTracker,
     ProgramDetails,
@@ -19,13 +19,13 @@ from algorithms.exchange import (
     read_stop,
     read_target,
 )
-from algorithms.exchange.serving import end_persistent
-from algorithms.exchange.stops import told_target, write_mast, write_stop
-from algorithms.faults import AlgorithmError, Fault
-from algorithms.interface import TargetLoss, TargetTracker, TargetUpdate, TrackingState
-from algorithms.vtt import VisualTargetTracker, VttOptions
-from scenarios.conformance import trackers
-from sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
+from marsyard.algorithms.exchange.serving import end_persistent
+from marsyard.algorithms.exchange.stops import told_target, write_mast, write_stop
+from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.interface import TargetLoss, TargetTracker, TargetUpdate, TrackingState
+from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
+from marsyard.scenarios.conformance import trackers
+from marsyard.sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "target_tracker.py"
 
@@ -33,8 +33,8 @@ EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "target_tracker.py"
 SERVER = """
 import json, os, sys
 from pathlib import Path
-from algorithms.exchange import read_mast, read_pose, read_stop, read_target
-from algorithms.vtt import VisualTargetTracker, VttOptions
+from marsyard.algorithms.exchange import read_mast, read_pose, read_stop, read_target
+from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
 tracker, masts = VisualTargetTracker(VttOptions()), {}
 def mast(asked):
     return masts.setdefault(asked["mast"], read_mast(Path(asked["mast"])))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from algorithms.image.normalized import coarse_to_fine_peak, halved, normalized_correlation
-from algorithms.image.registration import Warp, registered
-from algorithms.image.resampling import similarity_patch
+from marsyard.algorithms.image.normalized import coarse_to_fine_peak, halved, normalized_correlation
+from marsyard.algorithms.image.registration import Warp, registered
+from marsyard.algorithms.image.resampling import similarity_patch
 
 WARPS: tuple[Warp, ...] = ("shift", "stretch", "bend")
 

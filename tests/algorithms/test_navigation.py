@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.navigation import (
+from marsyard.algorithms.navigation import (
     NavigationOptions,
     NavigationOutcome,
     NavigationPlan,
@@ -15,8 +15,8 @@ from algorithms.navigation import (
     Wedge,
     navigate,
 )
-from sim.frames import rigid
-from sim.measurements import DriveCommand
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DriveCommand
 
 OPTIONS = NavigationOptions()
 EAST, NAVCAM = 0.5 * np.pi, np.radians(45.0)

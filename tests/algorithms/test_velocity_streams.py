@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from algorithms.answers import checked_velocity
-from algorithms.dimes import DimesEstimator
-from algorithms.exchange import (
+from marsyard.algorithms.answers import checked_velocity
+from marsyard.algorithms.dimes import DimesEstimator
+from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableVelocityStream,
     ProgramDetails,
@@ -20,13 +20,13 @@ from algorithms.exchange import (
     write_case,
     write_frame,
 )
-from algorithms.exchange.serving import end_persistent
-from algorithms.faults import AlgorithmError, Fault
-from algorithms.interface import VelocityEstimate, VelocityOutcome
-from algorithms.streams import StreamedEstimator, spanned
-from scenarios.conformance import inputs
-from scenarios.conformance.process import fingerprint
-from sim.measurements import DescentFrame, DescentMeasurements
+from marsyard.algorithms.exchange.serving import end_persistent
+from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.algorithms.streams import StreamedEstimator, spanned
+from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.conformance.process import fingerprint
+from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 NOTHING = VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)

@@ -12,8 +12,8 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page
 
-from reports.campaign import write_report
-from reports.dashboard.site import write_site
+from marsyard.reports.campaign import write_report
+from marsyard.reports.dashboard.site import write_site
 
 Open = Callable[..., tuple[Page, Any]]
 #: The success criteria of WCAG 2.2 of levels A and AA, as axe-core names its rules' sets.

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from campaigns.definition.loading import load_campaign
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import run_campaign
-from campaigns.store.table import read_rows
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import run_campaign
+from marsyard.campaigns.store.table import read_rows
 
 HEAD = """
 name = "fake"

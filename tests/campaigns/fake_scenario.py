@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from scenarios.interface import CaseResult
-from sim.cache import CacheWarning
-from sim.streams import Streams
+from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.cache import CacheWarning
+from marsyard.sim.streams import Streams
 
 
 class Wind(BaseModel):

@@ -7,15 +7,15 @@ from typing import ClassVar
 
 from pydantic import BaseModel
 
-from algorithms.answers import checked_velocity
-from algorithms.dimes import DimesOptions
-from scenarios.chosen import ChosenAlgorithms
-from scenarios.conformance import inputs
-from scenarios.estimators import VELOCITY, Task
-from scenarios.interface import CaseResult
-from scenarios.trial import Judged, attempted, case_result
-from scenarios.velocity import velocity_row
-from sim.streams import Streams
+from marsyard.algorithms.answers import checked_velocity
+from marsyard.algorithms.dimes import DimesOptions
+from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.estimators import VELOCITY, Task
+from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.trial import Judged, attempted, case_result
+from marsyard.scenarios.velocity import velocity_row
+from marsyard.sim.streams import Streams
 
 
 class FakeVelocityParameters(ChosenAlgorithms):

@@ -7,8 +7,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from scenarios.interface import CaseResult, record_conditions
-from sim.streams import Streams
+from marsyard.scenarios.interface import CaseResult, record_conditions
+from marsyard.sim.streams import Streams
 
 #: What each case does, by its number.
 DEEDS = (

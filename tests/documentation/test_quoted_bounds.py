@@ -7,8 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from campaigns.definition.loading import load_campaign
-from reports.statistics.proportions import minimum_sample_size, proportion_interval, proportion_lower, proportion_upper
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.reports.statistics.proportions import (
+    minimum_sample_size,
+    proportion_interval,
+    proportion_lower,
+    proportion_upper,
+)
 
 DOCS = Path(__file__).parents[2] / "docs"
 

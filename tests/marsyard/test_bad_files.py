@@ -14,8 +14,8 @@ from rasterio.crs import CRS
 from rasterio.transform import Affine
 from typer.testing import CliRunner
 
-from marsyard.cli import app
-from scenarios.conformance import inputs
+from marsyard.cli.app import app
+from marsyard.scenarios.conformance import inputs
 
 MARS = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
 DEGREES = CRS.from_string("+proj=longlat +R=3396190 +no_defs")

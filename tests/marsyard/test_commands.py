@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from marsyard.cli import app
+from marsyard.cli.app import app
 
 #: Commands that list, show or examine, and those that make something: each command is one or the other.
 LISTING = {"list", "show", "clean", "conformance", "doctor", "compare", "terrain list", "terrain stats"}

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from campaigns.definition.loading import load_campaign
-from marsyard.cli import app
-from marsyard.compile_command import SMALL
-from scenarios.registry import SCENARIOS
-from sim.kernel_cache import note_ready
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.cli.app import app
+from marsyard.cli.compile import SMALL
+from marsyard.scenarios.registry import SCENARIOS
+from marsyard.sim.kernel_cache import note_ready
 
 
 def test_every_system_has_a_small_case_that_the_catalogue_takes() -> None:

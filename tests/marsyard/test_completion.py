@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from marsyard.cli import app
+from marsyard.cli.app import app
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from campaigns.definition.loading import load_campaign
-from marsyard.cli import app
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.cli.app import app
 from marsyard.dataset import _prepare
-from scenarios.descent.parameters import DescentScenarioParameters
-from scenarios.descent.world import World
-from sim.camera import read_cahvor
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.world import World
+from marsyard.sim.camera import read_cahvor
 
 CAMPAIGN = """name = "samples"
 scenario = "landing"

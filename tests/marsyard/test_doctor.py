@@ -105,27 +105,28 @@ def test_a_package_from_elsewhere_is_named(monkeypatch: pytest.MonkeyPatch, tmp_
     genuine = importlib.util.find_spec
 
     def found(name: str) -> ModuleSpec | None:
-        return ModuleSpec("sim", None, origin=str(tmp_path / "sim" / "__init__.py")) if name == "sim" else genuine(name)
+        origin = str(tmp_path / "marsyard" / "__init__.py")
+        return ModuleSpec(name, None, origin=origin) if name == "marsyard" else genuine(name)
 
     monkeypatch.setattr(importlib.util, "find_spec", found)
     check = next(doctor.check_shadowing())
     assert check.verdict is Verdict.FAIL
-    assert f"sim from {tmp_path / 'sim'}" in check.found
+    assert f"marsyard from {tmp_path / 'marsyard'}" in check.found
 
 
 def test_a_folder_without_init_counts_as_shadow(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "reports").mkdir()
-    spec = ModuleSpec("reports", None, is_package=True)
-    spec.submodule_search_locations = [str(tmp_path / "reports")]
+    (tmp_path / "marsyard").mkdir()
+    spec = ModuleSpec("marsyard", None, is_package=True)
+    spec.submodule_search_locations = [str(tmp_path / "marsyard")]
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: spec)
-    assert str(tmp_path / "reports") in next(doctor.check_shadowing()).found
+    assert str(tmp_path / "marsyard") in next(doctor.check_shadowing()).found
 
 
 def test_other_owners_of_our_names_and_rivals_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: {"sim": ["Sim_Games", "marsyard"]})
+    monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: {"marsyard": ["Sim_Games", "marsyard"]})
     monkeypatch.setattr(doctor, "_version", lambda _: "0.1.45")
     _, stranger, *rivals = doctor.check_shadowing()
-    assert "sim-games also installs a package named sim" in stranger.found
+    assert "sim-games also installs a package named marsyard" in stranger.found
     assert any("pip uninstall -y pyrender pyrender2" in rival.mend for rival in rivals)
 
 

@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
-from marsyard import cli, gallery_command
-from marsyard.gallery_command import PAGE, PLATES, SHEET, SHEET_BYTES, Plate, contact_sheet, displayed, write_gallery
-from marsyard.render_command import Shot
-from sim.sensor import PRESETS
-from sim.terrain import sites
+from marsyard.cli import app as cli
+from marsyard.cli import gallery as gallery_command
+from marsyard.cli.gallery import PAGE, PLATES, SHEET, SHEET_BYTES, Plate, contact_sheet, displayed, write_gallery
+from marsyard.cli.render import Shot
+from marsyard.sim.sensor import PRESETS
+from marsyard.sim.terrain import sites
 
 
 class _Links(HTMLParser):

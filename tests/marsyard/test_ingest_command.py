@@ -11,9 +11,9 @@ import pandas as pd
 from folders import landing_folder, read_rows, velocity_folder, write_texts
 from typer.testing import CliRunner
 
-from campaigns.definition.loading import load_campaign
-from marsyard.cli import app
-from scenarios.conformance import inputs
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.cli.app import app
+from marsyard.scenarios.conformance import inputs
 
 
 def told(*words: str) -> tuple[int, str]:

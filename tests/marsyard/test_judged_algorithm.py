@@ -19,8 +19,8 @@ import pytest
 from fake_campaign import rows_of
 from typer.testing import CliRunner
 
-from marsyard.cli import app
-from reports.dashboard.site import write_site
+from marsyard.cli.app import app
+from marsyard.reports.dashboard.site import write_site
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
@@ -28,7 +28,7 @@ pytestmark = [
 ]
 
 OWN = """
-from algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 
 class Mine:
     version = "3.1"
@@ -77,7 +77,7 @@ def test_the_record_describes_the_algorithms(folder: Path) -> None:
     assert (judged["version"], judged["options"]) == ("3.1", {"gain": 0.5})
     assert re.fullmatch("[0-9a-f]{16}", judged["source_hash"])
     assert (compared["spec"], compared["role"]) == ("homography", "compared")
-    assert compared["path"] == "algorithms.baselines.homography:HomographyEstimator"
+    assert compared["path"] == "marsyard.algorithms.baselines.homography:HomographyEstimator"
     assert compared["version"]
     assert compared["options"]
 
@@ -137,8 +137,8 @@ def test_the_command_in_the_report_runs_the_same_cases_again(folder: Path, tmp_p
 
 
 def test_appended_blocks_are_part_of_the_command(folder: Path) -> None:
-    from reports.sections import rerun_commands
-    from reports.stored import read_run
+    from marsyard.reports.sections import rerun_commands
+    from marsyard.reports.stored import read_run
 
     run = read_run(folder / "run")
     configuration = {**run.record["configuration"], "appended": [20]}

@@ -10,11 +10,11 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from campaigns.definition.loading import load_campaign
-from marsyard.cli import app
-from marsyard.evidence import evidence_limits
-from reports.sampled import sampled
-from reports.verdicts import Status, judge_campaign
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.cli.app import app
+from marsyard.cli.evidence import evidence_limits
+from marsyard.reports.sampled import sampled
+from marsyard.reports.verdicts import Status, judge_campaign
 
 #: EuRoC's first camera (its sensor.yaml), of the fields that are read.
 EUROC = """resolution: [752, 480]
@@ -120,7 +120,7 @@ def test_what_cannot_run_is_not_written(here: Path, words: tuple[str, ...], said
 
 
 def test_answers_of_the_dialogue_are_refused_at_once(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("marsyard.new_command._is_terminal", lambda: True)
+    monkeypatch.setattr("marsyard.cli.new._is_terminal", lambda: True)
     answers = ["velocty", "velocity", "venus", "meridiani", "absent.yaml", "", "absent.csv", "", "-3", "many", "4"]
     result = CliRunner().invoke(app, ["new", "mine"], input="\n".join(answers) + "\n")
     assert result.exit_code == 0, result.output

@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 from fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
 
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import ConfigurationError
-from marsyard import cli, nightly_command
-from marsyard.nightly_plan import PLAN_FILE, definition_of, night_seed, read_plan
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import ConfigurationError
+from marsyard.cli import app as cli
+from marsyard.cli import nightly as nightly_command
+from marsyard.cli.nightly_plan import PLAN_FILE, definition_of, night_seed, read_plan
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),

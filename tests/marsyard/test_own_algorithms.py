@@ -9,7 +9,7 @@ import pytest
 from fake_campaign import rows_of
 from typer.testing import CliRunner
 
-from marsyard.cli import app
+from marsyard.cli.app import app
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
@@ -18,7 +18,7 @@ pytestmark = [
 
 HOSTILE = """
 import os, re
-from algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 
 class Hostile:
     def estimate(self, measurements):
@@ -58,7 +58,7 @@ def test_the_suite_outlives_what_it_examines(tmp_path: Path, monkeypatch: pytest
 
 LEAVING = """
 import os, threading, time
-from algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 
 class Leaving:
     def estimate(self, measurements):

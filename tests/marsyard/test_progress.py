@@ -12,10 +12,10 @@ import pytest
 from fake_campaign import Silence
 from rich.console import Console
 
-from campaigns.running import compilation
-from campaigns.running.compilation import compilation_reported
-from marsyard.progress import BarProgress, LineProgress
-from sim.kernel_cache import note_ready
+from marsyard.campaigns.running import compilation
+from marsyard.campaigns.running.compilation import compilation_reported
+from marsyard.cli.progress import BarProgress, LineProgress
+from marsyard.sim.kernel_cache import note_ready
 
 
 class Clock:
@@ -74,7 +74,7 @@ def test_a_stage_that_is_left_before_its_end_stops_counting() -> None:
 
 def test_lines_give_the_time_left_at_the_printed_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
-    monkeypatch.setattr("marsyard.progress.time.monotonic", clock)
+    monkeypatch.setattr("marsyard.cli.progress.time.monotonic", clock)
     console = Console(file=io.StringIO(), force_terminal=False)
     lines = LineProgress(console)
     lines.begin("cases", 8)

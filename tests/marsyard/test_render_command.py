@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from marsyard import cli
-from marsyard.render_command import ENDINGS
-from sim.camera import read_cahvor
+from marsyard.cli import app as cli
+from marsyard.cli.render import ENDINGS
+from marsyard.sim.camera import read_cahvor
 
 Command = Callable[..., tuple[int, str]]
 

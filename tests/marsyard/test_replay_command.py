@@ -14,9 +14,9 @@ import pytest
 from fake_campaign import Silence, run, write_campaign
 from typer.testing import CliRunner
 
-from campaigns.errors import StoreError
-from campaigns.store.products import load_products, pack_products, save_packed
-from marsyard.cli import app
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.products import load_products, pack_products, save_packed
+from marsyard.cli.app import app
 
 SCENARIO = """
 from fake_scenario import FakeScenario
@@ -71,10 +71,10 @@ def test_a_scenario_that_is_not_found_is_one_message_and_changes_nothing(
 
 
 def test_an_algorithm_that_is_not_found_is_one_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from campaigns.definition.identity import identity_of
-    from campaigns.definition.loading import load_campaign
-    from campaigns.store import record
-    from campaigns.store.rows import ROWS_FILE, create_store
+    from marsyard.campaigns.definition.identity import identity_of
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.store import record
+    from marsyard.campaigns.store.rows import ROWS_FILE, create_store
 
     folder = tmp_path / "run"
     folder.mkdir()
@@ -122,7 +122,7 @@ def test_a_folder_that_cannot_be_written_to_is_replayed_into_another(
         return not hidden and access(path, mode, **options)
 
     opened: list[str] = []
-    connect = "campaigns.store.rows.sqlite3.connect"
+    connect = "marsyard.campaigns.store.rows.sqlite3.connect"
     original = sqlite3.connect
     monkeypatch.setattr("os.access", refused)
     monkeypatch.setattr(connect, lambda name, **options: opened.append(str(name)) or original(name, **options))

@@ -17,19 +17,19 @@ import pandas as pd
 import pytest
 from fake_campaign import REQUIREMENT, Silence, write_campaign
 
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import CampaignError
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import run_campaign
-from campaigns.store import record
-from marsyard import cli
-from marsyard.deciding import run_until_decided
-from marsyard.site_server import server
-from reports.deciding import next_look
-from reports.notable import notable_cases
-from reports.sampled import Sampled
-from reports.stored import read_run
-from reports.verdicts import judge_campaign
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import run_campaign
+from marsyard.campaigns.store import record
+from marsyard.cli import app as cli
+from marsyard.cli.deciding import run_until_decided
+from marsyard.cli.site_server import server
+from marsyard.reports.deciding import next_look
+from marsyard.reports.notable import notable_cases
+from marsyard.reports.sampled import Sampled
+from marsyard.reports.stored import read_run
+from marsyard.reports.verdicts import judge_campaign
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),

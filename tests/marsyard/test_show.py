@@ -18,7 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from marsyard import cli
+from marsyard.cli import app as cli
 
 CAMPAIGN = """
 name = "fake"

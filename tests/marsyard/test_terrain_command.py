@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from marsyard.cli import app
-from sim.terrain import sites
+from marsyard.cli.app import app
+from marsyard.sim.terrain import sites
 
 
 def invoke(*arguments: str) -> tuple[int, str]:

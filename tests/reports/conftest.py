@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from campaigns.store.products import pack_products, save_packed
+from marsyard.campaigns.store.products import pack_products, save_packed
 
 VELOCITY: Mapping[str, Any] = {
     "id": "DIMES-VEL",

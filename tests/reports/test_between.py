@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from reports.between import Contrast, Figure, contrast_grid, contrasts, figures_of, sample_of
-from reports.statistics.changes import difference_p
-from reports.stored import StoredRun, read_run
+from marsyard.reports.between import Contrast, Figure, contrast_grid, contrasts, figures_of, sample_of
+from marsyard.reports.statistics.changes import difference_p
+from marsyard.reports.stored import StoredRun, read_run
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from campaigns.errors import StoreError
-from reports.campaign import write_report
-from reports.explorer import script_hash
+from marsyard.campaigns.errors import StoreError
+from marsyard.reports.campaign import write_report
+from marsyard.reports.explorer import script_hash
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]

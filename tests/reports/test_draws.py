@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.collections import PathCollection
 from matplotlib.patches import Rectangle
 
-from reports.draws import Drawn, draws_figure, save_figure
+from marsyard.reports.draws import Drawn, draws_figure, save_figure
 
 
 def _drawn() -> list[Drawn]:

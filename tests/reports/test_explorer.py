@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from reports.explorer import MOST_POINTS, embedded, explorer_data, points_of
-from reports.notable import notable_cases
-from reports.stored import read_run
-from reports.systems import gallery_cases
+from marsyard.reports.explorer import MOST_POINTS, embedded, explorer_data, points_of
+from marsyard.reports.notable import notable_cases
+from marsyard.reports.stored import read_run
+from marsyard.reports.systems import gallery_cases
 
 Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"

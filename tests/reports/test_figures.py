@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from reports.figures import (
+from marsyard.reports.figures import (
     beyond_the_axis,
     error_against,
     error_distribution,
@@ -16,7 +16,7 @@ from reports.figures import (
     error_scatter,
     outcome_bars,
 )
-from reports.svg import svg_markup
+from marsyard.reports.svg import svg_markup
 
 Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"

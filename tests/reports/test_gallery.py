@@ -10,12 +10,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from reports.gallery import driver_plates
-from reports.hda.hazards import _distance_grid
-from reports.hda.map_errors import _rank_text, analyse
-from reports.overall import overall
-from reports.traceability import junit_xml
-from reports.wording import NOTHING, number
+from marsyard.reports.gallery import driver_plates
+from marsyard.reports.hda.hazards import _distance_grid
+from marsyard.reports.hda.map_errors import _rank_text, analyse
+from marsyard.reports.overall import overall
+from marsyard.reports.traceability import junit_xml
+from marsyard.reports.wording import NOTHING, number
 
 Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"

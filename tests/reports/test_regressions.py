@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from campaigns.errors import StoreError
-from reports.history import FINISHED, INTERRUPTED, RUNNING, History, NightCampaign, NightFigure
-from reports.night_page import night_text
-from reports.regressions import Change, Comparison, changes, comparisons_of
-from reports.statistics.changes import Sample
+from marsyard.campaigns.errors import StoreError
+from marsyard.reports.history import FINISHED, INTERRUPTED, RUNNING, History, NightCampaign, NightFigure
+from marsyard.reports.night_page import night_text
+from marsyard.reports.regressions import Change, Comparison, changes, comparisons_of
+from marsyard.reports.statistics.changes import Sample
 
 CASES, TERRAINS = 100, 12
 

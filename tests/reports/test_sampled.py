@@ -14,11 +14,11 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from reports.campaign import write_report
-from reports.overall import exit_code, overall
-from reports.sampled import INDEPENDENT, Sampled, sampled
-from reports.tables import verdict_table
-from reports.verdicts import Status, judge_campaign
+from marsyard.reports.campaign import write_report
+from marsyard.reports.overall import exit_code, overall
+from marsyard.reports.sampled import INDEPENDENT, Sampled, sampled
+from marsyard.reports.tables import verdict_table
+from marsyard.reports.verdicts import Status, judge_campaign
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]

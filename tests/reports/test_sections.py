@@ -11,15 +11,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from reports.answers import answer_shares
-from reports.campaign import write_report
-from reports.conditions import conditions_section, cuts, terrain_spread
-from reports.dimes.carried import carried_section
-from reports.dimes.landing import landing_section
-from reports.dimes.sensitivity import analyse, sensitivity_section
-from reports.faults import fault_rows, faults_section
-from reports.section import Section, Subject
-from reports.stored import StoredRun
+from marsyard.reports.answers import answer_shares
+from marsyard.reports.campaign import write_report
+from marsyard.reports.conditions import conditions_section, cuts, terrain_spread
+from marsyard.reports.dimes.carried import carried_section
+from marsyard.reports.dimes.landing import landing_section
+from marsyard.reports.dimes.sensitivity import analyse, sensitivity_section
+from marsyard.reports.faults import fault_rows, faults_section
+from marsyard.reports.section import Section, Subject
+from marsyard.reports.stored import StoredRun
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]

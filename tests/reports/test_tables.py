@@ -10,10 +10,17 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from reports.columns import axis_columns, category_column, driver_columns, label, magnitude_label, primary_metric
-from reports.tables import error_table, outcome_counts, outcome_table, verdict_table
-from reports.verdicts import judge_campaign
-from reports.wording import interval, number, percent, stated
+from marsyard.reports.columns import (
+    axis_columns,
+    category_column,
+    driver_columns,
+    label,
+    magnitude_label,
+    primary_metric,
+)
+from marsyard.reports.tables import error_table, outcome_counts, outcome_table, verdict_table
+from marsyard.reports.verdicts import judge_campaign
+from marsyard.reports.wording import interval, number, percent, stated
 
 Rows = Callable[..., pd.DataFrame]
 

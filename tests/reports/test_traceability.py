@@ -9,10 +9,10 @@ from xml.etree import ElementTree as Xml
 
 import pandas as pd
 
-from reports.campaign import write_report
-from reports.overall import overall
-from reports.traceability import COLUMNS, evidence_of, junit_xml, verification_csv
-from reports.verdicts import judge_campaign
+from marsyard.reports.campaign import write_report
+from marsyard.reports.overall import overall
+from marsyard.reports.traceability import COLUMNS, evidence_of, junit_xml, verification_csv
+from marsyard.reports.verdicts import judge_campaign
 
 Rows = Callable[..., pd.DataFrame]
 HOSTILE = '=HYPERLINK("x")\x00<&>'

@@ -9,9 +9,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-import reports.twin
-from reports.campaign import write_report
-from reports.twin import SCHEMA, Twin
+import marsyard.reports.twin
+from marsyard.reports.campaign import write_report
+from marsyard.reports.twin import SCHEMA, Twin
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
@@ -19,7 +19,7 @@ MakeRun = Callable[..., Path]
 
 def test_the_schema_beside_the_layout_is_its_own() -> None:
     # To renew it: json.dump(Twin.model_json_schema(), file, indent=1), with a newline behind.
-    kept = Path(reports.twin.__file__).with_name("report.schema.json").read_text()
+    kept = Path(marsyard.reports.twin.__file__).with_name("report.schema.json").read_text()
     assert json.loads(kept) == Twin.model_json_schema()
     assert Twin.model_fields["report_schema"].annotation.__args__ == (SCHEMA,)
 

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reports.overall import exit_code, overall
-from reports.sampled import Sampled, sampled
-from reports.statistics.proportions import proportion_lower, proportion_upper
-from reports.verdicts import Status, Verdict, judge_campaign
+from marsyard.reports.overall import exit_code, overall
+from marsyard.reports.sampled import Sampled, sampled
+from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.verdicts import Status, Verdict, judge_campaign
 
 Rows = Callable[..., pd.DataFrame]
 

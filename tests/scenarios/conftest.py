@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from scenarios.columns import StatedColumns, stated_columns
-from scenarios.dotted import found_at
-from scenarios.interface import CaseResult
-from scenarios.registry import SCENARIOS
+from marsyard.scenarios.columns import StatedColumns, stated_columns
+from marsyard.scenarios.dotted import found_at
+from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.registry import SCENARIOS
 
 
 def _unstated(row: Any, stated: StatedColumns, own: tuple[str, ...]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.interface import (
+from marsyard.algorithms.interface import (
     MastAim,
     SiteEstimate,
     SiteOutcome,
@@ -16,9 +16,9 @@ from algorithms.interface import (
     VelocityEstimate,
     VelocityOutcome,
 )
-from algorithms.vtt import VisualTargetTracker
-from scenarios.parts.scores import ScoredSite, ScoredVelocity
-from sim.measurements import (
+from marsyard.algorithms.vtt import VisualTargetTracker
+from marsyard.scenarios.parts.scores import ScoredSite, ScoredVelocity
+from marsyard.sim.measurements import (
     DescentMeasurements,
     LandingMeasurements,
     MastCalibration,

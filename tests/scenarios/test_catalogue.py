@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from campaigns.definition.catalogue import catalogue
-from campaigns.definition.loading import load_campaign
-from campaigns.running.engine import check_metrics
-from campaigns.store.columns import Row
-from marsyard.compile_command import SMALL
-from scenarios.rover import SharedDriveParameters, SharedDriveScenario
-from sim.streams import Streams
+from marsyard.campaigns.definition.catalogue import catalogue
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.running.engine import check_metrics
+from marsyard.campaigns.store.columns import Row
+from marsyard.cli.compile import SMALL
+from marsyard.scenarios.rover import SharedDriveParameters, SharedDriveScenario
+from marsyard.sim.streams import Streams
 
 
 def _row_of(scenario: str) -> Row:

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenarios.conformance import Finding, Subject, check_names, inputs, run_check, task_of, trackers
-from scenarios.conformance.surfaces import TexturedPlane
-from scenarios.estimators import LANDING, TRACKING, VELOCITY
-from sim.camera import Cahv
+from marsyard.scenarios.conformance import Finding, Subject, check_names, inputs, run_check, task_of, trackers
+from marsyard.scenarios.conformance.surfaces import TexturedPlane
+from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY
+from marsyard.sim.camera import Cahv
 
 HEAD = """
 import os, random, gc
 import numpy as np
-from algorithms.interface import VelocityEstimate, VelocityOutcome as Outcome
-from algorithms.vtt import VisualTargetTracker, VttOptions
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome as Outcome
+from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
 NOTHING = VelocityEstimate(Outcome.NO_VALID_TRACK, None)
 def seen(m):
     return m.images[0].counts.std() > 5
@@ -84,8 +84,8 @@ def estimator(lines: str) -> str:
         ("process", "os.chdir('/')\nreturn NOTHING", "it has changed the current folder"),
         ("process", "np.random.random()\nreturn NOTHING", "it has changed NumPy's global random state"),
         ("process", "os.environ['X_OF_MINE'] = '1'\nreturn NOTHING", "it has changed environment variables"),
-        ("truth", "import sim.terrain\nreturn NOTHING", "it imports what knows the truth: bad_"),
-        ("truth", "from sim import sensor\nreturn NOTHING", ": sim.sensor"),
+        ("truth", "import marsyard.sim.terrain\nreturn NOTHING", "it imports what knows the truth: bad_"),
+        ("truth", "from marsyard.sim import sensor\nreturn NOTHING", ": marsyard.sim.sensor"),
         ("truth", "gc.get_objects()\nreturn NOTHING", "goes through all objects of the process (gc.get_objects)"),
         ("truth", "import inspect\ninspect.stack()\nreturn NOTHING", "looks at its callers' frames"),
         (
@@ -212,8 +212,8 @@ def test_the_task_is_told_by_name_and_methods(tmp_path: Path, monkeypatch: pytes
         "tracking",
         "velocity",
     ]
-    assert task_of("algorithms.hda:HdaEstimator") == "landing"
-    assert task_of("algorithms.vtt:VisualTargetTracker") == "tracking"
+    assert task_of("marsyard.algorithms.hda:HdaEstimator") == "landing"
+    assert task_of("marsyard.algorithms.vtt:VisualTargetTracker") == "tracking"
     assert task_of(bad(tmp_path, monkeypatch, estimator("return NOTHING"))) == "velocity"
     with pytest.raises(ValueError, match="unknown algorithm 'vt'"):
         task_of("vt")

@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from algorithms.baselines import HomographyEstimator
-from algorithms.dimes import DimesOptions
-from algorithms.exchange import ExecutableLimits, ExecutableTargetTracker, ExecutableVelocityEstimator
-from algorithms.interface import VelocityEstimate, VelocityOutcome
-from algorithms.streams import StreamedEstimator
-from algorithms.vtt import VttOptions
-from scenarios import estimators
-from scenarios.descent.parameters import DescentScenarioParameters
-from scenarios.estimators import LANDING, TRACKING, VELOCITY, check_chosen, labels
-from scenarios.trial import Judged, attempted, case_result
-from scenarios.velocity import consistency_row
+from marsyard.algorithms.baselines import HomographyEstimator
+from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.exchange import ExecutableLimits, ExecutableTargetTracker, ExecutableVelocityEstimator
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.algorithms.streams import StreamedEstimator
+from marsyard.algorithms.vtt import VttOptions
+from marsyard.scenarios import estimators
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, check_chosen, labels
+from marsyard.scenarios.trial import Judged, attempted, case_result
+from marsyard.scenarios.velocity import consistency_row
 
 LIMITS = ExecutableLimits()
 
@@ -39,7 +39,9 @@ def test_a_module_that_raises_is_told_and_not_a_traceback(tmp_path: Path, monkey
 
 def test_an_entry_point_is_named_like_ours(monkeypatch: pytest.MonkeyPatch) -> None:
     group = estimators.GROUP
-    points = [EntryPoint(name, "algorithms.baselines:HomographyEstimator", group) for name in ("theirs", "dimes")]
+    points = [
+        EntryPoint(name, "marsyard.algorithms.baselines:HomographyEstimator", group) for name in ("theirs", "dimes")
+    ]
     monkeypatch.setattr(estimators, "installed", lambda: {point.name: point for point in points})
     assert isinstance(VELOCITY.make("theirs", DimesOptions(), LIMITS), HomographyEstimator)
     assert not isinstance(VELOCITY.make("dimes", DimesOptions(), LIMITS), HomographyEstimator)

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-import scenarios
-from algorithms.interface import VelocityOutcome
-from scenarios.fieldtest import FieldTestParameters, FieldTestScenario, pictures
-from scenarios.fieldtest.elevation import ElevationModel
-from scenarios.fieldtest.ephemeris import sun_direction
-from scenarios.fieldtest.parameters import ElevationParameters
-from scenarios.fieldtest.run import Run, RunKey, worked_out
-from scenarios.fieldtest.scenario import case_order
-from scenarios.fieldtest.triples import Category
-from scenarios.parts import ScoredFlight
-from scenarios.views import Eye, site_scene
-from sim.streams import Streams
-from sim.terrain import Surface
+from marsyard import scenarios
+from marsyard.algorithms.interface import VelocityOutcome
+from marsyard.scenarios.fieldtest import FieldTestParameters, FieldTestScenario, pictures
+from marsyard.scenarios.fieldtest.elevation import ElevationModel
+from marsyard.scenarios.fieldtest.ephemeris import sun_direction
+from marsyard.scenarios.fieldtest.parameters import ElevationParameters
+from marsyard.scenarios.fieldtest.run import Run, RunKey, worked_out
+from marsyard.scenarios.fieldtest.scenario import case_order
+from marsyard.scenarios.fieldtest.triples import Category
+from marsyard.scenarios.parts import ScoredFlight
+from marsyard.scenarios.views import Eye, site_scene
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import Surface
 
 CATALOGUE = Path(scenarios.__file__).parent / "catalogue" / "dimes-fieldtest.toml"
 IMU = {"rate_hz": 25.0, "gyro_bias_deg_h_k": 0.0}

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from algorithms.answers import checked_site, checked_update, checked_velocity
-from algorithms.interface import (
+from marsyard.algorithms.answers import checked_site, checked_update, checked_velocity
+from marsyard.algorithms.interface import (
     SiteEstimate,
     SiteOutcome,
     TargetUpdate,
@@ -23,13 +23,13 @@ from algorithms.interface import (
     VelocityEstimate,
     VelocityOutcome,
 )
-from reports.verdicts import Status, judge_campaign
-from scenarios.conformance.inputs import descent
-from scenarios.handover import Handover
-from scenarios.interface import CaseResult, Scalar, conditions_recorded_by
-from scenarios.registry import scenario
-from scenarios.velocity import asked
-from sim.streams import Streams
+from marsyard.reports.verdicts import Status, judge_campaign
+from marsyard.scenarios.conformance.inputs import descent
+from marsyard.scenarios.handover import Handover
+from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
+from marsyard.scenarios.registry import scenario
+from marsyard.scenarios.velocity import asked
+from marsyard.sim.streams import Streams
 
 for _folder in ("descent", "rover", ""):
     sys.path.append(str(Path(__file__).resolve().parent / _folder))

@@ -16,16 +16,16 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
-from scenarios.measured.ingest import _flat_field
-from scenarios.measured.layout import VELOCITY, IngestError, read_ingest_file
-from scenarios.measured.picture_files import read_counts
-from scenarios.measured.store import CasesFile
-from scenarios.measured.table import read_table
-from scenarios.meshes import MOST_BYTES, MeshFileError, read_mesh
-from scenarios.offline import VELOCITY_FORM, answers_of
-from sim.camera import read_cameras
-from sim.dynamics.recorded_files import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
-from sim.sensor import read_datasheet
+from marsyard.scenarios.measured.ingest import _flat_field
+from marsyard.scenarios.measured.layout import VELOCITY, IngestError, read_ingest_file
+from marsyard.scenarios.measured.picture_files import read_counts
+from marsyard.scenarios.measured.store import CasesFile
+from marsyard.scenarios.measured.table import read_table
+from marsyard.scenarios.meshes import MOST_BYTES, MeshFileError, read_mesh
+from marsyard.scenarios.offline import VELOCITY_FORM, answers_of
+from marsyard.sim.camera import read_cameras
+from marsyard.sim.dynamics.recorded_files import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
+from marsyard.sim.sensor import read_datasheet
 
 
 def test_a_calibration_with_aliases_is_refused(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from pydantic import ValidationError
 
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.relief import Relief
-from scenarios.meshes import MeshFileError, MeshParameters, read_mesh, standing
-from scenarios.views import SiteGround
-from sim.terrain import Surface, TerrainParameters, site, synthesise
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.relief import Relief
+from marsyard.scenarios.meshes import MeshFileError, MeshParameters, read_mesh, standing
+from marsyard.scenarios.views import SiteGround
+from marsyard.sim.terrain import Surface, TerrainParameters, site, synthesise
 
 BOX = (2.0, 1.0, 0.5)
 

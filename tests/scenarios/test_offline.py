@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from algorithms.dimes import DimesOptions
-from algorithms.exchange import ExecutableLimits, read_case
-from algorithms.faults import AlgorithmError
-from algorithms.hda import HdaOptions
-from algorithms.interface import SiteOutcome, VelocityOutcome
-from scenarios.conformance import inputs
-from scenarios.conformance.process import fingerprint
-from scenarios.estimators import LANDING, TRACKING, VELOCITY, labels, sources_of
-from scenarios.offline import SITE_FORM, VELOCITY_FORM, answers_of
+from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.exchange import ExecutableLimits, read_case
+from marsyard.algorithms.faults import AlgorithmError
+from marsyard.algorithms.hda import HdaOptions
+from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
+from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.conformance.process import fingerprint
+from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, labels, sources_of
+from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, answers_of
 
 LIMITS = ExecutableLimits()
 HEAD = "case,outcome,velocity_east_m_s,velocity_north_m_s\n"

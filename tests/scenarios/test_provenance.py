@@ -6,9 +6,9 @@ import hashlib
 
 import numpy as np
 
-from scenarios.provenance import rendered
-from sim.processor import processor_features
-from sim.render.backend import default_backend
+from marsyard.scenarios.provenance import rendered
+from marsyard.sim.processor import processor_features
+from marsyard.sim.render.backend import default_backend
 
 
 def test_a_hash_is_of_the_counts_in_order_however_they_lie_in_memory() -> None:

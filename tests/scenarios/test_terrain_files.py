@@ -19,10 +19,10 @@ from rasterio.crs import CRS
 from rasterio.transform import Affine
 from rasterio.warp import transform
 
-from campaigns.definition.loading import load_campaign
-from scenarios.descent import DescentScenarioParameters
-from scenarios.terrain_files import check_source, grid_north_deg
-from sim.terrain.imported import RealTerrain, TerrainFileError
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.scenarios.descent import DescentScenarioParameters
+from marsyard.scenarios.terrain_files import check_source, grid_north_deg
+from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError
 
 #: Mars, equidistant cylindrical about the equator, in metres (IAU 2000 sphere).
 MARS = "+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs"

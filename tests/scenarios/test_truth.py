@@ -19,20 +19,20 @@ import pytest
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from scenarios.descent import DescentScenario, DescentScenarioParameters
-from scenarios.descent.optics import camera_optics
-from scenarios.fieldtest import FieldTestScenario
-from scenarios.fieldtest.run import field_camera
-from scenarios.interface import Scalar
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.scenario import LandingScenario
-from scenarios.parts.scores import ScoredDescent, ScoredFlight
-from scenarios.rover import RoverScenarioParameters, run_case
-from sim.camera import CameraModel
-from sim.frames import rigid
-from sim.measurements import DescentMeasurements, LandingMeasurements, MastCalibration, RoverMeasurements
-from sim.sensor import Detector
-from sim.streams import Streams
+from marsyard.scenarios.descent import DescentScenario, DescentScenarioParameters
+from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.fieldtest import FieldTestScenario
+from marsyard.scenarios.fieldtest.run import field_camera
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.scenario import LandingScenario
+from marsyard.scenarios.parts.scores import ScoredDescent, ScoredFlight
+from marsyard.scenarios.rover import RoverScenarioParameters, run_case
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, MastCalibration, RoverMeasurements
+from marsyard.sim.sensor import Detector
+from marsyard.sim.streams import Streams
 
 for _folder in ("descent", "rover", ""):
     sys.path.append(str(Path(__file__).resolve().parent / _folder))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenarios.views import (
+from marsyard.scenarios.views import (
     DETAIL_TRIANGLES,
     ROCK_TRIANGLES,
     SMALLEST_ROCK_PX,
@@ -20,12 +20,12 @@ from scenarios.views import (
     rocks_in_sight,
     site_scene,
 )
-from sim.camera import Cahv
-from sim.frames import direction
-from sim.render import PixelRays, Sun, process_renderer
-from sim.render.backend import default_backend
-from sim.sensor import PRESETS, preset
-from sim.terrain import Site, site
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import direction
+from marsyard.sim.render import PixelRays, Sun, process_renderer
+from marsyard.sim.render.backend import default_backend
+from marsyard.sim.sensor import PRESETS, preset
+from marsyard.sim.terrain import Site, site
 
 SUN = Sun(direction(np.radians(250.0), np.radians(35.0)))
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sim.cache import GIGA, limit_bytes, make_room, touch
+from marsyard.sim.cache import GIGA, limit_bytes, make_room, touch
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_leftovers_go_after_a_day_and_files_being_written_never(folder: Path) ->
 def test_the_limit_is_a_share_of_what_the_disk_could_give(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MARSYARD_CACHE_GB", raising=False)
     free = 20 * GIGA
-    monkeypatch.setattr("sim.cache.shutil.disk_usage", lambda _: SimpleNamespace(free=free))
+    monkeypatch.setattr("marsyard.sim.cache.shutil.disk_usage", lambda _: SimpleNamespace(free=free))
     assert limit_bytes(tmp_path, 0) == 8 * GIGA
     # what is kept already does not shrink the limit
     assert limit_bytes(tmp_path, 3 * GIGA) == 9.2 * GIGA

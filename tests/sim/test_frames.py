@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.frames import SITE_FROM_WORLD, composed, direction, rigid, rigid_from_axes
+from marsyard.sim.frames import SITE_FROM_WORLD, composed, direction, rigid, rigid_from_axes
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.kernel_cache import kernels_are_ready, note_ready
+from marsyard.sim.kernel_cache import kernels_are_ready, note_ready
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def _folder(sources: Path, cache: Path, **environment: str) -> str:
     kept = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     done = subprocess.run(
-        [sys.executable, "-c", "import os, sim; print(os.environ['NUMBA_CACHE_DIR'])"],
+        [sys.executable, "-c", "import os, marsyard.sim; print(os.environ['NUMBA_CACHE_DIR'])"],
         cwd=sources,
         env=kept | {"MARSYARD_CACHE": str(cache), "PYTHONPATH": str(sources)} | environment,
         capture_output=True,
@@ -28,11 +28,10 @@ def _folder(sources: Path, cache: Path, **environment: str) -> str:
 @pytest.mark.parametrize("kernels", ["sim/terrain/kernels.py", "algorithms/hda/kernels/motion.py"])
 def test_a_changed_kernel_is_compiled_anew_with_all_that_call_it(kernels: str, tmp_path: Path) -> None:
     sources = tmp_path / "sources"
-    for folder in ("sim", "algorithms"):
-        shutil.copytree(ROOT / folder, sources / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "marsyard", sources / "marsyard", ignore=shutil.ignore_patterns("__pycache__"))
     before = _folder(sources, tmp_path / "cache")
     assert _folder(sources, tmp_path / "cache") == before
-    changed = sources / kernels
+    changed = sources / "marsyard" / kernels
     changed.write_text(changed.read_text() + "\n# changed\n")
     assert _folder(sources, tmp_path / "cache") != before
 

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.validation.sampling_checks import all_seeds, collisions, seeds, stream_words
-from sim.streams import Streams, stream_key
+from marsyard.sim.streams import Streams, stream_key
 
 
 def _first(streams: Streams, name: str) -> tuple[int, ...]:

@@ -51,6 +51,11 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the campaign's file and its runs A (one worker) and B (two workers)."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "small.toml").write_text(CAMPAIGN)
+    # a user's own files by the names of Marsyard's folders are no part of it
+    (folder / "sim.py").write_text("raise ImportError('the wrong module')\n")
+    for name in ("reports", "tests"):
+        (folder / name).mkdir()
+        (folder / name / "__init__.py").write_text("raise ImportError('the wrong module')\n")
     for jobs, out in (("1", "A"), ("2", "B")):
         done = _marsyard("run", "small.toml", "--jobs", jobs, "--out", out, cwd=folder)
         assert done.returncode == 3, done.stdout + done.stderr

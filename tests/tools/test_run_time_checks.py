@@ -10,7 +10,7 @@ import jaxtyping
 import numpy as np
 import pytest
 
-from sim.frames import direction, rigid
+from marsyard.sim.frames import direction, rigid
 
 
 def test_a_wrong_shape_is_refused() -> None:
@@ -25,14 +25,14 @@ def test_a_right_shape_passes() -> None:
 
 def test_kernels_are_not_wrapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = "def f(x: int) -> int:\n    return x\n"
-    for package, module in (("algorithms", "kernels"), ("algorithms", "ordinary")):
+    for package, module in (("marsyard.algorithms", "kernels"), ("marsyard.algorithms", "ordinary")):
         (tmp_path / f"{module}.py").write_text(source)
         monkeypatch.delitem(sys.modules, f"{package}.{module}", raising=False)
-    monkeypatch.setattr(importlib.import_module("algorithms"), "__path__", [str(tmp_path)])
-    kernel = importlib.import_module("algorithms.kernels").f
-    checked = importlib.import_module("algorithms.ordinary").f
-    monkeypatch.delitem(sys.modules, "algorithms.kernels")
-    monkeypatch.delitem(sys.modules, "algorithms.ordinary")
+    monkeypatch.setattr(importlib.import_module("marsyard.algorithms"), "__path__", [str(tmp_path)])
+    kernel = importlib.import_module("marsyard.algorithms.kernels").f
+    checked = importlib.import_module("marsyard.algorithms.ordinary").f
+    monkeypatch.delitem(sys.modules, "marsyard.algorithms.kernels")
+    monkeypatch.delitem(sys.modules, "marsyard.algorithms.ordinary")
 
     assert kernel("a text") == "a text"
     with pytest.raises(jaxtyping.TypeCheckError):

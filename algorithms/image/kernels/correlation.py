@@ -1,4 +1,5 @@
-"""Compiled correlation; `algorithms.image.normalized` and `.correlation` say what it is and check what they are given.
+"""Compiled correlation; `marsyard.algorithms.image.normalized` and `.correlation` say what it is and check what they
+are given.
 
 Images of the normalised one are float32, so that a vector register holds eight values; sums that are subtracted from
 each other are float64.

@@ -1,4 +1,4 @@
-"""Compiled inversion of the frame transfer; `algorithms.image.frame_transfer` says what it is."""
+"""Compiled inversion of the frame transfer; `marsyard.algorithms.image.frame_transfer` says what it is."""
 
 from __future__ import annotations
 

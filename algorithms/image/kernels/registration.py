@@ -1,4 +1,4 @@
-"""Compiled registration; `algorithms.image.registration` says what it is and checks what it is given."""
+"""Compiled registration; `marsyard.algorithms.image.registration` says what it is and checks what it is given."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from algorithms.image.kernels.quintic import sample, sample_shifted
+from marsyard.algorithms.image.kernels.quintic import sample, sample_shifted
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Compiled geometry of a rocker-bogie suspension; `sim.dynamics.rover` has the model and names every angle."""
+"""Compiled geometry of a rocker-bogie suspension; `marsyard.sim.dynamics.rover` has the model and names every angle."""
 
 from __future__ import annotations
 

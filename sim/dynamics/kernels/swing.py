@@ -1,4 +1,5 @@
-"""Compiled equations of motion of the two-stage swing; `sim.dynamics.swing` derives them and names every symbol.
+"""Compiled equations of motion of the two-stage swing; `marsyard.sim.dynamics.swing` derives them and names every
+symbol.
 
 A state is a vector of 22: position and velocity of the canopy, the line's direction and its rate, the lander's axis and
 its rate, and the lander's x axis, each with three components in world axes; and the lander's spin about its axis.
@@ -53,7 +54,7 @@ class Chain(NamedTuple):
 
 
 class WindField(NamedTuple):
-    """Mean wind and gusts as functions of height: see `sim.dynamics.wind`.
+    """Mean wind and gusts as functions of height: see `marsyard.sim.dynamics.wind`.
 
     A row of `waves` has its wavenumber, rad/m, then the amplitudes east, north and up of its cosine, then of its sine.
     """

@@ -1,6 +1,6 @@
 """A small autonomous helicopter: flight for pictures at constant height, and landing on a site."""
 
-from sim.dynamics.rotorcraft.flight import (
+from marsyard.sim.dynamics.rotorcraft.flight import (
     Air,
     GroundPatch,
     LandingLaser,
@@ -9,14 +9,14 @@ from sim.dynamics.rotorcraft.flight import (
     landing_flight,
     transit_flight,
 )
-from sim.dynamics.rotorcraft.parameters import (
+from marsyard.sim.dynamics.rotorcraft.parameters import (
     AirParameters,
     LandingGuidance,
     RotorcraftParameters,
     TransitParameters,
     VibrationParameters,
 )
-from sim.dynamics.rotorcraft.path import FlownPath, Vibration
+from marsyard.sim.dynamics.rotorcraft.path import FlownPath, Vibration
 
 __all__ = [
     "Air",

@@ -22,15 +22,15 @@ import numpy as np
 import scipy  # its signal is slow to import, and so left until it is called
 from jaxtyping import Float64, Int64
 
-from sim.dynamics.rotorcraft import kernels
-from sim.dynamics.rotorcraft.kernels import CARRIED, PLACE, SIZE, THRUST
-from sim.dynamics.rotorcraft.parameters import (
+from marsyard.sim.dynamics.rotorcraft import kernels
+from marsyard.sim.dynamics.rotorcraft.kernels import CARRIED, PLACE, SIZE, THRUST
+from marsyard.sim.dynamics.rotorcraft.parameters import (
     AirParameters,
     LandingGuidance,
     RotorcraftParameters,
     TransitParameters,
 )
-from sim.dynamics.rotorcraft.path import FlownPath, Vibration
+from marsyard.sim.dynamics.rotorcraft.path import FlownPath, Vibration
 
 #: How long after the last picture the flight for pictures ends, s: clocks may be late.
 TAIL_S = 0.1

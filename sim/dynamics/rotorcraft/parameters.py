@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim.dynamics.rotorcraft.kernels import Craft
+from marsyard.sim.dynamics.rotorcraft.kernels import Craft
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]

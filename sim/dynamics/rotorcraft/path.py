@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from sim.dynamics.angles import turning
-from sim.dynamics.rotorcraft.kernels import ANGLE, PLACE, PUSH, RATE, SPEED, TWIST
-from sim.dynamics.rotorcraft.parameters import VibrationParameters
-from sim.dynamics.state import State
-from sim.dynamics.trajectory import Motion
+from marsyard.sim.dynamics.angles import turning
+from marsyard.sim.dynamics.rotorcraft.kernels import ANGLE, PLACE, PUSH, RATE, SPEED, TWIST
+from marsyard.sim.dynamics.rotorcraft.parameters import VibrationParameters
+from marsyard.sim.dynamics.state import State
+from marsyard.sim.dynamics.trajectory import Motion
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.terrain.kernels import Array
+from marsyard.sim.terrain.kernels import Array
 
 Longs = NDArray[np.int64]
 

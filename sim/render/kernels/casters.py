@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.strips import Longs, numbers, times
-from sim.terrain.kernels import Array
+from marsyard.sim.render.kernels.strips import Longs, numbers, times
+from marsyard.sim.terrain.kernels import Array
 
 #: Cells of a grid: least u and v, cells a metre along u and v; columns, rows; the first item of each cell, and one more
 #: at the end; the items.

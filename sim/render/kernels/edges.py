@@ -8,11 +8,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32, Extent, cross_ground, way_in, way_out, world_ray
-from sim.render.kernels.hierarchy import Hierarchy, in_beam, nearest_hit
-from sim.render.kernels.intersection import hit_triangle
-from sim.render.kernels.sight import Ints
-from sim.terrain.kernels import Array, Level
+from marsyard.sim.render.kernels.ground import Array32, Extent, cross_ground, way_in, way_out, world_ray
+from marsyard.sim.render.kernels.hierarchy import Hierarchy, in_beam, nearest_hit
+from marsyard.sim.render.kernels.intersection import hit_triangle
+from marsyard.sim.render.kernels.sight import Ints
+from marsyard.sim.terrain.kernels import Array, Level
 
 Longs = NDArray[np.int64]
 #: Difference of brightness, as a share of the brighter, from which an edge between two things matters: four times

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.terrain.kernels import CEILING_BLOCK, Array, Level, sample
+from marsyard.sim.terrain.kernels import CEILING_BLOCK, Array, Level, sample
 
 Array32 = NDArray[np.float32]
 #: Least and greatest x, least and greatest y, metres.

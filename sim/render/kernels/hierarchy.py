@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.intersection import hit_triangle
-from sim.terrain.kernels import Array
+from marsyard.sim.render.kernels.intersection import hit_triangle
+from marsyard.sim.terrain.kernels import Array
 
 Longs = NDArray[np.int64]
 Boxes = NDArray[np.float32]

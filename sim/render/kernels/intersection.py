@@ -6,7 +6,7 @@ import math
 
 from numba import njit
 
-from sim.terrain.kernels import Array
+from marsyard.sim.terrain.kernels import Array
 
 
 @njit(cache=True, inline="always")

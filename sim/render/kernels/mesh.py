@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.terrain.kernels import Array, Level, sample
+from marsyard.sim.terrain.kernels import Array, Level, sample
 
 Longs = NDArray[np.int64]
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from sim.render.kernels.ground import Array32
-from sim.terrain.kernels import Array
+from marsyard.sim.render.kernels.ground import Array32
+from marsyard.sim.terrain.kernels import Array
 
 
 @njit(cache=True, error_model="numpy")

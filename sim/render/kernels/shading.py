@@ -8,11 +8,22 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.casters import Casters, sun_hidden
-from sim.render.kernels.sight import FLATTEST, Ints
-from sim.render.kernels.sky import sky_brightness
-from sim.render.kernels.strips import ROW, STRIP, Array32, Matrix, Near, fetch_levels, no_cells, numbers, spline, times
-from sim.render.kernels.sun import (
+from marsyard.sim.render.kernels.casters import Casters, sun_hidden
+from marsyard.sim.render.kernels.sight import FLATTEST, Ints
+from marsyard.sim.render.kernels.sky import sky_brightness
+from marsyard.sim.render.kernels.strips import (
+    ROW,
+    STRIP,
+    Array32,
+    Matrix,
+    Near,
+    fetch_levels,
+    no_cells,
+    numbers,
+    spline,
+    times,
+)
+from marsyard.sim.render.kernels.sun import (
     UNSURE,
     Shadow,
     cloud_cover,
@@ -21,8 +32,8 @@ from sim.render.kernels.sun import (
     shadow_clearance,
     sun_over_ground,
 )
-from sim.render.kernels.texture import add_texture
-from sim.terrain.kernels import Array, Level, sample
+from marsyard.sim.render.kernels.texture import add_texture
+from marsyard.sim.terrain.kernels import Array, Level, sample
 
 #: Cover of a layer of clouds, and its numbers.
 Clouds = tuple[Array32, Array]
@@ -212,7 +223,7 @@ def shade(
     Parameters
     ----------
     levels, top_level, spacing
-        The surface's pyramid (`sim.render.pyramid`), its coarsest level, and the spacing of its level 0.
+        The surface's pyramid (`marsyard.sim.render.pyramid`), its coarsest level, and the spacing of its level 0.
     distance, triangle_of_pixel, weights, level_of_pixel
         What each ray meets, as `look` finds it.
     world_from_body, position

@@ -8,10 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import CLOSING, Extent, first_ground
-from sim.render.kernels.hierarchy import Hierarchy, nearest_hit
-from sim.render.kernels.intersection import hit_triangle
-from sim.render.kernels.strips import (
+from marsyard.sim.render.kernels.ground import CLOSING, Extent, first_ground
+from marsyard.sim.render.kernels.hierarchy import Hierarchy, nearest_hit
+from marsyard.sim.render.kernels.intersection import hit_triangle
+from marsyard.sim.render.kernels.strips import (
     ROW,
     STRIP,
     Array32,
@@ -24,7 +24,7 @@ from sim.render.kernels.strips import (
     spline,
     times,
 )
-from sim.terrain.kernels import Array, Level
+from marsyard.sim.terrain.kernels import Array, Level
 
 Ints = NDArray[np.int32]
 #: Sine of the flattest angle at which a pixel's footprint on the ground is still drawn out in full.
@@ -257,8 +257,8 @@ def look(
     Parameters
     ----------
     levels, ceilings, top_level, spacing, extent
-        The surface's pyramid and its ceilings (`sim.render.pyramid`), its coarsest level, the spacing of its level 0,
-        and where the ground ends.
+        The surface's pyramid and its ceilings (`marsyard.sim.render.pyramid`), its coarsest level, the spacing of its
+        level 0, and where the ground ends.
     depth, ids, focal, view_from_body
         Pinhole views from `position`: depth along the axis, number of the triangle plus one (0 for ground; empty where
         no triangles were drawn, for none are in view), focal lengths in samples, and rotations from body axes to the

@@ -6,7 +6,7 @@ import math
 
 from numba import njit
 
-from sim.terrain.kernels import Array
+from marsyard.sim.terrain.kernels import Array
 
 #: Sine of the elevation below which the sky is as bright as there.
 HORIZON = 1e-3

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.terrain.kernels import Array, Level, bspline_weights
+from marsyard.sim.terrain.kernels import Array, Level, bspline_weights
 
 Array32 = NDArray[np.float32]
 Longs = NDArray[np.int64]
@@ -144,7 +144,7 @@ def fetch_levels(
 def spline(cells: Array32, shares: Array, k: int) -> tuple[float, float, float, float]:
     """Height, slopes along x and y by sample, and albedo, from the control values around the k-th place.
 
-    The numbers are those of `sim.terrain.kernels.sample`, by the same sums in the same order.
+    The numbers are those of `marsyard.sim.terrain.kernels.sample`, by the same sums in the same order.
     """
     wx0, wx1, wx2, wx3, dx0, dx1, dx2, dx3 = bspline_weights(shares[k])
     wy0, wy1, wy2, wy3, dy0, dy1, dy2, dy3 = bspline_weights(shares[ROW + k])

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.render.kernels.ground import Array32
-from sim.terrain.kernels import Array, Level, sample
+from marsyard.sim.render.kernels.ground import Array32
+from marsyard.sim.terrain.kernels import Array, Level, sample
 
 Longs = NDArray[np.int64]
 #: Height and reach of the ground's shadow on the posts of a grid (`sweep_shadow`), and whether its rows run along x.

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from sim.terrain.kernels import Array
+from marsyard.sim.terrain.kernels import Array
 
 #: Mean square of `gradient_noise` over space.
 NOISE_VARIANCE = 0.0732

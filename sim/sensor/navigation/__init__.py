@@ -1,6 +1,6 @@
 """The helicopter's on-board filter."""
 
-from sim.sensor.navigation.filter import (
+from marsyard.sim.sensor.navigation.filter import (
     FilterParameters,
     FilterState,
     Innovations,

@@ -1,7 +1,7 @@
 """The helicopter's on-board filter: an error-state Kalman filter over inertial unit, receiver, compass, inclinometers.
 
-It belongs to the instruments, as `sim.sensor.inertial` does: what it delivers, poses with errors correlated in time, is
-all that an algorithm under test is given of it.
+It belongs to the instruments, as `marsyard.sim.sensor.inertial` does: what it delivers, poses with errors correlated in
+time, is all that an algorithm under test is given of it.
 
 Fifteen errors are estimated (landing paper, section IV, and its reference [12]): position, velocity, attitude, gyro and
 accelerometer biases; the attitude's is multiplicative. What is correlated in time in the readings themselves, the
@@ -25,11 +25,11 @@ from jaxtyping import Bool, Float64, Int64
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.frames import rigid
-from sim.sensor.imu import DEG_H, DEG_SQRT_H, STANDARD_GRAVITY_M_S2, ImuIncrements, ImuParameters
-from sim.sensor.navigation import kernels
-from sim.sensor.rtk import RtkParameters, RtkSolutions, SolutionErrors
-from sim.sensor.tilt_compass import TiltCompassParameters, TiltCompassReadings
+from marsyard.sim.frames import rigid
+from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, STANDARD_GRAVITY_M_S2, ImuIncrements, ImuParameters
+from marsyard.sim.sensor.navigation import kernels
+from marsyard.sim.sensor.rtk import RtkParameters, RtkSolutions, SolutionErrors
+from marsyard.sim.sensor.tilt_compass import TiltCompassParameters, TiltCompassReadings
 
 Positive = Annotated[float, Field(gt=0.0)]
 

@@ -1,4 +1,4 @@
-"""Compiled error-state Kalman filter; `sim.sensor.navigation.filter` tells what is estimated and from what.
+"""Compiled error-state Kalman filter; `marsyard.sim.sensor.navigation.filter` tells what is estimated and from what.
 
 A state is a row of 16: position, velocity, quaternion (x, y, z, w; world from body), gyro bias, accelerometer bias. An
 error is true less believed, and for the attitude the small rotation about world axes that the believed one lacks. The

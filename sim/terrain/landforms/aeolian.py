@@ -7,8 +7,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from sim.terrain.landforms.ground import Ground, LandformParameters, smooth_pair
-from sim.terrain.landforms.kernels import add_dunes
+from marsyard.sim.terrain.landforms.ground import Ground, LandformParameters, smooth_pair
+from marsyard.sim.terrain.landforms.kernels import add_dunes
 
 #: Samples a slip face should have along its slope.
 SAMPLES_ON_SLIP_FACE = 2.1

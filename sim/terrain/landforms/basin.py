@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
-from sim.terrain.landforms.channels import walk
-from sim.terrain.landforms.ground import Ground, LandformParameters, finer, fitted
-from sim.terrain.landforms.kernels import add_cracks, cut_channels, raise_cones
+from marsyard.sim.terrain.landforms.channels import walk
+from marsyard.sim.terrain.landforms.ground import Ground, LandformParameters, finer, fitted
+from marsyard.sim.terrain.landforms.kernels import add_cracks, cut_channels, raise_cones
 
 #: Rounding of a fan's apex, as a share of its radius.
 APEX_ROUNDING = 0.06

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
-from sim.terrain.landforms.ground import Ground, LandformParameters
-from sim.terrain.landforms.kernels import cut_channels
+from marsyard.sim.terrain.landforms.ground import Ground, LandformParameters
+from marsyard.sim.terrain.landforms.kernels import cut_channels
 
 
 def walk(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 if TYPE_CHECKING:
-    from sim.terrain.parameters import TerrainParameters
+    from marsyard.sim.terrain.parameters import TerrainParameters
 
 EJECTA_REACH_RADII = 3.0
 #: Depth from the rim crest to the floor over diameter: 0.2 for fresh simple craters (Pike 1977; Robbins & Hynek 2012

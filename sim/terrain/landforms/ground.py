@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float32
 from pydantic import BaseModel, ConfigDict
 
-from sim.terrain.landforms.kernels import add_refined
-from sim.terrain.spectrum import Spectrum
+from marsyard.sim.terrain.landforms.kernels import add_refined
+from marsyard.sim.terrain.spectrum import Spectrum
 
 #: Smallest side of a grid on which a landform is made.
 SMALLEST_SIDE = 16

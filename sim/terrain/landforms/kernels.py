@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim.terrain.kernels import Array, Level, bspline_weights, collapse
+from marsyard.sim.terrain.kernels import Array, Level, bspline_weights, collapse
 
 Grid = NDArray[np.float32]
 Line = NDArray[np.float32]

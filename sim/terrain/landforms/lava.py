@@ -7,8 +7,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from sim.terrain.landforms.ground import Ground, LandformParameters, fitted, smooth_pair
-from sim.terrain.landforms.kernels import stamp_lobes
+from marsyard.sim.terrain.landforms.ground import Ground, LandformParameters, fitted, smooth_pair
+from marsyard.sim.terrain.landforms.kernels import stamp_lobes
 
 #: How far a lobe's outline strays, RMS, in half widths.
 CRENULATION = 0.28

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from sim.terrain.landforms.ground import Ground, LandformParameters
+from marsyard.sim.terrain.landforms.ground import Ground, LandformParameters
 
 
 class Swell(LandformParameters):

@@ -9,9 +9,9 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float64, Int32, Int64
 
-from sim.terrain.rocks.kernels import assemble, place_discs
-from sim.terrain.rocks.population import PlacedRock, RockParameters, draw_diameters
-from sim.terrain.rocks.shapes import (
+from marsyard.sim.terrain.rocks.kernels import assemble, place_discs
+from marsyard.sim.terrain.rocks.population import PlacedRock, RockParameters, draw_diameters
+from marsyard.sim.terrain.rocks.shapes import (
     COARSE,
     FINEST,
     FORMS,
@@ -21,8 +21,8 @@ from sim.terrain.rocks.shapes import (
     pixels_held,
     rock_shapes,
 )
-from sim.terrain.substreams import substream
-from sim.terrain.surface import Surface
+from marsyard.sim.terrain.substreams import substream
+from marsyard.sim.terrain.surface import Surface
 
 #: Side of the cells in which placement looks for neighbours, over the mean diameter.
 CELL_OVER_DIAMETER = 3.0
@@ -65,7 +65,7 @@ class RockField:
     period_m
         The distance after which rocks and terrain repeat.
     shape
-        Number of each rock's shape, see `sim.terrain.rocks.shapes`.
+        Number of each rock's shape, see `marsyard.sim.terrain.rocks.shapes`.
     position_m
         World position of each rock's centre on the ground, x and y within one period.
     diameter_m

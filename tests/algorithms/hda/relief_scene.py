@@ -13,9 +13,9 @@ import numpy as np
 from scipy import fft, ndimage
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.camera import Cahv, Cahvor
-from sim.frames import rigid
-from sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
+from marsyard.sim.camera import Cahv, Cahvor
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
 
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 

@@ -7,15 +7,20 @@ import pytest
 from relief_scene import Pass, bumps, measured, plane, pose
 from scipy.spatial.transform import Rotation
 
-from algorithms.hda import HdaOptions
-from algorithms.hda.baselines import SemiGlobalEstimator, essential_motion, rectification, semi_global_structure
-from algorithms.hda.estimator import motion_from_tracks
-from algorithms.hda.features import select_features
-from algorithms.hda.sighting import Sighting, sighting
-from algorithms.hda.tracking import track_features
-from algorithms.interface import SiteOutcome
-from sim.frames import rigid
-from sim.measurements import LandingMeasurements
+from marsyard.algorithms.hda import HdaOptions
+from marsyard.algorithms.hda.baselines import (
+    SemiGlobalEstimator,
+    essential_motion,
+    rectification,
+    semi_global_structure,
+)
+from marsyard.algorithms.hda.estimator import motion_from_tracks
+from marsyard.algorithms.hda.features import select_features
+from marsyard.algorithms.hda.sighting import Sighting, sighting
+from marsyard.algorithms.hda.tracking import track_features
+from marsyard.algorithms.interface import SiteOutcome
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import LandingMeasurements
 
 OPTIONS = HdaOptions(block_px=32, grid_px=8)
 

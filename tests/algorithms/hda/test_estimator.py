@@ -10,11 +10,11 @@ import pytest
 from relief_scene import Pass, bumps, measured, picture, plane, pose
 from scipy.spatial.transform import Rotation
 
-from algorithms.hda import HdaEstimator, HdaOptions, Safety, SurfaceFrame, TrackSeed, hda_products
-from algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
-from algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
-from sim.frames import rigid
-from sim.measurements import LandingMeasurements, PoseMeasurement
+from marsyard.algorithms.hda import HdaEstimator, HdaOptions, Safety, SurfaceFrame, TrackSeed, hda_products
+from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
+from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import LandingMeasurements, PoseMeasurement
 
 #: For pictures of 320 x 240; a lander of 1 m beside boulders of 0.3 m.
 OPTIONS = HdaOptions(

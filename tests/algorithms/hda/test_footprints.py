@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from algorithms.hda import HdaOptions, Safety
-from algorithms.hda.elevation import ElevationMap
-from algorithms.hda.footprints import Resolution, checked, roughness_limit_m
+from marsyard.algorithms.hda import HdaOptions, Safety
+from marsyard.algorithms.hda.elevation import ElevationMap
+from marsyard.algorithms.hda.footprints import Resolution, checked, roughness_limit_m
 
 SHARP = Resolution(window_m=0.0, noise_m=0.0)
 

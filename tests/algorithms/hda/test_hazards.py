@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from algorithms.hda import ElevationMap, HdaOptions, Safety, hazard_maps, safe_site
-from algorithms.hda.hazards import grassfire, safe_landing_map, smooth_surface
-from algorithms.hda.kernels.elevation import robust_plane
+from marsyard.algorithms.hda import ElevationMap, HdaOptions, Safety, hazard_maps, safe_site
+from marsyard.algorithms.hda.hazards import grassfire, safe_landing_map, smooth_surface
+from marsyard.algorithms.hda.kernels.elevation import robust_plane
 
 CELL_M = 0.1
 OPTIONS = HdaOptions(lander_diameter_m=1.0, max_roughness_m=0.2, max_slope_rad=float(np.deg2rad(15.0)))

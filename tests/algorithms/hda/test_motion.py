@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.hda import HdaOptions, Motion
-from algorithms.hda.estimator import motion_failure
-from algorithms.hda.kernels import motion as kernels
-from algorithms.hda.motion import estimate_motion, plane_depths
-from algorithms.interface import SiteOutcome
-from sim.frames import rigid
+from marsyard.algorithms.hda import HdaOptions, Motion
+from marsyard.algorithms.hda.estimator import motion_failure
+from marsyard.algorithms.hda.kernels import motion as kernels
+from marsyard.algorithms.hda.motion import estimate_motion, plane_depths
+from marsyard.algorithms.interface import SiteOutcome
+from marsyard.sim.frames import rigid
 
 FOCAL_PX = 811.0
 OPTIONS = HdaOptions()
@@ -98,7 +98,8 @@ def test_wrong_tracks_are_let_go_of() -> None:
         found = solved(places, second)
         scale = float(np.median(depths[~wrong] / found.depths[~wrong]))
         right += max(errors(found, moved, scale)) < 0.02
-    # 97 % of such motions come out right (`algorithms.hda.motion`); fewer than 36 of 40 then has a chance of 1 %.
+    # 97 % of such motions come out right (`marsyard.algorithms.hda.motion`); fewer than 36 of 40 then has a chance of 1
+    # %.
     assert right >= 36
 
 

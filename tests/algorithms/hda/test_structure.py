@@ -9,10 +9,10 @@ import pytest
 from relief_scene import Pass, bumps, measured, plane, pose
 from scipy.spatial.transform import Rotation
 
-from algorithms.hda import Fate, HdaEstimator, HdaOptions
-from algorithms.hda.kernels import matching
-from algorithms.hda.sighting import Sighting, sighting
-from algorithms.hda.structure import (
+from marsyard.algorithms.hda import Fate, HdaEstimator, HdaOptions
+from marsyard.algorithms.hda.kernels import matching
+from marsyard.algorithms.hda.sighting import Sighting, sighting
+from marsyard.algorithms.hda.structure import (
     dense_structure,
     depth_bounds,
     epipolar_segments,
@@ -22,8 +22,8 @@ from algorithms.hda.structure import (
     triangulated,
     within,
 )
-from algorithms.hda.view import undistorted
-from sim.frames import rigid
+from marsyard.algorithms.hda.view import undistorted
+from marsyard.sim.frames import rigid
 
 OPTIONS = HdaOptions(block_px=32, grid_px=8)
 RELIEF = bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=plane(0.05, 0.02))

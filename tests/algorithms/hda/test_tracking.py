@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from relief_scene import Pass, bumps, camera, picture, plane, pose
 
-from algorithms.hda import HdaOptions
-from algorithms.hda.features import eigenvalue_test, select_features
-from algorithms.hda.kernels import matching
-from algorithms.hda.pyramid import LevelSize, level_sizes, pyramid, reach_px
-from algorithms.hda.tracking import track_features
-from algorithms.image.correlation import pseudo_normalized_correlation
-from algorithms.image.peak import biquadratic_offset, highest_peak
+from marsyard.algorithms.hda import HdaOptions
+from marsyard.algorithms.hda.features import eigenvalue_test, select_features
+from marsyard.algorithms.hda.kernels import matching
+from marsyard.algorithms.hda.pyramid import LevelSize, level_sizes, pyramid, reach_px
+from marsyard.algorithms.hda.tracking import track_features
+from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
+from marsyard.algorithms.image.peak import biquadratic_offset, highest_peak
 
 OPTIONS = HdaOptions(block_px=32)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from relief_scene import camera
 
-from algorithms.hda.view import flat_fielded
-from sim.measurements import DetectorImage
-from sim.sensor import Detector, DetectorParameters, natural_fall_off
-from sim.sensor.optics import OpticsParameters
+from marsyard.algorithms.hda.view import flat_fielded
+from marsyard.sim.measurements import DetectorImage
+from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
+from marsyard.sim.sensor.optics import OpticsParameters
 
 
 def delivered(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, DetectorImage]:

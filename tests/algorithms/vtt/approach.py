@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.interface import TargetUpdate
-from algorithms.vtt.details import VttDetails
-from algorithms.vtt.options import VttOptions
-from sim.measurements import RoverTarget
+from marsyard.algorithms.interface import TargetUpdate
+from marsyard.algorithms.vtt.details import VttDetails
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.sim.measurements import RoverTarget
 from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, Sphere, pose, waves
 
 #: A smaller window than the paper's keeps the pictures that must be computed small.

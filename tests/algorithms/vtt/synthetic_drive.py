@@ -12,10 +12,10 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.interface import PixelBox, TargetTracker, TargetUpdate
-from sim.camera import Cahv, Cahvor, CameraModel
-from sim.frames import rigid
-from sim.measurements import MastCalibration, MastGeometry, MastImage, RoverMeasurements
+from marsyard.algorithms.interface import PixelBox, TargetTracker, TargetUpdate
+from marsyard.sim.camera import Cahv, Cahvor, CameraModel
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import MastCalibration, MastGeometry, MastImage, RoverMeasurements
 
 #: The mast of a MER: axes 1.4 m above the ground the rover's frame stands on; elbow and head are off their axes.
 MAST = MastGeometry(

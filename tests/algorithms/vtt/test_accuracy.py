@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from algorithms.vtt.accuracy import (
+from marsyard.algorithms.vtt.accuracy import (
     NAVCAM,
     PANCAM,
     StereoDesign,

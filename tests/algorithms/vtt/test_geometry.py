@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from algorithms.vtt.appearance import horizontal_axis, lever_pixels, magnification, roll_angle
-from algorithms.vtt.options import VttOptions
-from algorithms.vtt.pointing import aim_at_pixel, aim_at_position, mast_angles, middle
-from algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, searched_ranges, triangulated
-from algorithms.vtt.target import bearing_rad, designated_position_world, predicted_position
-from sim.camera import Cahv
-from sim.frames import rigid
-from sim.measurements import MastCalibration, MastGeometry, PixelTarget, RoverTarget, SiteTarget
+from marsyard.algorithms.vtt.appearance import horizontal_axis, lever_pixels, magnification, roll_angle
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, mast_angles, middle
+from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, searched_ranges, triangulated
+from marsyard.algorithms.vtt.target import bearing_rad, designated_position_world, predicted_position
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget, RoverTarget, SiteTarget
 from tests.algorithms.vtt.synthetic_drive import MAST, navcam, pancam, pose
 
 

@@ -7,11 +7,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from algorithms.interface import TargetLoss, TargetUpdate, TrackingState
-from algorithms.vtt.handoff import GoalReached, HandOffOutcome, hand_off
-from algorithms.vtt.loss import Evidence, Journey, Tolerances, losses, next_state, tolerances
-from algorithms.vtt.options import VttOptions
-from sim.measurements import MastCalibration
+from marsyard.algorithms.interface import TargetLoss, TargetUpdate, TrackingState
+from marsyard.algorithms.vtt.handoff import GoalReached, HandOffOutcome, hand_off
+from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, losses, next_state, tolerances
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.sim.measurements import MastCalibration
 from tests.algorithms.vtt.synthetic_drive import navcam, pancam
 
 OPTIONS = VttOptions()

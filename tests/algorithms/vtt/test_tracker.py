@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from algorithms.interface import TargetLoss, TargetTracker, TrackingState
-from algorithms.vtt.lucas_kanade import lucas_kanade_tracker
-from algorithms.vtt.options import PURE_NCC, VttOptions
-from algorithms.vtt.tracker import VisualTargetTracker
-from sim.camera import Cahvor
-from sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
+from marsyard.algorithms.interface import TargetLoss, TargetTracker, TrackingState
+from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
+from marsyard.algorithms.vtt.options import PURE_NCC, VttOptions
+from marsyard.algorithms.vtt.tracker import VisualTargetTracker
+from marsyard.sim.camera import Cahvor
+from marsyard.sim.measurements import PixelTarget, RoverTarget, SiteTarget, TargetDesignation
 from tests.algorithms.vtt.approach import SMALL, Body, approach, boulder, details, pixel_of, scene_of, slanted
 from tests.algorithms.vtt.synthetic_drive import Drive, Plane, navcam, pancam, pose
 

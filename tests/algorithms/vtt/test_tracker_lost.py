@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from algorithms.interface import TargetLoss, TrackingState
-from algorithms.vtt.tracker import VisualTargetTracker
-from sim.measurements import MastImage, RoverTarget
+from marsyard.algorithms.interface import TargetLoss, TrackingState
+from marsyard.algorithms.vtt.tracker import VisualTargetTracker
+from marsyard.sim.measurements import MastImage, RoverTarget
 from tests.algorithms.vtt.approach import SMALL, pixel_of, scene_of, slanted
 from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, navcam, pose, waves
 

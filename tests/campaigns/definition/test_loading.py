@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from campaigns.definition.catalogue import catalogue
-from campaigns.definition.loading import find_campaign, load_campaign
-from campaigns.errors import ConfigurationError
+from marsyard.campaigns.definition.catalogue import catalogue
+from marsyard.campaigns.definition.loading import find_campaign, load_campaign
+from marsyard.campaigns.errors import ConfigurationError
 
 CampaignFile = Callable[..., Path]
 

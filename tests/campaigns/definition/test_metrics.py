@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from campaigns.definition.catalogue import catalogue
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import ConfigurationError
-from marsyard.cli import app
-from scenarios.descent import DescentScenario
+from marsyard.campaigns.definition.catalogue import catalogue
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import ConfigurationError
+from marsyard.cli.app import app
+from marsyard.scenarios.descent import DescentScenario
 
 SCORE = """
 def braking(case):

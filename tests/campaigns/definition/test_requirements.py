@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 from fake_campaign import write_campaign
 
-from campaigns.definition.catalogue import catalogue
-from campaigns.definition.loading import load_campaign
-from campaigns.definition.requirements import (
+from marsyard.campaigns.definition.catalogue import catalogue
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.requirements import (
     applicable,
     read_requirements,
     shipped_requirements,
 )
-from campaigns.errors import ConfigurationError
+from marsyard.campaigns.errors import ConfigurationError
 
 NAMED = {
     "DIMES-VEL": 5.0, "DIMES-HARM": 5.0, "DIMES-AVAIL": None, "VTT-POS": 0.03, "VTT-TRACK": None, "VTT-HARM": None,

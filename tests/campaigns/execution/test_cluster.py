@@ -11,14 +11,14 @@ import distributed
 import pytest
 from fake_campaign import Silence
 
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import CampaignError
-from campaigns.execution.cluster import ClusterWorkers
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import run_campaign
-from campaigns.running.replay import differing_columns
-from campaigns.store import record
-from campaigns.store.table import read_rows
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.cluster import ClusterWorkers
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import run_campaign
+from marsyard.campaigns.running.replay import differing_columns
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.table import read_rows
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
@@ -57,14 +57,14 @@ def test_numbers_of_workers_that_are_none(
 
 @pytest.mark.parametrize("address", ["nowhere", "tcp://127.0.0.1:1"])
 def test_addresses_where_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
-    monkeypatch.setattr("campaigns.execution.cluster._REACH_S", 1)
+    monkeypatch.setattr("marsyard.campaigns.execution.cluster._REACH_S", 1)
     with pytest.raises(CampaignError, match=f"--cluster {address}: no scheduler answers"):
         ClusterWorkers(address)
 
 
 def test_an_address_that_is_none_does_not_hold_up_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that is left is closed where garbage is collected: at worst where the next client's loop starts."""
-    monkeypatch.setattr("campaigns.execution.cluster._REACH_S", 1)
+    monkeypatch.setattr("marsyard.campaigns.execution.cluster._REACH_S", 1)
     with pytest.raises(CampaignError, match="missing port number"):
         ClusterWorkers("nowhere")
     made = distributed.utils.get_loop_factory

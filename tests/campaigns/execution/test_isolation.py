@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from campaigns.execution import worker_process
-from campaigns.execution.cases import unfinished_row
-from campaigns.execution.work import UNLIMITED, Work, WorkLimits
-from campaigns.execution.worker_process import Done, request_fresh_worker
-from campaigns.execution.workers import LocalWorkers
-from campaigns.outcomes import CRASHED, TIMED_OUT, CaseEndedError
+from marsyard.campaigns.execution import worker_process
+from marsyard.campaigns.execution.cases import unfinished_row
+from marsyard.campaigns.execution.work import UNLIMITED, Work, WorkLimits
+from marsyard.campaigns.execution.worker_process import Done, request_fresh_worker
+from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.outcomes import CRASHED, TIMED_OUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 

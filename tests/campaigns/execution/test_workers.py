@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from campaigns.errors import CampaignError
-from campaigns.execution.batches import MOST_CASES, Batches
-from campaigns.execution.process_tree import used_memory
-from campaigns.execution.work import UNLIMITED, Work, WorkLimits
-from campaigns.execution.worker_process import Board, Done, Standing
-from campaigns.execution.workers import LocalWorkers
-from campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.batches import MOST_CASES, Batches
+from marsyard.campaigns.execution.process_tree import used_memory
+from marsyard.campaigns.execution.work import UNLIMITED, Work, WorkLimits
+from marsyard.campaigns.execution.worker_process import Board, Done, Standing
+from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
@@ -204,7 +204,7 @@ def leave(*_: object) -> None:
 
 def test_a_worker_that_cannot_begin_is_an_error_of_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
     with LocalWorkers(1) as workers:
-        monkeypatch.setattr("campaigns.execution.watched.run_batch", leave)
+        monkeypatch.setattr("marsyard.campaigns.execution.watched.run_batch", leave)
         with pytest.raises(CampaignError, match="worker processes die before they begin a case"):
             list(workers.run(Work(process_number, range(3))))
 

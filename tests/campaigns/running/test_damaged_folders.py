@@ -14,16 +14,16 @@ import pytest
 import typer
 from fake_campaign import Silence, rows_of, run
 
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import CampaignError, ConfigurationError, StoreError
-from campaigns.execution.crew import Crew
-from campaigns.execution.workers import LocalWorkers
-from campaigns.running.engine import resume_campaign
-from campaigns.running.replay import replay
-from campaigns.store import record
-from campaigns.store.rows import ROWS_FILE, RowStore, create_store
-from campaigns.store.table import write_table
-from marsyard.campaign_command import says_what_is_wrong
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError, ConfigurationError, StoreError
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.running.engine import resume_campaign
+from marsyard.campaigns.running.replay import replay
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
+from marsyard.campaigns.store.table import write_table
+from marsyard.cli.campaign import says_what_is_wrong
 
 CampaignFile = Callable[..., Path]
 
@@ -125,7 +125,7 @@ def test_a_full_folder_for_temporary_files_is_one_message(monkeypatch: pytest.Mo
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("campaigns.execution.temporary.tempfile.mkdtemp", full)
+    monkeypatch.setattr("marsyard.campaigns.execution.temporary.tempfile.mkdtemp", full)
     with pytest.raises(CampaignError, match=r"TMPDIR says where they go.*No space left"):
         LocalWorkers(1)
 

@@ -12,12 +12,12 @@ import pyarrow.parquet as pq
 import pytest
 from fake_campaign import TROUBLE, Silence, rows_of, run
 
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import ConfigurationError, StoreError
-from campaigns.running.engine import check_metrics
-from campaigns.running.replay import differing_columns, replay
-from campaigns.store import record
-from campaigns.store.table import refresh_table
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import ConfigurationError, StoreError
+from marsyard.campaigns.running.engine import check_metrics
+from marsyard.campaigns.running.replay import differing_columns, replay
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.table import refresh_table
 
 CampaignFile = Callable[..., Path]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from campaigns.definition.loading import load_campaign
-from campaigns.running.estimate import estimate
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.running.estimate import estimate
 
 CampaignFile = Callable[..., Path]
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from fake_campaign import Silence, rows_of, run
 
-from campaigns.definition.identity import package_versions
-from campaigns.errors import CampaignError, StoreError
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import append_cases, resume_campaign
-from campaigns.running.replay import differing_columns, replay
-from campaigns.store import record
-from campaigns.store.lock import folder_lock
+from marsyard.campaigns.definition.identity import package_versions
+from marsyard.campaigns.errors import CampaignError, StoreError
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import append_cases, resume_campaign
+from marsyard.campaigns.running.replay import differing_columns, replay
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.lock import folder_lock
 
 CampaignFile = Callable[..., Path]
 
@@ -55,7 +55,7 @@ def test_resume_of_a_finished_campaign_does_no_work(
     def forbidden(*_: object) -> None:
         raise AssertionError("a worker is started")
 
-    monkeypatch.setattr("campaigns.running.engine.hire", forbidden)
+    monkeypatch.setattr("marsyard.campaigns.running.engine.hire", forbidden)
     resume_campaign(done, Crew(1), watch)
     assert watch.notes[-1] == "the campaign is finished: all 4 cases have rows; nothing is run"
     assert watch.steps == {}
@@ -74,7 +74,7 @@ def test_crashed_cases_are_run_again_on_request(done: Path, watch: Silence) -> N
 
 def test_other_programs_do_not_go_on_unasked(done: Path, watch: Silence, monkeypatch: pytest.MonkeyPatch) -> None:
     real = package_versions()
-    monkeypatch.setattr("campaigns.definition.identity.package_versions", lambda: {**real, "numpy": "0.9"})
+    monkeypatch.setattr("marsyard.campaigns.definition.identity.package_versions", lambda: {**real, "numpy": "0.9"})
     before = {path: path.read_bytes() for path in done.glob("c*.*")}
     said = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo go on nevertheless.*--allow-changed"
     for act in (lambda: resume_campaign(done, Crew(1), watch), lambda: append_cases(done, 2, Crew(1), watch)):

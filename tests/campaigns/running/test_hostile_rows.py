@@ -9,9 +9,9 @@ import pytest
 from fake_campaign import Silence, rows_of, run, write_campaign
 from hostile_scenario import DEEDS
 
-from reports.campaign import write_report
-from reports.stored import read_run
-from reports.verdicts import Status, judge_campaign
+from marsyard.reports.campaign import write_report
+from marsyard.reports.stored import read_run
+from marsyard.reports.verdicts import Status, judge_campaign
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from fake_campaign import Silence, run
 
-from campaigns.definition.identity import identity_of
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import CampaignError
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import append_cases, resume_campaign
-from campaigns.running.replay import replay
-from campaigns.store import record
+from marsyard.campaigns.definition.identity import identity_of
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import append_cases, resume_campaign
+from marsyard.campaigns.running.replay import replay
+from marsyard.campaigns.store import record
 
 CAMERA = (
     "Model = CAHV = perspective, linear\nDimensions = 1024 1024\nC = 0 0 0\nA = 0 0 1\nH = 1200 0 512\nV = 0 1200 512\n"

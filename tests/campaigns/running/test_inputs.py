@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from fake_campaign import HEAD, Silence, rows_of, run
 
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import CampaignError
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import append_cases
-from campaigns.running.estimate import estimate
-from campaigns.running.inputs import plan_inputs, used_inputs
-from scenarios.interface import SelectsInputs
-from scenarios.registry import SCENARIOS, scenario
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import append_cases
+from marsyard.campaigns.running.estimate import estimate
+from marsyard.campaigns.running.inputs import plan_inputs, used_inputs
+from marsyard.scenarios.interface import SelectsInputs
+from marsyard.scenarios.registry import SCENARIOS, scenario
 
 CampaignFile = Callable[..., Path]
 DRAWN = '[dispersions]\nterrain = {distribution = "integer", low = 0, high = 9}'

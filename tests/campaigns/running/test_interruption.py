@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from fake_campaign import Silence, rows_of, run
 
-from campaigns.execution.crew import Crew
-from campaigns.execution.workers import LocalWorkers
-from campaigns.running.engine import resume_campaign
-from campaigns.running.replay import differing_columns
-from campaigns.store import record
-from campaigns.store.table import refresh_table
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.running.engine import resume_campaign
+from marsyard.campaigns.running.replay import differing_columns
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.table import refresh_table
 
 CampaignFile = Callable[..., Path]
 
@@ -135,7 +135,7 @@ def test_whatever_ends_the_runner_nothing_of_its_cases_is_left(
 def test_a_second_interruption_ends_the_program_at_once() -> None:
     program = """
 import signal, sys, time
-from marsyard.campaign_command import stopped_by_signals
+from marsyard.cli.campaign import stopped_by_signals
 with stopped_by_signals():
     try:
         print("ready", flush=True)

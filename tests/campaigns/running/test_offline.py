@@ -7,23 +7,23 @@ from pathlib import Path
 import pytest
 from fake_campaign import Silence, rows_of
 
-from algorithms.baselines import HomographyEstimator
-from algorithms.exchange import read_case
-from algorithms.interface import VelocityEstimate
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import CampaignError, StoreError
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import run_campaign
-from campaigns.running.offline import (
+from marsyard.algorithms.baselines import HomographyEstimator
+from marsyard.algorithms.exchange import read_case
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError, StoreError
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import run_campaign
+from marsyard.campaigns.running.offline import (
     Exported,
     export_campaign,
     other_pictures,
     scored_campaign,
     truth_folder,
 )
-from campaigns.running.replay import differing_columns
-from sim.measurements import DescentMeasurements
+from marsyard.campaigns.running.replay import differing_columns
+from marsyard.sim.measurements import DescentMeasurements
 
 CASES = 3
 FILE = f"""

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from campaigns.errors import CampaignError, StoreError
-from campaigns.running.replay import replay
+from marsyard.campaigns.errors import CampaignError, StoreError
+from marsyard.campaigns.running.replay import replay
 
 CampaignFile = Callable[..., Path]
 

@@ -10,10 +10,10 @@ import pytest
 from pydantic import ValidationError
 from scipy import stats
 
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import ConfigurationError
-from campaigns.sampling.correlation import Correlation
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import ConfigurationError
+from marsyard.campaigns.sampling.correlation import Correlation
 
 CampaignFile = Callable[..., Path]
 CASES = 4000

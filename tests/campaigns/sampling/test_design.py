@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.stats import qmc
 
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import ConfigurationError
-from campaigns.sampling.design import stratified
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import ConfigurationError
+from marsyard.campaigns.sampling.design import stratified
 
 CampaignFile = Callable[..., Path]
 HEAD = 'name = "fake"\nscenario = "fake_scenario:FakeScenario"\nseed = {seed}\ncases = {cases}\n{more}\n'

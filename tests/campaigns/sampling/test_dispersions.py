@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 from scipy import stats
 
-from campaigns.definition.loading import load_campaign
-from campaigns.sampling.dispersion import TAIL, Dispersion
-from campaigns.sampling.dispersions import AnyDispersion
-from campaigns.sampling.shapes import parameters_of, scipy_distributions
-from sim.streams import Streams
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.sampling.dispersion import TAIL, Dispersion
+from marsyard.campaigns.sampling.dispersions import AnyDispersion
+from marsyard.campaigns.sampling.shapes import parameters_of, scipy_distributions
+from marsyard.sim.streams import Streams
 
 CampaignFile = Callable[..., Path]
 CASES = 2000

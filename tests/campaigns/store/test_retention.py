@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from fake_campaign import Silence, rows_of, run
 
-from campaigns.definition.configuration import Requirement
-from campaigns.definition.loading import load_campaign
-from campaigns.running.replay import differing_columns
-from campaigns.store import record
-from campaigns.store.products import load_products
-from campaigns.store.retention import fails
-from campaigns.store.rows import RowStore, create_store
-from campaigns.store.table import write_table
-from campaigns.store.worst import showcase_case, worst_cases
+from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.running.replay import differing_columns
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.products import load_products
+from marsyard.campaigns.store.retention import fails
+from marsyard.campaigns.store.rows import RowStore, create_store
+from marsyard.campaigns.store.table import write_table
+from marsyard.campaigns.store.worst import showcase_case, worst_cases
 
 CampaignFile = Callable[..., Path]
 

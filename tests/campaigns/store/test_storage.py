@@ -16,12 +16,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from campaigns.errors import StoreError
-from campaigns.store import record
-from campaigns.store.lock import folder_lock, is_locked
-from campaigns.store.products import load_products, pack_products, save_packed
-from campaigns.store.rows import RowStore, create_store
-from campaigns.store.table import read_rows, write_table
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.lock import folder_lock, is_locked
+from marsyard.campaigns.store.products import load_products, pack_products, save_packed
+from marsyard.campaigns.store.rows import RowStore, create_store
+from marsyard.campaigns.store.table import read_rows, write_table
 
 
 def full(row: dict[str, Any]) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def test_columns_take_the_narrowest_type(tmp_path: Path) -> None:
 
 
 def test_tables_are_made_group_by_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("campaigns.store.table._GROUP", 7)
+    monkeypatch.setattr("marsyard.campaigns.store.table._GROUP", 7)
     rows = [{"case": case, "x": case / 3, **({"y": case} if case % 5 else {"z": True})} for case in range(50)]
     path = table_of(tmp_path, rows)
     assert pq.ParquetFile(path).num_row_groups == 8

@@ -10,11 +10,11 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from campaigns.definition.requirements import shipped_requirements
-from reports.dashboard.entries import Shown, find_campaigns, read_entries, slug_of
-from reports.dashboard.rows import margin_text, requirement_rows, sparkline
-from reports.dashboard.site import write_site
-from reports.explorer import script_hash
+from marsyard.campaigns.definition.requirements import shipped_requirements
+from marsyard.reports.dashboard.entries import Shown, find_campaigns, read_entries, slug_of
+from marsyard.reports.dashboard.rows import margin_text, requirement_rows, sparkline
+from marsyard.reports.dashboard.site import write_site
+from marsyard.reports.explorer import script_hash
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from reports.dimes.case_figures import (
+from marsyard.reports.dimes.case_figures import (
     MATCH,
     TEMPLATE,
     WINDOW,
@@ -21,8 +21,8 @@ from reports.dimes.case_figures import (
     tracks,
     write_dimes_figures,
 )
-from reports.dimes.shown import view
-from reports.systems import write_case_figures
+from marsyard.reports.dimes.shown import view
+from marsyard.reports.systems import write_case_figures
 
 
 def _squares(figure: Figure, colour: str) -> list[Rectangle]:

@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from reports.campaign import write_report
-from reports.dimes.fieldtest import PAPER, cells, field_test_section
-from reports.section import Subject
-from reports.stored import read_run
+from marsyard.reports.campaign import write_report
+from marsyard.reports.dimes.fieldtest import PAPER, cells, field_test_section
+from marsyard.reports.section import Subject
+from marsyard.reports.stored import read_run
 
 VELOCITY = {"id": "V", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.99, "confidence": 0.9}
 MakeRun = Callable[..., Path]

@@ -12,7 +12,8 @@ CELL_M, HEIGHT_M, FOCAL_PX = 0.25, 10.0, 240.0
 
 
 def synthetic_products() -> dict[str, Any]:
-    """Products as `scenarios.landing.score.products` gives them; the camera looks straight down, x to the east."""
+    """Products as `marsyard.scenarios.landing.score.products` gives them; the camera looks straight down, x to the
+    east."""
     rng = np.random.default_rng(1)
     rows, columns = SHAPE
     corner = np.array([-0.5 * (columns - 1), 0.5 * (rows - 1)]) * CELL_M

@@ -10,17 +10,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from reports.campaign import write_report
-from reports.hda.faults import landing_faults, landing_faults_section
-from reports.hda.hazards import hazard_classes, outcome_counts, site_shares
-from reports.hda.limits import AtSize, curves, knee
-from reports.hda.map_errors import analyse, with_shares
-from reports.hda.rows import Rate, rate
-from reports.hda.run_times import TABLE_1, paper_factor, stage_times
-from reports.hda.threshold import thresholds
-from reports.hda.touchdown import TABLE_2, touchdown_section
-from reports.section import Subject
-from reports.stored import StoredRun
+from marsyard.reports.campaign import write_report
+from marsyard.reports.hda.faults import landing_faults, landing_faults_section
+from marsyard.reports.hda.hazards import hazard_classes, outcome_counts, site_shares
+from marsyard.reports.hda.limits import AtSize, curves, knee
+from marsyard.reports.hda.map_errors import analyse, with_shares
+from marsyard.reports.hda.rows import Rate, rate
+from marsyard.reports.hda.run_times import TABLE_1, paper_factor, stage_times
+from marsyard.reports.hda.threshold import thresholds
+from marsyard.reports.hda.touchdown import TABLE_2, touchdown_section
+from marsyard.reports.section import Subject
+from marsyard.reports.stored import StoredRun
 from tests.reports.hda.made_up import landing_frame
 
 

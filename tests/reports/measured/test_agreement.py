@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from reports.measured.agreement import agreement_section
-from reports.measured.case_figures import matched_pairs
-from reports.measured.shown import MEASURED
-from reports.section import Subject
-from reports.stored import StoredRun
-from reports.systems import SYSTEMS
+from marsyard.reports.measured.agreement import agreement_section
+from marsyard.reports.measured.case_figures import matched_pairs
+from marsyard.reports.measured.shown import MEASURED
+from marsyard.reports.section import Subject
+from marsyard.reports.stored import StoredRun
+from marsyard.reports.systems import SYSTEMS
 
 
 def subject(**columns: object) -> Subject:

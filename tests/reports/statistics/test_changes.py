@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from reports.statistics.changes import Sample, difference_p, holm
+from marsyard.reports.statistics.changes import Sample, difference_p, holm
 
 
 def _sample(values: np.ndarray, terrains: np.ndarray | None = None) -> Sample:

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
-from reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
+from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 
 SIZE = 8
 

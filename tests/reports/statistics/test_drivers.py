@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from reports.statistics.drivers import Driver, driver
+from marsyard.reports.statistics.drivers import Driver, driver
 
 
 def _driver(x: np.ndarray, y: np.ndarray, groups: np.ndarray | None = None) -> Driver:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from reports.statistics.proportions import (
+from marsyard.reports.statistics.proportions import (
     further_cases_needed,
     minimum_sample_size,
     proportion_interval,

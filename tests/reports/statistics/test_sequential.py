@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from reports.statistics.proportions import proportion_lower, proportion_upper
-from reports.statistics.sequential import LaterLook, confidence_at, looks_of, spent_share
+from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.sequential import LaterLook, confidence_at, looks_of, spent_share
 
 
 def test_looks_halve_from_the_last_case() -> None:

@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from reports.campaign import FURTHER_SECTIONS
-from reports.vtt.beside import CHECKOUT_3, PAPER, TABLE_IV, beside_section
-from reports.vtt.goal import camera_runs, goal_section, losses_grid
-from reports.vtt.kinds import REGRESSION, TABLE_II, TERRAINS, regression_section, terrains_section
-from reports.vtt.steps import cells, steps_section
-from reports.vtt.table_1 import measured, table_1_section
-from reports.vtt.updates import CHECKOUT_1, TABLE_III, updates_section
+from marsyard.reports.campaign import FURTHER_SECTIONS
+from marsyard.reports.vtt.beside import CHECKOUT_3, PAPER, TABLE_IV, beside_section
+from marsyard.reports.vtt.goal import camera_runs, goal_section, losses_grid
+from marsyard.reports.vtt.kinds import REGRESSION, TABLE_II, TERRAINS, regression_section, terrains_section
+from marsyard.reports.vtt.steps import cells, steps_section
+from marsyard.reports.vtt.table_1 import measured, table_1_section
+from marsyard.reports.vtt.updates import CHECKOUT_1, TABLE_III, updates_section
 from tests.reports.vtt.tracking_rows import rows, subject, table
 
 
@@ -225,7 +225,7 @@ def test_goal_by_camera() -> None:
 
 def test_other_rows_have_no_section_of_tracking() -> None:
     """Rows of another system hold none of its columns; rows of crashed cases alone have no numbers."""
-    ours = [make for make in FURTHER_SECTIONS if make.__module__.startswith("reports.vtt.")]
+    ours = [make for make in FURTHER_SECTIONS if make.__module__.startswith("marsyard.reports.vtt.")]
     assert len(ours) == 7
     descent = pd.DataFrame({"case": [0, 1], "outcome": "VALID", "answered": True, "velocity_error_m_s": 1.0})
     for name in ("a-campaign", TERRAINS, REGRESSION, *PAPER):

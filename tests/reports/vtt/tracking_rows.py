@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from reports.section import Block, Section, Subject
-from reports.stored import StoredRun
+from marsyard.reports.section import Block, Section, Subject
+from marsyard.reports.stored import StoredRun
 
 
 def rows(cases: int, **columns: Any) -> pd.DataFrame:

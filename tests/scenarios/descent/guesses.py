@@ -2,8 +2,8 @@
 
 import time
 
-from algorithms.interface import VelocityEstimate, VelocityOutcome
-from sim.measurements import DescentMeasurements
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.sim.measurements import DescentMeasurements
 
 
 class Inertial:

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-from scenarios.descent import DescentScenario, DescentScenarioParameters
-from scenarios.interface import CaseResult
-from sim.streams import Streams
+from marsyard.scenarios.descent import DescentScenario, DescentScenarioParameters
+from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.streams import Streams
 
 #: A small world that is built in a moment.
 WORLD = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "place": {"bank": 1}}

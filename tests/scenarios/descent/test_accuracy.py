@@ -4,18 +4,18 @@ from typing import Any
 
 import numpy as np
 
-from algorithms.dimes import DimesDetails, DimesEstimator, Track
-from algorithms.dimes.binning import altitudes_at_images
-from scenarios.descent.exposure import expose
-from scenarios.descent.flight import flown_descent, mean_velocities, picture_states
-from scenarios.descent.measurement import Instruments, measure
-from scenarios.descent.optics import camera_optics
-from scenarios.descent.world import World
-from sim.dynamics import State
-from sim.measurements import DescentMeasurements
-from sim.sensor import Detector
-from sim.streams import Streams
-from sim.terrain import Surface
+from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, Track
+from marsyard.algorithms.dimes.binning import altitudes_at_images
+from marsyard.scenarios.descent.exposure import expose
+from marsyard.scenarios.descent.flight import flown_descent, mean_velocities, picture_states
+from marsyard.scenarios.descent.measurement import Instruments, measure
+from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.descent.world import World
+from marsyard.sim.dynamics import State
+from marsyard.sim.measurements import DescentMeasurements
+from marsyard.sim.sensor import Detector
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import Surface
 from tests.scenarios.descent.settings import FLAT, NOISELESS, PERFECT, parameters
 
 #: Swell of 200 m from trough to crest under ground that is rough on all scales.

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenarios.descent.exposure import expose
-from scenarios.descent.faults import (
+from marsyard.scenarios.descent.exposure import expose
+from marsyard.scenarios.descent.faults import (
     Faults,
     delivered,
     faulty_altitudes,
@@ -18,19 +18,19 @@ from scenarios.descent.faults import (
     faulty_terrain,
     faulty_times,
 )
-from scenarios.descent.flight import flown_descent, picture_states
-from scenarios.descent.haze import veiled
-from scenarios.descent.heat_shield import DIAMETER_M, HeatShield
-from scenarios.descent.optics import calibrated_camera, camera_optics
-from scenarios.descent.parameters import CameraParameters
-from scenarios.descent.world import World
-from sim.dynamics import State
-from sim.frames import direction, rigid
-from sim.measurements import AltitudeMeasurement, AttitudeMeasurement
-from sim.render import Frame, PixelRays, Sun
-from sim.sensor import Detector, DetectorParameters
-from sim.streams import Streams
-from sim.terrain import Environment, TerrainParameters
+from marsyard.scenarios.descent.flight import flown_descent, picture_states
+from marsyard.scenarios.descent.haze import veiled
+from marsyard.scenarios.descent.heat_shield import DIAMETER_M, HeatShield
+from marsyard.scenarios.descent.optics import calibrated_camera, camera_optics
+from marsyard.scenarios.descent.parameters import CameraParameters
+from marsyard.scenarios.descent.world import World
+from marsyard.sim.dynamics import State
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
+from marsyard.sim.render import Frame, PixelRays, Sun
+from marsyard.sim.sensor import Detector, DetectorParameters
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import Environment, TerrainParameters
 from tests.scenarios.descent.settings import NOISELESS, parameters, run
 
 SMALL = CameraParameters(columns=256, rows=256, pixel_pitch_um=48.0)

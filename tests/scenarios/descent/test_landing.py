@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from scenarios.descent.landing import touchdown
-from scenarios.descent.parameters import LandingParameters
+from marsyard.scenarios.descent.landing import touchdown
+from marsyard.scenarios.descent.parameters import LandingParameters
 
 EXACT = LandingParameters(steering_error=0.0, burn_error_m_s=0.0)
 DRIFT = np.array([12.0, -9.0])

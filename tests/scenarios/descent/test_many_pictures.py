@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from algorithms.exchange import read_case
-from algorithms.interface import VelocityEstimate, VelocityOutcome
-from campaigns.running.replay import differing_columns
-from scenarios.interface import CaseResult
-from sim.measurements import DescentFrame, DescentMeasurements
+from marsyard.algorithms.exchange import read_case
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.campaigns.running.replay import differing_columns
+from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 from tests.scenarios.descent.settings import DESCENT, PERFECT, parameters, run
 
 STREAM = "tests.scenarios.descent.test_many_pictures:Inertial"

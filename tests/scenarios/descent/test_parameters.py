@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from scenarios.descent import DescentScenarioParameters
-from scenarios.descent.optics import calibrated_camera, camera_optics
-from scenarios.descent.parameters import CameraParameters, binned_size_for
-from scenarios.descent.world import World
-from sim.sensor import OwnCamera
-from sim.terrain import site
+from marsyard.scenarios.descent import DescentScenarioParameters
+from marsyard.scenarios.descent.optics import calibrated_camera, camera_optics
+from marsyard.scenarios.descent.parameters import CameraParameters, binned_size_for
+from marsyard.scenarios.descent.world import World
+from marsyard.sim.sensor import OwnCamera
+from marsyard.sim.terrain import site
 
 #: A site on Mars and one on Earth.
 SITES = ("gusev", "ivanpah")
@@ -27,7 +27,7 @@ SITES = ("gusev", "ivanpah")
         ({"site": "mars-yard"}, "gusev"),
         ({"site": "gusev", "terrain": {"sample": 512}}, "terrain.sample"),
         ({"algorithm": "dime"}, "did you mean 'dimes'"),
-        ({"algorithm": "algorithms.dimes:Nothing"}, "no algorithm"),
+        ({"algorithm": "marsyard.algorithms.dimes:Nothing"}, "no algorithm"),
         ({"dimes": {"templates": 3}}, "templates"),
         ({"faults": {"hase": 1.0}}, "hase"),
     ],

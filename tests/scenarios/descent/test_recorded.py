@@ -11,11 +11,11 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from scenarios.descent import DescentScenarioParameters
-from scenarios.descent.flight import flown_descent
-from scenarios.descent.world import World
-from sim.dynamics.recorded_files import COLUMNS
-from sim.streams import Streams
+from marsyard.scenarios.descent import DescentScenarioParameters
+from marsyard.scenarios.descent.flight import flown_descent
+from marsyard.scenarios.descent.world import World
+from marsyard.sim.dynamics.recorded_files import COLUMNS
+from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import parameters, run
 
 #: OpenCV's camera axes in the body's: written by hand, as rows.

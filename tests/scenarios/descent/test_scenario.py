@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from campaigns.definition.catalogue import catalogue
-from campaigns.definition.loading import load_campaign
-from scenarios.interface import CaseResult
-from sim.streams import Streams
+from marsyard.campaigns.definition.catalogue import catalogue
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import DESCENT, FLAT, PERFECT, WORLD, run
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from scenarios.landing.faults import (
+from marsyard.scenarios.landing.faults import (
     Faults,
     arrived_numbers,
     faulty_detector,
@@ -14,10 +14,10 @@ from scenarios.landing.faults import (
     faulty_ranges,
     stuck_range_m,
 )
-from scenarios.landing.helicopter import HelicopterParameters, Transit
-from scenarios.landing.parameters import LandingScenarioParameters
-from sim.sensor import preset
-from sim.streams import Streams
+from marsyard.scenarios.landing.helicopter import HelicopterParameters, Transit
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.sim.sensor import preset
+from marsyard.sim.streams import Streams
 
 HELICOPTER = HelicopterParameters.model_validate({"transit": {"hover_s": 8.0}})
 

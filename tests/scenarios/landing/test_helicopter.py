@@ -7,11 +7,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from scenarios.landing.helicopter import HelicopterParameters, Touchdown, Transit, land
-from sim.dynamics.rotorcraft import GroundPatch
-from sim.sensor import LaserParameters
-from sim.sensor.ranging import RangingUnit
-from sim.streams import Streams
+from marsyard.scenarios.landing.helicopter import HelicopterParameters, Touchdown, Transit, land
+from marsyard.sim.dynamics.rotorcraft import GroundPatch
+from marsyard.sim.sensor import LaserParameters
+from marsyard.sim.sensor.ranging import RangingUnit
+from marsyard.sim.streams import Streams
 
 GRAVITY, HEIGHT = 9.8, 10.0
 SITE = np.array([4.0, 3.0, 0.0])

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from algorithms.hda import Fate, HdaDetails, Matches
-from algorithms.hda.view import View
-from scenarios.landing.motion import solved_row
-from sim.frames import rigid
-from sim.sensor import preset
+from marsyard.algorithms.hda import Fate, HdaDetails, Matches
+from marsyard.algorithms.hda.view import View
+from marsyard.scenarios.landing.motion import solved_row
+from marsyard.sim.frames import rigid
+from marsyard.sim.sensor import preset
 
 
 def test_every_match_is_counted_by_what_became_of_it() -> None:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenarios.landing.pair_choice import PairParameters, choose_pair
-from sim.frames import rigid
-from sim.measurements import PoseMeasurement
-from sim.sensor import preset
+from marsyard.scenarios.landing.pair_choice import PairParameters, choose_pair
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import PoseMeasurement
+from marsyard.sim.sensor import preset
 
 CAMERA = preset("xc-55").cameras()[0]
 HEIGHT = 10.0

@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import linprog
 
-from scenarios.landing import kernels
-from scenarios.landing.relief import Limits, Relief
+from marsyard.scenarios.landing import kernels
+from marsyard.scenarios.landing.relief import Limits, Relief
 
 LIMITS = Limits(diameter_m=2.0, max_slope_rad=float(np.radians(15.0)), max_roughness_m=0.2)
 SPACING = 0.025

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from algorithms.interface import SiteEstimate, SiteOutcome
-from campaigns.definition.loading import load_campaign
-from campaigns.running.engine import check_metrics
-from scenarios.conformance.parts import motion
-from scenarios.landing.descent import landing_row
-from scenarios.landing.flight import Flight
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.relief import Footprints, Limits, Relief
-from scenarios.landing.score import site_populations, site_row
-from scenarios.landing.truth import GroundTruth
-from sim.frames import rigid
-from sim.measurements import PoseMeasurement
-from sim.streams import Streams
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.running.engine import check_metrics
+from marsyard.scenarios.conformance.parts import motion
+from marsyard.scenarios.landing.descent import landing_row
+from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
+from marsyard.scenarios.landing.score import site_populations, site_row
+from marsyard.scenarios.landing.truth import GroundTruth
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import PoseMeasurement
+from marsyard.sim.streams import Streams
 
 SAFE_SITE, UNSAFE_SITE = np.array([-3.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0])
 REPORTED, REFUSED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE

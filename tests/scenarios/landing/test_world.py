@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from scenarios.landing.parameters import LandingScenarioParameters
-from scenarios.landing.world import World
-from sim.sensor import preset
-from sim.terrain import site
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.world import World
+from marsyard.sim.sensor import preset
+from marsyard.sim.terrain import site
 
 
 @pytest.mark.parametrize(("site_name", "camera"), [("gusev", "mer-descent-flown"), ("heli-hazardous", "xc-55")])

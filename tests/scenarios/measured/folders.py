@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sim.camera import write_cahvor
-from sim.frames import SITE_FROM_WORLD
-from sim.measurements import DescentMeasurements, DetectorImage, LandingMeasurements
+from marsyard.sim.camera import write_cahvor
+from marsyard.sim.frames import SITE_FROM_WORLD
+from marsyard.sim.measurements import DescentMeasurements, DetectorImage, LandingMeasurements
 
 #: OpenCV's camera axes in the axes of a body whose camera looks along -z.
 CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from algorithms.exchange.files import write_case
-from scenarios.conformance import inputs
-from scenarios.measured.store import put_camera
-from sim.camera import BODY_FRAME, read_cahvor
+from marsyard.algorithms.exchange.files import write_case
+from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.measured.store import put_camera
+from marsyard.sim.camera import BODY_FRAME, read_cahvor
 
 
 def test_exports_and_ingested_cases_state_the_body_frame(tmp_path: Path) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenarios.measured.consistency import PairAgreement, PairMatches, agreement_row, offsets_px
-from sim.camera import Cahv, Cahvor
-from sim.frames import rigid
+from marsyard.scenarios.measured.consistency import PairAgreement, PairMatches, agreement_row, offsets_px
+from marsyard.sim.camera import Cahv, Cahvor
+from marsyard.sim.frames import rigid
 
 CAMERA = Cahvor.from_cahv(
     Cahv(

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from folders import landing_folder, read_rows, velocity_folder, write_texts
 
-from scenarios.conformance import inputs
-from scenarios.measured.ingest import ingest
-from scenarios.measured.layout import IngestError
-from scenarios.measured.matching import MatchingScenario
-from scenarios.measured.store import CasesFile, images_of
-from sim.streams import Streams
+from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.measured.ingest import ingest
+from marsyard.scenarios.measured.layout import IngestError
+from marsyard.scenarios.measured.matching import MatchingScenario
+from marsyard.scenarios.measured.store import CasesFile, images_of
+from marsyard.sim.streams import Streams
 
 Rows = list[dict[str, str]]
 

@@ -9,15 +9,15 @@ import pytest
 from folders import landing_folder, read_rows, velocity_folder, write_texts
 from scipy.spatial.transform import Rotation
 
-from algorithms.dimes import DimesEstimator
-from scenarios.conformance import inputs
-from scenarios.interface import CaseResult
-from scenarios.measured.descent import MeasuredVelocityScenario
-from scenarios.measured.ingest import ingest
-from scenarios.measured.landing import MeasuredLandingScenario
-from scenarios.measured.matching import MatchingScenario
-from scenarios.parts import ScoredSite, ScoredVelocity
-from sim.streams import Streams
+from marsyard.algorithms.dimes import DimesEstimator
+from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.measured.descent import MeasuredVelocityScenario
+from marsyard.scenarios.measured.ingest import ingest
+from marsyard.scenarios.measured.landing import MeasuredLandingScenario
+from marsyard.scenarios.measured.matching import MatchingScenario
+from marsyard.scenarios.parts import ScoredSite, ScoredVelocity
+from marsyard.sim.streams import Streams
 
 STREAMS = Streams(seed=1, campaign="measured", case=0)
 TRUE = inputs.DESCENT_VELOCITY_M_S[:2]

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenarios.descent.flight import flown_descent
-from scenarios.descent.measurement import Instruments
-from scenarios.descent.world import World
-from scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
-from scenarios.parts.scores import scored
-from sim.streams import Streams
+from marsyard.scenarios.descent.flight import flown_descent
+from marsyard.scenarios.descent.measurement import Instruments
+from marsyard.scenarios.descent.world import World
+from marsyard.scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
+from marsyard.scenarios.parts.scores import scored
+from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import FLAT, PERFECT, parameters, run
 
 HERE = f"{__name__}:"

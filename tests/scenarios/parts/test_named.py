@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from campaigns.definition.configuration import CampaignConfiguration, problems_of
-from campaigns.definition.identity import chosen_parts, foreign_sources
-from scenarios.descent import DescentScenarioParameters
-from scenarios.parts import named
-from scenarios.parts.motions import OwnMotion
-from scenarios.parts.named import DYNAMICS, SCORE, checked_columns
-from scenarios.parts.scores import SCORED, ScoredDescent, ScoredFlight, ScoredLanding, score_of, taken_by
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, problems_of
+from marsyard.campaigns.definition.identity import chosen_parts, foreign_sources
+from marsyard.scenarios.descent import DescentScenarioParameters
+from marsyard.scenarios.parts import named
+from marsyard.scenarios.parts.motions import OwnMotion
+from marsyard.scenarios.parts.named import DYNAMICS, SCORE, checked_columns
+from marsyard.scenarios.parts.scores import SCORED, ScoredDescent, ScoredFlight, ScoredLanding, score_of, taken_by
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
 
@@ -102,7 +102,7 @@ def test_an_entry_point_names_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "scores_here.py").write_text(
-        "from scenarios.parts import ScoredDescent, ScoredFlight, ScoredLanding\n"
+        "from marsyard.scenarios.parts import ScoredDescent, ScoredFlight, ScoredLanding\n"
         "def any_case(case): return {}\n"
         "def two(case: ScoredDescent | ScoredLanding): return {}\n"
         "def landing(case: 'ScoredLanding'): return {}\n"

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenarios.conformance import Finding, Subject, check_names, run_check, task_of
-from scenarios.conformance import parts as suite
+from marsyard.scenarios.conformance import Finding, Subject, check_names, run_check, task_of
+from marsyard.scenarios.conformance import parts as suite
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
 HEAD = """
 import os
 import numpy as np
-from scenarios.parts import InstrumentReadings, Poses, ScoredDescent, ScoredLanding, ScoredRun
+from marsyard.scenarios.parts import InstrumentReadings, Poses, ScoredDescent, ScoredLanding, ScoredRun
 KEPT = []
 def poses(place, east=0.0):
     times = np.arange(place.from_s, 20.0, 0.1)
@@ -53,7 +53,7 @@ def bad(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
 @pytest.mark.parametrize(
     ("check", "random", "lines", "problem"),
     [
-        ("answer", False, "return poses(place)", "flies a tuple; allowed: scenarios.parts.Poses"),
+        ("answer", False, "return poses(place)", "flies a tuple; allowed: marsyard.scenarios.parts.Poses"),
         ("answer", False, "t, x, q = poses(place)\nreturn Poses(t, x[:, :2], q)", "positions_m of shape"),
         ("answer", False, "t, x, q = poses(place)\nreturn Poses(t[::40], x[::40], q[::40] * 0.9)", "length 0.9"),
         ("answer", False, "t, x, q = poses(place)\nt[5] = t[4]\nreturn Poses(t, x, q)", "time does not increase after"),
@@ -115,7 +115,12 @@ def test_what_a_motion_must_not_do(
             "return InstrumentReadings(truth.times_s, np.full(truth.times_s.size, np.inf))",
             "infinite altitude",
         ),
-        ("answer", "altitude", "return truth.times_s", "reads a ndarray; allowed: scenarios.parts.InstrumentReadings"),
+        (
+            "answer",
+            "altitude",
+            "return truth.times_s",
+            "reads a ndarray; allowed: marsyard.scenarios.parts.InstrumentReadings",
+        ),
         (
             "inputs",
             "altitude",

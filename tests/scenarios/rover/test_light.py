@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from short_run import SHORT
 
-from scenarios.rover import RoverScenarioParameters, Run, run_case
-from scenarios.rover.parameters import SunParameters
-from scenarios.rover.world import SunPath
-from sim.streams import Streams
+from marsyard.scenarios.rover import RoverScenarioParameters, Run, run_case
+from marsyard.scenarios.rover.parameters import SunParameters
+from marsyard.scenarios.rover.world import SunPath
+from marsyard.sim.streams import Streams
 
 
 def run(**changes: Any) -> Run:

@@ -5,11 +5,11 @@ import re
 import pytest
 from short_run import SHORT
 
-from scenarios.rover import RoverScenarioParameters, run_case
-from scenarios.rover import run as loop
-from scenarios.rover.mapping import Mapper
-from scenarios.rover.vehicle import Vehicle
-from sim.streams import Streams
+from marsyard.scenarios.rover import RoverScenarioParameters, run_case
+from marsyard.scenarios.rover import run as loop
+from marsyard.scenarios.rover.mapping import Mapper
+from marsyard.scenarios.rover.vehicle import Vehicle
+from marsyard.sim.streams import Streams
 
 
 def test_a_step_drives_by_what_was_tracked_and_mapped_before_it(monkeypatch: pytest.MonkeyPatch) -> None:

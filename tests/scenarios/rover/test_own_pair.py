@@ -11,12 +11,12 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 from short_run import SHORT
 
-from scenarios.rover import RoverScenario, RoverScenarioParameters
-from scenarios.rover.parameters import CameraParameters
-from sim.camera import write_cahvor
-from sim.frames import rigid
-from sim.sensor import preset, stereo_mast
-from sim.streams import Streams
+from marsyard.scenarios.rover import RoverScenario, RoverScenarioParameters
+from marsyard.scenarios.rover.parameters import CameraParameters
+from marsyard.sim.camera import write_cahvor
+from marsyard.sim.frames import rigid
+from marsyard.sim.sensor import preset, stereo_mast
+from marsyard.sim.streams import Streams
 
 OPENCV = (
     "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [640, 0, 321, 0, 640, 238, 0, 0, 1]}\n"

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from scenarios.rover.own_shadow import shades, template_patch
-from sim.dynamics import ROCKY_8, settle
-from sim.frames import direction
-from sim.sensor.mast import RESEARCH_MAST
+from marsyard.scenarios.rover.own_shadow import shades, template_patch
+from marsyard.sim.dynamics import ROCKY_8, settle
+from marsyard.sim.frames import direction
+from marsyard.sim.sensor.mast import RESEARCH_MAST
 from tests.sim.dynamics.grounds import Plane
 
 EAST = 0.5 * np.pi

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from scenarios.rover.points import Sight, about_line, distances, facing, hidden, shaded
+from marsyard.scenarios.rover.points import Sight, about_line, distances, facing, hidden, shaded
 
 
 @pytest.fixture(scope="module")

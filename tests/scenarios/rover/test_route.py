@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from scenarios.rover.parameters import LegParameters
-from scenarios.rover.route import GOAL_TOLERANCE_M, Belief, commands, finished, goal, towards
-from sim.measurements import DriveCommand
+from marsyard.scenarios.rover.parameters import LegParameters
+from marsyard.scenarios.rover.route import GOAL_TOLERANCE_M, Belief, commands, finished, goal, towards
+from marsyard.sim.measurements import DriveCommand
 
 
 def at(x: float, y: float) -> Belief:

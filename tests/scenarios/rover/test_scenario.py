@@ -4,10 +4,16 @@ import numpy as np
 import pytest
 from short_run import SHORT
 
-from scenarios.rover import RoverScenario, RoverScenarioParameters, SharedDriveParameters, SharedDriveScenario, run_case
-from scenarios.rover.shared import shared_drive, tracked
-from sim.render import PixelRays, process_renderer
-from sim.streams import Streams
+from marsyard.scenarios.rover import (
+    RoverScenario,
+    RoverScenarioParameters,
+    SharedDriveParameters,
+    SharedDriveScenario,
+    run_case,
+)
+from marsyard.scenarios.rover.shared import shared_drive, tracked
+from marsyard.sim.render import PixelRays, process_renderer
+from marsyard.sim.streams import Streams
 
 
 def parameters(**changes: object) -> RoverScenarioParameters:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
-from algorithms.vtt import VisualTargetTracker
-from sim.measurements import MastCalibration, RoverMeasurements, TargetDesignation
+from marsyard.algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
+from marsyard.algorithms.vtt import VisualTargetTracker
+from marsyard.sim.measurements import MastCalibration, RoverMeasurements, TargetDesignation
 
 
 class Confident:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 
 
 def _navcam_376() -> Cahvor:

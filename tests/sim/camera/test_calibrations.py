@@ -11,7 +11,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.camera import (
+from marsyard.sim.camera import (
     Cahvor,
     Cahvore,
     CameraFileError,

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 
 
 @st.composite

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pydantic import TypeAdapter
 
-from sim.camera import (
+from marsyard.sim.camera import (
     Cahv,
     Cahvor,
     Cahvore,
@@ -25,7 +25,7 @@ from sim.camera import (
     read_pds3,
     write_cahvor,
 )
-from sim.sensor import OwnCamera, OwnCameraChoice
+from marsyard.sim.sensor import OwnCamera, OwnCameraChoice
 
 LABEL = """PDS_VERSION_ID                    = PDS3
 RECORD_TYPE                       = FIXED_LENGTH

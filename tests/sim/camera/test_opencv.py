@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from sim.camera import Cahv, Cahvor, Cahvore, CameraModel, OpenCVIntrinsics, from_opencv, to_opencv
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel, OpenCVIntrinsics, from_opencv, to_opencv
 
 
 def far_points(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.camera import Cahv, Cahvor, Cahvore, CameraFileError, read_camera, read_cameras, read_pds4
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraFileError, read_camera, read_cameras, read_pds4
 
 #: Of NLF_0629_0722782785_631ECM_N0301344NCAM00427_06_095J01 (NASA PDS, mars2020_navcam_ops_raw): its camera model, the
 #: pointing and the fields of view that the label itself derives, the subframe and the axes; all else left out.

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.camera import CameraFileError, read_pds3_product
+from marsyard.sim.camera import CameraFileError, read_pds3_product
 
 COUNTS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 300
 LABEL = """PDS_VERSION_ID = PDS3

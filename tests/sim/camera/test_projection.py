@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 
 # ----- plausible cameras -----
 

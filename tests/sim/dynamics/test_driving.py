@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.dynamics import MER, NO_SLIP, SlipParameters, Soil, drive, settle
-from sim.measurements import DriveCommand
+from marsyard.sim.dynamics import MER, NO_SLIP, SlipParameters, Soil, drive, settle
+from marsyard.sim.measurements import DriveCommand
 from tests.sim.dynamics.grounds import Plane, uphill_east
 
 EAST, NORTH = 0.5 * np.pi, 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.dynamics.helicopter import HelicopterFlight, HelicopterParameters, helicopter_flight
+from marsyard.sim.dynamics.helicopter import HelicopterFlight, HelicopterParameters, helicopter_flight
 
 ORIGIN = np.array([100.0, -200.0, 35.0])
 

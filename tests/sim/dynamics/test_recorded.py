@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim.dynamics import Trajectory
-from sim.dynamics.recorded import RecordedMotion
-from sim.dynamics.recorded_files import COLUMNS, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.dynamics.recorded import RecordedMotion
+from marsyard.sim.dynamics.recorded_files import COLUMNS, TrajectoryFileError, read_poses
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
 #: The beginning of freiburg1_xyz of the TUM RGB-D benchmark (Sturm et al. 2012): its two first poses, twice, the

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.dynamics import Trajectory
-from sim.dynamics.rotorcraft import (
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.dynamics.rotorcraft import (
     Air,
     AirParameters,
     GroundPatch,
@@ -20,7 +20,7 @@ from sim.dynamics.rotorcraft import (
     landing_flight,
     transit_flight,
 )
-from sim.dynamics.rotorcraft.flight import TAIL_S
+from marsyard.sim.dynamics.rotorcraft.flight import TAIL_S
 
 GRAVITY, COURSE, HEADING = 9.8, 0.3, 1.0
 OVER, SITE = np.array([100.0, 50.0, 12.0]), np.array([103.0, 52.0])

@@ -8,9 +8,9 @@ import trimesh
 from jaxtyping import Float64
 from pydantic import ValidationError
 
-from sim.dynamics import MER, ROCKY_8, Ground, RockyGround, RoverParameters, settle
-from sim.dynamics.rover import WHEELS, wheel_centres
-from sim.terrain import PlacedRock, RockField, RockParameters, Surface
+from marsyard.sim.dynamics import MER, ROCKY_8, Ground, RockyGround, RoverParameters, settle
+from marsyard.sim.dynamics.rover import WHEELS, wheel_centres
+from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
 from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
 
 EAST, NORTH = 0.5 * np.pi, 0.0

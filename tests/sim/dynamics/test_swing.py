@@ -9,9 +9,9 @@ import pytest
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
-from sim.dynamics import SwingDescent, SwingParameters
-from sim.dynamics.chain import Modes, chain_of
-from sim.dynamics.kernels.swing import Chain, WindField, aerodynamic_force, derivatives
+from marsyard.sim.dynamics import SwingDescent, SwingParameters
+from marsyard.sim.dynamics.chain import Modes, chain_of
+from marsyard.sim.dynamics.kernels.swing import Chain, WindField, aerodynamic_force, derivatives
 
 START = np.array([100.0, -50.0, 2100.0])
 GROUND_M = 100.0

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from sim.dynamics import Wind, WindParameters
-from sim.dynamics.wind import LONGEST_WAVE_SCALES, SHORTEST_WAVE_M
+from marsyard.sim.dynamics import Wind, WindParameters
+from marsyard.sim.dynamics.wind import LONGEST_WAVE_SCALES, SHORTEST_WAVE_M
 
 GROUND_M = -1900.0
 

@@ -3,10 +3,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sim.camera import Cahv, Cahvor
-from sim.render import Renderer, process_renderer
-from sim.render.backend import default_backend
-from sim.terrain import Surface, TerrainParameters, synthesise
+from marsyard.sim.camera import Cahv, Cahvor
+from marsyard.sim.render import Renderer, process_renderer
+from marsyard.sim.render.backend import default_backend
+from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 
 
 @pytest.fixture(scope="session")

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from sim.render.backend import DepthRenderer, PinholeView, RenderingError, default_backend
+from marsyard.sim.render.backend import DepthRenderer, PinholeView, RenderingError, default_backend
 
 DRAW = """
 import sys
 import numpy as np
 from scipy.spatial.transform import Rotation
-from sim.camera import Cahv
-from sim.frames import direction, rigid
-from sim.render import Photometry, PixelRays, Renderer, Scene, Sun
-from sim.terrain import TerrainParameters, synthesise
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.terrain import TerrainParameters, synthesise
 
 surface = synthesise(TerrainParameters(samples=256, rms_slope_deg=6.0, outer_scale_m=200.0), np.random.default_rng(1))
 camera = Cahv.from_field_of_view(
@@ -68,7 +68,7 @@ def test_an_unknown_backend_is_named(monkeypatch) -> None:
 
 @pytest.mark.parametrize(("installed", "chosen"), [(("OSMesa", "EGL"), "osmesa"), (("EGL",), "egl"), ((), "osmesa")])
 def test_without_a_choice_the_installed_backend_is_taken(monkeypatch, installed, chosen) -> None:
-    from sim.render import backend
+    from marsyard.sim.render import backend
 
     monkeypatch.delenv("MARSYARD_GL", raising=False)
     monkeypatch.setattr(backend, "find_library", lambda name: f"lib{name}.so" if name in installed else None)
@@ -103,7 +103,7 @@ def test_what_was_loaded_before_is_drawn_no_more() -> None:
 
 def test_a_process_keeps_to_one_backend() -> None:
     program = (
-        "from sim.render.backend import DepthRenderer, RenderingError\n"
+        "from marsyard.sim.render.backend import DepthRenderer, RenderingError\n"
         "import OpenGL\n"
         "try:\n    DepthRenderer(64, 'egl')\nexcept RenderingError as error:\n    print(error)\n"
     )
@@ -116,7 +116,7 @@ def test_a_process_keeps_to_one_backend() -> None:
 
 def test_python_without_assertions_is_refused() -> None:
     program = (
-        "from sim.render.backend import DepthRenderer, RenderingError\n"
+        "from marsyard.sim.render.backend import DepthRenderer, RenderingError\n"
         "try:\n    DepthRenderer(64, 'osmesa')\nexcept RenderingError as error:\n    print(error)\n"
     )
     done = subprocess.run([sys.executable, "-O", "-c", program], check=True, capture_output=True, text=True, timeout=60)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim.frames import direction, rigid
-from sim.render import CloudLayer, CloudParameters, Frame, Photometry, PixelRays, Scene, Sun
-from sim.terrain import Surface
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import CloudLayer, CloudParameters, Frame, Photometry, PixelRays, Scene, Sun
+from marsyard.sim.terrain import Surface
 
 ALBEDO = 0.3
 SUN = Sun(direction(np.radians(130.0), np.radians(50.0)))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim.render.kernels.depth import metres
+from marsyard.sim.render.kernels.depth import metres
 
 
 def test_depths_of_a_perspective_become_metres() -> None:

@@ -8,13 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.motion import View, supersampled
 from benchmarks.validation.raycast import meet_triangles
-from sim.camera import Cahv
-from sim.frames import direction, rigid
-from sim.render import Objects, Photometry, PixelRays, Scene, Sun
-from sim.render.edges import edge_pixels, rays_within
-from sim.render.kernels.hierarchy import nearest_hit
-from sim.terrain import Surface, TerrainParameters, synthesise
-from sim.terrain.rocks import PlacedRock, RockField, RockParameters
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Objects, Photometry, PixelRays, Scene, Sun
+from marsyard.sim.render.edges import edge_pixels, rays_within
+from marsyard.sim.render.kernels.hierarchy import nearest_hit
+from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
+from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
 SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
 SAMPLES = 16

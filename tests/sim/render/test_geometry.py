@@ -7,14 +7,14 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.raycast import Ground
-from sim.camera import Cahvor
-from sim.frames import direction, rigid
-from sim.render import Objects, Photometry, PixelRays, Scene, Sun
-from sim.render.backend import RenderingError
-from sim.render.kernels.ground import cross_ground, pass_over, way_in, way_out
-from sim.render.pyramid import ceilings
-from sim.terrain import Surface
-from sim.terrain.kernels import CEILING_BLOCK
+from marsyard.sim.camera import Cahvor
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Objects, Photometry, PixelRays, Scene, Sun
+from marsyard.sim.render.backend import RenderingError
+from marsyard.sim.render.kernels.ground import cross_ground, pass_over, way_in, way_out
+from marsyard.sim.render.pyramid import ceilings
+from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain.kernels import CEILING_BLOCK
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
 #: Ground that is as bright as its albedo, from wherever it is seen.

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.validation.raycast import meet_triangles
-from sim.frames import direction
-from sim.render import Objects
-from sim.render.kernels.hierarchy import in_beam, nearest_hit
+from marsyard.sim.frames import direction
+from marsyard.sim.render import Objects
+from marsyard.sim.render.kernels.hierarchy import in_beam, nearest_hit
 
 EYE = np.array([0.3, -0.2, 1.1])
 

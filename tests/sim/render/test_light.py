@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim.frames import direction, rigid
-from sim.render import Photometry, PixelRays, Scene, Sun
-from sim.terrain import Surface
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Photometry, PixelRays, Scene, Sun
+from marsyard.sim.terrain import Surface
 
 NADIR = rigid(Rotation.identity(), np.array([0.0, 0.0, 1000.0]))
 

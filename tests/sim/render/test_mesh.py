@@ -3,7 +3,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sim.render.mesh import cells_in_hull, graded_offsets, ground_mesh
+from marsyard.sim.render.mesh import cells_in_hull, graded_offsets, ground_mesh
 
 
 @given(finest=st.floats(0.5, 20.0), stretch=st.floats(1.01, 1000.0), count=st.integers(8, 200).map(lambda n: 2 * n + 1))

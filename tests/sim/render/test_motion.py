@@ -6,11 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.estimators import PATCH, SmoothPicture, symmetric_shifts
 from benchmarks.validation.motion import View, measure, patch_grid
-from sim.camera import Cahv
-from sim.frames import direction, rigid
-from sim.render import Objects, Photometry, Scene, Sun, Texture
-from sim.terrain import TerrainParameters, synthesise
-from sim.terrain.rocks import PlacedRock, RockField, RockParameters
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Objects, Photometry, Scene, Sun, Texture
+from marsyard.sim.terrain import TerrainParameters, synthesise
+from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
 SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
 #: The bar of the means over all patches, in full measurements of 200 patches and more.

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim.render import Objects
+from marsyard.sim.render import Objects
 
 #: Triangles of each body.
 COUNTS = (5, 1, 80, 3)

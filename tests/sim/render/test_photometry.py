@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from sim.camera import Cahv, Cahvore
-from sim.frames import direction, rigid
-from sim.render import Photometry, PixelRays, Scene, Sun
-from sim.terrain import Surface
+from marsyard.sim.camera import Cahv, Cahvore
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Photometry, PixelRays, Scene, Sun
+from marsyard.sim.terrain import Surface
 
 ALBEDO = 0.2
 LAWS = {

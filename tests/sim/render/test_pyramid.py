@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sim.render.pyramid import LEVELS, pyramid
-from sim.terrain import Surface
+from marsyard.sim.render.pyramid import LEVELS, pyramid
+from marsyard.sim.terrain import Surface
 
 
 @pytest.mark.parametrize("side", [16, 128])

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenarios.views import Eye, SiteGround, mast_pose, nadir_pose, site_scene
-from sim.frames import direction
-from sim.render import Objects, PixelRays, Sun, process_renderer
-from sim.render.backend import default_backend
-from sim.render.reach import EVERYWHERE, shade_reach
-from sim.sensor import preset
-from sim.terrain import RockParameters, TerrainParameters, site
+from marsyard.scenarios.views import Eye, SiteGround, mast_pose, nadir_pose, site_scene
+from marsyard.sim.frames import direction
+from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
+from marsyard.sim.render.backend import default_backend
+from marsyard.sim.render.reach import EVERYWHERE, shade_reach
+from marsyard.sim.sensor import preset
+from marsyard.sim.terrain import RockParameters, TerrainParameters, site
 
 ROCKY = TerrainParameters(samples=512, spacing_m=3.0, rocks=RockParameters(abundance=0.15, smallest_m=1.0))
 

@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.raycast import meet_triangles
-from sim.camera import Cahv
-from sim.dynamics import MER, ROCKY_8, RoverParameters, settle
-from sim.frames import direction, rigid
-from sim.measurements import MastGeometry
-from sim.render import Photometry, PixelRays, Renderer, Scene, Sun, may_shade, rover_objects, rover_sphere
-from sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
-from sim.terrain import Surface
+from marsyard.sim.camera import Cahv
+from marsyard.sim.dynamics import MER, ROCKY_8, RoverParameters, settle
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.measurements import MastGeometry
+from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun, may_shade, rover_objects, rover_sphere
+from marsyard.sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
+from marsyard.sim.terrain import Surface
 from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
 
 LAMBERT = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)

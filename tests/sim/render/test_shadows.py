@@ -5,15 +5,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.raycast import Ground, meet_triangles
-from sim.camera import Cahv
-from sim.frames import direction, rigid
-from sim.render import Frame, Objects, Photometry, PixelRays, Scene, Sun
-from sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
-from sim.render.kernels.casters import sun_hidden
-from sim.render.kernels.ground import height_range
-from sim.render.reach import casters_towards
-from sim.terrain import Surface, TerrainParameters, synthesise
-from sim.terrain.rocks import RockField, RockParameters
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Scene, Sun
+from marsyard.sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
+from marsyard.sim.render.kernels.casters import sun_hidden
+from marsyard.sim.render.kernels.ground import height_range
+from marsyard.sim.render.reach import casters_towards
+from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
+from marsyard.sim.terrain.rocks import RockField, RockParameters
 
 ALBEDO = 0.2
 #: Brightness is then albedo times the cosine of incidence in the sun, and 0 in shadow.

@@ -5,11 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from sim.camera import Cahv
-from sim.frames import direction, rigid
-from sim.render import DustySky, Frame, Photometry, PixelRays, Scene, Sun
-from sim.render.kernels.sky import sky_brightness
-from sim.terrain import Surface
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import DustySky, Frame, Photometry, PixelRays, Scene, Sun
+from marsyard.sim.render.kernels.sky import sky_brightness
+from marsyard.sim.terrain import Surface
 
 DUSTY = Photometry(sky_share=0.25, sky=DustySky(0.5, 0.95, 0.65))
 

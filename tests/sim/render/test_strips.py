@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sim.render.kernels.strips import ROW, STRIP, fetch_levels, no_cells, spline
-from sim.terrain import Surface
-from sim.terrain.kernels import sample
+from marsyard.sim.render.kernels.strips import ROW, STRIP, fetch_levels, no_cells, spline
+from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain.kernels import sample
 
 SIDE, SPACING_M = 64, 0.5
 SAMPLES = np.random.default_rng(3).normal(size=(SIDE, SIDE, 2)).astype(np.float32)

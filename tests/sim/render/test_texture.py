@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from sim.render.kernels.texture import CELLS_LEAST, NOISE_VARIANCE, add_texture, gradient_noise
-from sim.terrain import sites
+from marsyard.sim.render.kernels.texture import CELLS_LEAST, NOISE_VARIANCE, add_texture, gradient_noise
+from marsyard.sim.terrain import sites
 
 PLACES = np.random.default_rng(5).uniform(-500.0, 500.0, (60000, 3))
 

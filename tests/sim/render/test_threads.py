@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim.frames import direction, rigid
-from sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture, threads
-from sim.terrain.rocks import PlacedRock, RockField, RockParameters
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture, threads
+from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
 
 @pytest.mark.parametrize(("pixels", "count"), [(100_001, 1), (100_001, 2), (99_999, 7), (20_001, 3), (5, 2)])
@@ -44,10 +44,10 @@ def test_pictures_do_not_depend_on_threads(renderer, rough, descent_camera, monk
     )
     rays = PixelRays.of(descent_camera().cropped(400, 400, (161, 161)))
     pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
-    monkeypatch.setattr("sim.render.renderer.in_parts", partial(threads.in_parts, threads=1))
+    monkeypatch.setattr("marsyard.sim.render.renderer.in_parts", partial(threads.in_parts, threads=1))
     alone = renderer.render(scene, rays, pose)
     assert np.any(alone.body >= 0)
-    monkeypatch.setattr("sim.render.renderer.in_parts", partial(threads.in_parts, threads=3))
+    monkeypatch.setattr("marsyard.sim.render.renderer.in_parts", partial(threads.in_parts, threads=3))
     shared = renderer.render(scene, rays, pose)
     for name in ("radiance", "range_m", "body", "normal"):
         np.testing.assert_array_equal(getattr(alone, name), getattr(shared, name))

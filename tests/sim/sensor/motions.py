@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from sim.dynamics import Motion, State
+from marsyard.sim.dynamics import Motion, State
 
 GRAVITY = 3.71
 

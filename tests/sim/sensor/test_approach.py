@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from sim.dynamics import Motion, State
-from sim.sensor import Approach, ApproachParameters, Imu, ImuIncrements, ImuParameters, InertialSolution
-from sim.sensor.imu import true_increments
+from marsyard.sim.dynamics import Motion, State
+from marsyard.sim.sensor import Approach, ApproachParameters, Imu, ImuIncrements, ImuParameters, InertialSolution
+from marsyard.sim.sensor.imu import true_increments
 from tests.sim.sensor.test_imu import perfect
 
 #: Short, so that it can be measured at the full rate.

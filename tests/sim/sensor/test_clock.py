@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sim.sensor import Clock, ClockParameters
+from marsyard.sim.sensor import Clock, ClockParameters
 
 
 def test_an_offset_is_common_and_jitter_is_not() -> None:

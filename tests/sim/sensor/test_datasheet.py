@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from sim.sensor import DetectorChoice, DetectorParameters, preset, read_datasheet
+from marsyard.sim.sensor import DetectorChoice, DetectorParameters, preset, read_datasheet
 
 CHOICE: TypeAdapter[DetectorParameters] = TypeAdapter(DetectorChoice)
 #: Sony IMX265 as a camera's maker states it by EMVA 1288 (rounded), behind 16 mm f/4.

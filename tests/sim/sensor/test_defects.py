@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.sensor.defects import filled
+from marsyard.sim.sensor.defects import filled
 
 
 def test_listed_pixels_get_the_mean_of_their_good_neighbours() -> None:

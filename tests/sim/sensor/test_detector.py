@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from algorithms.image.frame_transfer import without_frame_transfer
-from sim.sensor import Detector, DetectorParameters, ImageMotion
-from sim.sensor.defects import BurstParameters, DefectParameters
-from sim.sensor.detector import dark_seconds
-from sim.sensor.optics import OpticsParameters
+from marsyard.algorithms.image.frame_transfer import without_frame_transfer
+from marsyard.sim.sensor import Detector, DetectorParameters, ImageMotion
+from marsyard.sim.sensor.defects import BurstParameters, DefectParameters
+from marsyard.sim.sensor.detector import dark_seconds
+from marsyard.sim.sensor.optics import OpticsParameters
 
 EVEN = np.ones((64, 48), dtype=np.float32)
 SHARP = OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sim.sensor import AutoExposureParameters, Detector, DetectorParameters, auto_expose
+from marsyard.sim.sensor import AutoExposureParameters, Detector, DetectorParameters, auto_expose
 
 GROUND = (0.1 + 0.02 * np.random.default_rng(0).random((128, 96))).astype(np.float32)
 ASKED = AutoExposureParameters()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from sim.sensor import Imu, ImuParameters, WarmUp
-from sim.sensor.imu import DEG_H, DEG_SQRT_H, STANDARD_GRAVITY_M_S2
+from marsyard.sim.sensor import Imu, ImuParameters, WarmUp
+from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, STANDARD_GRAVITY_M_S2
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
 #: No error but those that a test asks for.

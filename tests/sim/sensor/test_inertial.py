@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim.sensor import Imu, ImuIncrements, ImuParameters, InertialSolution, NavigationErrors
-from sim.sensor.clock import Clock, ClockParameters
-from sim.sensor.imu import DEG_H
+from marsyard.sim.sensor import Imu, ImuIncrements, ImuParameters, InertialSolution, NavigationErrors
+from marsyard.sim.sensor.clock import Clock, ClockParameters
+from marsyard.sim.sensor.imu import DEG_H
 from tests.sim.sensor.motions import GRAVITY, Swaying
 from tests.sim.sensor.test_imu import perfect
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.camera import CameraModel
-from sim.sensor.mast import (
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.sensor.mast import (
     MASTS,
     MER_MAST,
     Mast,

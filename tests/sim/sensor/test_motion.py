@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
-from sim.camera import Cahv, Cahvor
-from sim.frames import rigid
-from sim.render import Photometry, Scene, Sun, process_renderer
-from sim.render.backend import default_backend
-from sim.render.rays import PixelRays
-from sim.sensor import ImageMotion, natural_fall_off
-from sim.sensor.kernels import path_kernel
-from sim.sensor.motion import moving_exposure
-from sim.terrain import TerrainParameters, synthesise
+from marsyard.sim.camera import Cahv, Cahvor
+from marsyard.sim.frames import rigid
+from marsyard.sim.render import Photometry, Scene, Sun, process_renderer
+from marsyard.sim.render.backend import default_backend
+from marsyard.sim.render.rays import PixelRays
+from marsyard.sim.sensor import ImageMotion, natural_fall_off
+from marsyard.sim.sensor.kernels import path_kernel
+from marsyard.sim.sensor.motion import moving_exposure
+from marsyard.sim.terrain import TerrainParameters, synthesise
 
 Picture = NDArray[np.float64]
 EXPOSURE_S = 4e-3

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from sim.dynamics.rotorcraft import (
+from marsyard.sim.dynamics.rotorcraft import (
     Air,
     AirParameters,
     FlownPath,
@@ -17,12 +17,12 @@ from sim.dynamics.rotorcraft import (
     TransitParameters,
     transit_flight,
 )
-from sim.dynamics.rotorcraft.flight import TAIL_S
-from sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
-from sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
-from sim.sensor.navigation.kernels import GPS_PLACE, GPS_SPEED
-from sim.sensor.rtk import Outage, RtkParameters, RtkReceiver
-from sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
+from marsyard.sim.dynamics.rotorcraft.flight import TAIL_S
+from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
+from marsyard.sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
+from marsyard.sim.sensor.navigation.kernels import GPS_PLACE, GPS_SPEED
+from marsyard.sim.sensor.rtk import Outage, RtkParameters, RtkReceiver
+from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
 
 GRAVITY, FLIGHTS = 9.8, 50
 CRAFT, TRANSIT = RotorcraftParameters(), TransitParameters(hover_s=8.0)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.dynamics import MER, NO_SLIP, Drive, Ground, SlipParameters, Soil, drive, settle
-from sim.measurements import DriveCommand
-from sim.sensor.odometry import EXACT, Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
+from marsyard.sim.dynamics import MER, NO_SLIP, Drive, Ground, SlipParameters, Soil, drive, settle
+from marsyard.sim.measurements import DriveCommand
+from marsyard.sim.sensor.odometry import EXACT, Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
 from tests.sim.dynamics.grounds import Plane, uphill_east
 
 EAST = 0.5 * np.pi

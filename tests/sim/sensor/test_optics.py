@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from sim.camera import Cahv, Cahvore
-from sim.sensor import Detector, DetectorParameters, natural_fall_off
-from sim.sensor.optics import OpticsParameters, dust_transmission, line_spread, spread
+from marsyard.sim.camera import Cahv, Cahvore
+from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
+from marsyard.sim.sensor.optics import OpticsParameters, dust_transmission, line_spread, spread
 
 MER = OpticsParameters()
 FORWARD = {"axis": np.array([0.0, 0.0, -1.0]), "right": np.array([1.0, 0.0, 0.0])}

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from sim.camera import Cahvor, looking_down, read_camera
-from sim.sensor import NamedOrOwnCamera, OwnCamera, OwnCameraChoice
+from marsyard.sim.camera import Cahvor, looking_down, read_camera
+from marsyard.sim.sensor import NamedOrOwnCamera, OwnCamera, OwnCameraChoice
 
 CHOICE: TypeAdapter[OwnCamera] = TypeAdapter(OwnCameraChoice)
 EITHER: TypeAdapter[str | OwnCamera] = TypeAdapter(NamedOrOwnCamera)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from sim.camera import Cahv, Cahvor, Cahvore
-from sim.sensor import PRESETS, Detector, DetectorChoice, DetectorParameters, natural_fall_off, preset
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore
+from marsyard.sim.sensor import PRESETS, Detector, DetectorChoice, DetectorParameters, natural_fall_off, preset
 
 
 class _Campaign(BaseModel):

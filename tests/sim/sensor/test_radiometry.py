@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from sim.sensor import DetectorParameters, preset
-from sim.sensor.radiometry import (
+from marsyard.sim.sensor import DetectorParameters, preset
+from marsyard.sim.sensor.radiometry import (
     DARK_E_S,
     DARKEST_RADIANCE_FACTOR,
     NG3_FIELD,

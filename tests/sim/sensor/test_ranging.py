@@ -9,7 +9,7 @@ import pytest
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from sim.sensor import (
+from marsyard.sim.sensor import (
     RTK,
     Gps,
     GpsParameters,
@@ -22,8 +22,8 @@ from sim.sensor import (
     Sampling,
     height_above_ground,
 )
-from sim.sensor.radar import first_return
-from sim.terrain import Surface
+from marsyard.sim.sensor.radar import first_return
+from marsyard.sim.terrain import Surface
 from tests.sim.sensor.motions import Swaying
 
 DESCENT = Swaying(position_m=(2500.0, 2500.0, 2000.0), velocity_m_s=(10.0, 0.0, -75.0))

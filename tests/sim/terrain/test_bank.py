@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import sim.cache as cache_module
-from sim.cache import CacheWarning
-from sim.terrain import TerrainBank, TerrainParameters
+import marsyard.sim.cache as cache_module
+from marsyard.sim.cache import CacheWarning
+from marsyard.sim.terrain import TerrainBank, TerrainParameters
 
 SMALL = TerrainParameters(samples=64)
 
@@ -71,10 +71,10 @@ def test_zeros_in_a_cached_file_are_noticed_and_the_terrain_is_built_again(cache
 def test_a_file_is_verified_once_by_a_process(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bank = TerrainBank(SMALL, seed=1)
     built = _bytes(bank, 0)
-    monkeypatch.setattr("sim.cache._VERIFIED", {})
+    monkeypatch.setattr("marsyard.sim.cache._VERIFIED", {})
     summed: list[int] = []
     checksum = cache_module._checksum
-    monkeypatch.setattr("sim.cache._checksum", lambda array: summed.append(array.size) or checksum(array))
+    monkeypatch.setattr("marsyard.sim.cache._checksum", lambda array: summed.append(array.size) or checksum(array))
     assert [_bytes(bank, 0), _bytes(bank, 0)] == [built, built]
     assert len(summed) == 1
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
-from sim.terrain.embedding import embed, grid_for
-from sim.terrain.imported import RealTerrain, TerrainFileError, filled, read_rasters
-from sim.terrain.statistics import terrain_statistics
+from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
+from marsyard.sim.terrain.embedding import embed, grid_for
+from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, filled, read_rasters
+from marsyard.sim.terrain.statistics import terrain_statistics
 
 ROWS, COLUMNS = 90, 110
 

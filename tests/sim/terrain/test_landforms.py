@@ -9,12 +9,12 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from sim.terrain import TerrainParameters, synthesise
-from sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
-from sim.terrain.landforms.ground import finer, smooth_pair
-from sim.terrain.landforms.kernels import add_cracks, add_dunes, stamp_craters
-from sim.terrain.statistics import mean_slope_deg
-from sim.terrain.substreams import substream
+from marsyard.sim.terrain import TerrainParameters, synthesise
+from marsyard.sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
+from marsyard.sim.terrain.landforms.ground import finer, smooth_pair
+from marsyard.sim.terrain.landforms.kernels import add_cracks, add_dunes, stamp_craters
+from marsyard.sim.terrain.statistics import mean_slope_deg
+from marsyard.sim.terrain.substreams import substream
 
 SMOOTH = TerrainParameters(samples=512, rms_slope_deg=0.0, craters_per_km2=0.0, albedo_contrast=0.0)
 
@@ -61,8 +61,8 @@ def test_adding_a_landform_changes_no_other(name: str) -> None:
 def test_bytes_do_not_depend_on_the_number_of_threads() -> None:
     program = (
         "import hashlib, numpy as np\n"
-        "from sim.terrain import TerrainParameters, synthesise\n"
-        "from sim.terrain.landforms import *\n"
+        "from marsyard.sim.terrain import TerrainParameters, synthesise\n"
+        "from marsyard.sim.terrain.landforms import *\n"
         "p = TerrainParameters(samples=256, dunes=Dunes(), lava=Lava(), swell=Swell(), playa=Playa())\n"
         "print(hashlib.sha256(synthesise(p, np.random.default_rng(5)).levels[0].tobytes()).hexdigest())\n"
     )

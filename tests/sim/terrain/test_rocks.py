@@ -4,9 +4,9 @@ import trimesh
 from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
-from sim.terrain import PlacedRock, RockField, RockParameters, Surface
-from sim.terrain.rocks.population import covered_share, draw_diameters, rocks_per_m2
-from sim.terrain.rocks.shapes import (
+from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
+from marsyard.sim.terrain.rocks.population import covered_share, draw_diameters, rocks_per_m2
+from marsyard.sim.terrain.rocks.shapes import (
     COARSE,
     FINE,
     FINEST,

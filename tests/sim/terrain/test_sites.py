@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.terrain import Environment, Surface, TerrainParameters, site, sites, synthesise
-from sim.terrain.rocks import RockField
-from sim.terrain.sites import PAPER
-from sim.terrain.statistics import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
+from marsyard.sim.terrain import Environment, Surface, TerrainParameters, site, sites, synthesise
+from marsyard.sim.terrain.rocks import RockField
+from marsyard.sim.terrain.sites import PAPER
+from marsyard.sim.terrain.statistics import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
 
 FIELD = ("pisgah", "kelso", "ivanpah")
 MARS = ("gusev", "meridiani")

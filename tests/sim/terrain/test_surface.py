@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from sim.terrain import Surface
-from sim.terrain.kernels import CEILING_BLOCK
+from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain.kernels import CEILING_BLOCK
 
 
 @pytest.fixture(scope="module")

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sim.terrain import TerrainParameters, synthesise
-from sim.terrain.landforms.craters import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
-from sim.terrain.landforms.kernels import stamp_craters
-from sim.terrain.spectrum import Spectrum
+from marsyard.sim.terrain import TerrainParameters, synthesise
+from marsyard.sim.terrain.landforms.craters import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
+from marsyard.sim.terrain.landforms.kernels import stamp_craters
+from marsyard.sim.terrain.spectrum import Spectrum
 
 
 def test_same_stream_same_bytes() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import typer
 
-from marsyard.campaign_command import says_what_is_wrong
+from marsyard.cli.campaign import says_what_is_wrong
 
 #: A case of each system, with settings that make it small: together they call all kernels that campaigns call.
 SMALL: Mapping[str, Sequence[str]] = {
@@ -23,9 +23,9 @@ def compile_kernels() -> None:
 
     Each system runs a small case. What is compiled stays on disk until the code changes (`marsyard clean` tells where).
     """
-    from campaigns.definition.loading import load_campaign
-    from campaigns.execution.worker_process import limit_threads
-    from sim.kernel_cache import kernels_are_ready, note_ready
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.execution.worker_process import limit_threads
+    from marsyard.sim.kernel_cache import kernels_are_ready, note_ready
 
     limit_threads()
     for name, settings in SMALL.items():

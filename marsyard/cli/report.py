@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marsyard.campaign_command import DirectoryArgument, console, says_what_is_wrong
+from marsyard.cli.campaign import DirectoryArgument, console, says_what_is_wrong
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,8 +45,8 @@ def report(
 
     Nothing is run again but for --gallery.
     """
-    from marsyard.outcome import conclude
-    from marsyard.report_pictures import keep_notable_cases
+    from marsyard.cli.outcome import conclude
+    from marsyard.cli.report_pictures import keep_notable_cases
 
     if gallery:
         keep_notable_cases(directory, typer.echo)
@@ -69,9 +69,9 @@ def compare(
 
     Exit status 0 in any event: a difference is no verdict.
     """
-    from marsyard.showing import grid_table
-    from reports.between import contrast_data, contrast_grid, contrasts, same_grounds
-    from reports.stored import read_run
+    from marsyard.cli.showing import grid_table
+    from marsyard.reports.between import contrast_data, contrast_grid, contrasts, same_grounds
+    from marsyard.reports.stored import read_run
 
     runs = [read_run(directory) for directory in (first, second)]
     paired, found = contrasts(*runs)
@@ -91,9 +91,9 @@ def compare(
 
 def _asked(directory: Path, path: Path) -> Sequence[dict[str, Any]]:
     """The requirements of a file that a campaign shows."""
-    from campaigns.definition.requirements import applicable, read_requirements
-    from campaigns.errors import CampaignError
-    from campaigns.store import record
+    from marsyard.campaigns.definition.requirements import applicable, read_requirements
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.store import record
 
     name = str(record.read(directory)["name"])
     found = applicable(read_requirements(path), name)
@@ -107,8 +107,8 @@ def _write_csv(directory: Path) -> Path:
     import pyarrow.csv as pa_csv
     import pyarrow.parquet as pq
 
-    from campaigns.errors import StoreError
-    from campaigns.store.table import TABLE_FILE
+    from marsyard.campaigns.errors import StoreError
+    from marsyard.campaigns.store.table import TABLE_FILE
 
     path = directory / "cases.csv"
     partial = path.with_name(f"{path.name}.partial")
@@ -125,7 +125,7 @@ def _write_csv(directory: Path) -> Path:
 
 def _print_page(directory: Path) -> Path:
     """Prints the page into a PDF by a browser without a window."""
-    from campaigns.errors import CampaignError
+    from marsyard.campaigns.errors import CampaignError
 
     browser = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
     if browser is None:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from sim.terrain.embedding import RealExtent
-    from sim.terrain.parameters import TerrainParameters
-    from sim.terrain.sites import PaperFigures
-    from sim.terrain.statistics import TerrainStatistics
+    from marsyard.sim.terrain.embedding import RealExtent
+    from marsyard.sim.terrain.parameters import TerrainParameters
+    from marsyard.sim.terrain.sites import PaperFigures
+    from marsyard.sim.terrain.statistics import TerrainStatistics
 
 #: Exit status where the command or a file is wrong, as elsewhere.
 WRONG = 2
@@ -30,7 +30,7 @@ def list_sites(
     from rich.console import Console
     from rich.table import Table
 
-    from sim.terrain.sites import sites
+    from marsyard.sim.terrain.sites import sites
 
     if as_json:
         told = [
@@ -79,13 +79,13 @@ def stats(
 
     import numpy as np
 
-    from marsyard.terrain_picture import write_terrain_picture
-    from scenarios.imported_site import MAX_HOLE_FRACTION, site_or_file
-    from scenarios.terrain_files import grid_north_deg
-    from sim.terrain.embedding import embed
-    from sim.terrain.sites import PAPER
-    from sim.terrain.statistics import terrain_statistics
-    from sim.terrain.synthesis import synthesise
+    from marsyard.cli.terrain_picture import write_terrain_picture
+    from marsyard.scenarios.imported_site import MAX_HOLE_FRACTION, site_or_file
+    from marsyard.scenarios.terrain_files import grid_north_deg
+    from marsyard.sim.terrain.embedding import embed
+    from marsyard.sim.terrain.sites import PAPER
+    from marsyard.sim.terrain.statistics import terrain_statistics
+    from marsyard.sim.terrain.synthesis import synthesise
 
     try:
         known = site_or_file(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)
@@ -167,7 +167,7 @@ def _print(
     from rich.console import Console
     from rich.table import Table
 
-    from sim.terrain.statistics import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
+    from marsyard.sim.terrain.statistics import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
 
     side = parameters.samples * parameters.spacing_m
     slope = "" if paper is None else _range(paper.mean_slope_deg, 0)

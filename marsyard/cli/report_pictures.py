@@ -16,15 +16,15 @@ def keep_notable_cases(directory: Path, say: Callable[[str], None]) -> None:
     CampaignError
         Where the campaign's scenario or an algorithm cannot be imported.
     """
-    from campaigns.execution.workers import LocalWorkers
-    from campaigns.running.replay import replay_with
-    from campaigns.running.stored import loaded_campaign
-    from campaigns.store.products import save_packed
-    from campaigns.store.record import stored_configuration
-    from campaigns.store.retention import case_directory
-    from campaigns.store.table import stored_row
-    from reports.notable import notable_cases
-    from reports.stored import read_run
+    from marsyard.campaigns.execution.workers import LocalWorkers
+    from marsyard.campaigns.running.replay import replay_with
+    from marsyard.campaigns.running.stored import loaded_campaign
+    from marsyard.campaigns.store.products import save_packed
+    from marsyard.campaigns.store.record import stored_configuration
+    from marsyard.campaigns.store.retention import case_directory
+    from marsyard.campaigns.store.table import stored_row
+    from marsyard.reports.notable import notable_cases
+    from marsyard.reports.stored import read_run
 
     run = read_run(directory)
     lacking = [case for case in notable_cases(run) if case not in run.showcases]

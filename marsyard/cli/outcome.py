@@ -7,19 +7,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from campaigns.errors import StoreError
-from campaigns.store import record
-from campaigns.store.lock import is_locked
-from campaigns.store.table import TABLE_FILE, refresh_table
-from marsyard.campaign_command import Exit
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.lock import is_locked
+from marsyard.campaigns.store.table import TABLE_FILE, refresh_table
+from marsyard.cli.campaign import Exit
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Console
     from rich.table import Table
 
-    from reports.judged import Judged
-    from reports.verdicts import Verdict
+    from marsyard.reports.judged import Judged
+    from marsyard.reports.verdicts import Verdict
 
 
 def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[str, Any]] | None = None) -> int:
@@ -33,8 +33,8 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
     StoreError
         Where the folder holds no campaign with rows, or the report cannot be written.
     """
-    from reports.tables import verdict_table
-    from reports.wording import count
+    from marsyard.reports.tables import verdict_table
+    from marsyard.reports.wording import count
 
     stored = record.read(directory)
     finished = stored["state"] == "finished"
@@ -64,8 +64,8 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
     StoreError
         Where the folder holds no campaign with rows, or the report cannot be written.
     """
-    from reports.campaign import write_judged
-    from reports.judged import judged
+    from marsyard.reports.campaign import write_judged
+    from marsyard.reports.judged import judged
 
     found = judged(directory, requirements)
     if requirements is None and found.run.said("state") == "finished":
@@ -80,9 +80,9 @@ def _comparison_tables(
     frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], verdicts: Sequence[Verdict]
 ) -> list[Table]:
     """What algorithms on the same cases did; nothing where there is one only."""
-    from marsyard.showing import grid_table
-    from reports.columns import primary_metric
-    from reports.comparison import comparison, comparison_grids
+    from marsyard.cli.showing import grid_table
+    from marsyard.reports.columns import primary_metric
+    from marsyard.reports.comparison import comparison, comparison_grids
 
     metric = primary_metric(frame, requirements)
     bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from marsyard.campaign_command import says_what_is_wrong
+from marsyard.cli.campaign import says_what_is_wrong
 
 
 class System(StrEnum):
@@ -55,11 +55,11 @@ def new(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it is there.")] = False,
 ) -> None:
     """Write a commented campaign of your own; at a terminal asks for what is not given."""
-    from campaigns.definition.loading import load_campaign
-    from campaigns.errors import CampaignError
-    from marsyard.evidence import evidence_limits
-    from marsyard.new_campaign import Choices, campaign_text
-    from reports.wording import count
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.cli.evidence import evidence_limits
+    from marsyard.cli.new_campaign import Choices, campaign_text
+    from marsyard.reports.wording import count
 
     path = Path(f"{name}.toml") if out is None else out
     if path.exists() and not overwrite:
@@ -116,7 +116,7 @@ def _asked(question: str, usual: str, asked: bool, check: Callable[[str], str]) 
 
 def _one_of(allowed: Sequence[str]) -> Callable[[str], str]:
     """Accepts one of some words."""
-    from campaigns.errors import not_allowed
+    from marsyard.campaigns.errors import not_allowed
 
     def check(answer: str) -> str:
         if answer not in allowed:
@@ -128,7 +128,7 @@ def _one_of(allowed: Sequence[str]) -> Callable[[str], str]:
 
 def _sites(system: System) -> list[str]:
     """Sites that a system's scenario accepts: those with a terrain at its scale."""
-    from sim.terrain import sites
+    from marsyard.sim.terrain import sites
 
     scale = "descent" if system == System.VELOCITY else "ground"
     return [name for name, one in sites().items() if getattr(one, scale) is not None]
@@ -143,7 +143,7 @@ def _readable_file(answer: str) -> str:
 
 def _camera_file(answer: str) -> str:
     """Accepts nothing, or a file that a camera is read from."""
-    from sim.camera import CameraFileError, read_camera
+    from marsyard.sim.camera import CameraFileError, read_camera
 
     if answer:
         try:

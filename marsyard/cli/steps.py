@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from campaigns.errors import StoreError
+from marsyard.campaigns.errors import StoreError
 
 
 def write_steps(directory: Path, products: Mapping[str, Any]) -> int:

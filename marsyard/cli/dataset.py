@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from marsyard.campaign_command import CampaignArgument, SetOption, says_what_is_wrong, size_text
+from marsyard.cli.campaign import CampaignArgument, SetOption, says_what_is_wrong, size_text
 
 
 @says_what_is_wrong
@@ -24,7 +24,7 @@ def dataset(
 
     Of campaigns of landings. Two pictures a case; shards that are there stay.
     """
-    from campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.dataset import write_dataset
 
     shards = write_dataset(load_campaign(campaign, override or [], cases, seed), out, shard, jobs)

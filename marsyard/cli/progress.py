@@ -87,16 +87,16 @@ class BarProgress:
         self._bars.stop()
 
     def begin(self, stage: str, total: int) -> None:
-        """See `campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.Watch`."""
         self._bars.stop_task(self._task)
         self._task = self._bars.add_task(stage, total=total)
 
     def step(self) -> None:
-        """See `campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.Watch`."""
         self._bars.advance(self._task)
 
     def note(self, text: str) -> None:
-        """See `campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.Watch`."""
         self._bars.console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
 
 
@@ -117,13 +117,13 @@ class LineProgress:
         return None
 
     def begin(self, stage: str, total: int) -> None:
-        """See `campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.Watch`."""
         self._stage, self._total, self._done = stage, total, 0
         self._began = self._told = time.monotonic()
         self._line(f"{stage}: {total}")
 
     def step(self) -> None:
-        """See `campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.Watch`."""
         self._done += 1
         now = time.monotonic()
         if self._done < self._total and now - self._told < LINE_INTERVAL_S:
@@ -134,7 +134,7 @@ class LineProgress:
         self._line(f"{text}, {left:.0f} s left" if self._done < self._total else f"{text}, {elapsed:.1f} s")
 
     def note(self, text: str) -> None:
-        """See `campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.Watch`."""
         self._line(f"note: {text}")
 
     def _line(self, text: str) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from marsyard.campaign_command import (
+from marsyard.cli.campaign import (
     CampaignArgument,
     Exit,
     SetOption,
@@ -22,19 +22,19 @@ from marsyard.campaign_command import (
     run,
     says_what_is_wrong,
 )
-from marsyard.clean_command import clean
-from marsyard.compile_command import compile_kernels
-from marsyard.conformance_command import conformance
-from marsyard.dashboard_command import dashboard
-from marsyard.dataset_command import dataset
-from marsyard.gallery_command import gallery
-from marsyard.ingest_command import ingest
-from marsyard.new_command import new
-from marsyard.nightly_command import nightly
-from marsyard.offline_command import export, score
-from marsyard.render_command import render
-from marsyard.report_command import compare, report
-from marsyard.terrain_command import app as terrain
+from marsyard.cli.clean import clean
+from marsyard.cli.compile import compile_kernels
+from marsyard.cli.conformance import conformance
+from marsyard.cli.dashboard import dashboard
+from marsyard.cli.dataset import dataset
+from marsyard.cli.gallery import gallery
+from marsyard.cli.ingest import ingest
+from marsyard.cli.new import new
+from marsyard.cli.nightly import nightly
+from marsyard.cli.offline import export, score
+from marsyard.cli.render import render
+from marsyard.cli.report import compare, report
+from marsyard.cli.terrain import app as terrain
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -65,8 +65,8 @@ def list_campaigns(
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
 ) -> None:
     """List the campaigns of the catalogue."""
-    from campaigns.definition.catalogue import catalogue
-    from marsyard.listing import catalogue_data, catalogue_table
+    from marsyard.campaigns.definition.catalogue import catalogue
+    from marsyard.cli.listing import catalogue_data, catalogue_table
 
     if as_json:
         typer.echo(json.dumps(catalogue_data(catalogue()), indent=2))
@@ -89,9 +89,9 @@ def show(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with every value that was drawn.")] = False,
 ) -> None:
     """Show a campaign: its parameters, its dispersions with their sources, and its requirements; or what it draws."""
-    from campaigns.definition.loading import load_campaign
-    from campaigns.errors import CampaignError
-    from marsyard.showing import described, show_campaign, show_draws, write_draws_figure
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.cli.showing import described, show_campaign, show_draws, write_draws_figure
 
     if figure is not None and draw is None:
         raise CampaignError("--figure shows draws: say of how many cases with --draw N")

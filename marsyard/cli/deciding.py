@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from campaigns.definition.campaign import Campaign
-from campaigns.errors import CampaignError
-from campaigns.execution.crew import Crew
-from campaigns.running.engine import Watch, append_cases, run_campaign
-from campaigns.store import record
-from marsyard.outcome import read_frame
-from reports.deciding import next_look
-from reports.sampled import sampled
-from reports.statistics.sequential import looks_of
-from reports.verdicts import ESTIMATE, judge_campaign
-from reports.wording import count
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.running.engine import Watch, append_cases, run_campaign
+from marsyard.campaigns.store import record
+from marsyard.cli.outcome import read_frame
+from marsyard.reports.deciding import next_look
+from marsyard.reports.sampled import sampled
+from marsyard.reports.statistics.sequential import looks_of
+from marsyard.reports.verdicts import ESTIMATE, judge_campaign
+from marsyard.reports.wording import count
 
 
 def run_until_decided(campaign: Campaign, directory: Path, crew: Crew, watch: Watch) -> None:
-    """Runs a campaign of at most its number of cases; see `reports.statistics.sequential`.
+    """Runs a campaign of at most its number of cases; see `marsyard.reports.statistics.sequential`.
 
     Raises
     ------

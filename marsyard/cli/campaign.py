@@ -17,10 +17,10 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from campaigns.definition.campaign import Campaign
-    from campaigns.execution.crew import Crew
-    from campaigns.running.engine import Watch
-    from campaigns.running.replay import Replay
+    from marsyard.campaigns.definition.campaign import Campaign
+    from marsyard.campaigns.execution.crew import Crew
+    from marsyard.campaigns.running.engine import Watch
+    from marsyard.campaigns.running.replay import Replay
 
 
 class Exit(IntEnum):
@@ -79,7 +79,7 @@ def says_what_is_wrong(command: Callable[Parameters, None]) -> Callable[Paramete
     @functools.wraps(command)
     def guarded(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
         # here, so that `doctor` starts, and says so, where another package stands in for ours
-        from campaigns.errors import CampaignError
+        from marsyard.campaigns.errors import CampaignError
 
         try:
             command(*args, **kwargs)
@@ -120,13 +120,13 @@ def run(
     algorithm: AlgorithmOption = None,
 ) -> None:
     """Run a campaign, judge its requirements, and write its report."""
-    from campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.definition.loading import load_campaign
 
     limits = [] if case_time is None else [f"limits.case_time_s={case_time}"]
     loaded = load_campaign(campaign, [*(override or []), *limits], cases, seed, algorithm or [])
     # only now, so that a file that is wrong is told of at once
-    from campaigns.running.engine import run_campaign
-    from marsyard.deciding import run_until_decided
+    from marsyard.campaigns.running.engine import run_campaign
+    from marsyard.cli.deciding import run_until_decided
 
     crew = make_crew(jobs, cluster)
     if dry_run:
@@ -156,8 +156,8 @@ def resume(
     allow_changed: ChangedOption = False,
 ) -> None:
     """Run the cases that an interrupted or killed campaign still lacks, and judge it; finished cases stay."""
-    from campaigns.running.engine import resume_campaign
-    from marsyard.deciding import go_on_until_decided
+    from marsyard.campaigns.running.engine import resume_campaign
+    from marsyard.cli.deciding import go_on_until_decided
 
     crew, words = make_crew(jobs, cluster), _outcomes(retry or [])
 
@@ -177,9 +177,9 @@ def append(
     allow_changed: ChangedOption = False,
 ) -> None:
     """Add a block of cases to a finished campaign, run them, and judge all; the cases that are there stay."""
-    from campaigns.errors import CampaignError
-    from campaigns.running.engine import append_cases, with_block
-    from campaigns.store.record import stored_configuration
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.running.engine import append_cases, with_block
+    from marsyard.campaigns.store.record import stored_configuration
 
     if stored_configuration(directory).most_cases is not None:
         raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
@@ -200,8 +200,8 @@ def replay(
     ] = False,
 ) -> None:
     """Run one case again, keep and draw its intermediate results, and compare its row with the stored one."""
-    from campaigns.running.replay import replay as run_again
-    from campaigns.store.retention import case_directory
+    from marsyard.campaigns.running.replay import replay as run_again
+    from marsyard.campaigns.store.retention import case_directory
 
     replayed = run_again(directory, case)
     target = out if out is not None else case_directory(directory, case)
@@ -219,9 +219,9 @@ def replay(
 
 def _write_products(target: Path, replayed: Replay, *, step: bool) -> list[str]:
     """Writes the products, stages and figures of a replayed case, all of them or none; returns lines that name them."""
-    from campaigns.store.products import PackedProducts, replaced_files, unpack_products, write_packed
-    from marsyard.steps import write_steps
-    from reports.systems import write_case_figures
+    from marsyard.campaigns.store.products import PackedProducts, replaced_files, unpack_products, write_packed
+    from marsyard.cli.steps import write_steps
+    from marsyard.reports.systems import write_case_figures
 
     packed = replayed.products or PackedProducts.nothing()
     products = unpack_products(packed)
@@ -257,9 +257,9 @@ def console(*, stderr: bool = False) -> Console:
 
 def make_crew(jobs: int | None, cluster: str | None) -> Crew:
     """Who runs a campaign, as the options say."""
-    from campaigns.errors import CampaignError
-    from campaigns.execution.crew import Crew
-    from campaigns.execution.workers import available_cores
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.execution.crew import Crew
+    from marsyard.campaigns.execution.workers import available_cores
 
     if jobs is not None and jobs < 1:
         raise CampaignError(f"--jobs {jobs}: at least one worker process is needed")
@@ -270,8 +270,8 @@ def make_crew(jobs: int | None, cluster: str | None) -> Crew:
 
 def _outcomes(words: Sequence[str]) -> list[str]:
     """What `--retry` asks for."""
-    from campaigns.errors import CampaignError, not_allowed
-    from campaigns.outcomes import RETRYABLE
+    from marsyard.campaigns.errors import CampaignError, not_allowed
+    from marsyard.campaigns.outcomes import RETRYABLE
 
     for word in words:
         if word not in (*RETRYABLE, "all"):
@@ -281,8 +281,8 @@ def _outcomes(words: Sequence[str]) -> list[str]:
 
 def carry_out(directory: Path, work: Callable[[Watch], None]) -> None:
     """Does a campaign's work and judges it; where it is interrupted says how to go on."""
-    from marsyard.outcome import conclude
-    from marsyard.run_log import RunLog
+    from marsyard.cli.outcome import conclude
+    from marsyard.cli.run_log import RunLog
 
     with shown_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
         work(log)
@@ -292,9 +292,9 @@ def carry_out(directory: Path, work: Callable[[Watch], None]) -> None:
 @contextmanager
 def shown_progress(directory: Path, to_go_on: str) -> Iterator[Watch]:
     """Shows how far the work in a folder is; where it is interrupted says how to go on, and ends with status 130."""
-    from campaigns.errors import CampaignError
-    from campaigns.store.record import read
-    from marsyard.progress import campaign_progress
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.store.record import read
+    from marsyard.cli.progress import campaign_progress
 
     try:
         with stopped_by_signals(), campaign_progress(console(stderr=True)) as progress:
@@ -333,8 +333,8 @@ def stopped_by_signals() -> Iterator[None]:
 
 def _print_estimate(campaign: Campaign, crew: Crew) -> None:
     """Prints what a campaign would take."""
-    from campaigns.running.estimate import estimate
-    from reports.wording import count
+    from marsyard.campaigns.running.estimate import estimate
+    from marsyard.reports.wording import count
 
     workers = crew.jobs if crew.cluster is None else os.cpu_count() or 1
     found = estimate(campaign, workers)
@@ -354,7 +354,7 @@ def _print_estimate(campaign: Campaign, crew: Crew) -> None:
 
 def _print_limits(campaign: Campaign) -> None:
     """Prints why the campaign's requirements cannot read PASS, and the change that helps."""
-    from marsyard.evidence import evidence_limits
+    from marsyard.cli.evidence import evidence_limits
 
     for limit in evidence_limits(campaign):
         typer.echo(f"note: {limit}")

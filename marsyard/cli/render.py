@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Bool, Float32, UInt16
 
-    from scenarios.views import SiteGround
-    from sim.camera import CameraModel
-    from sim.render import Frame, Scene
-    from sim.sensor import AutoExposure
-    from sim.terrain import Site
+    from marsyard.scenarios.views import SiteGround
+    from marsyard.sim.camera import CameraModel
+    from marsyard.sim.render import Frame, Scene
+    from marsyard.sim.sensor import AutoExposure
+    from marsyard.sim.terrain import Site
 
 #: Exit status where the command or a file is wrong, as elsewhere.
 WRONG = 2
@@ -52,10 +52,10 @@ class Shot:
     @classmethod
     def usual(cls, site: str, camera: str, **settings: Any) -> Shot:
         """A picture from the camera's usual stance where not set otherwise. Raises ValueError for what cannot be."""
-        from scenarios.imported_site import MAX_HOLE_FRACTION, is_terrain_file, site_or_file
-        from scenarios.views import STANCES
-        from sim.sensor import PRESETS
-        from sim.terrain import sites
+        from marsyard.scenarios.imported_site import MAX_HOLE_FRACTION, is_terrain_file, site_or_file
+        from marsyard.scenarios.views import STANCES
+        from marsyard.sim.sensor import PRESETS
+        from marsyard.sim.terrain import sites
 
         if not is_terrain_file(site):
             _known("site", site, sites())
@@ -84,7 +84,7 @@ class Shot:
     @property
     def place(self) -> Site:
         """The site, or that of the terrain model's file. Raises ValueError where it cannot be used."""
-        from scenarios.imported_site import site_or_file
+        from marsyard.scenarios.imported_site import site_or_file
 
         return site_or_file(self.site, self.max_hole_fraction)
 
@@ -227,7 +227,7 @@ def render(
 @contextmanager
 def says_why_not(out: Path) -> Iterator[None]:
     """Ends a command with what kept it from making pictures, or from writing them there."""
-    from sim.render.backend import RenderingError
+    from marsyard.sim.render.backend import RenderingError
 
     try:
         yield
@@ -243,11 +243,11 @@ def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Pictur
     """The picture; of a stereo pair both, or the left one alone."""
     import numpy as np
 
-    from scenarios.views import Eye, SiteGround, camera_pose, site_scene
-    from sim.frames import direction
-    from sim.render import PixelRays, Sun, process_renderer
-    from sim.render.backend import default_backend
-    from sim.sensor import preset
+    from marsyard.scenarios.views import Eye, SiteGround, camera_pose, site_scene
+    from marsyard.sim.frames import direction
+    from marsyard.sim.render import PixelRays, Sun, process_renderer
+    from marsyard.sim.render.backend import default_backend
+    from marsyard.sim.sensor import preset
 
     ground = SiteGround.of(shot.place, "descent" if shot.scale == "descent" else "ground", seed=shot.seed)
     of_camera = preset(shot.camera)
@@ -274,7 +274,7 @@ def _filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"
     """Which pixels see ground in holes of a terrain model; None where the ground is a preset's."""
     import numpy as np
 
-    from sim.terrain.embedding import embed
+    from marsyard.sim.terrain.embedding import embed
 
     terrain = ground.terrain
     if terrain.source is None:
@@ -290,8 +290,8 @@ def _exposed(
     shot: Shot, ground: SiteGround, camera: CameraModel, number: int, frame: Frame
 ) -> tuple[AutoExposure, UInt16[np.ndarray, "rows columns"]]:
     """What the camera's detector delivers at the site, exposed automatically; its rows are not summed."""
-    from sim.sensor import AutoExposureParameters, Detector, auto_expose, natural_fall_off, preset
-    from sim.streams import Streams
+    from marsyard.sim.sensor import AutoExposureParameters, Detector, auto_expose, natural_fall_off, preset
+    from marsyard.sim.streams import Streams
 
     streams = Streams(shot.seed, "render", number)
     of_camera, air = preset(shot.camera), ground.site.environment
@@ -317,8 +317,8 @@ def layers(picture: Picture) -> dict[str, Any]:
     """The truth layers, each of the picture's rows and columns, and the pose."""
     import numpy as np
 
-    from sim.render import process_renderer
-    from sim.render.backend import default_backend
+    from marsyard.sim.render import process_renderer
+    from marsyard.sim.render.backend import default_backend
 
     frame, scene = picture.frame, picture.scene
     directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
@@ -350,7 +350,7 @@ def write(picture: Picture, shot: Shot, prefix: Path) -> list[Path]:
     import cv2
     import numpy as np
 
-    from sim.camera import BODY_FRAME, write_cahvor
+    from marsyard.sim.camera import BODY_FRAME, write_cahvor
 
     png, npz, cahvor, sidecar = (_path(prefix, picture.suffix, ending) for ending in ENDINGS)
     done, encoded = cv2.imencode(".png", picture.sixteen_bit())
@@ -368,7 +368,7 @@ def record(picture: Picture, shot: Shot) -> dict[str, Any]:
     """All that a picture was made from, and what its numbers mean."""
     from importlib.metadata import version
 
-    from sim.render.backend import default_backend
+    from marsyard.sim.render.backend import default_backend
 
     columns, rows = picture.camera.size
     scene, exposed = picture.scene, picture.exposed
@@ -415,7 +415,7 @@ def _path(prefix: Path, suffix: str, ending: str) -> Path:
 
 def _check_files(prefix: Path, camera: str, overwrite: bool) -> None:
     """Raises ValueError where the files cannot be written, or are there and may not be replaced."""
-    from sim.sensor import preset
+    from marsyard.sim.sensor import preset
 
     folder = prefix.parent
     if prefix.name in ("", ".", ".."):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.configuration import CampaignConfiguration
-from reports.sampled import sampled
-from reports.statistics.proportions import minimum_sample_size
-from reports.verdicts import ESTIMATE
-from reports.wording import count, stated
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.reports.sampled import sampled
+from marsyard.reports.statistics.proportions import minimum_sample_size
+from marsyard.reports.verdicts import ESTIMATE
+from marsyard.reports.wording import count, stated
 
 #: Terrains of at most so many cases are counted; a draw takes milliseconds.
 _MOST_DRAWS = 5000

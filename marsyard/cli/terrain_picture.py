@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sim.terrain import Surface
-    from sim.terrain.embedding import Embedded
+    from marsyard.sim.terrain import Surface
+    from marsyard.sim.terrain.embedding import Embedded
 
 #: Longest side of a picture, pixels.
 MAX_PIXELS = 2048
@@ -26,7 +26,7 @@ def write_terrain_picture(path: Path, surface: Surface, real: Embedded | None) -
     import cv2
     import numpy as np
 
-    from sim.terrain.statistics import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
+    from marsyard.sim.terrain.statistics import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
 
     if path.suffix.lower() != ".png":
         raise ValueError(f"--picture {path}: a file that ends in .png is needed")

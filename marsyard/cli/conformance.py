@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marsyard.campaign_command import Exit, console, says_what_is_wrong
+from marsyard.cli.campaign import Exit, console, says_what_is_wrong
 
 if TYPE_CHECKING:
-    from scenarios.conformance import Finding, Subject
+    from marsyard.scenarios.conformance import Finding, Subject
 
 
 @says_what_is_wrong
@@ -34,8 +34,8 @@ def conformance(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Put an algorithm, or your own motion, instrument or score, to its suite: right types, no change of inputs, ..."""
-    from campaigns.running.conformance import examine, subject_of
-    from scenarios.parts.named import KINDS
+    from marsyard.campaigns.running.conformance import examine, subject_of
+    from marsyard.scenarios.parts.named import KINDS
 
     subject = subject_of(algorithm, task, time_limit)
     findings = []

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 
-from campaigns.errors import CampaignError
-from scenarios.descent.parameters import binned_size_for
-from sim.camera import CameraFileError, read_camera
+from marsyard.campaigns.errors import CampaignError
+from marsyard.scenarios.descent.parameters import binned_size_for
+from marsyard.sim.camera import CameraFileError, read_camera
 
 #: Terrains of a new campaign's bank: enough for cases that are appended, and as many as a bank may have.
 FEWEST_TERRAINS, MOST_TERRAINS = 10_000, 100_000

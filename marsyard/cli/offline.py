@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from marsyard.campaign_command import (
+from marsyard.cli.campaign import (
     CampaignArgument,
     ClusterOption,
     Exit,
@@ -38,11 +38,11 @@ def export(
     override: SetOption = None,
 ) -> None:
     """Write a campaign's pictures, measurements and cameras for others to answer; again to go on where it stopped."""
-    from campaigns.definition.loading import load_campaign
-    from campaigns.running.offline import Exported, export_campaign, truth_folder
-    from campaigns.store import record
-    from reports.wording import count
-    from scenarios.offline import EXPORT
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.running.offline import Exported, export_campaign, truth_folder
+    from marsyard.campaigns.store import record
+    from marsyard.reports.wording import count
+    from marsyard.scenarios.offline import EXPORT
 
     exported = Exported(out, truth if truth is not None else truth_folder(out))
     kept = ["retain.products=none", "retain.showcase=none"]
@@ -76,9 +76,9 @@ def score(
     cluster: ClusterOption = None,
 ) -> None:
     """Score answers that were made elsewhere: the scoring, the verdicts and the report of a run."""
-    from campaigns.running.engine import Watch, run_campaign
-    from campaigns.running.offline import Exported, other_pictures, scored_campaign, truth_folder
-    from reports.wording import count
+    from marsyard.campaigns.running.engine import Watch, run_campaign
+    from marsyard.campaigns.running.offline import Exported, other_pictures, scored_campaign, truth_folder
+    from marsyard.reports.wording import count
 
     exported = Exported(directory, truth if truth is not None else truth_folder(directory))
     words = ("marsyard", "score", str(directory), str(answers), "--truth", str(exported.truth))

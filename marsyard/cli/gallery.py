@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marsyard.render_command import Shot, says_why_not, take
+from marsyard.cli.render import Shot, says_why_not, take
 
 if TYPE_CHECKING:
     import numpy as np
@@ -117,7 +117,7 @@ def write_gallery(plates: Sequence[Plate], folder: Path) -> Path:
 
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    from sim.terrain import sites
+    from marsyard.sim.terrain import sites
 
     folder.mkdir(parents=True, exist_ok=True)
     for one in plates:
@@ -126,7 +126,7 @@ def write_gallery(plates: Sequence[Plate], folder: Path) -> Path:
     order = dict.fromkeys(one.shot.site for one in plates)
     groups = [(sites()[name], [_shown(one) for one in plates if one.shot.site == name]) for name in order]
     environment = Environment(
-        loader=PackageLoader("reports"),
+        loader=PackageLoader("marsyard.reports"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from marsyard.campaign_command import console, says_what_is_wrong, size_text
+from marsyard.cli.campaign import console, says_what_is_wrong, size_text
 
 #: What is kept, and what it costs to be without it.
 KINDS = {
@@ -44,7 +44,7 @@ def clean(
 
     Campaigns' folders are never touched. Running campaigns go on: what they need is built again.
     """
-    from campaigns.errors import CampaignError, not_allowed
+    from marsyard.campaigns.errors import CampaignError, not_allowed
 
     for kind in kinds or []:
         if kind not in KINDS:
@@ -73,8 +73,8 @@ def clean(
 
 def kept(kind: str) -> Kept:
     """What is kept of a kind. Raises CampaignError where MARSYARD_CACHE_GB is not a number of gigabytes."""
-    from campaigns.errors import CampaignError
-    from sim.cache import cache_directory, limit_bytes
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.sim.cache import cache_directory, limit_bytes
 
     folder = cache_directory(kind)
     sizes = []
@@ -94,7 +94,7 @@ def kept(kind: str) -> Kept:
 
 def _removed(folder: Path) -> int:
     """Removes all files in a folder; returns their bytes. What another process writes just now stays."""
-    from sim.cache import UNFINISHED
+    from marsyard.sim.cache import UNFINISHED
 
     freed = 0
     for path in sorted(folder.rglob("*"), reverse=True):

@@ -10,11 +10,11 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from campaigns.definition.campaign import Campaign
-from campaigns.definition.configuration import MOST_CASES, key_text, problems_of
-from campaigns.definition.loading import load_campaign
-from campaigns.errors import ConfigurationError, Problem
-from sim.files import check_regular
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import MOST_CASES, key_text, problems_of
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import ConfigurationError, Problem
+from marsyard.sim.files import check_regular
 
 #: The plan that ships with Marsyard.
 PLAN_FILE = Path(__file__).resolve().parents[1] / "scenarios" / "nightly.toml"

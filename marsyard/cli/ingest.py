@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marsyard.campaign_command import says_what_is_wrong
+from marsyard.cli.campaign import says_what_is_wrong
 
 if TYPE_CHECKING:
-    from scenarios.measured.store import StoredCases
+    from marsyard.scenarios.measured.store import StoredCases
 
 #: Name of the campaign's file.
 CAMPAIGN_FILE = "campaign.toml"
@@ -27,9 +27,9 @@ def ingest(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="New folder for the cases and their campaign.")],
 ) -> None:
     """Make a campaign of real cases from pictures with measured attitude and altitude."""
-    from campaigns.errors import CampaignError, StoreError
-    from scenarios.measured.ingest import ingest as ingested
-    from scenarios.measured.layout import INGEST_FILE, read_ingest_file
+    from marsyard.campaigns.errors import CampaignError, StoreError
+    from marsyard.scenarios.measured.ingest import ingest as ingested
+    from marsyard.scenarios.measured.layout import INGEST_FILE, read_ingest_file
 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StoreError(f"{out} is there already, and is not empty; name a new folder with --out")
@@ -47,8 +47,8 @@ def ingest(
         raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-    from campaigns.definition.loading import load_campaign
-    from reports.wording import count
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.reports.wording import count
 
     try:
         load_campaign(str(out / CAMPAIGN_FILE))
@@ -115,7 +115,7 @@ def _options(stored: StoredCases) -> str:
 
 def binned_size(delivered: tuple[int, int], rows_summed: int) -> tuple[int, int]:
     """The size (columns, rows) that DIMES bins delivered pictures to, whose rows are summed already."""
-    from scenarios.descent.parameters import binned_size_for
+    from marsyard.scenarios.descent.parameters import binned_size_for
 
     columns, rows = binned_size_for(delivered[0], delivered[1] * rows_summed)
     return (columns, rows) if delivered[1] % rows == 0 else delivered

@@ -13,16 +13,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from campaigns.definition.campaign import Campaign, leaves, value_at
-from campaigns.definition.configuration import CampaignConfiguration, description_at
-from campaigns.errors import CampaignError
-from campaigns.sampling.design import said_of
-from campaigns.sampling.dispersion import Dispersion
-from reports.columns import split_unit
-from reports.wording import asked_text, count
+from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, description_at
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.sampling.design import said_of
+from marsyard.campaigns.sampling.dispersion import Dispersion
+from marsyard.reports.columns import split_unit
+from marsyard.reports.wording import asked_text, count
 
 if TYPE_CHECKING:
-    from reports.sections import Grid
+    from marsyard.reports.sections import Grid
 
 #: Width of a column of drawn values with what sets it apart.
 _VALUE_WIDTH = 12
@@ -72,7 +72,7 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
     CampaignError
         Where the file has another ending or cannot be written, or there is nothing to draw.
     """
-    from reports.draws import Drawn, draws_figure, save_figure
+    from marsyard.reports.draws import Drawn, draws_figure, save_figure
 
     if path.suffix not in _FIGURES:
         raise CampaignError(f"--figure {path}: unknown kind of picture; allowed: {', '.join(_FIGURES)}")

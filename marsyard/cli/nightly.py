@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marsyard.campaign_command import Exit, JobsOption, console, make_crew, says_what_is_wrong, stopped_by_signals
+from marsyard.cli.campaign import Exit, JobsOption, console, make_crew, says_what_is_wrong, stopped_by_signals
 
 if TYPE_CHECKING:
-    from campaigns.execution.crew import Crew
-    from campaigns.running.engine import Watch
-    from marsyard.nightly_plan import Plan, PlannedCampaign
-    from reports.history import History, NightCampaign
-    from reports.regressions import Change
+    from marsyard.campaigns.execution.crew import Crew
+    from marsyard.campaigns.running.engine import Watch
+    from marsyard.cli.nightly_plan import Plan, PlannedCampaign
+    from marsyard.reports.history import History, NightCampaign
+    from marsyard.reports.regressions import Change
 
 #: What a nightly's folder holds.
 HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "site"
@@ -38,12 +38,12 @@ def nightly(
 
     Exit status: as of the campaigns, the worst; 1 also for a regression, or a campaign that could not be run.
     """
-    from campaigns.errors import StoreError
-    from campaigns.store.lock import folder_lock
-    from campaigns.store.record import git_commit
-    from marsyard.nightly_plan import PLAN_FILE, read_plan
-    from marsyard.progress import campaign_progress
-    from reports.history import FINISHED, INTERRUPTED, History
+    from marsyard.campaigns.errors import StoreError
+    from marsyard.campaigns.store.lock import folder_lock
+    from marsyard.campaigns.store.record import git_commit
+    from marsyard.cli.nightly_plan import PLAN_FILE, read_plan
+    from marsyard.cli.progress import campaign_progress
+    from marsyard.reports.history import FINISHED, INTERRUPTED, History
 
     path = plan or PLAN_FILE
     stated, crew = read_plan(path), make_crew(jobs, None)
@@ -79,12 +79,12 @@ class _Night:
 
 def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) -> None:
     """Runs a campaign, judges it, and keeps its figures; whatever goes wrong with it leaves the others alone."""
-    from campaigns.errors import CampaignError
-    from campaigns.running.engine import run_campaign
-    from marsyard.nightly_plan import definition_of
-    from marsyard.outcome import settle
-    from reports.between import figures_of, sample_of
-    from reports.history import NightCampaign, NightFigure
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.running.engine import run_campaign
+    from marsyard.cli.nightly_plan import definition_of
+    from marsyard.cli.outcome import settle
+    from marsyard.reports.between import figures_of, sample_of
+    from marsyard.reports.history import NightCampaign, NightFigure
 
     try:
         campaign = planned.load(now.plan.seed, now.night, folder)
@@ -105,14 +105,14 @@ def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) 
 
 
 def _changes(history: History, night: int) -> list[Change]:
-    from reports.regressions import changes, comparisons_of
+    from marsyard.reports.regressions import changes, comparisons_of
 
     return changes(comparisons_of(history, night))
 
 
 def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
     """Writes the page, renews the dashboard, and prints the page."""
-    from reports.dashboard.site import write_site
+    from marsyard.reports.dashboard.site import write_site
 
     text = _write_page(history, night, out, found)
     write_site(out / SITE, [out / RUNS])
@@ -121,9 +121,9 @@ def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> N
 
 def _write_page(history: History, night: int, out: Path, found: Sequence[Change]) -> str:
     """Writes what is known of the night so far, and returns it."""
-    from reports.campaign import write_whole
-    from reports.night_page import night_text
-    from reports.regressions import comparisons_of
+    from marsyard.reports.campaign import write_whole
+    from marsyard.reports.night_page import night_text
+    from marsyard.reports.regressions import comparisons_of
 
     nights = history.nights()
     now = next(one for one in nights if one.night == night)

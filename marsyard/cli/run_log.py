@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 if TYPE_CHECKING:
-    from campaigns.running.engine import Watch
+    from marsyard.campaigns.running.engine import Watch
 
 LOG_FILE = "run.log"
 #: Seconds between two lines on how far a stage is.

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from marsyard.campaign_command import says_what_is_wrong
+from marsyard.cli.campaign import says_what_is_wrong
 
 LOOPBACK = "127.0.0.1"
 
@@ -27,9 +27,9 @@ def dashboard(
     host: Annotated[str, typer.Option("--host", metavar="ADDRESS", help="With --serve: where to listen.")] = LOOPBACK,
 ) -> None:
     """Write a dashboard over stored campaigns: requirements, latest verdicts, trends, pages of campaigns and cases."""
-    from campaigns.definition.requirements import read_requirements
-    from campaigns.errors import CampaignError, StoreError
-    from reports.dashboard.site import write_site
+    from marsyard.campaigns.definition.requirements import read_requirements
+    from marsyard.campaigns.errors import CampaignError, StoreError
+    from marsyard.reports.dashboard.site import write_site
 
     missing = [str(one) for one in directories if not one.is_dir()]
     if missing:
@@ -48,8 +48,8 @@ def dashboard(
 
 
 def _serve(directory: Path, host: str, port: int) -> None:
-    from campaigns.errors import CampaignError
-    from marsyard.site_server import server
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.cli.site_server import server
 
     try:
         serving = server(directory, host, port)
