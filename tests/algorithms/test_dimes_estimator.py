@@ -367,9 +367,9 @@ def test_altitude_error_per_picture_costs_what_geometry_says() -> None:
         *measured.altitudes[:2],
         replace(measured.altitudes[2], altitude_m=measured.altitudes[2].altitude_m + error),
     )
-    for track in details_of(ESTIMATOR.estimate(replace(measured, altitudes=wrong))).tracks:
-        if track.pair == 0:
-            continue
+    tracks = [t for t in details_of(ESTIMATOR.estimate(replace(measured, altitudes=wrong))).tracks if t.pair == 1]
+    assert len(tracks) == 2
+    for track in tracks:
         earlier, later = (truth.positions[k, 2] for k in (1, 2))
         _, rays = measured.images[2].camera.binned(4, 1).rays(track.match_pixel[None, :])
         ray = truth.attitudes[2].apply(rays[0])

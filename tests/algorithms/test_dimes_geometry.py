@@ -135,7 +135,9 @@ def test_every_candidate_has_room_for_template_and_window() -> None:
             tilted(*rng.uniform([0.0, 0.0, 0.0], [25.0, 360.0, 360.0])),
         )
         geometry = search_geometry(first, second, OPTIONS)
-        for ground in candidates(first, second).ground:
+        found = candidates(first, second).ground
+        assert len(found) > 0
+        for ground in found:
             assert inside_frame(first, ground + square_outline(geometry.template_half_m, 15), 0.0, LIMIT).all()
             assert inside_frame(second, ground + square_outline(geometry.window_half_m, 15), 0.0, LIMIT).all()
 

@@ -281,15 +281,13 @@ def test_noise_of_a_detector_costs_little() -> None:
 
 def test_lucas_kanade_follows_in_the_same_loop() -> None:
     target = np.array([6.0, 0.1, 0.2])
-    drive = Drive(scene_of(slanted(1, target), target, 1), navcam(), lucas_kanade_tracker(SMALL))
+    tracker: TargetTracker = lucas_kanade_tracker(SMALL)
+    drive = Drive(scene_of(slanted(1, target), target, 1), navcam(), tracker)
+    assert tracker.state is TrackingState.NO_TARGET
     true, last = approach(drive, target, 0.1)[-1]
     assert last.found
+    assert tracker.state is TrackingState.NORMAL
     assert np.linalg.norm(pixel_of(last) - drive.true_pixel(true, target)) < 2.5
-
-
-def test_both_trackers_keep_the_protocol() -> None:
-    trackers: list[TargetTracker] = [VisualTargetTracker(), lucas_kanade_tracker()]
-    assert all(tracker.state is TrackingState.NO_TARGET for tracker in trackers)
 
 
 @pytest.mark.parametrize(
