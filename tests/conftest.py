@@ -35,6 +35,8 @@ os.environ["PYOPENGL_PLATFORM"] = _BACKEND
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ[_variable] = "1"
 os.environ["MPLBACKEND"] = "Agg"
+# Programs that tests start, and their workers, import the tests' modules by name.
+os.environ["PYTHONPATH"] = os.pathsep.join([*filter(None, [os.environ.get("PYTHONPATH")]), str(ROOT)])
 # Terrains that tests build outlive the run, but stay out of the user's own cache.
 os.environ.setdefault("MARSYARD_CACHE", str(ROOT / "build" / "test-cache"))
 

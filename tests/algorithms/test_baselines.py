@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_descent import INTERVAL_S, Flight, flight, render, terrain, tilted, waves
 
 from marsyard.algorithms.baselines import BaselineDetails, HomographyEstimator, PairPatches, PhaseCorrelationEstimator
 from marsyard.algorithms.baselines.homography import distortion
@@ -17,6 +16,7 @@ from marsyard.algorithms.dimes.binning import usable_views
 from marsyard.algorithms.dimes.ground import inside_frame, square
 from marsyard.algorithms.interface import VelocityEstimator, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
+from tests.algorithms.synthetic_descent import INTERVAL_S, Flight, flight, render, terrain, tilted, waves
 
 ESTIMATORS: dict[str, VelocityEstimator] = {"phase": PhaseCorrelationEstimator(), "homography": HomographyEstimator()}
 both = pytest.mark.parametrize("name", ESTIMATORS)

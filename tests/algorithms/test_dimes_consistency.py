@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic_descent import CAMERA, ROWS_SUMMED, calibration
 
 from marsyard.algorithms.dimes.binning import View, view
 from marsyard.algorithms.dimes.consistency import combinations, propagated
@@ -17,6 +16,7 @@ from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.validity import TrackMetrics, ValidityCheck, failed_checks
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DetectorImage
+from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, calibration
 
 THRESHOLD = DimesOptions().imu_threshold_m_s
 METRICS = TrackMetrics(contrast=0.02, peak=0.9, peak_width_px=4.0, second_peak_ratio=0.3, on_border=False)

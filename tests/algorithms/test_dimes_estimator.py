@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
-from synthetic_descent import (
+
+from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesOptions, ValidityCheck, dimes_products
+from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
+from marsyard.sim.frames import direction
+from marsyard.sim.measurements import DescentMeasurements
+from tests.algorithms.synthetic_descent import (
     INTERVAL_S,
     Flight,
     body_rays,
@@ -23,11 +28,6 @@ from synthetic_descent import (
     tilted,
     waves,
 )
-
-from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesOptions, ValidityCheck, dimes_products
-from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
-from marsyard.sim.frames import direction
-from marsyard.sim.measurements import DescentMeasurements
 
 ESTIMATOR: VelocityEstimator = DimesEstimator()
 LEVEL_FLIGHT = (tilted(0.0, 0.0, 0.0), tilted(0.0, 0.0, 0.0), tilted(0.0, 0.0, 0.0))

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic_descent import CAMERA, INTERVAL_S, ROWS_SUMMED, Texture, calibration, delivered, scene, tilted
 
 from marsyard.algorithms.dimes.binning import View, view
 from marsyard.algorithms.dimes.ground import (
@@ -31,6 +30,16 @@ from marsyard.algorithms.dimes.rectification import ground_lattice, rectified_pa
 from marsyard.algorithms.dimes.selection import best_candidates, contrasts, select_templates
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage
+from tests.algorithms.synthetic_descent import (
+    CAMERA,
+    INTERVAL_S,
+    ROWS_SUMMED,
+    Texture,
+    calibration,
+    delivered,
+    scene,
+    tilted,
+)
 
 OPTIONS = DimesOptions()
 LIMIT = OPTIONS.max_off_nadir_rad

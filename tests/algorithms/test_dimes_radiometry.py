@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic_descent import CAMERA, ROWS_SUMMED, calibration, delivered, fall_off, scene, terrain
 
 from marsyard.algorithms.dimes.binning import View, bin_factors, bin_mean, view
 from marsyard.algorithms.dimes.radiometry import corrected_patch
 from marsyard.algorithms.image.frame_transfer import without_frame_transfer
 from marsyard.sim.measurements import DetectorImage
+from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, calibration, delivered, fall_off, scene, terrain
 
 LEVEL = 1600.0
 TIMES = [(5e-6, 2e-6), (5e-6, 0.0), (0.0, 2e-6), (3e-6, 3e-6), (1e-6, 5e-6), (0.0, 0.0)]

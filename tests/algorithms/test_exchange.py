@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
-from synthetic_descent import Flight, render, tilted
 
 from marsyard.algorithms.answers import checked_site, checked_velocity
 from marsyard.algorithms.exchange import (
@@ -27,6 +26,7 @@ from marsyard.algorithms.exchange.serving import end_persistent
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, PoseMeasurement
+from tests.algorithms.synthetic_descent import Flight, render, tilted
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 TRUE = np.array([12.0, -7.0])

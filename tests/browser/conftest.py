@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Page, Request, sync_playwright
-
-HERE = str(Path(__file__).resolve().parents[1] / "reports")
-if HERE not in sys.path:
-    sys.path.append(HERE)
 
 
 @dataclass

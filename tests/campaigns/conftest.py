@@ -1,21 +1,14 @@
-"""Makes the fake scenario importable, here and in worker processes, and writes campaigns of it."""
+"""Campaigns of the fake scenario."""
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-HERE = str(Path(__file__).resolve().parent)
-if HERE not in sys.path:
-    sys.path.append(HERE)
-    os.environ["PYTHONPATH"] = os.pathsep.join([*filter(None, [os.environ.get("PYTHONPATH")]), HERE])
-
-from fake_campaign import TROUBLE, Silence, run, write_campaign  # noqa: E402
+from tests.campaigns.fake_campaign import TROUBLE, Silence, run, write_campaign
 
 
 @pytest.fixture

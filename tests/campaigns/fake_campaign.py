@@ -13,7 +13,7 @@ from marsyard.campaigns.store.table import read_rows
 
 HEAD = """
 name = "fake"
-scenario = "fake_scenario:FakeScenario"
+scenario = "tests.campaigns.fake_scenario:FakeScenario"
 description = "a campaign without a world"
 cases = 12
 seed = 5

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from folders import read_rows, velocity_folder, write_texts
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 from typer.testing import CliRunner
 
 from marsyard.cli.app import app
 from marsyard.scenarios.conformance import inputs
+from tests.scenarios.measured.folders import read_rows, velocity_folder, write_texts
 
 MARS = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
 DEGREES = CRS.from_string("+proj=longlat +R=3396190 +no_defs")

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from fake_campaign import HEAD, REQUIREMENT, write_campaign
 
 from marsyard.cli import app as cli
+from tests.campaigns.fake_campaign import HEAD, REQUIREMENT, write_campaign
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from folders import landing_folder, read_rows, velocity_folder, write_texts
 from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
 from marsyard.scenarios.conformance import inputs
+from tests.scenarios.measured.folders import landing_folder, read_rows, velocity_folder, write_texts
 
 
 def told(*words: str) -> tuple[int, str]:

@@ -16,11 +16,11 @@ from typing import Any
 from xml.etree import ElementTree as Xml
 
 import pytest
-from fake_campaign import rows_of
 from typer.testing import CliRunner
 
 from marsyard.cli.app import app
 from marsyard.reports.dashboard.site import write_site
+from tests.campaigns.fake_campaign import rows_of
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
@@ -39,7 +39,7 @@ class Mine:
 """
 CAMPAIGN = """
 name = "own campaign"
-scenario = "fake_velocity:FakeVelocityScenario"
+scenario = "tests.campaigns.fake_velocity:FakeVelocityScenario"
 cases = 50
 [[requirements]]
 id = "v"

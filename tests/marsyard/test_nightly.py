@@ -9,13 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli import app as cli
 from marsyard.cli import nightly as nightly_command
 from marsyard.cli.nightly_plan import PLAN_FILE, definition_of, night_seed, read_plan
+from tests.campaigns.fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),

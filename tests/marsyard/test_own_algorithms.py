@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from fake_campaign import rows_of
 from typer.testing import CliRunner
 
 from marsyard.cli.app import app
+from tests.campaigns.fake_campaign import rows_of
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
@@ -32,7 +32,7 @@ class Hostile:
 """
 CAMPAIGN = """
 name = "fake-velocity"
-scenario = "fake_velocity:FakeVelocityScenario"
+scenario = "tests.campaigns.fake_velocity:FakeVelocityScenario"
 cases = 2
 [[requirements]]
 id = "v"

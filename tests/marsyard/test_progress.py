@@ -9,13 +9,13 @@ import time
 from pathlib import Path
 
 import pytest
-from fake_campaign import Silence
 from rich.console import Console
 
 from marsyard.campaigns.running import compilation
 from marsyard.campaigns.running.compilation import compilation_reported
 from marsyard.cli.progress import BarProgress, LineProgress
 from marsyard.sim.kernel_cache import note_ready
+from tests.campaigns.fake_campaign import Silence
 
 
 class Clock:

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_campaign import Silence, run, write_campaign
 from typer.testing import CliRunner
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from marsyard.cli.app import app
+from tests.campaigns.fake_campaign import Silence, run, write_campaign
 
 SCENARIO = """
-from fake_scenario import FakeScenario
+from tests.campaigns.fake_scenario import FakeScenario
 
 class Mine(FakeScenario):
     pass
@@ -32,7 +32,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mine")
     (folder / "my_scenario.py").write_text(SCENARIO)
     path = write_campaign(folder)
-    path.write_text(path.read_text().replace("fake_scenario:FakeScenario", "my_scenario:Mine"))
+    path.write_text(path.read_text().replace("tests.campaigns.fake_scenario:FakeScenario", "my_scenario:Mine"))
     before = Path.cwd()
     os.chdir(folder)
     try:

@@ -15,7 +15,6 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from fake_campaign import REQUIREMENT, Silence, write_campaign
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
@@ -30,6 +29,7 @@ from marsyard.reports.notable import notable_cases
 from marsyard.reports.sampled import Sampled
 from marsyard.reports.stored import read_run
 from marsyard.reports.verdicts import judge_campaign
+from tests.campaigns.fake_campaign import REQUIREMENT, Silence, write_campaign
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),

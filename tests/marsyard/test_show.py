@@ -22,7 +22,7 @@ from marsyard.cli import app as cli
 
 CAMPAIGN = """
 name = "fake"
-scenario = "fake_scenario:FakeScenario"
+scenario = "tests.campaigns.fake_scenario:FakeScenario"
 description = "a campaign without a world"
 cases = 25
 seed = 5
@@ -263,7 +263,7 @@ def test_no_bytes_end_in_a_traceback(campaign: Path, text: bytes) -> None:
     ],
 )
 def test_odd_values_are_refused(campaign: Path, line: str) -> None:
-    head = "name = 'fake'\nscenario = 'fake_scenario:FakeScenario'\ncases = 3\n"
+    head = "name = 'fake'\nscenario = 'tests.campaigns.fake_scenario:FakeScenario'\ncases = 3\n"
     campaign.write_text(head + line)
     shown = marsyard("show", campaign)
     assert (shown.status, shown.out) == (2, "")

@@ -4,10 +4,7 @@ does not depend on it.
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,11 +27,8 @@ from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded
 from marsyard.scenarios.registry import scenario
 from marsyard.scenarios.velocity import asked
 from marsyard.sim.streams import Streams
+from tests.scenarios import spies
 
-for _folder in ("descent", "rover", ""):
-    sys.path.append(str(Path(__file__).resolve().parent / _folder))
-
-spies = importlib.import_module("tests.scenarios.spies")
 SPY = "tests.scenarios.spies"
 
 
@@ -47,9 +41,9 @@ def _empty() -> Iterator[None]:
 
 def run(name: str, algorithm: str, compared: tuple[str, ...] = (), case: int = 0) -> CaseResult:
     """A small case of a scenario."""
-    from settings import DESCENT, WORLD
-    from short_run import SHORT
-    from test_fieldtest import stated
+    from tests.scenarios.descent.settings import DESCENT, WORLD
+    from tests.scenarios.rover.short_run import SHORT
+    from tests.scenarios.test_fieldtest import stated
 
     chosen: dict[str, Any] = {"algorithm": f"{SPY}:{algorithm}", "compared": [f"{SPY}:{one}" for one in compared]}
     turn = {"legs": [{"motion": "circle", "step_deg": 5.0, "steps": 1}]}

@@ -7,11 +7,8 @@ known far better than any camera resolves), and the geometry of a mast (its erro
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Iterator
 from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,11 +30,8 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, MastCalibration, RoverMeasurements
 from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
+from tests.scenarios import spies
 
-for _folder in ("descent", "rover", ""):
-    sys.path.append(str(Path(__file__).resolve().parent / _folder))
-
-spies = importlib.import_module("tests.scenarios.spies")
 SPIES = {"scores": ["tests.scenarios.spies:keep"]}
 
 Numbers = Float[np.ndarray, "..."]
@@ -89,7 +83,7 @@ def assert_all_are_looked_at(kind: type[Any], names: set[str]) -> None:
 
 @pytest.mark.parametrize("case", range(3))
 def test_descents_are_measured(case: int) -> None:
-    from settings import DESCENT, WORLD
+    from tests.scenarios.descent.settings import DESCENT, WORLD
 
     p = DescentScenarioParameters.model_validate(
         {**WORLD, "descent": DESCENT, "algorithm": "tests.scenarios.spies:VelocitySpy", **SPIES}
@@ -129,7 +123,7 @@ def assert_flight_is_measured(
 @pytest.mark.parametrize("case", range(3))
 def test_triples_of_the_field_test_are_measured(case: int) -> None:
     """Their time tags are a virtual interval apart by the paper's method (III.D), whenever they were taken."""
-    from test_fieldtest import stated
+    from tests.scenarios.test_fieldtest import stated
 
     runs = [stated().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}]
     p = stated(runs=runs, algorithm="tests.scenarios.spies:VelocitySpy", **SPIES)
@@ -172,7 +166,7 @@ def test_landings_are_measured(case: int, helicopter: dict[str, Any] | None) -> 
 @pytest.mark.parametrize("case", range(2))
 def test_stops_of_a_rover_are_measured(case: int) -> None:
     """The estimated pose is right at the start by definition, and from then on never again."""
-    from short_run import SHORT
+    from tests.scenarios.rover.short_run import SHORT
 
     p = RoverScenarioParameters.model_validate({**SHORT, "algorithm": "tests.scenarios.spies:TrackerSpy"})
     run = run_case(p, Streams(1, "truth", case))

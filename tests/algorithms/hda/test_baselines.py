@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from relief_scene import Pass, bumps, measured, plane, pose
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaOptions
@@ -21,6 +20,7 @@ from marsyard.algorithms.hda.tracking import track_features
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
+from tests.algorithms.hda.relief_scene import Pass, bumps, measured, plane, pose
 
 OPTIONS = HdaOptions(block_px=32, grid_px=8)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from relief_scene import camera, pose
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import ElevationMap, HdaOptions, SurfaceFrame
 from marsyard.algorithms.hda.elevation import elevation_map
 from marsyard.algorithms.hda.surface import plane_normal, surface_from_camera, upwards, world_from_surface
 from marsyard.algorithms.hda.view import View, camera_pose
+from tests.algorithms.hda.relief_scene import camera, pose
 
 
 def cloud(count: int, rng: np.random.Generator, slopes: tuple[float, float] = (0.2, -0.1)) -> np.ndarray:

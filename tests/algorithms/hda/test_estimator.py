@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from relief_scene import Pass, bumps, measured, picture, plane, pose
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions, Safety, SurfaceFrame, TrackSeed, hda_products
@@ -15,6 +14,7 @@ from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlob
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements, PoseMeasurement
+from tests.algorithms.hda.relief_scene import Pass, bumps, measured, picture, plane, pose
 
 #: For pictures of 320 x 240; a lander of 1 m beside boulders of 0.3 m.
 OPTIONS = HdaOptions(

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from relief_scene import Pass, bumps, measured, plane, pose
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import Fate, HdaEstimator, HdaOptions
@@ -24,6 +23,7 @@ from marsyard.algorithms.hda.structure import (
 )
 from marsyard.algorithms.hda.view import undistorted
 from marsyard.sim.frames import rigid
+from tests.algorithms.hda.relief_scene import Pass, bumps, measured, plane, pose
 
 OPTIONS = HdaOptions(block_px=32, grid_px=8)
 RELIEF = bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=plane(0.05, 0.02))

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from relief_scene import Pass, bumps, camera, picture, plane, pose
 
 from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.hda.features import eigenvalue_test, select_features
@@ -15,6 +14,7 @@ from marsyard.algorithms.hda.pyramid import LevelSize, level_sizes, pyramid, rea
 from marsyard.algorithms.hda.tracking import track_features
 from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
 from marsyard.algorithms.image.peak import biquadratic_offset, highest_peak
+from tests.algorithms.hda.relief_scene import Pass, bumps, camera, picture, plane, pose
 
 OPTIONS = HdaOptions(block_px=32)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from relief_scene import camera
 
 from marsyard.algorithms.hda.view import flat_fielded
 from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
 from marsyard.sim.sensor.optics import OpticsParameters
+from tests.algorithms.hda.relief_scene import camera
 
 
 def delivered(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, DetectorImage]:

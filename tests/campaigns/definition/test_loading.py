@@ -16,6 +16,7 @@ from marsyard.campaigns.definition.loading import find_campaign, load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 
 CampaignFile = Callable[..., Path]
+FAKE = "tests.campaigns.fake_scenario"
 
 
 def refusal(path: Path | str, *overrides: str, cases: int | None = None, seed: int | None = None) -> str:
@@ -123,17 +124,32 @@ def test_draws_that_are_refused_only_together(campaign_file: CampaignFile) -> No
             "unknown scenario 'descnt' (did you mean 'descent'?)",
         ),
         ("name='a'\nscenario='no_such_module:X'\ncases=1", "scenario: no scenario at 'no_such_module:X': No module"),
-        ("name='a'\nscenario='fake_scenario:Wind'\ncases=1", "is not a scenario: it has no parameters_type"),
-        ("name='a b'\nscenario='fake_scenario:FakeScenario'\ncases=1", "name: string should match pattern"),
-        ("scenario='fake_scenario:FakeScenario'\ncases=1", "name: required, but missing"),
         (
-            "name='a'\nscenario='fake_scenario:FakeScenario'\ncases=0",
+            f"name='a'\nscenario='{FAKE}:Wind'\ncases=1",
+            "is not a scenario: it has no parameters_type",
+        ),
+        (
+            f"name='a b'\nscenario='{FAKE}:FakeScenario'\ncases=1",
+            "name: string should match pattern",
+        ),
+        (f"scenario='{FAKE}:FakeScenario'\ncases=1", "name: required, but missing"),
+        (
+            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=0",
             "cases: input should be greater",
         ),
-        ("name='a'\nscenario='fake_scenario:FakeScenario'\ncases=true", "cases: input should be a valid integer"),
-        ("name='a'\nscenario='fake_scenario:FakeScenario'\ncases=1\nseed=-1", "seed: input should be greater than or"),
-        ("name='a'\nscenario='fake_scenario:FakeScenario'\ncases=1\nsed=1", "sed: unknown key (did you mean 'seed'?)"),
-        ("name='a'\nscenario='fake_scenario:FakeScenario'\ncases=1\nx=", "not valid TOML"),
+        (
+            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=true",
+            "cases: input should be a valid integer",
+        ),
+        (
+            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nseed=-1",
+            "seed: input should be greater than or",
+        ),
+        (
+            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nsed=1",
+            "sed: unknown key (did you mean 'seed'?)",
+        ),
+        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nx=", "not valid TOML"),
     ],
 )
 def test_the_campaign_itself(campaign_file: CampaignFile, head: str, said: str) -> None:
@@ -280,7 +296,7 @@ _values = st.recursive(
 @given(changes=st.dictionaries(_words, _values, min_size=1, max_size=3))
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_no_file_ends_in_a_traceback(tmp_path: Path, changes: dict[str, object]) -> None:
-    base: dict[str, object] = {"name": "fake", "scenario": "fake_scenario:FakeScenario", "cases": 3}
+    base: dict[str, object] = {"name": "fake", "scenario": "tests.campaigns.fake_scenario:FakeScenario", "cases": 3}
     text = "\n".join(f"{_toml(key)} = {_toml(value)}" for key, value in {**base, **changes}.items())
     path = tmp_path / "fuzzed.toml"
     path.write_text(text)
@@ -317,7 +333,7 @@ def test_a_spoilt_value_is_named_by_its_key(tmp_path: Path, place: tuple[str, st
     table, key = place
     tables = {name: dict(inner) for name, inner in _WHOLE.items()}
     tables[table].pop(key) if gone else tables[table].update({key: value})
-    head = 'name = "fake"\nscenario = "fake_scenario:FakeScenario"\ncases = 12\n'
+    head = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\ncases = 12\n'
     texts = [f"{name} = {_toml([inner] if name == 'requirements' else inner)}" for name, inner in tables.items()]
     path = tmp_path / "spoilt.toml"
     path.write_text(head + "\n".join(texts))

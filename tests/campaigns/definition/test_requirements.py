@@ -5,7 +5,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from fake_campaign import write_campaign
 
 from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.loading import load_campaign
@@ -15,6 +14,7 @@ from marsyard.campaigns.definition.requirements import (
     shipped_requirements,
 )
 from marsyard.campaigns.errors import ConfigurationError
+from tests.campaigns.fake_campaign import write_campaign
 
 NAMED = {
     "DIMES-VEL": 5.0, "DIMES-HARM": 5.0, "DIMES-AVAIL": None, "VTT-POS": 0.03, "VTT-TRACK": None, "VTT-HARM": None,

@@ -9,7 +9,6 @@ from typing import Any
 
 import distributed
 import pytest
-from fake_campaign import Silence
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
@@ -19,6 +18,7 @@ from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import read_rows
+from tests.campaigns.fake_campaign import Silence
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),

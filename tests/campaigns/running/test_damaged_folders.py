@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import typer
-from fake_campaign import Silence, rows_of, run
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError, ConfigurationError, StoreError
@@ -24,6 +23,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.campaigns.store.table import write_table
 from marsyard.cli.campaign import says_what_is_wrong
+from tests.campaigns.fake_campaign import Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]
 

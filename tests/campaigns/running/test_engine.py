@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from fake_campaign import TROUBLE, Silence, rows_of, run
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError, StoreError
@@ -18,6 +17,7 @@ from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import refresh_table
+from tests.campaigns.fake_campaign import TROUBLE, Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]
 

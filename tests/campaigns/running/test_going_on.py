@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_campaign import Silence, rows_of, run
 
 from marsyard.campaigns.definition.identity import package_versions
 from marsyard.campaigns.errors import CampaignError, StoreError
@@ -17,6 +16,7 @@ from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import folder_lock
+from tests.campaigns.fake_campaign import Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]
 

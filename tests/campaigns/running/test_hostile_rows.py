@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_campaign import Silence, rows_of, run, write_campaign
-from hostile_scenario import DEEDS
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.stored import read_run
 from marsyard.reports.verdicts import Status, judge_campaign
+from tests.campaigns.fake_campaign import Silence, rows_of, run, write_campaign
+from tests.campaigns.hostile_scenario import DEEDS
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 HEAD = """
 name = "hostile"
-scenario = "hostile_scenario:HostileScenario"
+scenario = "tests.campaigns.hostile_scenario:HostileScenario"
 cases = 24
 """
 REQUIREMENTS = """

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_campaign import Silence, run
 
 from marsyard.campaigns.definition.identity import identity_of
 from marsyard.campaigns.definition.loading import load_campaign
@@ -17,6 +16,7 @@ from marsyard.campaigns.execution.crew import Crew
 from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
+from tests.campaigns.fake_campaign import Silence, run
 
 CAMERA = (
     "Model = CAHV = perspective, linear\nDimensions = 1024 1024\nC = 0 0 0\nA = 0 0 1\nH = 1200 0 512\nV = 0 1200 512\n"

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from fake_campaign import HEAD, Silence, rows_of, run
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
@@ -16,6 +15,7 @@ from marsyard.campaigns.running.estimate import estimate
 from marsyard.campaigns.running.inputs import plan_inputs, used_inputs
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.registry import SCENARIOS, scenario
+from tests.campaigns.fake_campaign import HEAD, Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]
 DRAWN = '[dispersions]\nterrain = {distribution = "integer", low = 0, high = 9}'

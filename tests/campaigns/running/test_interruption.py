@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_campaign import Silence, rows_of, run
 
 from marsyard.campaigns.execution.crew import Crew
 from marsyard.campaigns.execution.workers import LocalWorkers
@@ -22,6 +21,7 @@ from marsyard.campaigns.running.engine import resume_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import refresh_table
+from tests.campaigns.fake_campaign import Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]
 

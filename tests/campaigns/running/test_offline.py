@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from fake_campaign import Silence, rows_of
 
 from marsyard.algorithms.baselines import HomographyEstimator
 from marsyard.algorithms.exchange import read_case
@@ -24,11 +23,12 @@ from marsyard.campaigns.running.offline import (
 )
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.sim.measurements import DescentMeasurements
+from tests.campaigns.fake_campaign import Silence, rows_of
 
 CASES = 3
 FILE = f"""
 name = "fake-velocity"
-scenario = "fake_velocity:FakeVelocityScenario"
+scenario = "tests.campaigns.fake_velocity:FakeVelocityScenario"
 cases = {CASES}
 seed = 3
 [[requirements]]

@@ -17,7 +17,7 @@ from marsyard.campaigns.sampling.correlation import Correlation
 
 CampaignFile = Callable[..., Path]
 CASES = 4000
-HEAD = 'name = "fake"\nscenario = "fake_scenario:FakeScenario"\nseed = 5\ncases = {cases}\n'
+HEAD = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = 5\ncases = {cases}\n'
 #: Standard errors that a right sampler stays within but for one seed in 16,000 for each figure.
 BAND = 4.0
 

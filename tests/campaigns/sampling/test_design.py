@@ -18,7 +18,9 @@ from marsyard.campaigns.errors import ConfigurationError
 from marsyard.campaigns.sampling.design import stratified
 
 CampaignFile = Callable[..., Path]
-HEAD = 'name = "fake"\nscenario = "fake_scenario:FakeScenario"\nseed = {seed}\ncases = {cases}\n{more}\n'
+HEAD = (
+    'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = {seed}\ncases = {cases}\n{more}\n'
+)
 DISPERSIONS = """
 [dispersions]
 "wind.east_m_s" = {distribution = "uniform", low = 0, high = 1}

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_campaign import Silence, rows_of, run
 
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.loading import load_campaign
@@ -21,6 +20,7 @@ from marsyard.campaigns.store.retention import fails
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import write_table
 from marsyard.campaigns.store.worst import showcase_case, worst_cases
+from tests.campaigns.fake_campaign import Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from folders import landing_folder, read_rows, velocity_folder, write_texts
 
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.measured.ingest import ingest
@@ -17,6 +16,7 @@ from marsyard.scenarios.measured.layout import IngestError
 from marsyard.scenarios.measured.matching import MatchingScenario
 from marsyard.scenarios.measured.store import CasesFile, images_of
 from marsyard.sim.streams import Streams
+from tests.scenarios.measured.folders import landing_folder, read_rows, velocity_folder, write_texts
 
 Rows = list[dict[str, str]]
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import landing_folder, read_rows, velocity_folder, write_texts
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesEstimator
@@ -18,6 +17,7 @@ from marsyard.scenarios.measured.landing import MeasuredLandingScenario
 from marsyard.scenarios.measured.matching import MatchingScenario
 from marsyard.scenarios.parts import ScoredSite, ScoredVelocity
 from marsyard.sim.streams import Streams
+from tests.scenarios.measured.folders import landing_folder, read_rows, velocity_folder, write_texts
 
 STREAMS = Streams(seed=1, campaign="measured", case=0)
 TRUE = inputs.DESCENT_VELOCITY_M_S[:2]

@@ -3,13 +3,13 @@
 import re
 
 import pytest
-from short_run import SHORT
 
 from marsyard.scenarios.rover import RoverScenarioParameters, run_case
 from marsyard.scenarios.rover import run as loop
 from marsyard.scenarios.rover.mapping import Mapper
 from marsyard.scenarios.rover.vehicle import Vehicle
 from marsyard.sim.streams import Streams
+from tests.scenarios.rover.short_run import SHORT
 
 
 def test_a_step_drives_by_what_was_tracked_and_mapped_before_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
-from short_run import SHORT
 
 from marsyard.scenarios.rover import RoverScenario, RoverScenarioParameters
 from marsyard.scenarios.rover.parameters import CameraParameters
@@ -17,6 +16,7 @@ from marsyard.sim.camera import write_cahvor
 from marsyard.sim.frames import rigid
 from marsyard.sim.sensor import preset, stereo_mast
 from marsyard.sim.streams import Streams
+from tests.scenarios.rover.short_run import SHORT
 
 OPENCV = (
     "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [640, 0, 321, 0, 640, 238, 0, 0, 1]}\n"

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from short_run import SHORT
 
 from marsyard.scenarios.rover import (
     RoverScenario,
@@ -14,6 +13,7 @@ from marsyard.scenarios.rover import (
 from marsyard.scenarios.rover.shared import shared_drive, tracked
 from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.streams import Streams
+from tests.scenarios.rover.short_run import SHORT
 
 
 def parameters(**changes: object) -> RoverScenarioParameters:
