@@ -5,9 +5,11 @@ from __future__ import annotations
 import io
 import math
 import os
+import re
 import warnings
 import zipfile
 from collections.abc import Mapping
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from rasterio.transform import Affine
 from rasterio.warp import transform
 
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.scenarios import terrain_files
 from marsyard.scenarios.descent import DescentScenarioParameters
 from marsyard.scenarios.terrain_files import check_source, grid_north_deg
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError
@@ -243,3 +246,9 @@ def test_campaigns_refuse_them_when_they_are_read(tmp_path: Path) -> None:
     path = tif(tmp_path, crs=None)
     with pytest.raises(ValidationError, match=r"dtm.tif: states no projection"):
         DescentScenarioParameters.model_validate({"terrain": {"source": {"dtm": str(path)}}})
+
+
+def test_advice_names_commands_that_are_installed() -> None:
+    named = set(re.findall(r"\brio ([a-z]+(?:-[a-z]+)*)", Path(terrain_files.__file__).read_text()))
+    assert "warp" in named
+    assert named <= {command.name for command in entry_points(group="rasterio.rio_commands")}
