@@ -164,15 +164,7 @@ class SwingDescent:
 
     def state(self, time_s: float) -> State:
         """Truth at a time. Raises ValueError outside of the span."""
-        m = self.motion(np.array([time_s]))
-        return State(
-            time_s=time_s,
-            position_m=m.positions_m[0],
-            velocity_m_s=m.velocities_m_s[0],
-            attitude=m.attitudes[0],
-            body_rate_rad_s=m.body_rates_rad_s[0],
-            specific_force_m_s2=m.specific_forces_m_s2[0],
-        )
+        return self.motion(np.array([time_s])).state(0)
 
     def time_of_altitude(self, altitude_m: float) -> float:
         """When the camera passes an altitude above `ground_height_m`. Raises ValueError if it does not in the span."""
@@ -278,5 +270,4 @@ def _tilt_axis(azimuth_rad: float) -> Vector:
 def _across(vector: Vector, direction: Vector) -> Vector:
     """Unit vector of the part of a vector across a direction."""
     part = vector - (vector @ direction) * direction
-    unit: Vector = part / np.linalg.norm(part)
-    return unit
+    return np.asarray(part / np.linalg.norm(part))
