@@ -42,8 +42,7 @@ class Vibration:
     def derivative(self, times_s: Float64[np.ndarray, "n"], order: int) -> Float64[np.ndarray, "n 6"]:
         """Displacement (order 0) or a derivative of it at these times."""
         turned = self.rate_rad_s * times_s[:, None] + self.phases_rad + 0.5 * np.pi * order
-        shaken: Float64[np.ndarray, "n 6"] = self.amplitudes * self.rate_rad_s**order * np.sin(turned)
-        return shaken
+        return np.asarray(self.amplitudes * self.rate_rad_s**order * np.sin(turned))
 
 
 @dataclass(frozen=True)
@@ -78,8 +77,7 @@ class FlownPath:
     @property
     def knots_s(self) -> Float64[np.ndarray, "knots"]:
         """Times of the rows."""
-        times: Float64[np.ndarray, "knots"] = self.start_s + self.step_s * np.arange(len(self.rows))
-        return times
+        return np.asarray(self.start_s + self.step_s * np.arange(len(self.rows)))
 
     def state(self, time_s: float) -> State:
         """Truth at a time. Raises ValueError outside of the span."""
