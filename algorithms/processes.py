@@ -57,4 +57,4 @@ def _kilobytes(process: int, file: str, fields: str) -> float:
         text = Path(f"/proc/{process}/{file}").read_text()
     except OSError:
         return 0.0
-    return sum(float(size) for size in re.findall(rf"^{fields}:\s+(\d+) kB", text, re.MULTILINE))
+    return float(sum(int(size) for size in re.findall(rf"^{fields}:\s+(\d+) kB", text, re.MULTILINE)))

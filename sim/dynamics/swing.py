@@ -50,8 +50,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.sim.dynamics.chain import Modes, SwingParameters, chain_of
 from marsyard.sim.dynamics.integration import Path, StateVector
 from marsyard.sim.dynamics.kernels.swing import AXIS, CANOPY, LINE, Chain, truth
-from marsyard.sim.dynamics.state import State
-from marsyard.sim.dynamics.trajectory import Motion
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory
 from marsyard.sim.dynamics.wind import Wind
 
 Vector = Float64[np.ndarray, "3"]
@@ -64,7 +63,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True)
-class SwingDescent:
+class SwingDescent(Trajectory):
     """A descent through a place; a `Trajectory`.
 
     The body's origin is the camera, with the IMU beside it. At zero time, the first picture's nominal time, it is where
@@ -161,10 +160,6 @@ class SwingDescent:
         """Truth at many times. Raises ValueError outside of the span."""
         positions, velocities, matrices, rates, forces = truth(self.path.at(times_s), self.chain, self.wind.field)
         return Motion(times_s, positions, velocities, Rotation.from_matrix(matrices, assume_valid=True), rates, forces)
-
-    def state(self, time_s: float) -> State:
-        """Truth at a time. Raises ValueError outside of the span."""
-        return self.motion(np.array([time_s])).state(0)
 
     def time_of_altitude(self, altitude_m: float) -> float:
         """When the camera passes an altitude above `ground_height_m`. Raises ValueError if it does not in the span."""

@@ -10,8 +10,7 @@ from jaxtyping import Float64
 from marsyard.sim.dynamics.angles import turning
 from marsyard.sim.dynamics.rotorcraft.kernels import ANGLE, PLACE, PUSH, RATE, SPEED, TWIST
 from marsyard.sim.dynamics.rotorcraft.parameters import VibrationParameters
-from marsyard.sim.dynamics.state import State
-from marsyard.sim.dynamics.trajectory import Motion
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Vibration:
 
 
 @dataclass(frozen=True)
-class FlownPath:
+class FlownPath(Trajectory):
     """A flight from its rows (see `kernels`); place and angles are twice continuously differentiable.
 
     The body frame has its origin in camera, laser and instruments, x forward, y to the left, z up along the rotor.
@@ -78,10 +77,6 @@ class FlownPath:
     def knots_s(self) -> Float64[np.ndarray, "knots"]:
         """Times of the rows."""
         return np.asarray(self.start_s + self.step_s * np.arange(len(self.rows)))
-
-    def state(self, time_s: float) -> State:
-        """Truth at a time. Raises ValueError outside of the span."""
-        return self.motion(np.array([time_s])).state(0)
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Truth at many times. Raises ValueError outside of the span."""
