@@ -19,9 +19,9 @@ from marsyard.algorithms.dimes.overlap import (
 from marsyard.algorithms.dimes.rectification import rectified_patch
 from marsyard.algorithms.dimes.selection import select_templates
 from marsyard.algorithms.dimes.validity import failed_checks, track_metrics
+from marsyard.algorithms.image.alignment import refine_shift
 from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
 from marsyard.algorithms.image.peak import Peak, biquadratic_offset, highest_peak
-from marsyard.algorithms.image.registration import registered
 
 
 def match_corner(
@@ -36,8 +36,8 @@ def match_corner(
     if not options.subpixel:
         return whole
     start = whole + biquadratic_offset(surface, peak)
-    aligned = registered(template, window, start, "shift") if options.align and not peak.on_border else None
-    return start if aligned is None else aligned.corner
+    aligned = refine_shift(template, window, start) if options.align and not peak.on_border else None
+    return start if aligned is None else aligned
 
 
 def camera_displacement(corner: Float[np.ndarray, "2"], geometry: SearchGeometry) -> Float[np.ndarray, "2"]:

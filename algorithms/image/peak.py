@@ -32,7 +32,7 @@ def biquadratic_offset(surface: Float[np.ndarray, "rows columns"], peak: Peak) -
     """Offset (row, column) of the top of the quadric through the 3 x 3 values about the peak, by least squares.
 
     In pixels, held to [-1, 1]; zero on the border and where the quadric has no maximum. Its bias towards whole pixels
-    reaches several hundredths of a pixel; `marsyard.algorithms.image.registration` removes it.
+    reaches several hundredths of a pixel; see `marsyard.algorithms.image.alignment` for what removes it.
     """
     if peak.on_border:
         return np.zeros(2)

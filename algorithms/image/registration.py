@@ -1,8 +1,5 @@
 """Registration of a template that may have been shifted, stretched and bent: Gauss-Newton on quintic splines.
 
-Fits of a surface to a correlation peak lean towards whole pixels (up to about 0.09 px for the biquadratic). Aligning
-the pictures themselves, with the window interpolated by a spline of high order, has no such lean.
-
 Shifting alone leans: where the picture is longer one way than the template, texture that is denser on one side pulls
 the match to that side, by up to tenths of a pixel. Solving for the stretch as well takes that out. Of a round surface
 seen from another height the picture bends: its middle moves otherwise than its border does on the mean, always to the
@@ -17,8 +14,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from marsyard.algorithms.image.alignment import SURROUND, spline_coefficients
 from marsyard.algorithms.image.kernels import registration as kernels
-from marsyard.algorithms.image.resampling import SURROUND, spline_coefficients
 
 #: What a template may have undergone: a shift; a linear map too; a quadratic map of its offsets too.
 Warp = Literal["shift", "stretch", "bend"]

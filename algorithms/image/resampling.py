@@ -5,22 +5,11 @@ OpenCV's warps place samples up to 0.05 px wrong; a tracker that replaces its te
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage
 
+from marsyard.algorithms.image.alignment import SURROUND, spline_coefficients
 from marsyard.algorithms.image.kernels import quintic as kernels
-
-ORDER: Final = 5
-#: Pixels around a patch that the spline is computed from; what is beyond shifts a match by less than 1e-4 px.
-SURROUND = 12
-
-
-def spline_coefficients(image: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
-    """Coefficients of the quintic spline through the picture; borders mirror about their last pixels."""
-    return np.asarray(ndimage.spline_filter(image, order=ORDER, output=np.float64, mode="mirror"))
 
 
 def similarity_patch(

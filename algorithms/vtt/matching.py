@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform
 
+from marsyard.algorithms.image.alignment import SURROUND
 from marsyard.algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
 from marsyard.algorithms.image.peak import Peak, biquadratic_offset
 from marsyard.algorithms.image.registration import Warp, registered, splined
-from marsyard.algorithms.image.resampling import SURROUND, similarity_patch
+from marsyard.algorithms.image.resampling import similarity_patch
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.target import bearing_rad
 from marsyard.sim.camera import CameraModel

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.image.resampling import SURROUND
+from marsyard.algorithms.image.alignment import SURROUND
 from marsyard.algorithms.interface import MastAim, PixelBox
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.stereo import epipolar_pixels

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
+from marsyard.algorithms.image.alignment import refine_shift, shifted_patch, spline_coefficients
 from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
 from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
 from marsyard.algorithms.image.kernels import cubic
 from marsyard.algorithms.image.peak import Peak, biquadratic_offset, highest_peak, peak_width, second_peak
-from marsyard.algorithms.image.registration import registered
 
 
 def brute_force(template: np.ndarray, window: np.ndarray) -> np.ndarray:
@@ -76,11 +76,6 @@ def blobs(seed: int, shift: tuple[float, float] = (0.0, 0.0), size: int = 55, wi
     return image
 
 
-def shifted(template: np.ndarray, window: np.ndarray, corner: np.ndarray) -> np.ndarray | None:
-    match = registered(template, window, corner, "shift")
-    return None if match is None else match.corner
-
-
 def subpixel_errors(align: bool) -> np.ndarray:
     """Errors (row, column) of measured shifts over a table of fractions of a pixel."""
     fractions = np.linspace(-0.5, 0.5, 6)
@@ -92,7 +87,7 @@ def subpixel_errors(align: bool) -> np.ndarray:
         peak = highest_peak(surface)
         found: np.ndarray | None = np.array([peak.row, peak.column]) + biquadratic_offset(surface, peak)
         if align:
-            found = shifted(template, window, found)
+            found = refine_shift(template, window, found)
         assert found is not None
         errors.append(found - 12.0 - np.array([fy, fx]))
     return np.array(errors)
@@ -108,12 +103,25 @@ def test_subpixel_bias() -> None:
 def test_alignment_gives_up_rather_than_wander() -> None:
     window = blobs(1)
     template = blobs(2)[12:43, 12:43]
-    assert shifted(np.zeros((31, 31)), window, np.array([12.0, 12.0])) is None
-    assert shifted(window[12:43, 12:43], window, np.array([1.0, 12.0])) is None  # too near the border
+    assert refine_shift(np.zeros((31, 31)), window, np.array([12.0, 12.0])) is None
+    assert refine_shift(window[12:43, 12:43], window, np.array([1.0, 12.0])) is None  # too near the border
     edge = np.tile(np.linspace(0.0, 1.0, 55), (55, 1))
-    assert shifted(edge[12:43, 12:43], edge, np.array([12.0, 12.0])) is None  # slides along itself
-    found = shifted(template, window, np.array([12.0, 12.0]))
+    assert refine_shift(edge[12:43, 12:43], edge, np.array([12.0, 12.0])) is None  # slides along itself
+    found = refine_shift(template, window, np.array([12.0, 12.0]))
     assert found is None or np.hypot(*(found - 12.0)) <= 1.5
+
+
+def test_shifted_patch_equals_scipys_spline() -> None:
+    image = blobs(4)
+    corner = np.array([20.3, 17.8])
+    patch, by_row, by_column = shifted_patch(spline_coefficients(image), corner, (9, 11))
+    places = np.mgrid[:9, :11] + corner[:, None, None]
+    np.testing.assert_allclose(patch, ndimage.map_coordinates(image, places, order=5, mode="mirror"), atol=1e-12)
+    step = 1e-4
+    ahead = shifted_patch(spline_coefficients(image), corner + np.array([step, 0.0]), (9, 11))[0]
+    right = shifted_patch(spline_coefficients(image), corner + np.array([0.0, step]), (9, 11))[0]
+    np.testing.assert_allclose(by_row, (ahead - patch) / step, atol=1e-3)
+    np.testing.assert_allclose(by_column, (right - patch) / step, atol=1e-3)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 2), (23, 17)])
