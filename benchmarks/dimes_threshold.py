@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-import marsyard.algorithms.dimes.threshold as derivation
+import benchmarks.threshold_derivation as derivation
+from marsyard.algorithms.dimes import options
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.reports.statistics.samples import quantile_bounds
 
-STORED = Path(derivation.__file__).with_name("imu_threshold.json")
+STORED = Path(options.__file__).with_name("imu_threshold.json")
 #: Raised when the derivation changes in a way that its inputs do not tell.
 VERSION = 1
 QUANTILES = (0.5, 0.9, 0.95, 0.99, 0.995, 0.999)
@@ -41,7 +42,7 @@ def derived(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
         for bounds in WRONG_BY_M_S
     ]
     return {
-        "derivation": "marsyard.algorithms.dimes.threshold",
+        "derivation": "benchmarks.threshold_derivation",
         "derivation_version": VERSION,
         "versions": {name: version(name) for name in ("marsyard", "numpy", "scipy")},
         "inputs": asdict(inputs),

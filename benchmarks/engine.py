@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from joblib import Parallel, delayed
 from pydantic import BaseModel, ConfigDict
 
 from benchmarks.timing import Figure
+from marsyard.algorithms.processes import resident_bytes
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
 from marsyard.campaigns.definition.loading import load_campaign
@@ -67,7 +69,7 @@ class Stopwatch:
     def step(self) -> None:
         self._done += self._counts
         if self._counts and self._done in self._marks:
-            self.at[self._done] = (time.perf_counter(), _resident_mb())
+            self.at[self._done] = (time.perf_counter(), resident_bytes([os.getpid()]) / 1e6)
 
     def note(self, text: str) -> None:
         print(f"note: {text}")
@@ -171,11 +173,6 @@ def table_seconds(rows: int) -> float:
             began = time.process_time()
             write_table(Path(folder, "cases.parquet"), store)
             return time.process_time() - began
-
-
-def _resident_mb() -> float:
-    text = Path("/proc/self/statm").read_text()
-    return int(text.split()[1]) * 4096 / 1e6
 
 
 if __name__ == "__main__":

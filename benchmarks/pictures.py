@@ -9,12 +9,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.timing import Figure, core_seconds
+from marsyard.algorithms.processes import used_memory
 from marsyard.scenarios.descent import CameraParameters, DescentScenarioParameters, camera_optics, flown_descent
 from marsyard.scenarios.views import Eye, SiteGround, nadir_pose, site_scene
 from marsyard.sim.camera import Cahv, Cahvor
@@ -121,7 +121,7 @@ def memory(frames: int) -> list[Figure]:
             scene, ground = Scene(surface, (east, 0.0), SUN, Photometry()), surface
         for picture in range(PICTURES_OF_A_SCENE):
             renderer.render(scene, optics.rays, nadir_pose(ground, east, 0.0, 2000.0 - 150.0 * picture))
-            sizes.append(_own_gb())
+            sizes.append(used_memory([os.getpid()]) / 1e9)
     quarter = len(sizes) // 4
     # medians: what a scene with rocks takes while it is loaded depends on its rocks
     growth = float(np.median(sizes[-quarter:]) - np.median(sizes[quarter : 2 * quarter]))
@@ -134,14 +134,6 @@ def memory(frames: int) -> list[Figure]:
             bar=1.2,
         ),
     ]
-
-
-def _own_gb() -> float:
-    """Memory that is this process's own: without the pages of terrain files, which all workers share."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("RssAnon:"):
-            return int(line.split()[1]) * 1024 / 1e9
-    raise RuntimeError("the kernel does not tell a process's own memory")
 
 
 def on_all_cores(repeats: int) -> list[Figure]:

@@ -1,16 +1,15 @@
 """Algorithms that are programs of their own: cases as files, answers as JSON (docs/own-algorithms.md)."""
 
-from marsyard.algorithms.exchange.command import PREFIXES, command_of
 from marsyard.algorithms.exchange.executable import (
     ExecutableSiteEstimator,
+    ExecutableTargetTracker,
     ExecutableVelocityEstimator,
     ExecutableVelocityStream,
 )
 from marsyard.algorithms.exchange.files import EXCHANGE, Pictures, read_case, read_frame, write_case, write_frame
-from marsyard.algorithms.exchange.process import Command, ExecutableLimits
+from marsyard.algorithms.exchange.process import PREFIXES, Command, ExecutableLimits, command_of
 from marsyard.algorithms.exchange.replies import ProgramDetails
 from marsyard.algorithms.exchange.stops import read_mast, read_pose, read_stop, read_target
-from marsyard.algorithms.exchange.tracker import ExecutableTargetTracker
 
 __all__ = [
     "EXCHANGE",

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,6 +42,9 @@ ANSWER_VERSIONS = (1, 2)
 
 CASE_FILE, FRAME_FILE = "case.json", "frame.json"
 
+#: What is known of a detector beside its flat field.
+_CALIBRATION = tuple(one.name for one in fields(DetectorCalibration) if one.name != "flat_field")
+
 #: Form in which pictures are written.
 Pictures = Literal["pgm", "png"]
 
@@ -50,13 +55,14 @@ def write_case(
     """Writes what instruments delivered into a folder that is there. Raises OSError where that fails."""
     told = _descent(measurements) if isinstance(measurements, DescentMeasurements) else _landing(measurements)
     images = _write_images(folder, measurements.images, pictures)
-    _write_json(folder / CASE_FILE, {**told, "images": images})
+    write_json(folder / CASE_FILE, {"exchange": EXCHANGE, **told, "images": images})
 
 
 def write_frame(folder: Path, frame: DescentFrame) -> None:
     """Writes what came with one picture of a descent into a folder that is there. Raises OSError where that fails."""
     (image,) = _write_images(folder, [frame.image], "pgm")
     told = {
+        "exchange": EXCHANGE,
         "image": image,
         "attitude": _told_attitude(frame.attitude),
         "altitude": _told_altitude(frame.altitude),
@@ -64,14 +70,13 @@ def write_frame(folder: Path, frame: DescentFrame) -> None:
         "inertial_velocity_m_s": _told_vector(frame.inertial_velocity_m_s),
         "interval_velocity_m_s": _told_vector(frame.interval_velocity_m_s),
     }
-    _write_json(folder / FRAME_FILE, told)
+    write_json(folder / FRAME_FILE, told)
 
 
 def read_frame(folder: Path) -> DescentFrame:
     """Reads what `write_frame` wrote. Raises ValueError where the folder holds no frame, or one of another version."""
-    path = folder / FRAME_FILE
-    try:
-        told = _read_json(path)
+    with reading(folder / FRAME_FILE, "picture of a descent") as told:
+        _check_version(told)
         return DescentFrame(
             image=_read_image(folder, told["image"]),
             attitude=_read_attitude(told["attitude"]),
@@ -80,8 +85,6 @@ def read_frame(folder: Path) -> DescentFrame:
             inertial_velocity_m_s=_optional_vector(told["inertial_velocity_m_s"]),
             interval_velocity_m_s=_optional_vector(told["interval_velocity_m_s"]),
         )
-    except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
-        raise ValueError(f"{path} is no picture of a descent: {error}") from error
 
 
 def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
@@ -92,25 +95,29 @@ def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
     ValueError
         Where the folder holds no case, or one of another version.
     """
-    path = folder / CASE_FILE
-    try:
-        told = _read_json(path)
+    with reading(folder / CASE_FILE, "case") as told:
+        _check_version(told)
         images = [_read_image(folder, one) for one in told["images"]]
         return _read_descent(told, images) if told["task"] == "velocity" else _read_landing(told, images)
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Write a table of values as JSON. Raises ValueError where one is not finite."""
+    path.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def reading(path: Path, kind: str) -> Iterator[Mapping[str, Any]]:
+    """The table of a JSON file; a fault in the file, or in what is made of it, becomes a ValueError that names both."""
+    try:
+        yield json.loads(path.read_text(encoding="utf-8"))
     except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
-        raise ValueError(f"{path} is no case: {error}") from error
+        raise ValueError(f"{path} is no {kind}: {error}") from error
 
 
-def _write_json(path: Path, told: Mapping[str, Any]) -> None:
-    outline = {"exchange": EXCHANGE, **told}
-    path.write_text(json.dumps(outline, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _read_json(path: Path) -> Mapping[str, Any]:
-    told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+def _check_version(told: Mapping[str, Any]) -> None:
     if told["exchange"] != EXCHANGE:
         raise ValueError(f"it has version {told['exchange']} of the exchange; this program reads {EXCHANGE}")
-    return told
 
 
 def _descent(measurements: DescentMeasurements) -> dict[str, Any]:
@@ -215,15 +222,7 @@ def _write_images(folder: Path, images: Sequence[DetectorImage], pictures: Pictu
             fields.append((flat, known.flat_field))
             known.flat_field.astype("<f8").tofile(folder / flat)
         rows, columns = image.counts.shape
-        calibration = {
-            "flat_field": flat,
-            "exposure_s": known.exposure_s,
-            "transfer_row_s": known.transfer_row_s,
-            "clear_row_s": known.clear_row_s,
-            "rows_summed": known.rows_summed,
-            "offset_dn": known.offset_dn,
-            "full_scale_dn": known.full_scale_dn,
-        }
+        calibration = {"flat_field": flat, **{one: getattr(known, one) for one in _CALIBRATION}}
         size = {"columns": columns, "rows": rows}
         written.append({"file": name, "camera": camera, "time_s": image.time_s, **size, "calibration": calibration})
     return written
@@ -236,15 +235,7 @@ def _read_image(folder: Path, told: Mapping[str, Any]) -> DetectorImage:
         counts=read_picture(folder / told["file"]),
         time_s=told["time_s"],
         camera=read_cahvor(folder / told["camera"]),
-        calibration=DetectorCalibration(
-            flat_field=flat.astype(np.float64),
-            exposure_s=known["exposure_s"],
-            transfer_row_s=known["transfer_row_s"],
-            clear_row_s=known["clear_row_s"],
-            rows_summed=known["rows_summed"],
-            offset_dn=known["offset_dn"],
-            full_scale_dn=known["full_scale_dn"],
-        ),
+        calibration=DetectorCalibration(flat.astype(np.float64), **{one: known[one] for one in _CALIBRATION}),
     )
 
 

@@ -1,6 +1,6 @@
-"""Runs a program within limits on time, memory and output; whatever it does becomes an answer or a fault.
+"""Programs under test: how they are named, and how one runs within limits on time, memory and output.
 
-The program leads a process group of its own, which is ended as a whole, and goes when the process that started it goes.
+A program leads a process group of its own, which is ended as a whole, and ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -8,19 +8,21 @@ from __future__ import annotations
 import ctypes
 import os
 import selectors
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.processes import descendants, resident_bytes
 
 #: Seconds between two looks at the memory that a program has.
 _LOOK_S = 0.02
@@ -30,7 +32,6 @@ KEPT_STDERR = 4000
 _LEAVE_S = 0.5
 
 _PR_SET_PDEATHSIG = 1
-_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _libc = ctypes.CDLL(None)
 
 
@@ -61,6 +62,38 @@ class Command:
     words: tuple[str, ...]
     persistent: bool
     stream: bool = False
+
+
+#: How a program is named: whether one process answers many cases, and whether it gets pictures one by one.
+PREFIXES: Mapping[str, tuple[bool, bool]] = {
+    "exec:": (False, False),
+    "serve:": (True, False),
+    "exec-stream:": (False, True),
+    "serve-stream:": (True, True),
+}
+
+
+def command_of(text: str) -> Command | None:
+    """The program that a text names (`exec:./mine --flag`); None where it names none.
+
+    Raises
+    ------
+    ValueError
+        Where it names one that is not there, or its quotes do not close.
+    """
+    prefix = next((one for one in PREFIXES if text.startswith(one)), None)
+    if prefix is None:
+        return None
+    try:
+        words = shlex.split(text.removeprefix(prefix))
+    except ValueError as error:
+        raise ValueError(f"'{text}' cannot be read: {error}") from error
+    if not words:
+        raise ValueError(f"'{text}' names no program; expected {prefix}PROGRAM, with arguments behind it")
+    if shutil.which(words[0]) is None:
+        where = "is not there, or may not be run" if "/" in words[0] else "is not on the PATH; write ./ before your own"
+        raise ValueError(f"no program for '{text}': {words[0]} {where}")
+    return Command(tuple(words), *PREFIXES[prefix])
 
 
 @dataclass(frozen=True)
@@ -102,7 +135,7 @@ class Child:
         except OSError as error:
             message = f"{self.words[0]} cannot be started: {error.strerror or error}"
             raise AlgorithmError(Fault.CRASHED, message) from error
-        self._begin()
+        self._reset()
 
     @property
     def process(self) -> int:
@@ -126,7 +159,7 @@ class Child:
         taken as the answer to the next case.
         """
         started = time.perf_counter()
-        self._begin()
+        self._reset()
         if asked is not None:
             self._refuse_unasked_output()
             self._tell(asked)
@@ -146,7 +179,7 @@ class Child:
             self._process.wait(_LEAVE_S)
         self._kill()
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
         self._output.clear()
         self._stderr.clear()
         self._deadline_s = time.monotonic() + self.limits.time_s
@@ -199,7 +232,7 @@ class Child:
             raise self._ended(Fault.TIMED_OUT, f"no answer within {self.limits.time_s:g} s")
         if len(self._output) + len(self._stderr) > self.limits.output_mb * 1e6:
             raise self._ended(Fault.TOO_MUCH_OUTPUT, f"it wrote more than {self.limits.output_mb:g} MB")
-        if resident_bytes(self._process.pid) > self.limits.memory_gb * 1e9:
+        if resident_bytes([self._process.pid, *descendants(self._process.pid)]) > self.limits.memory_gb * 1e9:
             raise self._ended(Fault.OUT_OF_MEMORY, f"it took more than {self.limits.memory_gb:g} GB of memory")
 
     def _wait(self) -> None:
@@ -230,28 +263,14 @@ class Child:
                     stream.close()
 
     def _said(self, output: bytes, started: float) -> Said:
-        self._drain_stderr()
-        return Said(output, _text(self._stderr), time.perf_counter() - started)
-
-    def _drain_stderr(self) -> None:
-        """Takes what stands in the pipe of standard error when the answer has come."""
+        """The answer, with what stands in the pipe of standard error by now."""
         stream = self._process.stderr
-        if stream is None or stream.closed:
-            return
-        with selectors.DefaultSelector() as selector:
-            selector.register(stream, selectors.EVENT_READ)
-            while selector.select(0.0) and (read := os.read(stream.fileno(), 1 << 16)):
-                self._stderr.extend(read)
-
-
-def resident_bytes(process: int) -> int:
-    """Memory that a process and its children hold, as far as Linux tells; 0 where it does not."""
-    try:
-        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-        children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-    except (OSError, IndexError, ValueError):
-        return 0
-    return pages * _PAGE_BYTES + sum(resident_bytes(int(child)) for child in children)
+        if stream is not None and not stream.closed:
+            with selectors.DefaultSelector() as selector:
+                selector.register(stream, selectors.EVENT_READ)
+                while selector.select(0.0) and (read := os.read(stream.fileno(), 1 << 16)):
+                    self._stderr.extend(read)
+        return Said(output, _text(self._stderr), time.perf_counter() - started)
 
 
 def _go_with_parent() -> None:

@@ -1,16 +1,25 @@
-"""Programs that are asked line by line: started once in a process, asked for many cases, ended with it."""
+"""Programs that are asked line by line, and the one exchange of question and answer that all programs take part in.
+
+A persistent program (`serve:`) is started once in a process, asked for many cases, and ended with it. One that is not
+(`exec:`) is a server of a single run: of one target, one stream, or one case. For one case it needs no greeting: the
+case's folder is its last argument, and its answer all that it writes until it ends.
+"""
 
 from __future__ import annotations
 
 import atexit
 import json
-from collections.abc import Mapping
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from marsyard.algorithms.exchange.files import ANSWER_VERSIONS
 from marsyard.algorithms.exchange.process import Child, Command, ExecutableLimits, Said, shortened
-from marsyard.algorithms.exchange.replies import table_of
+from marsyard.algorithms.exchange.replies import ProgramDetails, table_of
 from marsyard.algorithms.faults import AlgorithmError, Fault
 
 
@@ -57,14 +66,14 @@ class Server:
 _waiting: dict[tuple[Command, ExecutableLimits], Server] = {}
 
 
-def taken(command: Command, limits: ExecutableLimits) -> Server:
+def acquire(command: Command, limits: ExecutableLimits) -> Server:
     """A program that reads lines: a persistent one that waits, else one that is started now. It is the caller's."""
     waiting = _waiting.pop((command, limits), None) if command.persistent else None
-    return waiting or _greeted(command, limits)
+    return waiting or _start(command, limits)
 
 
-def given_back(command: Command, limits: ExecutableLimits, server: Server) -> None:
-    """Takes a program that has answered all that it was asked: a persistent one waits, another ends."""
+def release(command: Command, limits: ExecutableLimits, server: Server) -> None:
+    """Keep a persistent program that has answered all requests for the next case; end another."""
     if command.persistent and (command, limits) not in _waiting:
         _waiting[command, limits] = server
     else:
@@ -83,8 +92,8 @@ def end_persistent() -> None:
         _waiting.popitem()[1].child.leave()
 
 
-def _greeted(command: Command, limits: ExecutableLimits) -> Server:
-    """A program that was started and has said that it is ready, in one of the exchange's versions."""
+def _start(command: Command, limits: ExecutableLimits) -> Server:
+    """Start a program and read its greeting, in one of the exchange's versions."""
     child = Child(command.words, limits)
     said = child.line()
     try:
@@ -102,3 +111,70 @@ def _greeted(command: Command, limits: ExecutableLimits) -> Server:
         child.leave()
         raise
     return Server(child, version)
+
+
+class Session:
+    """One algorithm's exchange with a program that is asked line by line, started when it is first asked.
+
+    Attributes
+    ----------
+    folder
+        Where its input files are written; removed with the session.
+    """
+
+    def __init__(self, command: Command, limits: ExecutableLimits) -> None:
+        self._command, self._limits = command, limits
+        self._server: Server | None = None
+        self._release: weakref.finalize[Any, Any] | None = None
+        self.folder = Path(tempfile.mkdtemp(prefix="marsyard-talk-"))
+        weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+
+    def ask(
+        self, do: str, values: Mapping[str, Any], files: Mapping[str, Callable[[Path], None]] | None = None
+    ) -> tuple[Mapping[str, Any], ProgramDetails]:
+        """The program's answer to one line, read but not checked.
+
+        Parameters
+        ----------
+        do, values
+            The request, and what else stands in the line.
+        files
+            By the key that names the folder in the line: what writes it. It is there until the program has answered.
+        """
+        request = {"do": do, **values}
+        if self._server is None:
+            self._server = acquire(self._command, self._limits)
+            self._release = weakref.finalize(self, release, self._command, self._limits, self._server)
+        with tempfile.TemporaryDirectory(prefix=f"{do}-", dir=self.folder) as below:
+            for key, write in (files or {}).items():
+                folder = Path(below) / key
+                folder.mkdir()
+                write(folder)
+                request[key] = str(folder)
+            try:
+                answer, said = self._server.ask(request)
+            except AlgorithmError:
+                # it is ended already, and is not to be asked by others
+                if self._release is not None:
+                    self._release.detach()
+                raise
+        return answer, ProgramDetails(said.stderr, said.time_s)
+
+
+def ask_case(
+    command: Command, limits: ExecutableLimits, write: Callable[[Path], None]
+) -> tuple[Mapping[str, Any], ProgramDetails]:
+    """A program's answer to one case, read but not checked; `write` writes the case into a folder.
+
+    A persistent program that fails is ended, and started again for the next case.
+    """
+    with tempfile.TemporaryDirectory(prefix="marsyard-case-") as folder:
+        write(Path(folder))
+        if command.persistent:
+            server = acquire(command, limits)
+            answer, said = server.ask({"case": folder})
+            release(command, limits, server)
+        else:
+            said = Child((*command.words, folder), limits).answer()
+            answer = table_of(said)
+    return answer, ProgramDetails(said.stderr, said.time_s)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.exchange.files import read_picture, write_picture
+from marsyard.algorithms.exchange.files import read_picture, reading, write_json, write_picture
 from marsyard.sim.camera import HEAD_FRAME, read_cahvor, write_cahvor
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import (
@@ -25,6 +24,7 @@ from marsyard.sim.measurements import (
 )
 
 MAST_FILE, STOP_FILE = "mast.json", "stop.json"
+_OFFSETS, _LIMITS = ("base_m", "elbow_m", "head_m"), ("azimuth_limits_rad", "elevation_limits_rad")
 
 
 def write_mast(folder: Path, mast: MastCalibration) -> None:
@@ -33,31 +33,21 @@ def write_mast(folder: Path, mast: MastCalibration) -> None:
         write_cahvor(camera, folder / f"{name}.cahvor", frame=HEAD_FRAME)
     geometry = mast.geometry
     told = {
-        "base_m": geometry.base_m.tolist(),
-        "elbow_m": geometry.elbow_m.tolist(),
-        "head_m": geometry.head_m.tolist(),
-        "azimuth_limits_rad": list(geometry.azimuth_limits_rad),
-        "elevation_limits_rad": list(geometry.elevation_limits_rad),
+        **{name: getattr(geometry, name).tolist() for name in _OFFSETS},
+        **{name: list(getattr(geometry, name)) for name in _LIMITS},
         "left": {"camera": "left.cahvor", "columns": mast.left.size[0], "rows": mast.left.size[1]},
         "right": {"camera": "right.cahvor", "columns": mast.right.size[0], "rows": mast.right.size[1]},
     }
-    (folder / MAST_FILE).write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(folder / MAST_FILE, told)
 
 
 def read_mast(folder: Path) -> MastCalibration:
     """Reads what `write_mast` wrote. Raises ValueError where the folder holds no mast."""
-    path = folder / MAST_FILE
-    try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        offsets = [np.array(told[name], dtype=np.float64) for name in ("base_m", "elbow_m", "head_m")]
-        azimuths, elevations = told["azimuth_limits_rad"], told["elevation_limits_rad"]
+    with reading(folder / MAST_FILE, "mast") as told:
         left, right = (read_cahvor(folder / told[name]["camera"]) for name in ("left", "right"))
-        geometry = MastGeometry(
-            offsets[0], offsets[1], offsets[2], (azimuths[0], azimuths[1]), (elevations[0], elevations[1])
-        )
-    except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
-        raise ValueError(f"{path} is no mast: {error}") from error
-    return MastCalibration(geometry, left, right)
+        base, elbow, head = (np.array(told[name], dtype=np.float64) for name in _OFFSETS)
+        azimuths, elevations = ((told[name][0], told[name][1]) for name in _LIMITS)
+        return MastCalibration(MastGeometry(base, elbow, head, azimuths, elevations), left, right)
 
 
 def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
@@ -71,14 +61,12 @@ def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
         write_picture(folder / f"{name}.pgm", image.counts)
         rows, columns = image.counts.shape
         told[name] = {"file": f"{name}.pgm", "corner": list(image.corner), "columns": columns, "rows": rows}
-    (folder / STOP_FILE).write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(folder / STOP_FILE, told)
 
 
 def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
     """Reads what `write_stop` wrote. Raises ValueError where the folder holds no stop."""
-    path = folder / STOP_FILE
-    try:
-        told = json.loads(path.read_text(encoding="utf-8"))
+    with reading(folder / STOP_FILE, "stop") as told:
         left, right = (
             MastImage(
                 read_picture(folder / told[name]["file"]), (int(told[name]["corner"][0]), int(told[name]["corner"][1]))
@@ -86,10 +74,7 @@ def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
             for name in ("left", "right")
         )
         azimuth, elevation = float(told["azimuth_rad"]), float(told["elevation_rad"])
-        pose = read_pose(told["world_from_rover"])
-    except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
-        raise ValueError(f"{path} is no stop: {error}") from error
-    return RoverMeasurements(left, right, mast, azimuth, elevation, pose)
+        return RoverMeasurements(left, right, mast, azimuth, elevation, read_pose(told["world_from_rover"]))
 
 
 def told_pose(pose: RigidTransform) -> dict[str, list[float]]:

@@ -106,11 +106,14 @@ def estimate_motion(
     is first found for the given depths, which keeps it from the other of the two motions that explain a plane.
     """
     unit = float(np.median(depths))
-    candidates = [_solved(first, second, focal_px, unit / depths, start, unit, options) for start in starts]
-    quaternion, translation, inverse, _, converged = min(candidates, key=lambda found: found[3])
-    moved = rigid(Rotation.from_quat(quaternion, scalar_first=True), unit * translation)
+    candidates = []
+    for start in starts:
+        motion = kernels.Motion(start.rotation.as_quat(scalar_first=True), start.translation / unit, unit / depths)
+        candidates.append(_minimise(first, second, focal_px, motion, options))
+    best, _, converged = min(candidates, key=lambda found: found[1])
+    moved = rigid(Rotation.from_quat(best.q, scalar_first=True), unit * best.t)
     with np.errstate(divide="ignore"):
-        return assessed(first, second, focal_px, moved, unit / inverse, converged, options)
+        return assessed(first, second, focal_px, moved, unit / best.inverse_depths, converged, options)
 
 
 def assessed(
@@ -125,8 +128,9 @@ def assessed(
     """A motion with depths, and what its tracks say of it; the arguments are those of `estimate_motion`."""
     quaternion = second_from_first.rotation.as_quat(scalar_first=True)
     inverse = 1.0 / depths
+    unmatched = kernels.Matches(first, np.zeros_like(first), focal_px, 1.0)
     still, moved = (
-        kernels.residuals(first, np.zeros_like(first), focal_px, quaternion, translation, inverse)
+        kernels.residuals(unmatched, kernels.Motion(quaternion, translation, inverse))
         for translation in (np.zeros(3), np.array(second_from_first.translation))
     )
     residuals = np.hypot(*(moved - focal_px * second).T)
@@ -141,29 +145,21 @@ def assessed(
     )
 
 
-Solution = tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3"], Float[np.ndarray, "n"], float, bool]
-
-
-def _solved(
+def _minimise(
     first: Float[np.ndarray, "n 2"],
     second: Float[np.ndarray, "n 2"],
     focal_px: float,
-    inverse: Float[np.ndarray, "n"],
-    start: RigidTransform,
-    unit: float,
+    motion: kernels.Motion,
     options: HdaOptions,
-) -> Solution:
-    """Quaternion (w, x, y, z), translation and inverse depths in `unit`, cost, and whether a minimum was reached."""
-    q = start.rotation.as_quat(scalar_first=True)
-    t = start.translation / unit
+) -> tuple[kernels.Motion, float, bool]:
+    """Motion and inverse depths from a start, cost, and whether a minimum was reached."""
     cost, converged = np.inf, False
     stages = [(scale_px, False, START_TOLERANCE) for scale_px in START_SCALES_PX]
     stages.append((options.robust_px, True, TOLERANCE))
     for scale_px, with_depths, tolerance in stages:
-        q, t, inverse, cost, converged, _ = kernels.solve(
-            first, second, focal_px, q, t, inverse, scale_px, with_depths, ITERATIONS, tolerance
-        )
-    return q, t, inverse, cost, converged
+        matches = kernels.Matches(first, second, focal_px, scale_px)
+        motion, cost, converged, _ = kernels.solve(matches, motion, with_depths, ITERATIONS, tolerance)
+    return motion, cost, converged
 
 
 def _plausible(

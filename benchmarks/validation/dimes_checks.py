@@ -10,10 +10,10 @@ import numpy as np
 
 from benchmarks.dimes_threshold import STORED, WRONG_BY_M_S
 from benchmarks.estimators import ESTIMATORS, recorded, tried
+from benchmarks.threshold_derivation import ThresholdInputs
 from benchmarks.validation.imu_reference import Reference
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.algorithms.dimes.threshold import ThresholdInputs
 
 SEED = 4002
 HARMLESS = 0.995

@@ -1,6 +1,6 @@
 """The Monte Carlo behind DIMES' IMU check a second time: other code and templates, errors by first-order propagation.
 
-`marsyard.algorithms.dimes.threshold` places features with DIMES' own ground intersection, template grid and combination
+`benchmarks.threshold_derivation` places features with DIMES' own ground intersection, template grid and combination
 of tracks, through camera models. Here a template is a random place with room, a camera is a ray's slope, and each error
 moves the velocity by its partial derivative. Only what is drawn is the same (`ThresholdInputs`).
 
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.threshold import ThresholdInputs
+from benchmarks.threshold_derivation import ThresholdInputs
 
 #: The descent camera binned to 256 x 256: focal length over pixel pitch, and pixels from the middle to the edge.
 FOCAL_PX, HALF_PX = 14.67e-3 / 48e-6, 127.5

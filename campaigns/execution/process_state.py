@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.campaigns.execution.process_tree import children
+from marsyard.algorithms.processes import children
 
 #: Seconds for threads and processes that are about to end.
 _ENDING_S = 0.2

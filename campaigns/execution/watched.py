@@ -16,8 +16,9 @@ from typing import Any, TypeVar
 from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
+from marsyard.algorithms.processes import descendants, used_memory
 from marsyard.campaigns.execution import worker_process
-from marsyard.campaigns.execution.process_tree import descendants, kill, marked_processes, used_memory
+from marsyard.campaigns.execution.process_tree import kill, marked_processes
 from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL
 from marsyard.campaigns.execution.work import WorkLimits
 from marsyard.campaigns.execution.worker_process import FILES_CLOSED, BatchEnd, Board, run_batch

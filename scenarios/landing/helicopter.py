@@ -306,9 +306,7 @@ def land(
     held, flown, end = errors, None, None
     turns, moved = 0, np.inf
     while turns < MOST_TURNS and moved > STILL_M:
-        flight = landing_flight(
-            transit.flight, p.craft, p.guidance, site_m[:2], held, transit.air, ground, altimeter, end
-        )
+        flight = landing_flight(transit.flight, p.guidance, site_m[:2], held, transit.air, ground, altimeter, end)
         path = flight.path
         end = path.span_s[1] if end is None else end
         navigated = Navigated.over(

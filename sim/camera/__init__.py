@@ -13,7 +13,7 @@ from marsyard.sim.camera.cahvore import Cahvore
 from marsyard.sim.camera.calibrations import Calibration, read_calibrations
 from marsyard.sim.camera.files import read_camera, read_cameras
 from marsyard.sim.camera.mounting import looking_down
-from marsyard.sim.camera.opencv import OpenCVIntrinsics, Residual, from_opencv, from_opencv_fisheye, to_opencv
+from marsyard.sim.camera.opencv import Residual, from_opencv, from_opencv_fisheye
 from marsyard.sim.camera.pds4_labels import read_pds4
 from marsyard.sim.camera.pds_labels import read_pds3
 from marsyard.sim.camera.pds_products import Pds3Product, read_pds3_product
@@ -28,7 +28,6 @@ __all__ = [
     "Calibration",
     "CameraFileError",
     "CameraModel",
-    "OpenCVIntrinsics",
     "Pds3Product",
     "Residual",
     "from_opencv",
@@ -41,6 +40,5 @@ __all__ = [
     "read_pds3",
     "read_pds3_product",
     "read_pds4",
-    "to_opencv",
     "write_cahvor",
 ]

@@ -252,18 +252,6 @@ class CameraModel(ABC):
         """The camera whose pictures are moved by so much to the right and down."""
         return self._with(h=self.h + columns * self.a, v=self.v + rows * self.a)
 
-    @abstractmethod
-    def linearized(self, *, inside: bool = False) -> CameraModel:
-        """A `Cahv` of the same size that covers the whole view, or with `inside` only what fills its frame.
-
-        Its axes are square; A is the mean direction of the frame's pixels (see `marsyard.sim.camera.linearisation`).
-
-        Raises
-        ------
-        ValueError
-            If part of the frame's edge is blind, or 90 degrees or more from A without `inside`.
-        """
-
     def _with_image_map(self: M, scale: tuple[float, float], shift: tuple[float, float], size: tuple[int, int]) -> M:
         """The camera whose pixels are scale * pixel + shift."""
         return self._with(h=scale[0] * self.h + shift[0] * self.a, v=scale[1] * self.v + shift[1] * self.a, size=size)

@@ -44,10 +44,6 @@ class Cahv(CameraModel):
     def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
         return self._image_plane_direction(u, v), None
 
-    def linearized(self, *, inside: bool = False) -> Cahv:
-        """The camera itself: it is linear."""
-        return self
-
     @classmethod
     def from_axes(
         cls,

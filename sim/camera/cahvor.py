@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from marsyard.sim.camera import kernels
 from marsyard.sim.camera.base import UNIT_TOLERANCE, CameraModel
 from marsyard.sim.camera.cahv import Cahv
-from marsyard.sim.camera.linearisation import linearised
 from marsyard.sim.camera.radial import RadialPolynomial
 from marsyard.sim.camera.vectors import Gradient, Triple, Vector, dot
 
@@ -39,10 +38,6 @@ class RadialModel(CameraModel):
             raise ValueError(
                 f"r must begin with a number above -1 (1 + r[0] scales the image), not {float(self.r[0])!r}"
             )
-
-    def linearized(self, *, inside: bool = False) -> Cahv:
-        """See `CameraModel.linearized`."""
-        return linearised(self, inside=inside)
 
     @cached_property
     def _axis(self) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Conversion to and from OpenCV's cameras, with a stated residual.
+"""Conversion from OpenCV's cameras, with a stated residual.
 
 OpenCV's camera looks along z with x right and y down, and its pixels count as ours do. Its pinhole camera distorts
 about the direction z with k1, k2, k3 (radial) and p1, p2 (tangential):
@@ -9,8 +9,7 @@ about the direction z with k1, k2, k3 (radial) and p1, p2 (tangential):
 (its rational model divides the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6), and its fisheye moves a ray at the angle
 theta from z to the distance theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala & Brandt 2006).
 
-CAHVOR about O = A is the pinhole camera with k3 = p1 = p2 = 0. When O differs from A (the image plane is not square to
-the lens), or CAHVORE's lens is meant, OpenCV can only be fitted. The fisheye with
+CAHVOR about O = A is the pinhole camera with k3 = p1 = p2 = 0; others are fitted by tilting O. The fisheye with
 k3 = k4 = 0 is CAHVORE about O = A with the linearity 0 and a resting pupil.
 """
 
@@ -18,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -47,73 +45,6 @@ class Residual:
 
     rms_px: float
     max_px: float
-
-
-@dataclass(frozen=True, eq=False)
-class OpenCVIntrinsics:
-    """A camera as OpenCV takes it.
-
-    Attributes
-    ----------
-    model
-        "pinhole" for `cv2.projectPoints`, "fisheye" for `cv2.fisheye.projectPoints`.
-    matrix
-        Camera matrix, pixels, shape (3, 3).
-    distortion
-        (k1, k2, p1, p2, k3) for the pinhole, (k1, k2, k3, k4) for the fisheye.
-    camera_from_world
-        Takes points from the frame of the original camera's vectors to OpenCV's axes.
-    size
-        (columns, rows).
-    residual
-        Against the original camera over its whole frame, for points far away.
-    """
-
-    model: Literal["pinhole", "fisheye"]
-    matrix: Float[np.ndarray, "3 3"]
-    distortion: Float[np.ndarray, "coefficients"]
-    camera_from_world: RigidTransform
-    size: tuple[int, int]
-    residual: Residual
-
-
-def to_opencv(camera: CameraModel) -> OpenCVIntrinsics:
-    """OpenCV's camera nearest to a camera, by least squares over its frame.
-
-    Exact for `Cahv` with square axes and for `Cahvor` whose O is A; otherwise fitted, and the residual says how well.
-    `Cahvore` becomes OpenCV's fisheye with its pupil at C, which is right for points far away only; the fit covers
-    angles beyond 90 degrees, at which `cv2.fisheye.projectPoints` itself is wrong.
-
-    Raises
-    ------
-    ValueError
-        If the picture is a mirror image, or part of the frame sees nothing: OpenCV has no such camera.
-    """
-    if not camera.right_handed:
-        raise ValueError("OpenCV has no mirrored camera: u right, v down and A forward must be right-handed")
-    pixels = _frame_samples(camera.size)
-    directions = camera.rays(pixels)[1]
-    if not np.all(np.isfinite(directions)):
-        raise ValueError("part of the frame sees nothing: crop the camera first")
-    fisheye = isinstance(camera, Cahvore)
-    initial = _Candidate.of(camera)
-    candidate = initial
-    if not _residual(initial.pixels(directions) - pixels).max_px <= _EXACT_PX:
-
-        def differences(change: Array) -> Array:
-            return (initial.changed(change).pixels(directions) - pixels).ravel()
-
-        candidate = initial.changed(_fitted(differences, initial.scales()))
-    fx, fy, cx, cy = candidate.scale_centre
-    rotation = Rotation.from_matrix(candidate.camera_from_world)
-    return OpenCVIntrinsics(
-        model="fisheye" if fisheye else "pinhole",
-        matrix=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-        distortion=candidate.distortion,
-        camera_from_world=RigidTransform.from_components(-(candidate.camera_from_world @ camera.c), rotation),
-        size=camera.size,
-        residual=_residual(candidate.pixels(directions) - pixels),
-    )
 
 
 def from_opencv(
@@ -208,58 +139,6 @@ def from_opencv_fisheye(
     return camera, residual
 
 
-# ----- to OpenCV -----
-
-
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    """OpenCV's camera during the fit: rotation matrix, (fx, fy, cx, cy) and coefficients."""
-
-    camera_from_world: Array
-    scale_centre: Array
-    distortion: Array
-
-    @classmethod
-    def of(cls, camera: CameraModel) -> _Candidate:
-        """Looking along A; right but for the tilt of O, and for a fisheye but for the details of its lens."""
-        axis = camera.a / np.linalg.norm(camera.a)
-        rotation = np.stack([camera.right, np.cross(axis, camera.right), axis])
-        scale_centre = np.array([*camera.focal_lengths, *camera.image_centre])
-        if isinstance(camera, Cahvore):
-            scale_centre[:2] *= 1 + camera.r[0]
-            return cls(rotation, scale_centre, np.zeros(4))
-        coefficients = np.zeros(5)
-        if isinstance(camera, Cahvor):
-            gain = 1 + float(camera.r[0])
-            scale_centre[:2] *= gain
-            coefficients[:2] = camera.r[1:] / gain
-        return cls(rotation, scale_centre, coefficients)
-
-    def scales(self) -> Array:
-        """Sizes of change that matter alike: angles, pixels, coefficients."""
-        return np.array([1e-3] * 3 + [1.0] * 4 + [1e-3] * len(self.distortion))
-
-    def changed(self, change: Array) -> _Candidate:
-        turned = Rotation.from_rotvec(change[:3]).as_matrix() @ self.camera_from_world
-        return _Candidate(turned, self.scale_centre + change[3:7], self.distortion + change[7:])
-
-    def pixels(self, directions: Array) -> Array:
-        x, y, z = (directions @ self.camera_from_world.T).T
-        if len(self.distortion) == 5:
-            distorted = _distorted(np.stack([x / z, y / z], axis=-1), self.distortion)[0]
-        else:
-            across = np.hypot(x, y)
-            theta = np.arctan2(across, z)
-            gain = _fisheye_gain(theta, self.distortion)[0]
-            ratio = np.divide(theta * gain, across, out=np.ones_like(theta), where=across > 0)
-            distorted = np.stack([x * ratio, y * ratio], axis=-1)
-        pixels: Array = self.scale_centre[:2] * distorted + self.scale_centre[2:]
-        return pixels
-
-
-# ----- from OpenCV -----
-
-
 def _eight_coefficients(distortion: Array) -> Array:
     if len(distortion) not in (0, 4, 5, 8) or not np.all(np.isfinite(distortion)):
         raise ValueError(
@@ -348,9 +227,6 @@ def _undistorted(distorted: Array, coefficients: Array) -> Array:
     if not (np.max(np.abs(there - distorted)) < 1e-9 and np.all(np.linalg.det(slope) > 0)):
         raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
     return points
-
-
-# ----- both -----
 
 
 def _fitted(differences: Callable[[Array], Array], scales: Array) -> Array:

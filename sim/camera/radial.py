@@ -75,5 +75,4 @@ class RadialPolynomial:
         Solved for the ratio g itself, which stays finite on the axis: g (k1 + s (k3 + s k5)) = 1 with s = f^2 g^2.
         Newton from g = 1 / k1 approaches from one side where the polynomial bends one way; what it leaves is bisected.
         """
-        ratio: Vector = kernels.undistortion(self.coefficients, self.limits, distorted_tau)
-        return ratio
+        return np.asarray(kernels.undistortion(self.coefficients, self.limits, distorted_tau))

@@ -19,8 +19,7 @@ BLOCK = 16384
 
 def dot(vector: NDArray[np.float64], x: Vector, y: Vector, z: Vector) -> Vector:
     """Scalar product of one vector with n, the same for each whatever n is (a BLAS product need not be)."""
-    product: Vector = vector[0] * x + vector[1] * y + vector[2] * z
-    return product
+    return np.asarray(vector[0] * x + vector[1] * y + vector[2] * z)
 
 
 def cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """How vehicles move: truth states over time."""
 
 from marsyard.sim.dynamics.chain import SwingParameters
-from marsyard.sim.dynamics.driving import FIRM, NO_SLIP, Drive, DrivenPart, SlipParameters, Soil, drive
+from marsyard.sim.dynamics.driving import Drive, DrivenPart, SlipParameters, Soil, drive
 from marsyard.sim.dynamics.relief import RockyGround
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, Ground, RoverParameters, Stance, settle
 from marsyard.sim.dynamics.state import State
@@ -10,9 +10,7 @@ from marsyard.sim.dynamics.trajectory import Motion, Resting, Trajectory
 from marsyard.sim.dynamics.wind import Wind, WindParameters
 
 __all__ = [
-    "FIRM",
     "MER",
-    "NO_SLIP",
     "ROCKY_8",
     "Drive",
     "DrivenPart",

@@ -73,15 +73,6 @@ class SlipParameters(BaseModel):
         return float(min(self.flat + (1.0 - self.flat) * relative**self.exponent, 1.0))
 
 
-#: Hard ground (bedrock, a ramp of boards, packed soil): all is lost on 45 deg only, 5 % on 13 deg.
-FIRM = SlipParameters(full_slope_deg=45.0, flat=0.0, turn=0.01)
-#: Wheels that do exactly as they are told.
-NO_SLIP = SlipParameters(
-    flat=0.0, full_slope_deg=89.0, exponent=100.0, downhill=0.0, across=0.0, turn=0.0, turn_slope=0.0,
-    soil_spread=0.0, step_spread=0.0, wander_deg_m=0.0,
-)  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Soil:
     """The soil of one run: its parameters, and the factor by which it is more slippery than those say."""
@@ -175,18 +166,6 @@ class Drive:
         gained = sum(_along(part) for part in self.parts)
         return 1.0 - gained / self.command.length_m
 
-    @property
-    def aside_m(self) -> float:
-        """How far the rover slid to the left of its commanded motion."""
-        return sum(_along(part, 0.5 * np.pi) for part in self.parts)
-
-    @property
-    def turn_slip(self) -> float:
-        """Share of the commanded turn that was not made; NaN where none was asked for."""
-        if self.command.turn_left_rad == 0.0:
-            return float("nan")
-        return 1.0 - self.turn_left_rad / self.command.turn_left_rad
-
 
 def drive(
     rover: RoverParameters,
@@ -267,11 +246,11 @@ def _share(p: SlipParameters, slope_rad: float) -> float:
     return p.share(slope_rad) - p.flat
 
 
-def _along(part: DrivenPart, turned_rad: float = 0.0) -> float:
-    """True motion of a part along its commanded direction, or along one turned to the left of that, metres."""
+def _along(part: DrivenPart) -> float:
+    """True motion of a part along its commanded direction, metres."""
     ahead = np.array([part.command.forward_m, part.command.left_m])
     if (length := float(np.hypot(*ahead))) < _NO_PATH_M:
         return 0.0
-    angle = float(np.arctan2(ahead[1], ahead[0])) + 0.5 * part.command.turn_left_rad + turned_rad
+    angle = float(np.arctan2(ahead[1], ahead[0])) + 0.5 * part.command.turn_left_rad
     chord = length / max(float(np.hypot(*part.command.displacement_m)), _NO_PATH_M)
     return chord * float(part.motion.translation[:2] @ np.array([np.cos(angle), np.sin(angle)]))

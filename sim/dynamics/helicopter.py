@@ -22,8 +22,7 @@ from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics.angles import turning
-from marsyard.sim.dynamics.state import State
-from marsyard.sim.dynamics.trajectory import Motion
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory
 
 Positive = Annotated[float, Field(gt=0.0)]
 
@@ -127,7 +126,7 @@ class Tilt:
 
 
 @dataclass(frozen=True)
-class HelicopterFlight:
+class HelicopterFlight(Trajectory):
     """A flight, known from the start of the first pass over the targets to the end of the second.
 
     The body frame is the camera's: x along the line, y to its left, z up when the gimbal is at rest and the platform
@@ -170,10 +169,6 @@ class HelicopterFlight:
     def span_s(self) -> tuple[float, float]:
         """First and last time at which the motion is known."""
         return self.fly_overs_s[0][0], self.fly_overs_s[1][1]
-
-    def state(self, time_s: float) -> State:
-        """Truth at a time. Raises ValueError outside of the span."""
-        return self.motion(np.array([time_s])).state(0)
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Truth at many times. Raises ValueError outside of the span."""

@@ -15,8 +15,7 @@ from jaxtyping import Float64
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from marsyard.sim.dynamics.state import State
-from marsyard.sim.dynamics.trajectory import Motion
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory
 
 #: Fewest instants from which acceleration can be told.
 LEAST_INSTANTS = 4
@@ -27,7 +26,7 @@ ROUNDING_S = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedMotion:
+class RecordedMotion(Trajectory):
     """A `Trajectory` through recorded poses.
 
     Attributes
@@ -98,7 +97,3 @@ class RecordedMotion:
             body_rates_rad_s=self._attitude(times_s, 1),
             specific_forces_m_s2=attitudes.inv().apply(felt),
         )
-
-    def state(self, time_s: float) -> State:
-        """Truth at a time. Raises ValueError outside of the span."""
-        return self.motion(np.array([time_s])).state(0)

@@ -9,12 +9,11 @@ into those of the world; what axes these are no format says, and whoever uses th
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +32,7 @@ MOST_BYTES = 1 << 29
 MAX_ROWS = 5_000_000
 _KEPT_FILES = 4
 #: Cells of a table of text that hold no number.
-_MISSING = ("", "na", "n/a", "null", "none")
+_MISSING = ("na", "NA", "n/a", "N/A", "null", "NULL", "none", "None")
 _ALLOWED = (
     f"a CSV or Parquet table with the columns {', '.join(COLUMNS)}; TUM's lines of timestamp tx ty tz qx qy qz qw; "
     f"EuRoC's ground truth, whose header begins with #timestamp; or SPICE kernels, named in a file *{SUFFIX}"
@@ -128,9 +127,9 @@ def _values(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
     if head.startswith(b"PAR1") or (first.startswith("#timestamp") and "," in first):
         return _by_pandas(path, first)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # that a file is empty is said below
+        warnings.simplefilter("ignore")  # empty files are reported below; cells beyond the names are left out
         if "," in first and not first.startswith("#"):
-            return _comma_separated(path, first)
+            return _comma_separated(path)
         values = np.loadtxt(path, comments="#", ndmin=2)
     if values.size and values.shape[1] != 8:
         raise TrajectoryFileError(f"{path}: has {values.shape[1]} numbers in a line; allowed: {_ALLOWED}")
@@ -176,29 +175,20 @@ def _from_parquet(path: str) -> Float64[np.ndarray, "n 8"]:
     return values[:read]
 
 
-def _comma_separated(path: str, first: str) -> Float64[np.ndarray, "n 8"]:
-    """A table of text below this line of names; cells without a number become NaN."""
-    names = next(csv.reader([first], skipinitialspace=True))
-    read = partial(
-        np.loadtxt,
+def _comma_separated(path: str) -> Float64[np.ndarray, "n 8"]:
+    """A table of text below a line of names; cells without a number become NaN."""
+    import pandas as pd  # slow to import: for campaigns that have such a file
+
+    frame = pd.read_csv(
         path,
-        delimiter=",",
-        skiprows=1,
-        usecols=_place_columns(path, [name.strip() for name in names]),
-        quotechar='"',
-        encoding="utf-8",
-        ndmin=2,
+        usecols=lambda name: name.strip() in COLUMNS,
+        dtype=np.float64,
+        index_col=False,
+        skipinitialspace=True,
+        na_values=list(_MISSING),
+        float_precision="round_trip",
     )
-    try:
-        values = read()
-    except ValueError:
-        # several times slower: only where a cell is no number
-        values = read(converters=_number)
-    return np.asarray(values.reshape(-1, len(COLUMNS)))
-
-
-def _number(cell: str) -> float:
-    return float("nan") if cell.strip().lower() in _MISSING else float(cell)
+    return np.asarray(frame.to_numpy()[:, _place_columns(path, [name.strip() for name in frame.columns])])
 
 
 def _place_columns(path: str, names: Sequence[str]) -> list[int]:

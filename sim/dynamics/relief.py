@@ -68,8 +68,7 @@ class RockyGround:
         """Height of ground or rocks at world positions, metres."""
         cells = [(y - self.corner_m[1]) / CELL_M, (x - self.corner_m[0]) / CELL_M]
         above = map_coordinates(self.above_m, cells, order=1, mode="constant", prefilter=False)
-        height: Float[np.ndarray, "*batch"] = self.ground.height(x, y) + above
-        return height
+        return np.asarray(self.ground.height(x, y) + above)
 
 
 def _filled(triangles: Float64[np.ndarray, "triangles 3 3"]) -> Float64[np.ndarray, "points 3"]:

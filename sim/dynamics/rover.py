@@ -244,8 +244,7 @@ def wheel_centres(
 ) -> Float64[np.ndarray, "6 3"]:
     """Centres of the wheels in the rover frame at these angles of the joints, metres."""
     joints = np.array([differential_rad, *bogies_rad])
-    centres: Float64[np.ndarray, "6 3"] = suspension.wheel_centres(rover.wheel_places_m, *rover.pivots_m, joints)
-    return centres
+    return np.asarray(suspension.wheel_centres(rover.wheel_places_m, *rover.pivots_m, joints))
 
 
 def bogie_pivots(rover: RoverParameters, differential_rad: float) -> Float64[np.ndarray, "2 3"]:
@@ -308,8 +307,7 @@ class _Frame:
         """
         beside = _DIFFERENCE * np.eye(6)
         ends = self._heights(np.concatenate([unknown - beside, unknown + beside]), places[:, None])[..., 0]
-        slopes: Float64[np.ndarray, "6 6"] = ((ends[6:] - ends[:6]) / (2.0 * _DIFFERENCE)).T
-        return slopes
+        return np.asarray(((ends[6:] - ends[:6]) / (2.0 * _DIFFERENCE)).T)
 
     def _lowest(self, unknown: Float64[np.ndarray, "6"]) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 3"]]:
         """Least height of each tread above the ground, and the place on the tread, from its wheel's middle."""
@@ -334,5 +332,4 @@ class _Frame:
     ) -> Float64[np.ndarray, "n 6 places"]:
         """Heights above the ground of places of the wheels' treads, the same for all wheels or each wheel's own."""
         x, y, z = suspension.tread_places(unknown, self.yaw_rad, self.place_m, *self.shape, treads)
-        heights: Float64[np.ndarray, "n 6 places"] = z - self.ground.height(x, y)
-        return heights
+        return np.asarray(z - self.ground.height(x, y))

@@ -50,8 +50,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.sim.dynamics.chain import Modes, SwingParameters, chain_of
 from marsyard.sim.dynamics.integration import Path, StateVector
 from marsyard.sim.dynamics.kernels.swing import AXIS, CANOPY, LINE, Chain, truth
-from marsyard.sim.dynamics.state import State
-from marsyard.sim.dynamics.trajectory import Motion
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory
 from marsyard.sim.dynamics.wind import Wind
 
 Vector = Float64[np.ndarray, "3"]
@@ -64,7 +63,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True)
-class SwingDescent:
+class SwingDescent(Trajectory):
     """A descent through a place; a `Trajectory`.
 
     The body's origin is the camera, with the IMU beside it. At zero time, the first picture's nominal time, it is where
@@ -161,18 +160,6 @@ class SwingDescent:
         """Truth at many times. Raises ValueError outside of the span."""
         positions, velocities, matrices, rates, forces = truth(self.path.at(times_s), self.chain, self.wind.field)
         return Motion(times_s, positions, velocities, Rotation.from_matrix(matrices, assume_valid=True), rates, forces)
-
-    def state(self, time_s: float) -> State:
-        """Truth at a time. Raises ValueError outside of the span."""
-        m = self.motion(np.array([time_s]))
-        return State(
-            time_s=time_s,
-            position_m=m.positions_m[0],
-            velocity_m_s=m.velocities_m_s[0],
-            attitude=m.attitudes[0],
-            body_rate_rad_s=m.body_rates_rad_s[0],
-            specific_force_m_s2=m.specific_forces_m_s2[0],
-        )
 
     def time_of_altitude(self, altitude_m: float) -> float:
         """When the camera passes an altitude above `ground_height_m`. Raises ValueError if it does not in the span."""
@@ -278,5 +265,4 @@ def _tilt_axis(azimuth_rad: float) -> Vector:
 def _across(vector: Vector, direction: Vector) -> Vector:
     """Unit vector of the part of a vector across a direction."""
     part = vector - (vector @ direction) * direction
-    unit: Vector = part / np.linalg.norm(part)
-    return unit
+    return np.asarray(part / np.linalg.norm(part))

@@ -60,7 +60,7 @@ class Trajectory(Protocol):
 
     def state(self, time_s: float) -> State:
         """Truth at a time. Raises ValueError outside of the span."""
-        ...
+        return self.motion(np.array([time_s])).state(0)
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Truth at many times. Raises ValueError outside of the span."""
@@ -68,7 +68,7 @@ class Trajectory(Protocol):
 
 
 @dataclass(frozen=True)
-class Resting:
+class Resting(Trajectory):
     """A body that does not move.
 
     Attributes
@@ -87,10 +87,6 @@ class Resting:
     def span_s(self) -> tuple[float, float]:
         """All times."""
         return -np.inf, np.inf
-
-    def state(self, time_s: float) -> State:
-        """Truth at a time."""
-        return self.motion(np.array([time_s])).state(0)
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Truth at many times."""

@@ -87,18 +87,15 @@ class Wind:
 
     def velocities(self, heights_m: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
         """Wind towards east, north and up, m/s, at heights of the world's z, metres."""
-        rows: Float64[np.ndarray, "n 3"] = winds(heights_m, self.field)
-        return rows
+        return np.asarray(winds(heights_m, self.field))
 
 
 def _transverse(edges: Float64[np.ndarray, "m"], length_m: float) -> Float64[np.ndarray, "m-1"]:
     """Shares of variance between wavenumbers: the spectrum's integral is (2 atan x - x / (1 + x^2)) / pi, x = L k."""
     x = length_m * edges
-    shares: Float64[np.ndarray, "m-1"] = np.diff(2.0 * np.arctan(x) - x / (1.0 + x**2)) / np.pi
-    return shares
+    return np.asarray(np.diff(2.0 * np.arctan(x) - x / (1.0 + x**2)) / np.pi)
 
 
 def _longitudinal(edges: Float64[np.ndarray, "m"], length_m: float) -> Float64[np.ndarray, "m-1"]:
     """Shares of variance between wavenumbers: the spectrum's integral is 2 atan(L k) / pi."""
-    shares: Float64[np.ndarray, "m-1"] = np.diff(2.0 * np.arctan(length_m * edges)) / np.pi
-    return shares
+    return np.asarray(np.diff(2.0 * np.arctan(length_m * edges)) / np.pi)

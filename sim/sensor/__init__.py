@@ -5,7 +5,7 @@ from marsyard.sim.sensor.clock import Clock, ClockParameters
 from marsyard.sim.sensor.datasheet import Datasheet, read_datasheet
 from marsyard.sim.sensor.detector import Detector, DetectorParameters
 from marsyard.sim.sensor.exposure import AutoExposure, AutoExposureParameters, auto_expose
-from marsyard.sim.sensor.gps import POST_PROCESSED, RTK, STANDALONE, Gps, GpsParameters
+from marsyard.sim.sensor.gps import POST_PROCESSED, Gps, GpsParameters
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuIncrements, ImuParameters, WarmUp
 from marsyard.sim.sensor.inertial import InertialSolution, NavigationErrors
 from marsyard.sim.sensor.instrument import Instrument, Readings, Sampling
@@ -34,9 +34,7 @@ __all__ = [
     "MASTS",
     "POST_PROCESSED",
     "PRESETS",
-    "RTK",
     "SMALL_UNIT",
-    "STANDALONE",
     "Approach",
     "ApproachParameters",
     "AutoExposure",

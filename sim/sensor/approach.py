@@ -135,8 +135,7 @@ class Approach:
         hanging = np.maximum(times_s - self._deploy_s(), 0.0)
         braking = p.parachute_speed_m_s / p.inflation_s * np.exp(-hanging / p.inflation_s) + p.gravity_m_s2
         drag += np.where(times_s >= self._deploy_s(), braking, 0.0)
-        forces: Float64[np.ndarray, "n 3"] = drag[:, None] * np.array([0.0, 0.0, 1.0])
-        return forces
+        return np.asarray(drag[:, None] * np.array([0.0, 0.0, 1.0]))
 
     def _deploy_s(self) -> float:
         return self.end_s - self.parameters.parachute_s
@@ -148,14 +147,12 @@ class Approach:
         return float(2.0 * np.pi * self.parameters.spin_rpm / 60.0)
 
     def _spun(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
-        spun: Float64[np.ndarray, "n"] = self._spin_rate() * (np.minimum(times_s, self._deploy_s()) - self.start_s)
-        return spun
+        return np.asarray(self._spin_rate() * (np.minimum(times_s, self._deploy_s()) - self.start_s))
 
     def _turn_axis(self) -> Float64[np.ndarray, "3"]:
         # tilts nadir towards the heading: (0, 0, -1) x (sin a, cos a, 0)
         heading = np.radians(self.parameters.heading_deg)
-        axis: Float64[np.ndarray, "3"] = np.array([np.cos(heading), -np.sin(heading), 0.0])
-        return axis
+        return np.asarray(np.array([np.cos(heading), -np.sin(heading), 0.0]))
 
     def _knots(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Times at which the flight's direction begins to turn otherwise, and its angle from nadir then."""
@@ -165,11 +162,9 @@ class Approach:
 
     def _off_nadir(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         times, angles = self._knots()
-        angle: Float64[np.ndarray, "n"] = np.interp(times_s, times, angles)
-        return angle
+        return np.asarray(np.interp(times_s, times, angles))
 
     def _off_nadir_rate(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         times, angles = self._knots()
         rates = np.concatenate([[0.0], np.diff(angles) / np.diff(times), [0.0]])
-        rate: Float64[np.ndarray, "n"] = rates[np.searchsorted(times, times_s, side="right")]
-        return rate
+        return np.asarray(rates[np.searchsorted(times, times_s, side="right")])

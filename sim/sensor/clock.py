@@ -45,5 +45,4 @@ class Clock:
     def tags(self, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator) -> Float64[np.ndarray, "n"]:
         """Time tags of events at these true times, seconds."""
         jitter = self.parameters.jitter_sd_s * rng.standard_normal(times_s.size)
-        tags: Float64[np.ndarray, "n"] = times_s + self.offset_s + jitter
-        return tags
+        return np.asarray(times_s + self.offset_s + jitter)

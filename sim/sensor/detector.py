@@ -179,8 +179,7 @@ class Detector:
         if self.hot_e_s is not None:
             current = current + _sum_rows(self.hot_e_s, p.rows_summed)
         seconds = dark_seconds(p, rows)[:, None].astype(np.float32)
-        charge: Float32[np.ndarray, "delivered_rows _"] = np.float32(p.dark_growth) * current * seconds
-        return charge
+        return np.asarray(np.float32(p.dark_growth) * current * seconds)
 
 
 def dark_seconds(parameters: DetectorParameters, rows: int) -> Float64[np.ndarray, "delivered_rows"]:
@@ -189,8 +188,7 @@ def dark_seconds(parameters: DetectorParameters, rows: int) -> Float64[np.ndarra
     Row 0 is read out first.
     """
     waits = parameters.readout_row_s * np.arange(rows // parameters.rows_summed, dtype=np.float64)
-    seconds: Float64[np.ndarray, "delivered_rows"] = waits + parameters.exposure_s + rows * parameters.transfer_row_s
-    return seconds
+    return np.asarray(waits + parameters.exposure_s + rows * parameters.transfer_row_s)
 
 
 def _listed(
@@ -202,13 +200,9 @@ def _listed(
     bad = [one for one in (None if hot_e_s is None else hot_e_s > 0.0, dead) if one is not None]
     if not (parameters.defects.listed and bad):
         return None
-    listed: Bool[np.ndarray, "delivered_rows columns"] = (
-        _sum_rows(np.logical_or.reduce(bad).astype(np.float32), parameters.rows_summed) > 0.0
-    )
-    return listed
+    return np.asarray(_sum_rows(np.logical_or.reduce(bad).astype(np.float32), parameters.rows_summed) > 0.0)
 
 
 def _sum_rows(picture: Float[np.ndarray, "rows columns"], count: int) -> Float[np.ndarray, "summed columns"]:
     rows, columns = picture.shape
-    summed: Float[np.ndarray, "summed columns"] = picture.reshape(rows // count, count, columns).sum(axis=1)
-    return summed
+    return np.asarray(picture.reshape(rows // count, count, columns).sum(axis=1))

@@ -32,17 +32,6 @@ class GpsParameters(BaseModel):
     clock: ClockParameters = ClockParameters()
 
 
-#: One receiver on its own, by code (about 2 m horizontally, 3 m vertically).
-STANDALONE = GpsParameters()
-#: Carrier phases against a base station near by: 2 cm (the class of NovAtel's RT2 with its integers fixed).
-RTK = GpsParameters(
-    horizontal_noise_m=0.01,
-    vertical_noise_m=0.015,
-    horizontal_wander_m=0.01,
-    vertical_wander_m=0.02,
-    correlation_s=120.0,
-    latency_s=0.05,
-)
 #: Carrier phases after the fact, with precise orbits, in flight (the class of GIPSY-OASIS II).
 POST_PROCESSED = GpsParameters(
     rate_hz=1.0,

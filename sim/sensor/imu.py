@@ -45,8 +45,7 @@ class WarmUp(BaseModel):
     def temperature_k(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         """Temperature less that of the calibration, K."""
         since = np.maximum(times_s - self.start_s, 0.0)
-        temperature: Float64[np.ndarray, "n"] = -self.change_k * np.expm1(-since / self.time_constant_s)
-        return temperature
+        return np.asarray(-self.change_k * np.expm1(-since / self.time_constant_s))
 
 
 class ImuParameters(BaseModel):
@@ -149,14 +148,12 @@ class Triad:
     @property
     def sensitivity_error(self) -> Float64[np.ndarray, "3 3"]:
         """What the triad measures of a true input, less that input: this matrix times the input."""
-        error: Float64[np.ndarray, "3 3"] = np.diag(self.scale) + self.misalignment
-        return error
+        return np.asarray(np.diag(self.scale) + self.misalignment)
 
     def bias_at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
         """Bias at these times: constant, wandering and with temperature; unit/s."""
         thermal = self.warm_up.temperature_k(times_s)[:, None] * self.bias_per_k
-        bias: Float64[np.ndarray, "n 3"] = self.bias + thermal + self.wander.at(times_s)
-        return bias
+        return np.asarray(self.bias + thermal + self.wander.at(times_s))
 
     def measured(
         self, true: Float64[np.ndarray, "n 3"], boundaries_s: Float64[np.ndarray, "m"], rng: np.random.Generator
@@ -250,8 +247,7 @@ class Imu:
         count = int(np.floor((end_s - start_s) * self.parameters.rate_hz + 1e-9))
         if count < 1:
             raise ValueError(f"there is no sample from {start_s} s to {end_s} s at {self.parameters.rate_hz} Hz")
-        times: Float64[np.ndarray, "m"] = start_s + np.arange(count + 1) / self.parameters.rate_hz
-        return times
+        return np.asarray(start_s + np.arange(count + 1) / self.parameters.rate_hz)
 
     def increments(
         self, trajectory: Trajectory, start_s: float, end_s: float, rng: np.random.Generator
@@ -285,5 +281,4 @@ def true_increments(
 
 
 def _off_diagonal(rng: np.random.Generator) -> Float64[np.ndarray, "3 3"]:
-    matrix: Float64[np.ndarray, "3 3"] = rng.standard_normal((3, 3)) * (1.0 - np.eye(3))
-    return matrix
+    return np.asarray(rng.standard_normal((3, 3)) * (1.0 - np.eye(3)))

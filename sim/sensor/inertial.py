@@ -87,25 +87,18 @@ class InertialSolution:
         """Velocities at time tags, world axes; between samples the acceleration is constant."""
         interval, share = self._placed(times_s)
         before, after = self.velocities_m_s[interval], self.velocities_m_s[interval + 1]
-        velocity: Float64[np.ndarray, "n 3"] = before + share[:, None] * (after - before)
-        return velocity
+        return np.asarray(before + share[:, None] * (after - before))
 
     def displacement(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
         """Displacements from the first boundary to time tags, world axes; between samples acceleration is constant."""
         interval, share = self._placed(times_s)
         before, after = self.velocities_m_s[interval], self.velocities_m_s[interval + 1]
         passed = share[:, None] * self.increments.period_s
-        moved: Float64[np.ndarray, "n 3"] = self.displacements_m[interval] + passed * (
-            before + 0.5 * share[:, None] * (after - before)
-        )
-        return moved
+        return np.asarray(self.displacements_m[interval] + passed * (before + 0.5 * share[:, None] * (after - before)))
 
     def mean_velocities(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "intervals 3"]:
         """Mean velocities over the intervals between successive time tags, world axes, one fewer than tags."""
-        means: Float64[np.ndarray, "intervals 3"] = (
-            np.diff(self.displacement(times_s), axis=0) / np.diff(times_s)[:, None]
-        )
-        return means
+        return np.asarray(np.diff(self.displacement(times_s), axis=0) / np.diff(times_s)[:, None])
 
     def _placed(self, times_s: Float64[np.ndarray, "n"]) -> tuple[np.ndarray, Float64[np.ndarray, "n"]]:
         """Number of the interval in which each time falls, and the share of it that has passed.

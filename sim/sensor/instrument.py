@@ -66,12 +66,8 @@ class Sampling:
         """True times of all readings from a start to an end, seconds."""
         first = np.ceil((start_s - self.phase_s) * self.rate_hz)
         last = np.floor((end_s - self.phase_s) * self.rate_hz)
-        times: Float64[np.ndarray, "n"] = self.phase_s + np.arange(first, last + 1.0) / self.rate_hz
-        return times
+        return np.asarray(self.phase_s + np.arange(first, last + 1.0) / self.rate_hz)
 
     def latest(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         """True time of the last reading at or before each time, seconds."""
-        latest: Float64[np.ndarray, "n"] = (
-            self.phase_s + np.floor((times_s - self.phase_s) * self.rate_hz) / self.rate_hz
-        )
-        return latest
+        return np.asarray(self.phase_s + np.floor((times_s - self.phase_s) * self.rate_hz) / self.rate_hz)

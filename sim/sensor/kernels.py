@@ -8,6 +8,7 @@ exposure. Velocity is constant within tiles of `TILE` x `TILE` pixels.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,8 +21,35 @@ Array32 = NDArray[np.float32]
 TILE = 32
 #: Steps per pixel of path of the integral over the exposure.
 STEPS_PER_PX = 8
-#: Weights below this are not worth adding.
-LEAST_TAP = 1e-6
+#: Weights below this are left out.
+MIN_TAP = 1e-6
+
+
+class Transfer(NamedTuple):
+    """A moving scene while it is shifted out.
+
+    Attributes
+    ----------
+    padded, pad
+        The scene, and its border in rows and columns.
+    response
+        Response of every pixel.
+    edges
+        First row of each block of rows, and the number of rows, shape (blocks + 1,).
+    field, step
+        Image velocity, as for `blur`.
+    start_s, row_s
+        Time at which the transfer starts, from mid exposure, and time per row.
+    """
+
+    padded: Array32
+    pad: int
+    response: Array32
+    edges: NDArray[np.int64]
+    field: Array
+    step: float
+    start_s: float
+    row_s: float
 
 
 @njit(cache=True)
@@ -89,7 +117,7 @@ def _tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
     for p in range(kernel.shape[0]):
         q = 0
         while q < kernel.shape[1] - 3:
-            if abs(kernel[p, q]) > LEAST_TAP:
+            if abs(kernel[p, q]) > MIN_TAP:
                 groups[count, 0] = p
                 groups[count, 1] = q
                 count += 1
@@ -204,48 +232,37 @@ def block_means(picture: Array32, edges: NDArray[np.int64]) -> Array32:
 
 
 @njit(cache=True)
-def passed_blocks(
-    prefix: Array32,
-    pad: int,
-    response: Array32,
-    edges: NDArray[np.int64],
-    field: Array,
-    step: float,
-    start_s: float,
-    row_s: float,
-    out: Array32,
-) -> None:
-    """What a packet gathers on its way out from the upper edge of each block of rows, in units of radiance x rows.
+def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Array32:
+    """Charge that a packet gathers on its way out from the upper edge of each block of rows, in radiance x rows.
 
     A packet that starts at the upper edge of block R passes the middle of block K < R when the picture has moved on
     for (R - K - 1/2) blocks. Each block of the scene is seen at that one time.
 
     Parameters
     ----------
-    prefix, pad
-        Sums over the padded scene's rows before each row, shape (padded rows + 1, padded columns), and the border.
+    transfer
+        The moving scene.
+    prefix
+        Sums over the padded scene's rows before each row, shape (padded rows + 1, padded columns).
     response
         Mean response of each block, shape (blocks, columns).
-    edges
-        First row of each block, and the number of rows, shape (blocks + 1,).
-    field, step
-        Image velocity, as for `blur`.
-    start_s, row_s
-        Time at which the transfer starts, from mid exposure, and time per row.
-    out
-        Output, shape (blocks + 1, columns): the sum at each edge.
+
+    Returns
+    -------
+    The sum at each edge, shape (blocks + 1, columns).
     """
+    pad, edges = transfer.pad, transfer.edges
     blocks, columns = response.shape
     line = np.empty(TILE, dtype=np.float32)
     sums = prefix.reshape(-1)
-    out[:] = 0.0
+    out = np.zeros((blocks + 1, columns), dtype=np.float32)
     for start in range(1, blocks + 1):
         for block in range(start):
             middle = 0.5 * (edges[block] + edges[block + 1])
-            time = start_s + (edges[start] - middle) * row_s
+            time = transfer.start_s + (edges[start] - middle) * transfer.row_s
             for left in range(0, columns, TILE):
                 width = min(TILE, columns - left)
-                by_row, by_column = velocity_at(field, step, middle - 0.5, left + 0.5 * (width - 1))
+                by_row, by_column = velocity_at(transfer.field, transfer.step, middle - 0.5, left + 0.5 * (width - 1))
                 y = pad - by_row * time
                 x = pad + left - by_column * time
                 line[:] = 0.0
@@ -253,57 +270,38 @@ def passed_blocks(
                 _add_moved(sums, prefix.shape, edges[block] + y, x, np.float32(-1.0), line, width)
                 for c in range(width):
                     out[start, left + c] += response[block, left + c] * line[c]
+    return out
 
 
 @njit(cache=True)
-def add_passed(
-    padded: Array32,
-    pad: int,
-    response: Array32,
-    passed: Array32,
-    edges: NDArray[np.int64],
-    field: Array,
-    step: float,
-    start_s: float,
-    row_s: float,
-    charge: Array32,
-) -> None:
-    """Adds what every row's packet gathers on its way out to `charge`, in units of radiance x seconds.
+def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
+    """Add to `charge` (radiance x seconds, changed in place) what every row's packet gathers on its way out.
 
-    Between the edges of a block the sums over earlier blocks change linearly, as their times do; the block's own rows
-    are added one by one, seen half a block's time after the start.
-
-    Parameters
-    ----------
-    padded, pad, response
-        The scene with its border, and the response of every pixel.
-    passed, edges
-        The sums from `passed_blocks`, and the blocks.
-    field, step, start_s, row_s
-        As for `passed_blocks`.
-    charge
-        Changed in place, shape (rows, columns).
+    Between the edges of a block the sums over earlier blocks (`gather_blocks`) change linearly, as their times do; the
+    block's own rows are added one by one, seen half a block's time after the start.
     """
+    padded, pad, response, edges = transfer.padded, transfer.pad, transfer.response, transfer.edges
     columns = response.shape[1]
-    seconds = np.float32(row_s)
-    scene, weights, gathered = padded.reshape(-1), response.reshape(-1), charge.reshape(-1)
+    seconds = np.float32(transfer.row_s)
+    scene, weights, total = padded.reshape(-1), response.reshape(-1), charge.reshape(-1)
     moved = np.empty((np.max(np.diff(edges)), TILE), dtype=np.float32)
     own = np.empty(TILE, dtype=np.float32)
     before = np.empty(TILE, dtype=np.float32)
     change = np.empty(TILE, dtype=np.float32)
     for block in range(len(edges) - 1):
         first, last = edges[block], edges[block + 1]
-        time = start_s + 0.5 * (last - first) * row_s
+        time = transfer.start_s + 0.5 * (last - first) * transfer.row_s
         for left in range(0, columns, TILE):
             width = min(TILE, columns - left)
-            by_row, by_column = velocity_at(field, step, 0.5 * (first + last - 1), left + 0.5 * (width - 1))
+            middle = 0.5 * (first + last - 1)
+            by_row, by_column = velocity_at(transfer.field, transfer.step, middle, left + 0.5 * (width - 1))
             y = pad - by_row * time
             x = pad + left - by_column * time
             moved[:] = 0.0
             own[:] = 0.0
             for k in range(width):
-                before[k] = passed[block, left + k]
-                change[k] = passed[block + 1, left + k] - before[k]
+                before[k] = gathered[block, left + k]
+                change[k] = gathered[block + 1, left + k] - before[k]
             for r in range(first, last):
                 line = moved[r - first]
                 _add_moved(scene, padded.shape, r + y, x, np.float32(1.0), line, width)
@@ -316,5 +314,5 @@ def add_passed(
                 line = moved[r - first]
                 start = np.uint64(r * columns + left)
                 for k in range(width):
-                    gathered[start + np.uint64(k)] += seconds * (before[k] + share * change[k] + own[k])
+                    total[start + np.uint64(k)] += seconds * (before[k] + share * change[k] + own[k])
                     own[k] += line[k]

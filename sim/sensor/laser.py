@@ -88,8 +88,7 @@ def beam_rays(axis: Float64[np.ndarray, "3"], width_rad: float) -> Float64[np.nd
     turns = np.arange(6) * np.pi / 3.0
     around = np.outer(np.cos(turns), sideways) + np.outer(np.sin(turns), np.cross(axis, sideways))
     rays = np.concatenate([axis[None], axis + np.tan(ring) * around])
-    unit: Float64[np.ndarray, "7 3"] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    return unit
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def range_along(
@@ -105,8 +104,7 @@ def range_along(
 
     def clearance(distances_m: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         points = position_m + distances_m[:, None] * axis
-        above: Float64[np.ndarray, "n"] = points[:, 2] - surface.height(points[:, 0], points[:, 1])
-        return above
+        return np.asarray(points[:, 2] - surface.height(points[:, 0], points[:, 1]))
 
     distances = np.linspace(0.0, max_range_m, count)
     under = np.flatnonzero(clearance(distances) <= 0.0)

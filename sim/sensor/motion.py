@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.sensor.kernels import add_passed, block_means, blur, passed_blocks, sums_before
+from marsyard.sim.sensor.kernels import Transfer, add_smear, block_means, blur, gather_blocks, sums_before
 
 #: Distance of the grid's nodes, pixels.
 GRID_STEP_PX = 32.0
@@ -181,10 +181,8 @@ def _add_smear(
     charge: Float32[np.ndarray, "rows columns"],
 ) -> None:
     """Adds what packets gather under the rows before their own on the way out, from `start_s` after mid exposure."""
-    rows, columns = response.shape
+    rows = len(response)
     block_rows = int(np.clip(BLOCK_PX / max(motion.greatest_px_s * row_s, 1e-12), *BLOCK_ROWS))
     edges = np.append(np.arange(0, rows, block_rows), rows).astype(np.int64)
-    passed = np.empty((len(edges), columns), dtype=np.float32)
-    field, step = motion.velocity_px_s, GRID_STEP_PX
-    passed_blocks(sums_before(padded), pad, block_means(response, edges), edges, field, step, start_s, row_s, passed)
-    add_passed(padded, pad, response, passed, edges, field, step, start_s, row_s, charge)
+    transfer = Transfer(padded, pad, response, edges, motion.velocity_px_s, GRID_STEP_PX, start_s, row_s)
+    add_smear(transfer, gather_blocks(transfer, sums_before(padded), block_means(response, edges)), charge)

@@ -81,19 +81,6 @@ class OdometryParameters(BaseModel):
     visual: VisualOdometryParameters = VisualOdometryParameters()
 
 
-#: Odometry without errors of its own: slip alone makes it wrong, and visual odometry sees that.
-EXACT = OdometryParameters(
-    scale_error=0.0,
-    walk_m=0.0,
-    heading_scale_error=0.0,
-    heading_drift_deg_m=0.0,
-    heading_walk_deg=0.0,
-    misalignment_deg=0.0,
-    tilt_noise_deg=0.0,
-    visual=VisualOdometryParameters(scale_error=0.0, walk_m=0.0, floor_m=0.0),
-)
-
-
 @dataclass(frozen=True)
 class PoseEstimate:
     """What the rover believes at a stop.
@@ -114,13 +101,7 @@ class PoseEstimate:
 
     def error_m(self, true: RigidTransform) -> Float64[np.ndarray, "3"]:
         """Estimated less true position, world axes, metres."""
-        error: Float64[np.ndarray, "3"] = self.world_from_rover.translation - true.translation
-        return error
-
-    def error_rad(self, true: RigidTransform) -> Float64[np.ndarray, "3"]:
-        """Rotation vector, world axes, that turns the true attitude into the estimated one, radians."""
-        error: Float64[np.ndarray, "3"] = (self.world_from_rover.rotation * true.rotation.inv()).as_rotvec()
-        return error
+        return np.asarray(self.world_from_rover.translation - true.translation)
 
 
 @dataclass(frozen=True)
@@ -226,8 +207,7 @@ class Odometer:
         paths[:, :2] += noise_m / len(paths)
         true = Rotation.concatenate([part.before.world_from_rover.rotation for part in driven.parts])
         turn = Rotation.from_rotvec([0.0, 0.0, estimate.heading_error_rad]) * self._anchor
-        moved: Float64[np.ndarray, "3"] = (turn * true * self.misalignment).apply(paths).sum(axis=0)
-        return moved
+        return np.asarray((turn * true * self.misalignment).apply(paths).sum(axis=0))
 
     def _seen(self, estimate: PoseEstimate, driven: Drive, draws: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
         """Motion as visual odometry has it, world axes."""
@@ -236,5 +216,4 @@ class Odometer:
         motion = (start.inv() * end).translation
         error = np.hypot(p.walk_m * np.sqrt(driven.length_m), p.floor_m) * draws
         attitude = self._attitude(start, estimate.heading_error_rad)
-        moved: Float64[np.ndarray, "3"] = attitude.apply((1.0 + self.visual_scale) * motion + error)
-        return moved
+        return np.asarray(attitude.apply((1.0 + self.visual_scale) * motion + error))

@@ -78,10 +78,7 @@ def spread(
     if parameters.diffraction_px == 0.0 and parameters.diffusion_px == 0.0 and not parameters.pixel_aperture:
         return radiance
     taps = line_spread(parameters)
-    picture: Float32[np.ndarray, "rows columns"] = cv2.sepFilter2D(
-        radiance, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT
-    )
-    return picture
+    return np.asarray(cv2.sepFilter2D(radiance, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT))
 
 
 def natural_fall_off(camera: CameraModel) -> Float32[np.ndarray, "rows columns"]:

@@ -179,16 +179,14 @@ def _slopes(
 ) -> Float64[np.ndarray, "n"]:
     """Slope of the ground at offsets in plan, smoothed to the step."""
     x, y = position_m[0] + offsets_m[:, 0], position_m[1] + offsets_m[:, 1]
-    slopes: Float64[np.ndarray, "n"] = np.linalg.norm(surface.gradient(x, y, _level(surface, step_m)), axis=-1)
-    return slopes
+    return np.asarray(np.linalg.norm(surface.gradient(x, y, _level(surface, step_m)), axis=-1))
 
 
 def _refined(offsets_m: Float64[np.ndarray, "n 2"], step_m: float) -> Float64[np.ndarray, "m 2"]:
     """These nodes, each with its neighbours of a grid `REFINEMENT` times as fine."""
     line = (np.arange(REFINEMENT) - 0.5 * (REFINEMENT - 1)) * step_m
     about = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    refined: Float64[np.ndarray, "m 2"] = (offsets_m[:, None, :] + about).reshape(-1, 2)
-    return refined
+    return np.asarray((offsets_m[:, None, :] + about).reshape(-1, 2))
 
 
 def _level(surface: Surface, step_m: float) -> int:

@@ -121,11 +121,6 @@ class LightPath:
         flux = float(np.trapezoid(passed, wavelength_nm)) / sun_distance_au**2
         return area * self.transmission * flux / (4.0 * self.f_number**2)
 
-    def filter_transmission(self) -> float:
-        """Share of the electrons that the neutral-density filter leaves."""
-        wavelength_nm, electrons = self._electrons_per_m2()
-        return float(np.average(self._filter(wavelength_nm, electrons), weights=electrons))
-
     def mean_wavelength_nm(self) -> float:
         """Mean wavelength of the electrons' photons."""
         wavelength_nm, electrons = self._electrons_per_m2()
@@ -151,8 +146,7 @@ class LightPath:
             return np.ones_like(wavelength_nm)
         middle = np.average(wavelength_nm, weights=weights)
         tilt = 1.0 + DENSITY_SLOPE_PER_100_NM * (wavelength_nm - middle) / 100.0
-        transmitted: Float64[np.ndarray, "n"] = 10.0 ** (-self.neutral_density.optical_density * tilt)
-        return transmitted
+        return np.asarray(10.0 ** (-self.neutral_density.optical_density * tilt))
 
 
 def solar_photons(wavelength_nm: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
@@ -174,12 +168,4 @@ def signal_to_noise(
     signal = radiance_factor * p.responsivity_e_s * p.exposure_s * p.rows_summed
     dark = p.rows_summed * p.dark_e_s * p.dark_growth * dark_seconds(p, rows)
     noise = np.sqrt(signal + dark + p.read_noise_e**2 + p.gain_e_dn**2 / 12.0)
-    ratio: Float64[np.ndarray, "delivered_rows"] = signal / noise
-    return ratio
-
-
-def dark_share(parameters: DetectorParameters, radiance_factor: float, rows: int = 1024) -> float:
-    """Dark current's share of the noise: 1 - SNR / SNR without dark current, means over the picture's rows."""
-    without = parameters.model_copy(update={"dark_e_s": 0.0})
-    ratio = signal_to_noise(parameters, radiance_factor, rows).mean()
-    return float(1.0 - ratio / signal_to_noise(without, radiance_factor, rows).mean())
+    return np.asarray(signal / noise)

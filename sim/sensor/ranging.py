@@ -87,5 +87,4 @@ class RangingUnit:
 
 def height_above_ground(surface: Surface, positions_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
     """True altitude: height above the ground straight below, metres."""
-    height: Float64[np.ndarray, "n"] = positions_m[:, 2] - surface.height(positions_m[:, 0], positions_m[:, 1])
-    return height
+    return np.asarray(positions_m[:, 2] - surface.height(positions_m[:, 0], positions_m[:, 1]))

@@ -69,5 +69,4 @@ class GaussMarkov:
                 f"errors are asked for from {times_s.min():.3f} s to {times_s.max():.3f} s; they were drawn from "
                 f"{self.knots_s[0]:.3f} s to {self.knots_s[-1]:.3f} s"
             )
-        values: Float64[np.ndarray, "n channels"] = make_interp_spline(self.knots_s, self.values, k=1)(times_s)
-        return values
+        return np.asarray(make_interp_spline(self.knots_s, self.values, k=1)(times_s))

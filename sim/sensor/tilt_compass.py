@@ -133,8 +133,7 @@ class TiltCompass:
         """Error of the heading of a level unit at rest, noise apart, at true azimuths."""
         a = azimuths_rad
         round_about = np.stack([np.sin(a), np.cos(a), np.sin(2.0 * a), np.cos(2.0 * a)])
-        deviation: Float64[np.ndarray, "n"] = self.heading_bias_rad + self.iron_rad @ round_about
-        return deviation
+        return np.asarray(self.heading_bias_rad + self.iron_rad @ round_about)
 
     def _shown(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
         """Directions along which the pendulums lie: those of the specific force, lagging."""
@@ -174,8 +173,7 @@ class TiltCompass:
 
 
 def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    scaled: Float64[np.ndarray, "n 3"] = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return scaled
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 def _held(

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float32
 
 from marsyard.sim.cache import CacheWarning, cache_directory, load_array, make_room, save_array, touch
-from marsyard.sim.terrain.embedding import RealExtent, embed
 from marsyard.sim.terrain.parameters import TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
 from marsyard.sim.terrain.substreams import substream
@@ -72,11 +71,6 @@ class TerrainBank:
 
     def _rng(self, number: int) -> np.random.Generator:
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))
-
-    def real_extent(self) -> RealExtent | None:
-        """Where the real part of the bank's terrains lies; None where they are wholly synthetic."""
-        p = self.parameters
-        return None if p.source is None else embed(p.source, p.samples, p.spacing_m).extent
 
     def _path(self, number: int) -> Path:
         parameters = self.parameters.model_dump_json(exclude={"rocks"})

@@ -146,7 +146,4 @@ def nadir_picture(
     )
     cos_i = np.maximum(towards * up, 0.0)
     direct = 2.0 * CONTRAST_LUNAR_SHARE * cos_i / (cos_i + up) + (1.0 - CONTRAST_LUNAR_SHARE) * cos_i
-    brightness: Float64[np.ndarray, "rows columns"] = field[..., ALBEDO] * (
-        direct + CONTRAST_SKY_SHARE * 0.5 * (1.0 + up)
-    )
-    return brightness
+    return np.asarray(field[..., ALBEDO] * (direct + CONTRAST_SKY_SHARE * 0.5 * (1.0 + up)))

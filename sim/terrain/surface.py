@@ -85,5 +85,4 @@ class Surface:
         values = evaluate_field(
             self.levels[level], self.spacing_m * 2.0**level, np.ascontiguousarray(x.ravel()), y.ravel().copy()
         )
-        shaped: Float[np.ndarray, "*batch 4"] = values.reshape(*x.shape, 4)
-        return shaped
+        return np.asarray(values.reshape(*x.shape, 4))

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import marsyard.algorithms.dimes.threshold as derivation
+import benchmarks.threshold_derivation as derivation
+from benchmarks import dimes_threshold
+from benchmarks.threshold_derivation import ThresholdInputs, discrepancies, harm, right_track_errors, threshold_m_s
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.threshold import ThresholdInputs, discrepancies, harm, right_track_errors, threshold_m_s
 
-STORED = json.loads(Path(derivation.__file__).with_name("imu_threshold.json").read_text())
+STORED = json.loads(dimes_threshold.STORED.read_text())
 EXACT = ThresholdInputs(
     descents=20,
     altitude_sd=0.0,

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.threshold_derivation import ThresholdInputs, right_track_errors
 from benchmarks.validation import dimes_checks, landing_checks, tracking_checks
 from benchmarks.validation.document import RESULTS
 from benchmarks.validation.imu_reference import Reference
 from benchmarks.validation.records import Measure
-from marsyard.algorithms.dimes.threshold import ThresholdInputs, right_track_errors
 
 NAN = float("nan")
 #: Bars that are wider than three times their figure, by how their claims begin, and why.

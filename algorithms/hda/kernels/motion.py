@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -13,6 +14,23 @@ Array = NDArray[np.float64]
 LARGEST_DAMPING = 1e12
 #: Curvature added to each depth's, of the squared focal length: depths stay where they are when the camera stood still.
 DEPTH_FLOOR = 1e-14
+
+
+class Matches(NamedTuple):
+    """Features in both pictures, normalised image coordinates (n, 2); focal length and Cauchy's scale, px."""
+
+    first: Array
+    second: Array
+    focal: float
+    scale: float
+
+
+class Motion(NamedTuple):
+    """Rotation (unit quaternion w, x, y, z), translation, and the features' inverse depths in the first camera."""
+
+    q: Array
+    t: Array
+    inverse_depths: Array
 
 
 @njit(cache=True)
@@ -44,8 +62,10 @@ def turned(q: Array, step: Array) -> Array:
 
 
 @njit(cache=True)
-def residuals(first: Array, second: Array, focal: float, q: Array, t: Array, inverse_depths: Array) -> Array:
-    """Pixels from where the features were found to where motion and depths put them, shape (n, 2); inf behind."""
+def residuals(matches: Matches, motion: Motion) -> Array:
+    """Reprojection less measurement in the second picture, pixels, shape (n, 2); inf behind the camera."""
+    first, second, focal, _ = matches
+    q, t, inverse_depths = motion
     R = rotation_matrix(q)
     result = np.empty_like(second)
     for i in range(first.shape[0]):
@@ -94,47 +114,20 @@ def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, 
 
 
 @njit(cache=True)
-def _solved(S: Array, g: Array) -> Array:
-    """Solves S x = g by Cholesky, S given by its lower half; NaN where S is not positive."""
-    n = g.size
-    L = np.zeros((n, n))
-    x = np.empty(n)
-    for a in range(n):
-        for b in range(a + 1):
-            total = S[a, b]
-            for c in range(b):
-                total -= L[a, c] * L[b, c]
-            if a == b:
-                L[a, a] = math.sqrt(total) if total > 0.0 else math.nan
-            else:
-                L[a, b] = total / L[b, b]
-    for a in range(n):
-        total = g[a]
-        for c in range(a):
-            total -= L[a, c] * x[c]
-        x[a] = total / L[a, a]
-    for a in range(n - 1, -1, -1):
-        total = x[a]
-        for c in range(a + 1, n):
-            total -= L[c, a] * x[c]
-        x[a] = total / L[a, a]
-    return x
+def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, with_depths: bool) -> tuple[Array, Array]:
+    """A damped Gauss-Newton step of rotation and translation (6,) and of inverse depths, by Schur's complement.
 
-
-@njit(cache=True)
-def _step(
-    first: Array, r: Array, focal: float, q: Array, t: Array, inverse_depths: Array, scale: float, damping: float,
-    with_depths: bool,
-) -> tuple[Array, Array]:  # fmt: skip
-    """A damped Gauss-Newton step of rotation and translation (6,) and of inverse depths, by Schur's complement."""
+    NaN where the normal equations are not finite.
+    """
+    first, focal, scale = matches.first, matches.focal, matches.scale
     n = first.shape[0]
-    R = rotation_matrix(q)
+    R = rotation_matrix(motion.q)
     Jm, Jd = np.empty((2, 6)), np.empty(2)
     S, g, diagonal = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     mixed, curvature, slope = np.empty((n, 6)), np.empty(n), np.empty(n)
     for i in range(n):
         weight = 1.0 / (1.0 + (r[i, 0] ** 2 + r[i, 1] ** 2) / scale**2)
-        _jacobian(first[i, 0], first[i, 1], inverse_depths[i], focal, R, t, Jm, Jd)
+        _jacobian(first[i, 0], first[i, 1], motion.inverse_depths[i], focal, R, motion.t, Jm, Jd)
         curvature[i] = weight * (Jd[0] ** 2 + Jd[1] ** 2) * (1.0 + damping) + DEPTH_FLOOR * focal**2
         slope[i] = weight * (Jd[0] * r[i, 0] + Jd[1] * r[i, 1])
         for a in range(6):
@@ -143,13 +136,14 @@ def _step(
         for a in range(6):
             g[a] += weight * (Jm[0, a] * r[i, 0] + Jm[1, a] * r[i, 1]) - mixed[i, a] * slope[i] * eliminated
             diagonal[a] += weight * (Jm[0, a] ** 2 + Jm[1, a] ** 2)
-            for b in range(a + 1):
+            for b in range(6):
                 S[a, b] += weight * (Jm[0, a] * Jm[0, b] + Jm[1, a] * Jm[1, b])
                 S[a, b] -= mixed[i, a] * mixed[i, b] * eliminated
     for a in range(6):
         S[a, a] += damping * diagonal[a] + 1e-15 * focal**2
-    step = -_solved(S, g)
-    depth_steps = np.zeros(n)
+    step, depth_steps = np.full(6, math.nan), np.zeros(n)
+    if np.all(np.isfinite(S)) and np.all(np.isfinite(g)):
+        step = -np.linalg.solve(S, g)
     if with_depths:
         for i in range(n):
             depth_steps[i] = -(slope[i] + np.sum(mixed[i] * step)) / curvature[i]
@@ -158,34 +152,32 @@ def _step(
 
 @njit(cache=True)
 def solve(
-    first: Array, second: Array, focal: float, q: Array, t: Array, inverse_depths: Array, scale: float,
-    with_depths: bool, iterations: int, tolerance: float,
-) -> tuple[Array, Array, Array, float, bool, int]:  # fmt: skip
-    """Minimises Cauchy's cost from a start; the translation is in the unit that inverse depths are in.
+    matches: Matches, start: Motion, with_depths: bool, iterations: int, tolerance: float
+) -> tuple[Motion, float, bool, int]:
+    """Minimise Cauchy's cost from a start; the translation is in the unit that inverse depths are in.
 
-    Returns the quaternion, translation, inverse depths, cost, whether it converged (a step below the tolerance, or none
-    that lowers the cost) and how many steps were tried.
+    Returns motion and depths, cost, whether it converged (a step below the tolerance, or none that lowers the cost) and
+    how many steps were tried.
     """
-    r = residuals(first, second, focal, q, t, inverse_depths)
-    cost = cauchy_cost(r, scale)
+    motion = start
+    r = residuals(matches, motion)
+    cost = cauchy_cost(r, matches.scale)
     damping = 1e-3
     for iteration in range(iterations):
-        step, depth_steps = _step(first, r, focal, q, t, inverse_depths, scale, damping, with_depths)
-        new_q = turned(q, step[:3])
-        new_t = t + step[3:]
-        new_depths = inverse_depths + depth_steps
-        new_r = residuals(first, second, focal, new_q, new_t, new_depths)
-        new_cost = cauchy_cost(new_r, scale)
+        step, depth_steps = _compute_step(matches, r, motion, damping, with_depths)
+        tried = Motion(turned(motion.q, step[:3]), motion.t + step[3:], motion.inverse_depths + depth_steps)
+        new_r = residuals(matches, tried)
+        new_cost = cauchy_cost(new_r, matches.scale)
         size = math.sqrt(np.sum(step * step))
         if new_cost <= cost:
-            q, t, inverse_depths, r, cost = new_q, new_t, new_depths, new_r, new_cost
+            motion, r, cost = tried, new_r, new_cost
             damping = max(damping * 0.1, 1e-12)
             if size < tolerance:
-                return q, t, inverse_depths, cost, True, iteration + 1
+                return motion, cost, True, iteration + 1
         elif size < tolerance:
-            return q, t, inverse_depths, cost, True, iteration + 1
+            return motion, cost, True, iteration + 1
         else:
             damping *= 10.0
             if damping > LARGEST_DAMPING:
-                return q, t, inverse_depths, cost, False, iteration + 1
-    return q, t, inverse_depths, cost, False, iterations
+                return motion, cost, False, iteration + 1
+    return motion, cost, False, iterations

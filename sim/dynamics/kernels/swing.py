@@ -14,7 +14,6 @@ import numpy as np
 from numba import njit
 from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import NDArray
-from scipy.integrate import DOP853
 
 Array = NDArray[np.float64]
 
@@ -71,13 +70,8 @@ CHAIN_SIZE = len(Chain._fields)
 #: Without the waves.
 FIELD_SIZE = len(WindField._fields) - 1
 
-#: SciPy's coefficients of DOP853 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, II.5), and
-#: those of its control of the step.
-A, B, E3, E5 = (np.ascontiguousarray(one) for one in (DOP853.A, DOP853.B, DOP853.E3, DOP853.E5))
-A_EXTRA, D = np.ascontiguousarray(DOP853.A_EXTRA), np.ascontiguousarray(DOP853.D)
-STAGES, EXTRA, TERMS = len(B), len(A_EXTRA), 3 + len(D)
-SAFETY, MOST_SHRINKING, MOST_GROWTH = 0.9, 0.2, 10.0
-EXPONENT = -1.0 / (DOP853.error_estimator_order + 1)
+#: Terms of SciPy's polynomial over a step of DOP853.
+TERMS = 7
 
 
 @njit(cache=True)
@@ -140,7 +134,7 @@ def aerodynamic_force(y: Array, chain: Chain, field: WindField, force: Array) ->
 
 @njit(cache=True)
 def slope(_t: float, y: Array, constants: Array, waves: Array) -> Array:
-    """`derivatives` as an integrator calls it: with the constants of `packed`, which numba takes in far sooner."""
+    """`derivatives` as an integrator calls it, with the constants of `packed`: numba converts tuples slowly."""
     chain = Chain(*to_fixed_tuple(constants[:CHAIN_SIZE], CHAIN_SIZE))
     mean = to_fixed_tuple(constants[CHAIN_SIZE:], FIELD_SIZE)
     rates: Array = derivatives(y, chain, WindField(mean[0], mean[1], mean[2], mean[3], mean[4], waves))
@@ -153,125 +147,8 @@ def packed(chain: Chain, field: WindField) -> tuple[Array, Array]:
 
 
 @njit(cache=True)
-def _advanced(y: Array, length: float, weights: Array, stages: Array, out: Array) -> None:
-    """Writes a state moved on by a weighted sum of the first stages, as many as there are weights."""
-    for i in range(SIZE):
-        rate = 0.0
-        for k in range(weights.size):
-            rate += weights[k] * stages[k, i]
-        out[i] = y[i] + length * rate
-
-
-@njit(cache=True)
-def _error(before: Array, after: Array, relative: float, absolute: float, length: float, stages: Array) -> float:
-    """Norm of a step's error over what is tolerated: that of the fifth order, tempered by that of the third."""
-    fifth = 0.0
-    third = 0.0
-    for i in range(SIZE):
-        scale = absolute + relative * max(abs(before[i]), abs(after[i]))
-        a = 0.0
-        b = 0.0
-        for k in range(STAGES + 1):
-            a += stages[k, i] * E5[k]
-            b += stages[k, i] * E3[k]
-        fifth += (a / scale) ** 2
-        third += (b / scale) ** 2
-    if fifth == 0.0 and third == 0.0:
-        return 0.0
-    return abs(length) * fifth / math.sqrt((fifth + 0.01 * third) * SIZE)
-
-
-@njit(cache=True)
-def step(
-    t: float,
-    y: Array,
-    trial: float,
-    end: float,
-    relative: float,
-    absolute: float,
-    constants: Array,
-    waves: Array,
-    stages: Array,
-) -> tuple[bool, float, float, Array]:
-    """One step of DOP853, as SciPy takes it.
-
-    Parameters
-    ----------
-    t, y
-        Time and state.
-    trial, end
-        Length that is tried first, negative backwards, and the time that is not passed.
-    relative, absolute
-        Tolerances of the error.
-    constants, waves
-        As for `slope`.
-    stages
-        Slopes, shape (stages, 22): of the step's start, given; of its other stages and of its end, written.
-
-    Returns
-    -------
-    Whether a step could be taken, the time of its end, the size to try next, and the state there.
-    """
-    direction = 1.0 if trial > 0.0 else -1.0
-    shortest = 10.0 * abs(np.nextafter(t, direction * np.inf) - t)
-    size = max(abs(trial), shortest)
-    after = np.empty(SIZE)
-    rejected = False
-    while size >= shortest:
-        later = t + direction * size
-        if direction * (later - end) > 0.0:
-            later = end
-        length = later - t
-        size = abs(length)
-        for k in range(1, STAGES):
-            _advanced(y, length, A[k, :k], stages, after)
-            stages[k] = slope(t, after, constants, waves)
-        _advanced(y, length, B, stages, after)
-        stages[STAGES] = slope(t, after, constants, waves)
-        error = _error(y, after, relative, absolute, length, stages)
-        if error < 1.0:
-            growth = MOST_GROWTH if error == 0.0 else min(MOST_GROWTH, SAFETY * error**EXPONENT)
-            return True, later, size * (min(1.0, growth) if rejected else growth), after
-        size *= max(MOST_SHRINKING, SAFETY * error**EXPONENT)
-        rejected = True
-    return False, t, size, after
-
-
-@njit(cache=True)
-def terms(before: Array, after: Array, length: float, constants: Array, waves: Array, stages: Array) -> Array:
-    """Terms of DOP853's polynomial over a step, shape (7, 22), from its stages; its last three are written."""
-    at = np.empty(SIZE)
-    for k in range(EXTRA):
-        last = STAGES + 1 + k
-        _advanced(before, length, A_EXTRA[k, :last], stages, at)
-        stages[last] = slope(0.0, at, constants, waves)
-    out = np.zeros((TERMS, SIZE))
-    for i in range(SIZE):
-        change = after[i] - before[i]
-        out[0, i] = change
-        out[1, i] = length * stages[0, i] - change
-        out[2, i] = 2.0 * change - length * (stages[STAGES, i] + stages[0, i])
-        for k in range(TERMS - 3):
-            for stage in range(stages.shape[0]):
-                out[3 + k, i] += length * D[k, stage] * stages[stage, i]
-    return out
-
-
-@njit(cache=True)
 def interpolated(times: Array, knots: Array, starts: Array, lengths: Array, states: Array, polynomials: Array) -> Array:
-    """States at some times, a row each.
-
-    Parameters
-    ----------
-    times
-        The times.
-    knots
-        Earliest time of each step, increasing.
-    starts, lengths, states
-        Time and state from which each step was taken, and its length, negative backwards.
-    polynomials
-        The steps' `terms`, shape (steps, 7, 22).
-    """
+    """States at some times, a row each: the polynomials of `marsyard.sim.dynamics.integration.Path`, all at once."""
     rows = np.empty((times.size, SIZE))
     for n in range(times.size):
         i = max(np.searchsorted(knots, times[n], side="right") - 1, 0)

@@ -133,12 +133,15 @@ class RotorcraftFlight:
         Thrust and trim at the last knot.
     heading_rad
         Yaw that is held.
+    craft
+        The helicopter.
     """
 
     path: FlownPath
     phases: Int64[np.ndarray, "knots"]
     carried: Float64[np.ndarray, "4"]
     heading_rad: float
+    craft: RotorcraftParameters
 
     def first(self, phase: Phase) -> float | None:
         """Time at which a phase began; None if it did not."""
@@ -183,14 +186,13 @@ def transit_flight(
     rows = np.zeros((count, SIZE))
     rows[0, PLACE : PLACE + 3] = reference[0, :3]
     rows[0, kernels.ANGLE :][:3], carried = _trimmed(constants, heading_rad, air.mean_m_s)
-    kernels.follow(rows, carried, reference, heading_rad, air.mean_m_s, air.gusts_m_s, step, constants)
+    kernels.follow(kernels.Flight(rows, carried, heading_rad, air.mean_m_s, air.gusts_m_s, step), reference, constants)
     path = FlownPath(-p.lead_s, step, rows, Vibration.drawn(craft.vibration, rng), gravity_m_s2)
-    return RotorcraftFlight(path, np.full(count, Phase.TRANSIT.value), carried, heading_rad)
+    return RotorcraftFlight(path, np.full(count, Phase.TRANSIT.value), carried, heading_rad, craft)
 
 
 def landing_flight(
     flown: RotorcraftFlight,
-    craft: RotorcraftParameters,
     guidance: LandingGuidance,
     site_m: Float64[np.ndarray, "2"],
     errors: Float64[np.ndarray, "m 9"],
@@ -199,7 +201,7 @@ def landing_flight(
     laser: LandingLaser,
     end_s: float | None = None,
 ) -> RotorcraftFlight:
-    """The flight on to a site and down; it ends when told, or else a while after the touchdown or when the time is up.
+    """The flight on to a site and down, until `end_s`, or else `rest_s` after the touchdown or when the time is up.
 
     Parameters
     ----------
@@ -216,7 +218,7 @@ def landing_flight(
     ValueError
         If the air or the laser's noise is known for less than the flight may take.
     """
-    step, before = craft.step_s, len(flown.path.rows)
+    step, before = flown.craft.step_s, len(flown.path.rows)
     count = before + int(np.ceil((guidance.wait_s + guidance.longest_s) / step))
     air.check_lasts(count)
     if len(laser.noise_m) < count:
@@ -224,11 +226,36 @@ def landing_flight(
     rows = np.concatenate([flown.path.rows, np.zeros((count - before, SIZE))])
     phases = np.concatenate([flown.phases, np.full(count - before, Phase.WAIT.value)])
     held = np.concatenate([errors, np.repeat(errors[-1:], max(count - len(errors), 0), axis=0)])
-    commands = kernels.Landing(
+    hover_m = float(rows[before - 1, 2] + held[before - 1, 2])
+    wait_until = before - 1 + round((guidance.wait_s - TAIL_S) / step)
+    flight = kernels.Flight(rows, flown.carried.copy(), flown.heading_rad, air.mean_m_s, air.gusts_m_s, step)
+    kernels.land(
+        flight,
+        phases,
+        before - 1,
+        held,
+        laser.noise_m,
+        ground.as_kernel(),
+        _landing_commands(guidance, site_m, hover_m, wait_until, laser),
+        flown.craft.craft(flown.path.gravity_m_s2),
+    )
+    landed = np.flatnonzero(phases == Phase.ON_GROUND.value)
+    if end_s is not None:
+        count = min(count, round((end_s - flown.path.start_s) / step) + 1)
+    elif landed.size:
+        count = min(count, int(landed[0]) + int(np.ceil(guidance.rest_s / step)))
+    path = replace(flown.path, rows=rows[:count])
+    return replace(flown, path=path, phases=phases[:count], carried=flight.carried)
+
+
+def _landing_commands(
+    guidance: LandingGuidance, site_m: Float64[np.ndarray, "2"], hover_m: float, wait_until: int, laser: LandingLaser
+) -> kernels.Landing:
+    return kernels.Landing(
         site_east_m=float(site_m[0]),
         site_north_m=float(site_m[1]),
-        hover_m=float(rows[before - 1, 2] + held[before - 1, 2]),
-        wait_until=before - 1 + round((guidance.wait_s - TAIL_S) / step),
+        hover_m=hover_m,
+        wait_until=wait_until,
         approach_m_s=guidance.approach_m_s,
         near_m=guidance.near_m,
         descent_m_s=guidance.descent_m_s,
@@ -237,28 +264,6 @@ def landing_flight(
         laser_scale=laser.scale,
         laser_stuck_m=np.nan if laser.stuck_m is None else laser.stuck_m,
     )
-    carried = flown.carried.copy()
-    kernels.land(
-        rows,
-        phases,
-        before - 1,
-        carried,
-        held,
-        flown.heading_rad,
-        air.mean_m_s,
-        air.gusts_m_s,
-        laser.noise_m,
-        ground.as_kernel(),
-        commands,
-        step,
-        craft.craft(flown.path.gravity_m_s2),
-    )
-    landed = np.flatnonzero(phases == Phase.ON_GROUND.value)
-    if end_s is not None:
-        count = min(count, round((end_s - flown.path.start_s) / step) + 1)
-    elif landed.size:
-        count = min(count, int(landed[0]) + int(np.ceil(guidance.rest_s / step)))
-    return RotorcraftFlight(replace(flown.path, rows=rows[:count]), phases[:count], carried, flown.heading_rad)
 
 
 def _run_up(

@@ -59,6 +59,20 @@ class Landing(NamedTuple):
     laser_stuck_m: float
 
 
+class Flight(NamedTuple):
+    """A flight in progress: its rows, what is carried along, the yaw that is held, and the air at the knots.
+
+    `rows` and `carried` are written; `gusts` has a row for each of `rows`.
+    """
+
+    rows: Array
+    carried: Array
+    heading: float
+    wind: Array
+    gusts: Array
+    step: float
+
+
 class Ground(NamedTuple):
     """Heights on a grid: bilinear within it, held beyond. Row i lies at north_m + i * spacing_m."""
 
@@ -134,20 +148,10 @@ def _advance(row: Array, after: Array, step: float) -> None:
 
 
 @njit(cache=True)
-def _flown(
-    row: Array,
-    after: Array,
-    carried: Array,
-    tilt_error: Array,
-    ask: tuple[float, float, float],
-    heading: float,
-    wind: Array,
-    gust: Array,
-    step: float,
-    c: Craft,
-) -> None:
-    """Writes the next row: angles under the autopilot's command, then thrust along the body's z, drag and gravity."""
-    g = c.gravity_m_s2
+def _fly(flight: Flight, k: int, tilt_error: Array, ask: tuple[float, float, float], c: Craft) -> None:
+    """Write the row after row k: angles under the autopilot's command, then thrust along body z, drag and gravity."""
+    row, after, gust = flight.rows[k], flight.rows[k + 1], flight.gusts[k + 1]
+    carried, step, g = flight.carried, flight.step, c.gravity_m_s2
     believed = row[ANGLE] + tilt_error[0]
     cy, sy = math.cos(believed), math.sin(believed)
     pitch_ask = math.atan2(cy * ask[0] + sy * ask[1], g)
@@ -160,7 +164,7 @@ def _flown(
     across = cy * gust[1] - sy * gust[0]
     # the autopilot regulates what it believes; the gust tilts the rotor along itself and turns the nose into it
     aims = (
-        heading - tilt_error[0] - c.gust_yaw_s_m * across,
+        flight.heading - tilt_error[0] - c.gust_yaw_s_m * across,
         pitch_ask - tilt_error[1] + c.gust_tilt_s_m * along,
         roll_ask - tilt_error[2] - c.gust_tilt_s_m * across,
     )
@@ -182,7 +186,7 @@ def _flown(
     after[PUSH + 2] = thrust * math.cos(roll) * math.cos(pitch) - g
     for i in range(3):
         speed = row[SPEED + i] + step * row[PUSH + i]
-        after[PUSH + i] += (wind[i] + gust[i] - speed) / c.drag_s
+        after[PUSH + i] += (flight.wind[i] + gust[i] - speed) / c.drag_s
     _advance(row, after, step)
 
 
@@ -198,37 +202,31 @@ def _resting(row: Array, after: Array, step: float, c: Craft) -> None:
 
 
 @njit(cache=True)
-def follow(
-    rows: Array, carried: Array, path: Array, heading: float, wind: Array, gusts: Array, step: float, c: Craft
-) -> None:
-    """Fills rows from the first, which is given, along a path of rows (place, speed, push), on true states."""
+def follow(flight: Flight, path: Array, c: Craft) -> None:
+    """Fill rows from the first along a path of rows (position, velocity, acceleration), on true states."""
     exact = np.zeros(3)
-    for k in range(rows.shape[0] - 1):
-        seen = rows[max(k - c.delay_steps, 0)]
-        ask = _wanted(seen, carried, path[k, 0:3], path[k, 3:6], path[k, 6:9], step, c)
-        _flown(rows[k], rows[k + 1], carried, exact, ask, heading, wind, gusts[k + 1], step, c)
+    for k in range(flight.rows.shape[0] - 1):
+        seen = flight.rows[max(k - c.delay_steps, 0)]
+        ask = _wanted(seen, flight.carried, path[k, 0:3], path[k, 3:6], path[k, 6:9], flight.step, c)
+        _fly(flight, k, exact, ask, c)
 
 
 @njit(cache=True)
 def land(
-    rows: Array,
+    flight: Flight,
     phases: NDArray[np.int64],
     start: int,
-    carried: Array,
     errors: Array,
-    heading: float,
-    wind: Array,
-    gusts: Array,
     laser_noise: Array,
     ground: Ground,
     landing: Landing,
-    step: float,
     c: Craft,
 ) -> None:
-    """Fills rows and phases after `start`, on what is believed.
+    """Fill rows and phases after `start`, guided by the believed state.
 
-    Rows of `errors` are believed less true place, speed and angles (yaw, pitch, roll).
+    Rows of `errors` are believed less true position, velocity and angles (yaw, pitch, roll).
     """
+    rows = flight.rows
     goal = np.empty(3)
     speed = np.zeros(3)
     none = np.zeros(3)
@@ -240,7 +238,7 @@ def land(
             believed[i] = rows[seen, i] + errors[seen, i]
         if phase == REST:
             phases[k + 1] = REST
-            _resting(rows[k], rows[k + 1], step, c)
+            _resting(rows[k], rows[k + 1], flight.step, c)
             continue
         if phase == WAIT and k >= landing.wait_until:
             phase = APPROACH
@@ -264,8 +262,8 @@ def land(
         if phase >= DESCEND:
             speed[2] = -landing.descent_m_s if phase == DESCEND else -landing.flare_m_s
             goal[2] = believed[2]
-        ask = _wanted(believed, carried, goal, speed, none, step, c)
-        _flown(rows[k], rows[k + 1], carried, errors[k, PUSH:], ask, heading, wind, gusts[k + 1], step, c)
+        ask = _wanted(believed, flight.carried, goal, speed, none, flight.step, c)
+        _fly(flight, k, errors[k, PUSH:], ask, c)
         after = rows[k + 1]
         if phase != WAIT and after[2] - c.gear_m <= ground_height(ground, after[0], after[1]):
             phase = REST

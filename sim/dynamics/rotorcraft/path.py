@@ -10,8 +10,7 @@ from jaxtyping import Float64
 from marsyard.sim.dynamics.angles import turning
 from marsyard.sim.dynamics.rotorcraft.kernels import ANGLE, PLACE, PUSH, RATE, SPEED, TWIST
 from marsyard.sim.dynamics.rotorcraft.parameters import VibrationParameters
-from marsyard.sim.dynamics.state import State
-from marsyard.sim.dynamics.trajectory import Motion
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory
 
 
 @dataclass(frozen=True)
@@ -42,12 +41,11 @@ class Vibration:
     def derivative(self, times_s: Float64[np.ndarray, "n"], order: int) -> Float64[np.ndarray, "n 6"]:
         """Displacement (order 0) or a derivative of it at these times."""
         turned = self.rate_rad_s * times_s[:, None] + self.phases_rad + 0.5 * np.pi * order
-        shaken: Float64[np.ndarray, "n 6"] = self.amplitudes * self.rate_rad_s**order * np.sin(turned)
-        return shaken
+        return np.asarray(self.amplitudes * self.rate_rad_s**order * np.sin(turned))
 
 
 @dataclass(frozen=True)
-class FlownPath:
+class FlownPath(Trajectory):
     """A flight from its rows (see `kernels`); place and angles are twice continuously differentiable.
 
     The body frame has its origin in camera, laser and instruments, x forward, y to the left, z up along the rotor.
@@ -78,12 +76,7 @@ class FlownPath:
     @property
     def knots_s(self) -> Float64[np.ndarray, "knots"]:
         """Times of the rows."""
-        times: Float64[np.ndarray, "knots"] = self.start_s + self.step_s * np.arange(len(self.rows))
-        return times
-
-    def state(self, time_s: float) -> State:
-        """Truth at a time. Raises ValueError outside of the span."""
-        return self.motion(np.array([time_s])).state(0)
+        return np.asarray(self.start_s + self.step_s * np.arange(len(self.rows)))
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """Truth at many times. Raises ValueError outside of the span."""

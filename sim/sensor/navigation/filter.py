@@ -60,23 +60,23 @@ class FilterParameters(BaseModel):
 
 @dataclass(frozen=True)
 class FilterState:
-    """The filter between two of its runs: its state, covariance and what else it carries on (see `kernels`)."""
+    """The filter between two runs: state, covariance and memory (see `kernels`)."""
 
     state: Float64[np.ndarray, "16"]
     covariance: Float64[np.ndarray, "24 24"]
-    flags: Float64[np.ndarray, "5"]
+    memory: Float64[np.ndarray, "5"]
 
 
 @dataclass(frozen=True)
 class Innovations:
-    """What readings were off from what was expected of them.
+    """Measured less expected readings.
 
     Attributes
     ----------
     times_s
-        Times at which they were taken in.
+        Times of the updates.
     kinds
-        What of: `kernels.GPS_PLACE`, `GPS_SPEED`, `COMPASS` or `INCLINOMETER`.
+        What of: `kernels.POSITION_FIX`, `VELOCITY_FIX`, `COMPASS` or `INCLINOMETER`.
     axes
         Which component.
     normalised
@@ -170,23 +170,24 @@ class NavigationFilter:
             raise ValueError("the filter needs a solution of the receiver and a reading of the compass to start at")
         p = self.parameters
         state = np.zeros(kernels.STATE)
-        state[kernels.PLACE : kernels.PLACE + 3] = solutions.positions_m[known[0]]
-        state[kernels.SPEED : kernels.SPEED + 3] = solutions.velocities_m_s[known[0]]
-        state[kernels.QUATERNION : kernels.QUATERNION + 4] = _attitude(
-            readings.up_body[0], readings.headings_rad[0]
-        ).as_quat()
-        deviations = np.zeros(kernels.ERRORS)
-        deviations[kernels.PLACE : kernels.PLACE + 3] = p.first_place_m
-        deviations[kernels.SPEED : kernels.SPEED + 3] = p.first_speed_m_s
-        deviations[kernels.TURN : kernels.TURN + 3] = np.radians(
-            [p.first_tilt_deg, p.first_tilt_deg, p.first_heading_deg]
+        attitude = _attitude(readings.up_body[0], readings.headings_rad[0])
+        state[: kernels.STATE_GYRO_BIAS] = np.concatenate(
+            [solutions.positions_m[known[0]], solutions.velocities_m_s[known[0]], attitude.as_quat()]
         )
-        deviations[kernels.GYRO : kernels.GYRO + 3] = self._gyro_bias_rad_s()
-        deviations[kernels.FORCE : kernels.FORCE + 3] = self._accelerometer_bias_m_s2()
-        deviations[kernels.WANDER : kernels.WANDER + 3] = 1.0
-        deviations[kernels.DRIFT : kernels.DRIFT + 3] = self.rtk.velocity_wander_m_s
-        deviations[kernels.HEADING] = self._heading_bias_rad()
-        deviations[kernels.TILT :] = np.radians(self.compass.tilt_bias_deg)
+        # in the order of the error vector
+        deviations = np.concatenate(
+            [
+                np.full(3, p.first_place_m),
+                np.full(3, p.first_speed_m_s),
+                np.radians([p.first_tilt_deg, p.first_tilt_deg, p.first_heading_deg]),
+                np.full(3, self._gyro_bias_rad_s()),
+                np.full(3, self._accelerometer_bias_m_s2()),
+                np.ones(3),
+                self.rtk.velocity_wander_m_s,
+                [self._heading_bias_rad()],
+                np.full(2, np.radians(self.compass.tilt_bias_deg)),
+            ]
+        )
         return FilterState(state, np.diag(deviations**2), np.array([-1.0, 0.0, 0.0, 0.0, 0.0]))
 
     def run(
@@ -201,35 +202,33 @@ class NavigationFilter:
         tags = increments.times_s
         asked = np.zeros(0) if keep_s is None else keep_s
         kept_at = np.sort(np.clip(np.searchsorted(tags, asked, side="right") - 1, 0, tags.size - 1)).astype(np.int64)
-        covariance, flags = start.covariance.copy(), start.flags.copy()
-        states, covariances, deviations, said = kernels.run(
-            tags,
-            increments.period_s,
-            increments.delta_angles_rad,
-            increments.delta_velocities_m_s,
-            self._gps_rows(solutions),
-            self._tilt_rows(readings),
-            start.state,
-            covariance,
-            flags,
-            kept_at,
-            self._tuning(increments.period_s),
+        covariance, memory = start.covariance.copy(), start.memory.copy()
+        inputs = kernels.Inputs(
+            times=tags,
+            step=increments.period_s,
+            angles=increments.delta_angles_rad,
+            velocities=increments.delta_velocities_m_s,
+            gps=self._gps_rows(solutions),
+            tilts=self._tilt_rows(readings),
+            kept_at=kept_at,
         )
+        tuning = self._tuning(increments.period_s)
+        states, covariances, deviations, log = kernels.run(inputs, start.state, covariance, memory, tuning)
         quaternions = states[:, kernels.QUATERNION : kernels.QUATERNION + 4]
         return NavigationSolution(
             increments=increments,
-            positions_m=states[:, kernels.PLACE : kernels.PLACE + 3],
-            velocities_m_s=states[:, kernels.SPEED : kernels.SPEED + 3],
+            positions_m=states[:, kernels.POSITION : kernels.POSITION + 3],
+            velocities_m_s=states[:, kernels.VELOCITY : kernels.VELOCITY + 3],
             attitudes=Rotation.from_quat(quaternions),
-            gyro_biases_rad_s=states[:, kernels.GYRO_BIAS : kernels.GYRO_BIAS + 3],
-            accelerometer_biases_m_s2=states[:, kernels.FORCE_BIAS : kernels.FORCE_BIAS + 3],
+            gyro_biases_rad_s=states[:, kernels.STATE_GYRO_BIAS : kernels.STATE_ACCELEROMETER_BIAS],
+            accelerometer_biases_m_s2=states[:, kernels.STATE_ACCELEROMETER_BIAS : kernels.STATE],
             deviations=deviations,
             kept_at=kept_at,
             covariances=covariances,
             innovations=Innovations(
-                said[:, 0], said[:, 1].astype(np.int64), said[:, 2].astype(np.int64), said[:, 3], said[:, 4] == 1.0
+                log[:, 0], log[:, 1].astype(np.int64), log[:, 2].astype(np.int64), log[:, 3], log[:, 4] == 1.0
             ),
-            end=FilterState(states[-1].copy(), covariance, flags),
+            end=FilterState(states[-1].copy(), covariance, memory),
         )
 
     def _gps_rows(self, s: RtkSolutions) -> Float64[np.ndarray, "n 15"]:
@@ -237,16 +236,16 @@ class NavigationFilter:
         rows = np.empty((s.times_s.size, kernels.GPS_COLUMNS))
         rows[:, kernels.TAG] = s.times_s
         rows[:, kernels.ARRIVAL] = s.times_s + self.rtk.latency_s
-        rows[:, kernels.AT : kernels.AT + 3] = s.positions_m
-        rows[:, kernels.GOING : kernels.GOING + 3] = s.velocities_m_s
+        rows[:, kernels.GPS_POSITION : kernels.GPS_POSITION + 3] = s.positions_m
+        rows[:, kernels.GPS_VELOCITY : kernels.GPS_VELOCITY + 3] = s.velocities_m_s
         wanders, noises = (
             np.where(s.fixed[:, None], _share(self.rtk.fixed, part), _share(self.rtk.floating, part)) * s.reported_m
             for part in ("wander_m", "noise_m")
         )
-        rows[:, kernels.WANDERS : kernels.WANDERS + 3] = wanders
-        rows[:, kernels.NOISE : kernels.NOISE + 3] = noises
+        rows[:, kernels.GPS_WANDER : kernels.GPS_WANDER + 3] = wanders
+        rows[:, kernels.GPS_NOISE : kernels.GPS_NOISE + 3] = noises
         rows[:, kernels.FIXED] = s.fixed
-        rows[_stuck(s.positions_m, self.parameters.most_repeats), kernels.AT] = np.nan
+        rows[_stuck(s.positions_m, self.parameters.most_repeats), kernels.GPS_POSITION] = np.nan
         return rows
 
     def _tilt_rows(self, r: TiltCompassReadings) -> Float64[np.ndarray, "n 5"]:
@@ -286,26 +285,28 @@ class NavigationFilter:
         noise_east, noise_north, noise_up = r.velocity_noise_m_s
         return kernels.Tuning(
             gravity_m_s2=self.gravity_m_s2,
-            turn_density=i.angular_random_walk_deg_sqrt_h * DEG_SQRT_H,
-            force_density=1e-3 * i.velocity_random_walk_ug_sqrt_hz * milli_g,
+            attitude_density=i.angular_random_walk_deg_sqrt_h * DEG_SQRT_H,
+            velocity_density=1e-3 * i.velocity_random_walk_ug_sqrt_hz * milli_g,
             # a Gauss-Markov bias seen over much less than its correlation time is a random walk of this density
-            gyro_density=i.gyro_wander_deg_h * DEG_H * float(np.sqrt(2.0 / i.gyro_wander_s)),
-            bias_density=i.accelerometer_wander_mg * milli_g * float(np.sqrt(2.0 / i.accelerometer_wander_s)),
+            gyro_bias_density=i.gyro_wander_deg_h * DEG_H * float(np.sqrt(2.0 / i.gyro_wander_s)),
+            accelerometer_bias_density=i.accelerometer_wander_mg
+            * milli_g
+            * float(np.sqrt(2.0 / i.accelerometer_wander_s)),
             wander_kept_fixed=float(np.exp(-step_s / r.fixed.correlation_s)),
             wander_kept_floating=float(np.exp(-step_s / r.floating.correlation_s)),
-            drift_m_s=(east, north, up),
-            drift_kept=float(np.exp(-step_s / r.velocity_correlation_s)),
-            speed_noise_m_s=(noise_east, noise_north, noise_up),
+            velocity_wander_m_s=(east, north, up),
+            velocity_wander_kept=float(np.exp(-step_s / r.velocity_correlation_s)),
+            velocity_noise_m_s=(noise_east, noise_north, noise_up),
             tilt_noise_rad=float(np.radians(c.tilt_noise_deg)),
             heading_noise_rad=float(np.radians(np.hypot(c.heading_noise_deg, c.count_deg / np.sqrt(12.0)))),
             tan_dip=float(np.tan(np.radians(c.dip_deg))),
             lag_s=c.lag_s,
             disturbance=self.parameters.disturbance,
-            unseen_m_s2=self.parameters.unseen_m_s2,
+            unmodelled_acceleration_m_s2=self.parameters.unseen_m_s2,
             gate=self.parameters.gate,
-            most_refused=self.parameters.most_refused,
-            first_place_m=self.parameters.first_place_m,
-            first_speed_m_s=self.parameters.first_speed_m_s,
+            max_rejected_fixes=self.parameters.most_refused,
+            first_position_m=self.parameters.first_place_m,
+            first_velocity_m_s=self.parameters.first_speed_m_s,
             first_tilt_rad=float(np.radians(self.parameters.first_tilt_deg)),
         )
 
@@ -313,8 +314,7 @@ class NavigationFilter:
 def _share(errors: SolutionErrors, part: str) -> Float64[np.ndarray, "3"]:
     """What part of a solution's standard deviation is wander or noise; none of one that has none."""
     total = np.maximum(errors.total_m, np.finfo(float).tiny)
-    share: Float64[np.ndarray, "3"] = np.array(getattr(errors, part)) / total
-    return share
+    return np.asarray(np.array(getattr(errors, part)) / total)
 
 
 def _attitude(up_body: Float64[np.ndarray, "3"], heading_rad: float) -> Rotation:

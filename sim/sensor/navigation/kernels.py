@@ -1,9 +1,9 @@
-"""Compiled error-state Kalman filter; `marsyard.sim.sensor.navigation.filter` tells what is estimated and from what.
+"""Compiled error-state Kalman filter; `marsyard.sim.sensor.navigation.filter` states what is estimated and from what.
 
 A state is a row of 16: position, velocity, quaternion (x, y, z, w; world from body), gyro bias, accelerometer bias. An
-error is true less believed, and for the attitude the small rotation about world axes that the believed one lacks. The
-covariance has 15 errors that are estimated, then nine that are only considered: what wanders in the receiver's
-positions (in units of its standard deviation) and velocities, the compass's bias and the two inclinometers'.
+error is true less estimated; for the attitude it is the small rotation about world axes that the estimate lacks. The
+covariance has 15 errors that are estimated, then nine that are only considered: the wander of the receiver's positions
+(in units of its standard deviation) and velocities, the bias of the compass and those of the two inclinometers.
 """
 
 from __future__ import annotations
@@ -17,48 +17,72 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-PLACE, SPEED, TURN, GYRO, FORCE = 0, 3, 6, 9, 12
+#: Blocks of the error vector.
+POSITION, VELOCITY, ATTITUDE_ERROR, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
 ESTIMATED = 15
-WANDER, DRIFT, HEADING, TILT = 15, 18, 21, 22
+POSITION_WANDER, VELOCITY_WANDER, HEADING_BIAS, TILT_BIAS = 15, 18, 21, 22
 ERRORS = 24
-QUATERNION, GYRO_BIAS, FORCE_BIAS, STATE = 6, 10, 13, 16
-#: Columns of a receiver's row.
-TAG, ARRIVAL, AT, GOING, WANDERS, NOISE, FIXED, GPS_COLUMNS = 0, 1, 2, 5, 8, 11, 14, 15
-#: Columns of a compass's row; azimuths are made yaw.
+#: Blocks of the state, after position and velocity.
+QUATERNION, STATE_GYRO_BIAS, STATE_ACCELEROMETER_BIAS, STATE = 6, 10, 13, 16
+#: Columns of a receiver's row: time tag, time of delivery, solution, deviations of wander and noise, whether fixed.
+TAG, ARRIVAL, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED, GPS_COLUMNS = 0, 1, 2, 5, 8, 11, 14, 15
+#: Columns of a compass's row after its time tag; yaw is counterclockwise from east.
 UP, YAW, TILT_COLUMNS = 1, 4, 5
 #: What an innovation is of.
-GPS_PLACE, GPS_SPEED, COMPASS, INCLINOMETER = range(4)
-#: What goes on between runs: whether the receiver's last solution was fixed (-1: none yet), the lagging acceleration,
-#: world axes, and how many solutions in a row were refused.
-FIX, PUSHED, REFUSED, FLAGS = 0, 1, 4, 5
+POSITION_FIX, VELOCITY_FIX, COMPASS, INCLINOMETER = range(4)
+#: Memory between runs: whether the receiver's last solution was fixed (-1: none yet), the filtered acceleration in
+#: world axes, and how many solutions in a row were rejected.
+LAST_FIX, FILTERED_ACCELERATION, REJECTED, MEMORY = 0, 1, 4, 5
 #: Columns of an innovation: time, what of, axis, normalised by its standard deviation, whether it was used.
 INNOVATION = 5
 
 
 class Tuning(NamedTuple):
-    """What the filter takes for granted, SI units: see `FilterParameters`."""
+    """Assumptions of the filter, SI units: see `FilterParameters`."""
 
     gravity_m_s2: float
-    turn_density: float
-    force_density: float
-    gyro_density: float
-    bias_density: float
+    attitude_density: float
+    velocity_density: float
+    gyro_bias_density: float
+    accelerometer_bias_density: float
     wander_kept_fixed: float
     wander_kept_floating: float
-    drift_m_s: tuple[float, float, float]
-    drift_kept: float
-    speed_noise_m_s: tuple[float, float, float]
+    velocity_wander_m_s: tuple[float, float, float]
+    velocity_wander_kept: float
+    velocity_noise_m_s: tuple[float, float, float]
     tilt_noise_rad: float
     heading_noise_rad: float
     tan_dip: float
     lag_s: float
     disturbance: float
-    unseen_m_s2: float
+    unmodelled_acceleration_m_s2: float
     gate: float
-    most_refused: int
-    first_place_m: float
-    first_speed_m_s: float
+    max_rejected_fixes: int
+    first_position_m: float
+    first_velocity_m_s: float
     first_tilt_rad: float
+
+
+class Inputs(NamedTuple):
+    """What a run gets: boundaries of the inertial samples, their increments, rows of receiver and compass.
+
+    `kept_at` are the boundaries at which whole covariances are kept, in ascending order.
+    """
+
+    times: Array
+    step: float
+    angles: Array
+    velocities: Array
+    gps: Array
+    tilts: Array
+    kept_at: NDArray[np.int64]
+
+
+class Estimate(NamedTuple):
+    """A state and the covariance of its errors; both are changed in place."""
+
+    state: Array
+    covariance: Array
 
 
 @njit(cache=True)
@@ -95,64 +119,69 @@ def _product(a: tuple[float, float, float, float], b: tuple[float, float, float,
 
 
 @njit(cache=True)
-def _moved_on(
-    state: Array, after: Array, matrix: Array, angle: Array, velocity: Array, gravity: float, step: float, gained: Array
-) -> None:
-    """Writes the state a step later, and the velocity gained without gravity, world axes."""
-    turn = np.empty(3)
+def propagate_state(state: Array, after: Array, angle: Array, velocity: Array, gravity: float, step: float) -> Array:
+    """Write the state a step later; return the velocity gained without gravity, world axes."""
+    matrix, turn, gained = np.empty((3, 3)), np.empty(3), np.zeros(3)
+    matrix_of(state[QUATERNION:], matrix)
     for i in range(3):
-        gained[i] = 0.0
-        turn[i] = angle[i] - state[GYRO_BIAS + i] * step
+        turn[i] = angle[i] - state[STATE_GYRO_BIAS + i] * step
         for j in range(3):
-            gained[i] += matrix[i, j] * (velocity[j] - state[FORCE_BIAS + j] * step)
+            gained[i] += matrix[i, j] * (velocity[j] - state[STATE_ACCELEROMETER_BIAS + j] * step)
     for i in range(3):
         change = gained[i] - (gravity * step if i == 2 else 0.0)
-        after[PLACE + i] = state[PLACE + i] + (state[SPEED + i] + 0.5 * change) * step
-        after[SPEED + i] = state[SPEED + i] + change
-        after[GYRO_BIAS + i] = state[GYRO_BIAS + i]
-        after[FORCE_BIAS + i] = state[FORCE_BIAS + i]
+        after[POSITION + i] = state[POSITION + i] + (state[VELOCITY + i] + 0.5 * change) * step
+        after[VELOCITY + i] = state[VELOCITY + i] + change
+        after[STATE_GYRO_BIAS + i] = state[STATE_GYRO_BIAS + i]
+        after[STATE_ACCELEROMETER_BIAS + i] = state[STATE_ACCELEROMETER_BIAS + i]
     q = state[QUATERNION : QUATERNION + 4]
     _product((q[0], q[1], q[2], q[3]), _quaternion_of(turn), after[QUATERNION : QUATERNION + 4])
+    return gained
 
 
 @njit(cache=True)
-def _carried_on(m: Array, matrix: Array, force: Array, kept: float, drift_kept: float, step: float) -> None:
-    """Multiplies a matrix of columns of errors by how errors go on within a step."""
+def apply_transition(m: Array, matrix: Array, force: Array, kept: float, velocity_kept: float, step: float) -> None:
+    """Multiply a matrix of columns of errors by the transition over a step."""
     velocity, turn = np.empty(3), np.empty(3)
     for j in range(ERRORS):
         for i in range(3):
             velocity[i] = turn[i] = 0.0
             for k in range(3):
-                velocity[i] += force[i, k] * m[TURN + k, j] - step * matrix[i, k] * m[FORCE + k, j]
-                turn[i] += matrix[i, k] * m[GYRO + k, j]
+                velocity[i] += (
+                    force[i, k] * m[ATTITUDE_ERROR + k, j] - step * matrix[i, k] * m[ACCELEROMETER_BIAS + k, j]
+                )
+                turn[i] += matrix[i, k] * m[GYRO_BIAS + k, j]
         for i in range(3):
-            m[PLACE + i, j] += step * (m[SPEED + i, j] + 0.5 * velocity[i])
-            m[SPEED + i, j] += velocity[i]
-            m[TURN + i, j] -= step * turn[i]
-            m[WANDER + i, j] *= kept
-            m[DRIFT + i, j] *= drift_kept
+            m[POSITION + i, j] += step * (m[VELOCITY + i, j] + 0.5 * velocity[i])
+            m[VELOCITY + i, j] += velocity[i]
+            m[ATTITUDE_ERROR + i, j] -= step * turn[i]
+            m[POSITION_WANDER + i, j] *= kept
+            m[VELOCITY_WANDER + i, j] *= velocity_kept
 
 
 @njit(cache=True)
-def _spread(p: Array, matrix: Array, gained: Array, kept: float, t: Tuning, step: float) -> None:
-    """The covariance a step later: F P F' + Q, F applied to rows and then to columns."""
+def propagate_covariance(p: Array, matrix: Array, gained: Array, kept: float, t: Tuning, step: float) -> None:
+    """Replace the covariance by that a step later: F P F' + Q, F applied to rows and then to columns."""
     force = np.zeros((3, 3))
     force[0, 1], force[0, 2], force[1, 2] = gained[2], -gained[1], gained[0]
     force[1, 0], force[2, 0], force[2, 1] = -gained[2], gained[1], -gained[0]
-    _carried_on(p, matrix, force, kept, t.drift_kept, step)
-    _carried_on(p.T, matrix, force, kept, t.drift_kept, step)
+    apply_transition(p, matrix, force, kept, t.velocity_wander_kept, step)
+    apply_transition(p.T, matrix, force, kept, t.velocity_wander_kept, step)
     for i in range(3):
-        p[SPEED + i, SPEED + i] += t.force_density**2 * step
-        p[TURN + i, TURN + i] += t.turn_density**2 * step
-        p[GYRO + i, GYRO + i] += t.gyro_density**2 * step
-        p[FORCE + i, FORCE + i] += t.bias_density**2 * step
-        p[WANDER + i, WANDER + i] += 1.0 - kept * kept
-        p[DRIFT + i, DRIFT + i] += t.drift_m_s[i] ** 2 * (1.0 - t.drift_kept**2)
+        p[VELOCITY + i, VELOCITY + i] += t.velocity_density**2 * step
+        p[ATTITUDE_ERROR + i, ATTITUDE_ERROR + i] += t.attitude_density**2 * step
+        p[GYRO_BIAS + i, GYRO_BIAS + i] += t.gyro_bias_density**2 * step
+        p[ACCELEROMETER_BIAS + i, ACCELEROMETER_BIAS + i] += t.accelerometer_bias_density**2 * step
+        p[POSITION_WANDER + i, POSITION_WANDER + i] += 1.0 - kept * kept
+        p[VELOCITY_WANDER + i, VELOCITY_WANDER + i] += t.velocity_wander_m_s[i] ** 2 * (1.0 - t.velocity_wander_kept**2)
 
 
 @njit(cache=True)
-def _update(state: Array, p: Array, h: Array, innovation: float, noise: float, gate: float) -> tuple[float, bool]:
-    """Takes in a scalar; gains of what is considered are zero (Schmidt 1966). Normalised innovation; if it passed."""
+def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, gate: float, log: Array) -> None:
+    """Update with one scalar measurement; gains of considered errors are zero (Schmidt 1966).
+
+    Writes the normalised innovation, and whether it passed the gate, into the last columns of `log`.
+    """
+    state, p = estimate
     ph = np.zeros(ERRORS)
     for j in range(ERRORS):
         if h[j] != 0.0:
@@ -161,194 +190,178 @@ def _update(state: Array, p: Array, h: Array, innovation: float, noise: float, g
     variance = noise * noise
     for i in range(ERRORS):
         variance += h[i] * ph[i]
-    normalised = innovation / math.sqrt(variance)
-    if not abs(normalised) < gate:
-        return normalised, False
+    log[3] = residual / math.sqrt(variance)
+    log[4] = 1.0 if abs(log[3]) < gate else 0.0
+    if log[4] == 0.0:
+        return
     # P - K h'P - P h K' + K s K', with K zero for what is considered
     for i in range(ERRORS):
         gain_i = ph[i] / variance if i < ESTIMATED else 0.0
         for j in range(ERRORS):
             gain_j = ph[j] / variance if j < ESTIMATED else 0.0
             p[i, j] += -gain_i * ph[j] - ph[i] * gain_j + gain_i * variance * gain_j
-    correction = ph[:ESTIMATED] * (innovation / variance)
+    correction = ph[:ESTIMATED] * (residual / variance)
     for i in range(3):
-        state[PLACE + i] += correction[PLACE + i]
-        state[SPEED + i] += correction[SPEED + i]
-        state[GYRO_BIAS + i] += correction[GYRO + i]
-        state[FORCE_BIAS + i] += correction[FORCE + i]
+        state[POSITION + i] += correction[POSITION + i]
+        state[VELOCITY + i] += correction[VELOCITY + i]
+        state[STATE_GYRO_BIAS + i] += correction[GYRO_BIAS + i]
+        state[STATE_ACCELEROMETER_BIAS + i] += correction[ACCELEROMETER_BIAS + i]
     q = state[QUATERNION : QUATERNION + 4]
-    _product(_quaternion_of(correction[TURN : TURN + 3]), (q[0], q[1], q[2], q[3]), q)
-    return normalised, True
+    turn = correction[ATTITUDE_ERROR : ATTITUDE_ERROR + 3]
+    _product(_quaternion_of(turn), (q[0], q[1], q[2], q[3]), q)
 
 
 @njit(cache=True)
-def _take_in(
-    state: Array,
-    p: Array,
-    h: Array,
-    off: float,
-    noise: float,
-    gate: float,
-    log: Array,
-    time: float,
-    kind: int,
-    axis: int,
-) -> None:
-    """One scalar measurement, written into a row of the innovations."""
-    normalised, used = _update(state, p, h, off, noise, gate)
-    log[0], log[1], log[2], log[3] = time, kind, axis, normalised
-    log[4] = 1.0 if used else 0.0
-
-
-@njit(cache=True)
-def _between(times: Array, values: Array, until: int, time: float, out: Array) -> None:
-    """Writes values at a time among the rows up to `until`, on straight lines."""
-    k = until
+def _interpolate(times: Array, values: Array, last: int, time: float) -> Array:
+    """Values at a time among the rows up to `last`, linear between rows."""
+    k = last
     while k > 0 and times[k] > time:
         k -= 1
-    after = min(k + 1, until)
+    after = min(k + 1, last)
     span = times[after] - times[k]
     share = 0.0 if span <= 0.0 else min(max((time - times[k]) / span, 0.0), 1.0)
-    for i in range(out.size):
-        out[i] = values[k, i] + share * (values[after, i] - values[k, i])
+    out: Array = values[k] + share * (values[after] - values[k])
+    return out
 
 
 @njit(cache=True)
-def _reset_wander(p: Array) -> None:
-    for i in range(3):
-        p[WANDER + i, :] = 0.0
-        p[:, WANDER + i] = 0.0
-        p[WANDER + i, WANDER + i] = 1.0
+def _reset_errors(p: Array, block: int, size: float, added: float) -> None:
+    """Replace a block of three errors by uncorrelated ones of this deviation, plus `added` times their variance."""
+    for i in range(block, block + 3):
+        variance = added * p[i, i] + size * size
+        p[i, :] = 0.0
+        p[:, i] = 0.0
+        p[i, i] = variance
 
 
 @njit(cache=True)
-def _start_anew(state: Array, p: Array, row: Array, t: Tuning) -> None:
-    """Puts place and speed where a solution has them and trusts neither them nor the tilt any longer."""
-    for i in range(3):
-        state[PLACE + i], state[SPEED + i] = row[AT + i], row[GOING + i]
-        for at, size in ((PLACE, t.first_place_m), (SPEED, t.first_speed_m_s), (TURN, t.first_tilt_rad)):
-            kept = p[at + i, at + i] if at == TURN else 0.0
-            p[at + i, :] = 0.0
-            p[:, at + i] = 0.0
-            p[at + i, at + i] = kept + size * size
+def _restart(estimate: Estimate, row: Array, t: Tuning) -> None:
+    """Set position and velocity to a solution; distrust both and the attitude."""
+    state, p = estimate
+    state[POSITION : POSITION + 3] = row[GPS_POSITION : GPS_POSITION + 3]
+    state[VELOCITY : VELOCITY + 3] = row[GPS_VELOCITY : GPS_VELOCITY + 3]
+    _reset_errors(p, POSITION, t.first_position_m, 0.0)
+    _reset_errors(p, VELOCITY, t.first_velocity_m_s, 0.0)
+    _reset_errors(p, ATTITUDE_ERROR, t.first_tilt_rad, 1.0)
 
 
 @njit(cache=True)
-def _take_solution(row: Array, state: Array, p: Array, since: Array, time: float, t: Tuning, log: Array) -> None:
-    """A receiver's solution, carried to now by the way and the velocity since its time; six innovations."""
+def update_solution(row: Array, estimate: Estimate, since: Array, time: float, t: Tuning, log: Array) -> None:
+    """Update with a receiver's solution, carried to now by path and velocity since its time; six innovations."""
+    state, _ = estimate
     h = np.empty(ERRORS)
     for i in range(3):
         h[:] = 0.0
-        h[PLACE + i], h[SPEED + i], h[WANDER + i] = 1.0, row[TAG] - time, row[WANDERS + i]
-        off = row[AT + i] + since[i] - state[PLACE + i]
-        _take_in(state, p, h, off, row[NOISE + i], t.gate, log[i], time, GPS_PLACE, i)
+        h[POSITION + i], h[VELOCITY + i], h[POSITION_WANDER + i] = 1.0, row[TAG] - time, row[GPS_WANDER + i]
+        log[i, 0], log[i, 1], log[i, 2] = time, POSITION_FIX, i
+        residual = row[GPS_POSITION + i] + since[i] - state[POSITION + i]
+        update_scalar(estimate, h, residual, row[GPS_NOISE + i], t.gate, log[i])
     for i in range(3):
         h[:] = 0.0
-        h[SPEED + i], h[DRIFT + i] = 1.0, 1.0
-        off = row[GOING + i] + since[3 + i] - state[SPEED + i]
-        _take_in(state, p, h, off, t.speed_noise_m_s[i], t.gate, log[3 + i], time, GPS_SPEED, i)
+        h[VELOCITY + i], h[VELOCITY_WANDER + i] = 1.0, 1.0
+        log[3 + i, 0], log[3 + i, 1], log[3 + i, 2] = time, VELOCITY_FIX, i
+        residual = row[GPS_VELOCITY + i] + since[3 + i] - state[VELOCITY + i]
+        update_scalar(estimate, h, residual, t.velocity_noise_m_s[i], t.gate, log[3 + i])
 
 
 @njit(cache=True)
-def _take_up(row: Array, state: Array, p: Array, lean: float, time: float, t: Tuning, log: Array) -> None:
-    """What the inclinometers say of the x and y components of up; two innovations."""
+def update_tilt(row: Array, estimate: Estimate, lean: float, time: float, t: Tuning, log: Array) -> None:
+    """Update with the inclinometers' x and y components of up; two innovations."""
     h, matrix = np.empty(ERRORS), np.empty((3, 3))
     for i in range(2):
-        matrix_of(state[QUATERNION:], matrix)
+        matrix_of(estimate.state[QUATERNION:], matrix)
         h[:] = 0.0
-        h[TURN], h[TURN + 1], h[TILT + i] = matrix[1, i], -matrix[0, i], 1.0
+        h[ATTITUDE_ERROR], h[ATTITUDE_ERROR + 1], h[TILT_BIAS + i] = matrix[1, i], -matrix[0, i], 1.0
+        log[i, 0], log[i, 1], log[i, 2] = time, INCLINOMETER, i
         noise = math.hypot(t.tilt_noise_rad, lean)
-        _take_in(state, p, h, row[UP + i] - matrix[2, i], noise, t.gate, log[i], time, INCLINOMETER, i)
+        update_scalar(estimate, h, row[UP + i] - matrix[2, i], noise, t.gate, log[i])
 
 
 @njit(cache=True)
-def _take_yaw(row: Array, state: Array, p: Array, lean: float, time: float, t: Tuning, log: Array) -> None:
-    """What the compass says; one innovation."""
+def update_heading(row: Array, estimate: Estimate, lean: float, time: float, t: Tuning, log: Array) -> None:
+    """Update with the compass; one innovation."""
     h, matrix = np.zeros(ERRORS), np.empty((3, 3))
-    matrix_of(state[QUATERNION:], matrix)
+    matrix_of(estimate.state[QUATERNION:], matrix)
     level = matrix[0, 0] ** 2 + matrix[1, 0] ** 2
-    h[TURN] = -matrix[2, 0] * matrix[0, 0] / level
-    h[TURN + 1] = -matrix[2, 0] * matrix[1, 0] / level
-    h[TURN + 2], h[HEADING] = 1.0, 1.0
+    h[ATTITUDE_ERROR] = -matrix[2, 0] * matrix[0, 0] / level
+    h[ATTITUDE_ERROR + 1] = -matrix[2, 0] * matrix[1, 0] / level
+    h[ATTITUDE_ERROR + 2], h[HEADING_BIAS] = 1.0, 1.0
+    log[0, 0], log[0, 1], log[0, 2] = time, COMPASS, 0
     off = row[YAW] - math.atan2(matrix[1, 0], matrix[0, 0])
     noise = math.hypot(t.heading_noise_rad, t.tan_dip * lean)
-    _take_in(state, p, h, math.atan2(math.sin(off), math.cos(off)), noise, t.gate, log[0], time, COMPASS, 0)
+    update_scalar(estimate, h, math.atan2(math.sin(off), math.cos(off)), noise, t.gate, log[0])
 
 
 @njit(cache=True)
-def run(
-    times: Array,
-    step: float,
-    angles: Array,
-    velocities: Array,
-    gps: Array,
-    tilts: Array,
-    start: Array,
-    p: Array,
-    flags: Array,
-    kept_at: NDArray[np.int64],
-    t: Tuning,
-) -> tuple[Array, Array, Array, Array]:
+def _propagate(inputs: Inputs, k: int, states: Array, p: Array, memory: Array, t: Tuning) -> None:
+    """Propagate state, covariance and filtered acceleration over the sample that ends at boundary k."""
+    before, step, matrix = states[k - 1], inputs.step, np.empty((3, 3))
+    matrix_of(before[QUATERNION:], matrix)
+    gained = propagate_state(before, states[k], inputs.angles[k - 1], inputs.velocities[k - 1], t.gravity_m_s2, step)
+    kept = t.wander_kept_fixed if memory[LAST_FIX] == 1.0 else t.wander_kept_floating
+    propagate_covariance(p, matrix, gained, kept, t, step)
+    for i in range(3):
+        change = states[k, VELOCITY + i] - before[VELOCITY + i]
+        filtered = memory[FILTERED_ACCELERATION + i]
+        memory[FILTERED_ACCELERATION + i] += (change / step - filtered) * min(step / t.lag_s, 1.0)
+
+
+@njit(cache=True)
+def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tuple[Array, Array, Array, Array]:
     """States at all boundaries, covariances at some, the deviations of all, and innovations.
 
-    `flags` and `p` are left as they end. Readings tagged before the first boundary are left out.
+    `memory` and `p` are left as they end. Readings tagged before the first boundary are left out.
     """
-    count = times.size
-    states = np.empty((count, STATE))
-    inertial = np.zeros((count, 6))
+    times, gps, tilts, kept_at = inputs.times, inputs.gps, inputs.tilts, inputs.kept_at
+    states = np.empty((times.size, STATE))
+    # position and velocity from the inertial unit alone, since the run's start
+    inertial = np.zeros((times.size, 6))
     covariances = np.empty((kept_at.size, ESTIMATED, ESTIMATED))
-    deviations = np.empty((count, ESTIMATED))
+    deviations = np.empty((times.size, ESTIMATED))
     log = np.empty((6 * gps.shape[0] + 3 * tilts.shape[0], INNOVATION))
-    matrix, gained, since = np.empty((3, 3)), np.empty(3), np.empty(6)
-    said = fix = tilt = kept = 0
+    logged = fix = tilt = kept = 0
     states[0] = start
-    for k in range(count):
+    for k in range(times.size):
         state = states[k]
+        estimate = Estimate(state, p)
         if k > 0:
-            before = states[k - 1]
-            matrix_of(before[QUATERNION:], matrix)
-            _moved_on(before, state, matrix, angles[k - 1], velocities[k - 1], t.gravity_m_s2, step, gained)
-            _spread(p, matrix, gained, t.wander_kept_fixed if flags[FIX] == 1.0 else t.wander_kept_floating, t, step)
-            for i in range(3):
-                change = state[SPEED + i] - before[SPEED + i]
-                flags[PUSHED + i] += (change / step - flags[PUSHED + i]) * min(step / t.lag_s, 1.0)
-                inertial[k, i] = inertial[k - 1, i] + (inertial[k - 1, 3 + i] + 0.5 * change) * step
-                inertial[k, 3 + i] = inertial[k - 1, 3 + i] + change
+            _propagate(inputs, k, states, p, memory, t)
+            change = state[VELOCITY : VELOCITY + 3] - states[k - 1, VELOCITY : VELOCITY + 3]
+            inertial[k, :3] = inertial[k - 1, :3] + (inertial[k - 1, 3:] + 0.5 * change) * inputs.step
+            inertial[k, 3:] = inertial[k - 1, 3:] + change
         while fix < gps.shape[0] and gps[fix, ARRIVAL] <= times[k]:
             row = gps[fix]
             fix += 1
-            if math.isnan(row[AT]) or row[TAG] < times[0]:
+            if math.isnan(row[GPS_POSITION]) or row[TAG] < times[0]:
                 continue
-            if flags[FIX] != row[FIXED]:
-                _reset_wander(p)
-                flags[FIX] = row[FIXED]
-            _between(times, inertial, k, row[TAG], since)
-            for i in range(3):
-                # the way since then, from the velocity as it is believed now, back through what was gained
-                back = (state[SPEED + i] - inertial[k, 3 + i]) * (times[k] - row[TAG])
-                since[i] = inertial[k, i] - since[i] + back
-                since[3 + i] = inertial[k, 3 + i] - since[3 + i]
-            if flags[REFUSED] >= t.most_refused:
-                _start_anew(state, p, row, t)
-            _take_solution(row, state, p, since, times[k], t, log[said : said + 6])
-            flags[REFUSED] = 0.0 if log[said : said + 6, 4].all() else flags[REFUSED] + 1.0
-            said += 6
-        pushed = math.sqrt(flags[PUSHED] ** 2 + flags[PUSHED + 1] ** 2 + t.unseen_m_s2**2)
-        lean = t.disturbance * pushed / t.gravity_m_s2
+            if memory[LAST_FIX] != row[FIXED]:
+                _reset_errors(p, POSITION_WANDER, 1.0, 0.0)
+                memory[LAST_FIX] = row[FIXED]
+            # the path since the solution's time, from the velocity as estimated now
+            since = inertial[k] - _interpolate(times, inertial, k, row[TAG])
+            since[:3] += (state[VELOCITY : VELOCITY + 3] - inertial[k, 3:]) * (times[k] - row[TAG])
+            if memory[REJECTED] >= t.max_rejected_fixes:
+                _restart(estimate, row, t)
+            update_solution(row, estimate, since, times[k], t, log[logged : logged + 6])
+            memory[REJECTED] = 0.0 if log[logged : logged + 6, 4].all() else memory[REJECTED] + 1.0
+            logged += 6
+        east, north = memory[FILTERED_ACCELERATION], memory[FILTERED_ACCELERATION + 1]
+        level = math.sqrt(east**2 + north**2 + t.unmodelled_acceleration_m_s2**2)
+        lean = t.disturbance * level / t.gravity_m_s2
         while tilt < tilts.shape[0] and tilts[tilt, TAG] <= times[k]:
             row = tilts[tilt]
             tilt += 1
             if row[TAG] < times[0]:
                 continue
             if not math.isnan(row[UP]):
-                _take_up(row, state, p, lean, times[k], t, log[said : said + 2])
-                said += 2
+                update_tilt(row, estimate, lean, times[k], t, log[logged : logged + 2])
+                logged += 2
             if not math.isnan(row[YAW]):
-                _take_yaw(row, state, p, lean, times[k], t, log[said : said + 1])
-                said += 1
+                update_heading(row, estimate, lean, times[k], t, log[logged : logged + 1])
+                logged += 1
         for i in range(ESTIMATED):
             deviations[k, i] = math.sqrt(p[i, i])
         while kept < kept_at.size and kept_at[kept] == k:
             covariances[kept] = p[:ESTIMATED, :ESTIMATED]
             kept += 1
-    return states, covariances, deviations, log[:said]
+    return states, covariances, deviations, log[:logged]

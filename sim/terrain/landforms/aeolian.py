@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from marsyard.sim.terrain.landforms.ground import Ground, LandformParameters, smooth_pair
-from marsyard.sim.terrain.landforms.kernels import add_dunes
+from marsyard.sim.terrain.landforms.kernels import Bedforms, add_dunes
 
 #: Samples a slip face should have along its slope.
 SAMPLES_ON_SLIP_FACE = 2.1
@@ -56,15 +56,6 @@ class Dunes(LandformParameters):
         part = ground.coarser(
             min(self.height_m / steepest / SAMPLES_ON_SLIP_FACE, ground.period_m / modulation.shape[0])
         )
-        add_dunes(
-            part.height,
-            part.tone,
-            part.spacing_m,
-            modulation,
-            float(wave[0]),
-            float(wave[1]),
-            self.height_m,
-            steepest,
-            self.albedo_contrast,
-        )
+        bedforms = Bedforms(float(wave[0]), float(wave[1]), self.height_m, steepest, self.albedo_contrast)
+        add_dunes(part.height, part.tone, part.spacing_m, modulation, bedforms)
         ground.add(part)

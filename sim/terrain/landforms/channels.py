@@ -45,8 +45,7 @@ def walk(
 def _forgetting_sum(kicks: Float64[np.ndarray, "n"], keep: float) -> Float64[np.ndarray, "n"]:
     from scipy.signal import lfilter
 
-    summed: Float64[np.ndarray, "n"] = lfilter([1.0], [1.0, -keep], kicks)
-    return summed
+    return np.asarray(lfilter([1.0], [1.0, -keep], kicks))
 
 
 class Gullies(LandformParameters):

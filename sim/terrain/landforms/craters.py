@@ -55,5 +55,4 @@ def draw_craters(parameters: TerrainParameters, rng: np.random.Generator) -> Flo
 
 
 def _between(degraded: float, fresh: float, share: Float64[np.ndarray, "craters"]) -> Float64[np.ndarray, "craters"]:
-    mixed: Float64[np.ndarray, "craters"] = degraded + (fresh - degraded) * share
-    return mixed
+    return np.asarray(degraded + (fresh - degraded) * share)

@@ -9,7 +9,6 @@ from jaxtyping import Float32
 from pydantic import BaseModel, ConfigDict
 
 from marsyard.sim.terrain.landforms.kernels import add_refined
-from marsyard.sim.terrain.spectrum import Spectrum
 
 #: Smallest side of a grid on which a landform is made.
 SMALLEST_SIDE = 16
@@ -110,10 +109,3 @@ def smooth_pair(
     noise = rng.standard_normal((side, side, 2)) @ np.array([1.0, 1.0j])
     field = np.fft.ifft2(noise * amplitude) * side**2 / np.sqrt(2.0 * np.sum(amplitude**2))
     return np.stack([field.real, field.imag], axis=-1).astype(np.float32)
-
-
-def rough_field(
-    ground: Ground, hurst: float, outer_scale_m: float, rng: np.random.Generator
-) -> Float32[np.ndarray, "side side"]:
-    """A fractal field of unit expected variance on this ground's grid."""
-    return Spectrum.power_law(ground.side, ground.spacing_m, hurst, outer_scale_m).field(rng, 1.0)

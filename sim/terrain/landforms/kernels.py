@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -12,6 +13,20 @@ from marsyard.sim.terrain.kernels import Array, Level, bspline_weights, collapse
 
 Grid = NDArray[np.float32]
 Line = NDArray[np.float32]
+
+
+class Bedforms(NamedTuple):
+    """A train of dunes.
+
+    `wave_x` and `wave_y` are the plane wave's wavenumbers, rad/m; `crest_m` the RMS height of crest over trough,
+    `steepest` the slope of the slip face, `contrast` the logarithm of crests' albedo over troughs'.
+    """
+
+    wave_x: float
+    wave_y: float
+    crest_m: float
+    steepest: float
+    contrast: float
 
 
 @njit(cache=True)
@@ -132,12 +147,14 @@ def _add_row_of_dunes(
     real: Array,
     imaginary: Array,
     first_phase: float,
-    phase_step: float,
-    crest: float,
-    slip_of_height: float,
-    contrast: float,
+    spacing: float,
+    dunes: Bedforms,
 ) -> None:
-    """Adds dunes along a row, given the modulation and the plane wave's phase at its samples (see `add_dunes`)."""
+    """Add dunes along a row, given the modulation at its samples and the plane wave's phase at the first."""
+    phase_step, crest, contrast = dunes.wave_x * spacing, dunes.crest_m, dunes.contrast
+    wave = math.sqrt(dunes.wave_x * dunes.wave_x + dunes.wave_y * dunes.wave_y)
+    # the face falls along a line over its first half, then levels out: 4/3 as long as were it straight
+    slip_of_height = 4.0 / 3.0 * wave / (2.0 * math.pi * dunes.steepest)
     for j in range(height.shape[0]):
         strength = math.sqrt(real[j] * real[j] + imaginary[j] * imaginary[j])
         high = crest * min(strength, 1.6)
@@ -154,28 +171,15 @@ def _add_row_of_dunes(
 
 
 @njit(cache=True)
-def add_dunes(
-    height: Grid,
-    tone: Grid,
-    spacing: float,
-    modulation: Level,
-    wave_x: float,
-    wave_y: float,
-    crest: float,
-    steepest: float,
-    contrast: float,
-) -> None:
-    """Adds transverse dunes: a gentle stoss up to the crest, a slip face of the slope `steepest`, a concave apron.
+def add_dunes(height: Grid, tone: Grid, spacing: float, modulation: Level, dunes: Bedforms) -> None:
+    """Add transverse dunes: a gentle stoss up to the crest, a slip face, a concave apron.
 
-    The phase is that of a plane wave (wave_x, wave_y), radians per metre, times a smooth complex modulation of unit
-    mean square: control values of the same extent as the grid, on one no finer. Where the modulation vanishes crests
-    end and fork, and the dunes have no height.
+    The phase is that of the plane wave times a smooth complex modulation of unit mean square: control values of the
+    same extent as the grid, on one no finer. Where the modulation vanishes crests end and fork, and the dunes have no
+    height.
     """
     side, cells = height.shape[0], modulation.shape[0]
     step = side // cells
-    wave = math.sqrt(wave_x * wave_x + wave_y * wave_y)
-    # the face falls along a line over its first half, then levels out: 4/3 as long as were it straight
-    slip_of_height = 4.0 / 3.0 * wave / (2.0 * math.pi * steepest)
     weights = np.empty((step, 4))
     for k in range(step):
         weights[k] = bspline_weights(k / step)[:4]
@@ -191,8 +195,7 @@ def add_dunes(
                 a, b, c, d = weights[k]
                 real[j * step + k] = a * before[0] + b * here[0] + c * after[0] + d * beyond[0]
                 imaginary[j * step + k] = a * before[1] + b * here[1] + c * after[1] + d * beyond[1]
-        phase = wave_y * i * spacing
-        _add_row_of_dunes(height[i], tone[i], real, imaginary, phase, wave_x * spacing, crest, slip_of_height, contrast)
+        _add_row_of_dunes(height[i], tone[i], real, imaginary, dunes.wave_y * i * spacing, spacing, dunes)
 
 
 @njit(cache=True)

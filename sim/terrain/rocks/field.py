@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float64, Int32, Int64
 
-from marsyard.sim.terrain.rocks.kernels import assemble, place_discs
+from marsyard.sim.terrain.rocks.kernels import Placements, assemble, place_discs
 from marsyard.sim.terrain.rocks.population import PlacedRock, RockParameters, draw_diameters
 from marsyard.sim.terrain.rocks.shapes import (
     COARSE,
@@ -217,37 +217,26 @@ class RockField:
         number, position, detail = number[order], position[order], detail[order]
         diameter = self.diameter_m[number]
         scale = np.column_stack([diameter, diameter, self.height_m[number] / UNIT_HEIGHT])
-        chosen = [(int(level), detail == level) for level in np.unique(detail)]
-        sets = [rock_shapes(level) for level, _ in chosen]
-        counts = [int(np.count_nonzero(one)) for _, one in chosen]
-        total = sum(count * shapes.vertices.shape[1] for count, shapes in zip(counts, sets, strict=True))
-        vertices, normals = np.empty((total, 3)), np.empty((total, 3))
-        faces, start = [], 0
-        for (_, one), count, shapes in zip(chosen, counts, sets, strict=True):
-            each = shapes.vertices.shape[1]
-            stop = start + count * each
+        vertices, normals = [np.empty((0, 3))], [np.empty((0, 3))]
+        faces, start = [np.empty((0, 3), dtype=np.int32)], 0
+        for level in np.unique(detail):
+            one, shapes = detail == level, rock_shapes(int(level))
             rocks = number[one]
-            assemble(
-                self.shape[rocks],
-                position[one],
-                scale[one],
-                self.yaw_rad[rocks],
-                self.up[rocks],
-                shapes.vertices,
-                shapes.normals,
-                vertices[start:stop],
-                normals[start:stop],
-            )
-            first = np.arange(start, stop, each, dtype=np.int32)
+            placements = Placements(self.shape[rocks], position[one], scale[one], self.yaw_rad[rocks], self.up[rocks])
+            placed, directions = assemble(placements, shapes.vertices, shapes.normals)
+            stop = start + len(placed)
+            first = np.arange(start, stop, shapes.vertices.shape[1], dtype=np.int32)
+            vertices.append(placed)
+            normals.append(directions)
             faces.append((shapes.faces[None] + first[:, None, None]).reshape(-1, 3))
             start = stop
         body_of_face = np.repeat(
             np.arange(number.size, dtype=np.int32), [rock_shapes(int(level)).faces.shape[0] for level in detail]
         )
         return RockMesh(
-            vertices,
-            normals,
-            np.concatenate(faces) if faces else np.empty((0, 3), dtype=np.int32),
+            np.concatenate(vertices),
+            np.concatenate(normals),
+            np.concatenate(faces),
             number.astype(np.int32)[body_of_face],
             body_of_face,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -10,6 +11,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
+
+
+class Placements(NamedTuple):
+    """Rocks to assemble, one row each: number of the unit shape, position, scale, yaw (rad), and unit vector up."""
+
+    shape: Ints
+    position: Array
+    scale: Array
+    yaw: Array
+    up: Array
 
 
 @njit(cache=True)
@@ -97,23 +108,16 @@ def place_discs(
 
 
 @njit(cache=True)
-def assemble(
-    shape: Ints,
-    position: Array,
-    scale: Array,
-    yaw: Array,
-    up: Array,
-    unit_vertices: Array,
-    unit_normals: Array,
-    vertices: Array,
-    normals: Array,
-) -> None:
+def assemble(rocks: Placements, unit_vertices: Array, unit_normals: Array) -> tuple[Array, Array]:
     """Vertices and normals of rocks in world axes, one rock after the other.
 
     Each rock's unit shape is stretched by `scale`, turned by `yaw` about its own vertical, stood along `up` (the
-    shortest rotation from the vertical) and moved to `position`. Outputs have shape (rocks * vertices of a shape, 3).
+    shortest rotation from the vertical) and moved to `position`. Both have shape (rocks * vertices of a shape, 3).
     """
+    shape, position, scale, yaw, up = rocks
     each = unit_vertices.shape[1]
+    vertices = np.empty((shape.size * each, 3))
+    normals = np.empty((shape.size * each, 3))
     for n in range(shape.size):
         kind = shape[n]
         c = math.cos(yaw[n])
@@ -149,3 +153,4 @@ def assemble(
             normals[row, 0] = r00 * x + r01 * y + ux * z
             normals[row, 1] = r01 * x + r11 * y + uy * z
             normals[row, 2] = -ux * x - uy * y + uz * z
+    return vertices, normals

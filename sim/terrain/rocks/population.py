@@ -72,17 +72,6 @@ def decay_per_m(abundance: float) -> float:
     return 1.79 + 0.152 / abundance
 
 
-def covered_share(abundance: float, diameter_m: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-    """F_k(D): share of the ground under rocks of at least this diameter."""
-    share: Float64[np.ndarray, "*n"] = abundance * np.exp(-decay_per_m(abundance) * diameter_m)
-    return share
-
-
-def rocks_per_m2(abundance: float, smallest_m: float, largest_m: float) -> float:
-    """Expected number of rocks per square metre between two diameters."""
-    return float(_cumulative(abundance, smallest_m, largest_m)[1][-1])
-
-
 def _cumulative(
     abundance: float, smallest_m: float, largest_m: float
 ) -> tuple[Float64[np.ndarray, "grid"], Float64[np.ndarray, "grid"]]:
@@ -94,8 +83,7 @@ def _cumulative(
     q = decay_per_m(abundance)
 
     def per_log(d: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
-        density: Float64[np.ndarray, "n"] = abundance * q * np.exp(-q * d) / (np.pi * d / 4.0)
-        return density
+        return np.asarray(abundance * q * np.exp(-q * d) / (np.pi * d / 4.0))
 
     middle = np.sqrt(diameter[1:] * diameter[:-1])
     pieces = step / 6.0 * (per_log(diameter[:-1]) + 4.0 * per_log(middle) + per_log(diameter[1:]))
@@ -116,5 +104,4 @@ def draw_diameters(parameters: RockParameters, area_m2: float, rng: np.random.Ge
         )
     share = rng.random(int(rng.poisson(expected)))
     drawn = np.exp(np.interp(share * number[-1], number, np.log(diameter)))
-    largest_first: Float64[np.ndarray, "n"] = np.sort(drawn)[::-1]
-    return largest_first
+    return np.asarray(np.sort(drawn)[::-1])

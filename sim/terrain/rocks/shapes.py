@@ -159,8 +159,7 @@ class _Block:
     def surface(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """Points of the unit shape along directions of the block's own axes."""
         shift, stretch = self.frame
-        points: Float64[np.ndarray, "n 3"] = (self._raw(directions) - shift) * stretch
-        return points
+        return np.asarray((self._raw(directions) - shift) * stretch)
 
     def fitted(self, detail: int) -> Float64[np.ndarray, "corners"]:
         """Inverse distances of a level's corners whose flat triangles deviate least, in mean square, from the finest.
@@ -170,8 +169,7 @@ class _Block:
         """
         parts, radius = _parts_of_corners(detail), self.finest_radius
         weighed = parts.multiply(radius[:, None] ** 4).tocsc()
-        inverse: Float64[np.ndarray, "corners"] = splu((parts.T @ weighed).tocsc()).solve(weighed.T @ (1.0 / radius))
-        return inverse
+        return np.asarray(splu((parts.T @ weighed).tocsc()).solve(weighed.T @ (1.0 / radius)))
 
     def flat(self, inverse: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
         """Points at these inverse distances along the finest shape's directions."""
@@ -180,8 +178,7 @@ class _Block:
     def placed(self, own: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """Points of the unit shape, given before the block is stretched."""
         shift, stretch = self.frame
-        points: Float64[np.ndarray, "n 3"] = (own * self.axes - shift) * stretch
-        return points
+        return np.asarray((own * self.axes - shift) * stretch)
 
     def normals(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """Outward unit normals there, by differences of the implicit surface ``|x| - r(x / |x|)``."""
@@ -193,13 +190,11 @@ class _Block:
             offset = step * np.eye(3)[axis]
             gradient[:, axis] = (self._beyond(own + offset) - self._beyond(own - offset)) / (2.0 * step)
         gradient /= self.axes * self.frame[1]
-        unit: Float64[np.ndarray, "n 3"] = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-        return unit
+        return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def _beyond(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
         length = np.linalg.norm(points, axis=1)
-        beyond: Float64[np.ndarray, "n"] = length - self._radius(points / length[:, None])
-        return beyond
+        return np.asarray(length - self._radius(points / length[:, None]))
 
     def _radius(self, d: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
         towards = np.maximum(_products(d, self.cut_normals), 0.0) / self.cut_distances
@@ -209,12 +204,10 @@ class _Block:
         if self.folded:
             # of the same mean square, 1/2, about the mean 0; the cusps outwards
             wave = (2.0 / np.pi - np.abs(wave)) / np.sqrt(1.0 - 8.0 / np.pi**2)
-        bumpy: Float64[np.ndarray, "n"] = radius * (1.0 + np.sum(self.wave_heights * wave, axis=1))
-        return bumpy
+        return np.asarray(radius * (1.0 + np.sum(self.wave_heights * wave, axis=1)))
 
     def _raw(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        raw: Float64[np.ndarray, "n 3"] = directions * self._radius(directions)[:, None] * self.axes
-        return raw
+        return np.asarray(directions * self._radius(directions)[:, None] * self.axes)
 
     @cached_property
     def finest_radius(self) -> Float64[np.ndarray, "n"]:
@@ -239,8 +232,7 @@ class _Block:
 def _products(d: Float64[np.ndarray, "n 3"], vectors: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "n m"]:
     """Scalar products of each with each, written out so that no BLAS with its own order of summation takes part."""
     x, y, z = (d[:, axis, None] * vectors[:, axis] for axis in range(3))
-    products: Float64[np.ndarray, "n m"] = x + y + z
-    return products
+    return np.asarray(x + y + z)
 
 
 @cache

@@ -164,9 +164,8 @@ def test_residuals_are_pixels_from_projection_to_track() -> None:
     places, depths = scene(rng, 0.05)
     moved = move(rng)
     second = projected(places, depths, moved) + 0.01
-    r = kernels.residuals(
-        places, second, FOCAL_PX, moved.rotation.as_quat(scalar_first=True), moved.translation, 1.0 / depths
-    )
+    motion = kernels.Motion(moved.rotation.as_quat(scalar_first=True), moved.translation, 1.0 / depths)
+    r = kernels.residuals(kernels.Matches(places, second, FOCAL_PX, 1.0), motion)
     np.testing.assert_allclose(r, -0.01 * FOCAL_PX, rtol=1e-9)
 
 

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from marsyard.algorithms.processes import used_memory
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.batches import MOST_CASES, Batches
-from marsyard.campaigns.execution.process_tree import used_memory
 from marsyard.campaigns.execution.work import UNLIMITED, Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import Board, Done, Standing
 from marsyard.campaigns.execution.workers import LocalWorkers

@@ -143,54 +143,9 @@ def test_impossible_changes_are_refused(navcam: Cahvor) -> None:
 # ----- linear stand-ins -----
 
 
-def test_linear_camera_is_its_own_stand_in(pinhole: Cahv) -> None:
-    assert pinhole.linearized() is pinhole
-    assert pinhole.linearized(inside=True) is pinhole
-
-
-def test_linear_stand_in_bounds_the_view(navcam: Cahvor) -> None:
-    linear = navcam.linearized()
-    assert isinstance(linear, Cahv)
-    assert linear.size == navcam.size
-    assert linear.right_handed
-    assert linear.theta == pytest.approx(-math.pi / 2, abs=1e-12)
-    pixels, visible = linear.project(navcam.c + navcam.rays(navcam.border(200))[1])
-    assert visible.all()
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    # The border is sampled at 256 places a side; between them it bulges by less than 1e-3 px.
-    assert np.allclose(low, -0.5, atol=1e-3)
-    assert np.allclose(high, 1023.5, atol=1e-3)
-
-
-@pytest.mark.parametrize("name", ["navcam", "hazcam"])
-def test_linear_stand_in_inside_is_filled(name: str, request: pytest.FixtureRequest) -> None:
-    camera: CameraModel = request.getfixturevalue(name)
-    linear = camera.linearized(inside=True)
-    pixels, visible = camera.project(camera.c + 1e6 * linear.rays(linear.border(200))[1])
-    assert visible.all()
-    inside = np.clip(pixels, -0.501, 1023.501) == pixels
-    assert inside.all()
-    # It touches each side.
-    assert np.allclose(pixels.min(axis=0), -0.5, atol=0.05)
-    assert np.allclose(pixels.max(axis=0), 1023.5, atol=0.05)
-
-
-def test_no_linear_camera_covers_half_a_sphere(hazcam: Cahvore) -> None:
-    with pytest.raises(ValueError, match="less than 90"):
-        hazcam.linearized()
-    assert hazcam.cropped(256, 256, (512, 512)).linearized().right_handed
-
-
-def test_a_blind_edge_has_no_stand_in() -> None:
-    cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
-    with pytest.raises(ValueError, match="sees nothing"):
-        Cahvor.from_cahv(cahv, r=(0, -0.2, 0)).linearized()
-
-
 def test_mirrored_camera_keeps_its_handedness(navcam: Cahvor) -> None:
     mirrored = dataclasses.replace(navcam, h=1023 * navcam.a - navcam.h)
     assert not mirrored.right_handed
-    assert not mirrored.linearized().right_handed
     points = points_before(navcam)
     expected = navcam.project(points)[0]
     expected[..., 0] = 1023 - expected[..., 0]

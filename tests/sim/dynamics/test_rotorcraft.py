@@ -53,7 +53,7 @@ def _landing(
     heights = 2.0 + slope * np.tile(0.5 * np.arange(101.0) - 25.0, (101, 1))
     ground = GroundPatch(SITE - 25.0, 0.5, heights)
     laser = LandingLaser(1.0, np.zeros(len(air.gusts_m_s)), stuck_m)
-    return landing_flight(flown, craft, GUIDANCE, SITE, errors, air, ground, laser)
+    return landing_flight(flown, GUIDANCE, SITE, errors, air, ground, laser)
 
 
 def test_an_air_that_ends_too_soon_is_refused() -> None:

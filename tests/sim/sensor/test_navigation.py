@@ -20,7 +20,7 @@ from marsyard.sim.dynamics.rotorcraft import (
 from marsyard.sim.dynamics.rotorcraft.flight import TAIL_S
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from marsyard.sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
-from marsyard.sim.sensor.navigation.kernels import GPS_PLACE, GPS_SPEED
+from marsyard.sim.sensor.navigation.kernels import POSITION_FIX, VELOCITY_FIX
 from marsyard.sim.sensor.rtk import Outage, RtkParameters, RtkReceiver
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
 
@@ -89,8 +89,8 @@ def test_errors_are_what_the_covariance_says() -> None:
 
 
 def test_innovations_are_white() -> None:
-    normalised: dict[int, list[float]] = {GPS_PLACE: [], GPS_SPEED: []}
-    products: dict[int, list[float]] = {GPS_PLACE: [], GPS_SPEED: []}
+    normalised: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
+    products: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
     for seed in range(20):
         said = _flown(seed)[2].innovations
         assert np.mean(said.used) > 0.99
@@ -144,7 +144,7 @@ def test_stuck_instruments_stop_to_count() -> None:
             tilts[name].append(np.degrees(error[6:9]))
             if name == "stuck":
                 late = solution.innovations.kinds[solution.innovations.times_s > -7.0]
-                assert set(late) == {GPS_PLACE, GPS_SPEED}
+                assert set(late) == {POSITION_FIX, VELOCITY_FIX}
     free, left = (np.sqrt(np.mean(np.square(tilts[name]), axis=0)) for name in ("free", "stuck"))
     # the receiver's velocities give the tilt whether or not the inclinometers work
     assert np.all(left[:2] < 1.5 * free[:2] + 0.05)
@@ -164,7 +164,7 @@ def test_it_starts_anew_where_it_was_led_astray() -> None:
     astray = replace(start, state=start.state + np.eye(16)[0] * 20.0, covariance=0.01 * start.covariance)
     solution = navigation.run(astray, imu.increments(path, *span, rng), solutions, readings)
     said = solution.innovations
-    assert not said.used[(said.kinds == GPS_PLACE) & (said.axes == 0)][0]
+    assert not said.used[(said.kinds == POSITION_FIX) & (said.axes == 0)][0]
     off = np.abs(solution.positions_m - path.motion(imu.boundaries(*span)).positions_m)
     assert off[80, 0] > 15.0
     assert off[200:].max() < 0.1

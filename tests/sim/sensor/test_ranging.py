@@ -10,7 +10,6 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.sensor import (
-    RTK,
     Gps,
     GpsParameters,
     Instrument,
@@ -26,6 +25,15 @@ from marsyard.sim.sensor.radar import first_return
 from marsyard.sim.terrain import Surface
 from tests.sim.sensor.motions import Swaying
 
+#: Carrier phases against a base station near by: 2 cm (the class of NovAtel's RT2 with its integers fixed).
+RTK = GpsParameters(
+    horizontal_noise_m=0.01,
+    vertical_noise_m=0.015,
+    horizontal_wander_m=0.01,
+    vertical_wander_m=0.02,
+    correlation_s=120.0,
+    latency_s=0.05,
+)
 DESCENT = Swaying(position_m=(2500.0, 2500.0, 2000.0), velocity_m_s=(10.0, 0.0, -75.0))
 SIDE, SPACING = 1024, 5.0
 MIDDLE = 0.5 * SIDE * SPACING

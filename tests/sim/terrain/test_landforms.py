@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
 from marsyard.sim.terrain.landforms.ground import finer, smooth_pair
-from marsyard.sim.terrain.landforms.kernels import add_cracks, add_dunes, stamp_craters
+from marsyard.sim.terrain.landforms.kernels import Bedforms, add_cracks, add_dunes, stamp_craters
 from marsyard.sim.terrain.statistics import mean_slope_deg
 from marsyard.sim.terrain.substreams import substream
 
@@ -218,7 +218,7 @@ def test_dunes_are_the_stated_shape_of_the_stated_phase() -> None:
     modulation = np.random.default_rng(2).normal(size=(32, 32, 2)).astype(np.float32)
     wave = 2.0 * np.pi / (side * spacing) * np.array([5.0, -3.0])
     height, tone = np.zeros((2, side, side), dtype=np.float32)
-    add_dunes(height, tone, spacing, modulation, wave[0], wave[1], crest, steepest, 0.3)
+    add_dunes(height, tone, spacing, modulation, Bedforms(wave[0], wave[1], crest, steepest, 0.3))
     rows, columns = np.mgrid[:side, :side]
     real, imaginary = (
         map_coordinates(part.astype(np.float64), [rows / 4, columns / 4], order=3, mode="grid-wrap", prefilter=False)

@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 import trimesh
 from pydantic import ValidationError
+from scipy.integrate import quad
 from scipy.spatial import cKDTree
 
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
-from marsyard.sim.terrain.rocks.population import covered_share, draw_diameters, rocks_per_m2
+from marsyard.sim.terrain.rocks.population import decay_per_m, draw_diameters
 from marsyard.sim.terrain.rocks.shapes import (
     COARSE,
     FINE,
@@ -80,6 +81,12 @@ def test_shapes_differ() -> None:
             assert np.abs(vertices[one] - vertices[other]).max() > 0.05
 
 
+def _rocks_per_m2(abundance: float, smallest_m: float, largest_m: float) -> float:
+    """Number of rocks between two diameters: the covered fraction's density over the area of a rock, integrated."""
+    q = decay_per_m(abundance)
+    return float(quad(lambda d: abundance * q * np.exp(-q * d) / (0.25 * np.pi * d * d), smallest_m, largest_m)[0])
+
+
 @pytest.mark.parametrize("abundance", [0.02, 0.1, 0.4])
 def test_sizes_follow_golombek(abundance: float) -> None:
     """The area under rocks above each diameter is the model's, within 10 %, wherever rocks are many enough to say."""
@@ -91,11 +98,11 @@ def test_sizes_follow_golombek(abundance: float) -> None:
         share = np.sum(np.pi / 4 * above**2) / area
         # one sigma of a compound Poisson sum
         sigma = np.sqrt(np.sum((np.pi / 4 * above**2) ** 2)) / area
-        expected = float(covered_share(abundance, np.array(least)))
+        expected = abundance * np.exp(-decay_per_m(abundance) * least)
         assert share == pytest.approx(expected, abs=max(0.1 * expected, 3 * sigma))
         if least < 0.2:
             assert 3 * sigma < 0.1 * expected, "enough rocks for the bar of 10 %"
-        number = rocks_per_m2(abundance, least, 10.0) * area
+        number = area * _rocks_per_m2(abundance, least, 10.0)
         assert above.size == pytest.approx(number, abs=max(0.02 * number, 4 * np.sqrt(number)))
 
 
@@ -113,7 +120,7 @@ def test_no_two_rocks_overlap(field: RockField) -> None:
 def test_the_densest_ground_can_be_filled(ground: Surface) -> None:
     field = make(ground, abundance=0.4, smallest_m=0.06, placed=())
     covered = np.sum(np.pi / 4 * field.diameter_m**2) / field.period_m**2
-    assert covered == pytest.approx(float(covered_share(0.4, np.array(0.06))), rel=0.1)
+    assert covered == pytest.approx(0.4 * np.exp(-0.06 * decay_per_m(0.4)), rel=0.1)
 
 
 def test_same_seed_same_rocks_another_seed_others(ground: Surface, field: RockField) -> None:
