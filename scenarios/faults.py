@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.sensor import DetectorParameters
 
 Size = Annotated[float, Field(ge=0.0)]
 
 
-class SizedFaults(BaseModel):
+class SizedFaults(Parameters):
     """Faults by name, each with its size. A size of 0 is no fault."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     @property
     def name_and_size(self) -> tuple[str, float]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, UInt16
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.exchange.files import read_picture, write_picture
@@ -31,6 +31,7 @@ from marsyard.sim.measurements import (
     LandingMeasurements,
     PoseMeasurement,
 )
+from marsyard.sim.parameters import Parameters
 
 #: Version of `cases.json`, and its name.
 SCHEMA = 1
@@ -40,18 +41,14 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
-class _Plain(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Named(_Plain):
+class Named(Parameters):
     """A file beside `cases.json`, and the hash of its contents."""
 
     file: str
     sha256: str
 
 
-class StoredPicture(_Plain):
+class StoredPicture(Parameters):
     """One picture, its size (columns, rows), and what was measured when it was taken."""
 
     source: str
@@ -72,7 +69,7 @@ class StoredPicture(_Plain):
         return Rotation.from_quat(np.array(self.world_from_body_xyzw))
 
 
-class StoredTruth(_Plain):
+class StoredTruth(Parameters):
     """What is known beyond what was measured.
 
     Attributes
@@ -87,7 +84,7 @@ class StoredTruth(_Plain):
     poses: tuple[tuple[Vector, Quaternion], ...] | None = None
 
 
-class StoredCase(_Plain):
+class StoredCase(Parameters):
     """One case."""
 
     name: str
@@ -99,7 +96,7 @@ class StoredCase(_Plain):
     truth: StoredTruth = StoredTruth()
 
 
-class StoredDetector(_Plain):
+class StoredDetector(Parameters):
     """What is known of the detector of all pictures."""
 
     offset_dn: float
@@ -109,7 +106,7 @@ class StoredDetector(_Plain):
     rows_summed: int
 
 
-class StoredCases(_Plain):
+class StoredCases(Parameters):
     """`cases.json`."""
 
     schema_version: int

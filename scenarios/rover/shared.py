@@ -17,7 +17,7 @@ from typing import Annotated, cast
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import PixelBox, TrackingState
@@ -50,15 +50,12 @@ from marsyard.scenarios.rover.world import RunWorld, terrain_parameters
 from marsyard.scenarios.trial import Judged, attempted, case_result
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import Stance
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
 
-class _Parameters(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class VariantParameters(_Parameters):
+class VariantParameters(Parameters):
     """What one run has of its own: its rock, its place and its light."""
 
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
@@ -70,7 +67,7 @@ class VariantParameters(_Parameters):
     sun_elevation_deg: Annotated[float, Field(gt=3.0, le=90.0)] = 45.0
 
 
-class PointParameters(_Parameters):
+class PointParameters(Parameters):
     """A target on the rock's face, see `marsyard.scenarios.rover.TargetParameters`; of a circle as seen from its
     middle.
     """
@@ -79,7 +76,7 @@ class PointParameters(_Parameters):
     up: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
 
 
-class BandParameters(_Parameters):
+class BandParameters(Parameters):
     """A range of steps by which requirements choose their cases: a column of true and false of this name."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$")]
@@ -87,7 +84,7 @@ class BandParameters(_Parameters):
     most: float = 1.0
 
 
-class SharedDriveParameters(_Parameters):
+class SharedDriveParameters(Parameters):
     """Drives whose pictures many cases share; `run`, `target`, `skip`, `drive.algorithm`, `drive.vtt` make a case."""
 
     drive: Annotated[RoverScenarioParameters, Field(description="the drive at its finest steps, and the tracker")]

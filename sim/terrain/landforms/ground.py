@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32
-from pydantic import BaseModel, ConfigDict
 
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.terrain.landforms.kernels import add_refined
 from marsyard.sim.terrain.spectrum import Spectrum
 
@@ -15,10 +15,8 @@ from marsyard.sim.terrain.spectrum import Spectrum
 SMALLEST_SIDE = 16
 
 
-class LandformParameters(BaseModel):
+class LandformParameters(Parameters):
     """What all landforms' parameters have in common."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 @dataclass(frozen=True)
