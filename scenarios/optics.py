@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Annotated, cast
 
 import numpy as np
@@ -27,6 +28,12 @@ class Optics:
     def of(cls, camera: CameraModel) -> Optics:
         """The optics of a camera."""
         return cls(camera, PixelRays.of(camera), natural_fall_off(camera))
+
+
+@lru_cache(maxsize=8)
+def camera_optics(camera: CameraModel) -> Optics:
+    """The optics of a camera in the body frame; kept, as the cases of a process share cameras."""
+    return Optics.of(camera)
 
 
 class CalibrationParameters(Parameters):

@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.scenarios.descent.exposure import Exposure, exposures
-from marsyard.scenarios.descent.faults import faulty_detector
+from marsyard.scenarios.descent.exposure import exposures
 from marsyard.scenarios.descent.flight import flown_descent, picture_states
 from marsyard.scenarios.descent.optics import camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import World
-from marsyard.scenarios.samples import Sample, summed_rows
-from marsyard.sim.camera import CameraModel
-from marsyard.sim.dynamics import State
+from marsyard.scenarios.exposure import pixel_sample
+from marsyard.scenarios.faults import faulty_detector
+from marsyard.scenarios.samples import Sample
 from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
 
@@ -31,29 +30,14 @@ def descent_samples(p: DescentScenarioParameters, streams: Streams) -> Iterator[
     taken = exposures(p, world, states, optics, detector, streams)
     camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
     for state, exposure in zip(states, taken, strict=True):
-        yield _sample(p, world, state, exposure, camera)
-
-
-def _sample(
-    p: DescentScenarioParameters, world: World, state: State, exposure: Exposure, camera: CameraModel
-) -> Sample:
-    frame, rows = exposure.frame, summed_rows(p.detector.rows_summed)
-    about: dict[str, Any] = {
-        "site": p.site or "plain",
-        "time_s": state.time_s,
-        # the camera's axes are the body's, turned by the error of its alignment
-        "position_m": np.asarray(frame.world_from_body.translation).tolist(),
-        "world_from_body_xyzw": frame.world_from_body.rotation.as_quat().tolist(),
-        "velocity_m_s": state.velocity_m_s.tolist(),
-        "sun_direction": world.sun.direction.tolist(),
-    }
-    return Sample(
-        image=exposure.counts,
-        bits=p.detector.bits,
-        range_m=frame.range_m[rows].astype(np.float32),
-        normal=frame.normal[rows],
-        rocks=(frame.body[rows] >= 0).astype(np.uint8),
-        hazard=None,
-        camera=camera,
-        about=about,
-    )
+        frame = exposure.frame
+        about: dict[str, Any] = {
+            "site": p.site or "plain",
+            "time_s": state.time_s,
+            # the camera's axes are the body's, turned by the error of its alignment
+            "position_m": np.asarray(frame.world_from_body.translation).tolist(),
+            "world_from_body_xyzw": frame.world_from_body.rotation.as_quat().tolist(),
+            "velocity_m_s": state.velocity_m_s.tolist(),
+            "sun_direction": world.sun.direction.tolist(),
+        }
+        yield pixel_sample(exposure.counts, frame, p.detector, camera, about)

@@ -8,52 +8,28 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from marsyard.scenarios.landing.flight import Flight
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import Pair, take_pictures
-from marsyard.scenarios.landing.truth import GroundTruth
-from marsyard.scenarios.landing.world import World, camera_optics
+from marsyard.scenarios.exposure import pixel_sample
+from marsyard.scenarios.landing.truth import GroundTruth, RenderedFlight
 from marsyard.scenarios.samples import Sample, summed_rows
-from marsyard.sim.streams import Streams
 
 #: Values of a hazard map: a lander's footprint about the pixel's point is safe, is not, or is not all in sight.
 SAFE, UNSAFE, UNKNOWN = 0, 1, 255
 
 
-def landing_samples(p: LandingScenarioParameters, streams: Streams) -> Iterator[Sample]:
+def landing_samples(flown: RenderedFlight) -> Iterator[Sample]:
     """The two pictures of a case as they are delivered, with the truth of their pixels."""
-    world = World.of(p)
-    flight = Flight.of(p, world.ground.surface, streams)
-    pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
-    truth = GroundTruth.of(world, flight, pair, p.lander.limits)
-    for number in range(2):
-        yield _sample(p, world, flight, pair, truth, number)
-
-
-def _sample(
-    p: LandingScenarioParameters, world: World, flight: Flight, pair: Pair, truth: GroundTruth, number: int
-) -> Sample:
-    frame, image, state = pair.frames[number], pair.images[number], flight.states[number]
-    rows = summed_rows(p.detector.rows_summed)
-    points = frame.points_world()[rows]
-    about: dict[str, Any] = {
-        "site": p.site,
-        "time_s": image.time_s,
-        "position_m": state.position_m.tolist(),
-        "world_from_body_xyzw": state.attitude.as_quat().tolist(),
-        "sun_direction": world.sun.direction.tolist(),
-        "lander": p.lander.model_dump(mode="json"),
-    }
-    return Sample(
-        image=image.counts,
-        bits=p.detector.bits,
-        range_m=frame.range_m[rows].astype(np.float32),
-        normal=frame.normal[rows],
-        rocks=(frame.body[rows] >= 0).astype(np.uint8),
-        hazard=hazard_map(truth, points),
-        camera=image.camera,
-        about=about,
-    )
+    p, pair = flown.p, flown.pair
+    for frame, image, state in zip(pair.frames, pair.images, flown.flight.states, strict=True):
+        about: dict[str, Any] = {
+            "site": p.site,
+            "time_s": image.time_s,
+            "position_m": state.position_m.tolist(),
+            "world_from_body_xyzw": state.attitude.as_quat().tolist(),
+            "sun_direction": flown.world.sun.direction.tolist(),
+            "lander": p.lander.model_dump(mode="json"),
+        }
+        hazard = hazard_map(flown.truth, frame.points_world()[summed_rows(p.detector.rows_summed)])
+        yield pixel_sample(image.counts, frame, p.detector, image.camera, about, hazard)
 
 
 def hazard_map(truth: GroundTruth, points: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns"]:

@@ -10,10 +10,15 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.landing.flight import Flight
-from marsyard.scenarios.landing.pictures import Pair, seen_by_both
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.pictures import Pair, seen_by_both, take_pictures
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
 from marsyard.scenarios.landing.world import World
+from marsyard.scenarios.optics import camera_optics
+from marsyard.scenarios.views import SiteGround
+from marsyard.sim.streams import Streams
 
 #: Distance of the places at which the truth is asked for, in diameters of the footprint: 20 cm for 2 m.
 STEP_DIAMETERS = 0.1
@@ -103,6 +108,27 @@ class GroundTruth:
             return self.relief.footprints(place[None], self.limits)
         except ValueError:
             return None
+
+
+@dataclass(frozen=True)
+class RenderedFlight:
+    """A flight with its world, its pictures, and the truth about the ground that they show."""
+
+    p: LandingScenarioParameters
+    world: World
+    flight: Flight
+    pair: Pair
+    truth: GroundTruth
+
+    @classmethod
+    def of(
+        cls, p: LandingScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank
+    ) -> RenderedFlight:
+        """Fly a case and take its pictures."""
+        world = World.of(p, load_ground)
+        flight = Flight.of(p, world.ground.surface, streams)
+        pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
+        return cls(p, world, flight, pair, GroundTruth.of(world, flight, pair, p.lander.limits))
 
 
 def _horizontal_axes(attitude: Rotation) -> Float[np.ndarray, "2 2"]:
