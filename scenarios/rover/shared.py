@@ -179,7 +179,8 @@ class TruthGuide:
         corners = corners[corners[:, 2] > run.world.rocks.position_m[run.world.target_number, 2]]
         in_head = np.asarray((stance.world_from_rover * rig.rover_from_head).inv().apply(corners.copy()))
         left, right = (_box(camera, in_head, self.margin_px) for camera in (rig.left, rig.right))
-        return MastAim(*angles, left, right)
+        # the mast stays where its encoders read these angles
+        return MastAim(*rig.state.readings_rad, left, right)
 
     def observe(self, run: Run, view: View) -> RunOutcome | None:
         """Keep the pictures."""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from marsyard.scenarios.conformance.process import fingerprint
 
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.algorithms.exchange import ExecutableLimits, read_case
@@ -13,7 +14,6 @@ from marsyard.algorithms.faults import AlgorithmError
 from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.conformance.process import fingerprint
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, labels, sources_of
 from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, answers_of
 
