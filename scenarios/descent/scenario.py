@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
+import numpy as np
 from pydantic import BaseModel
 
 from marsyard.scenarios.base import TerrainScenario, judged_attempt
-from marsyard.scenarios.descent.exposure import expose
+from marsyard.scenarios.descent.exposure import expose, exposures
 from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import Flown, flown_descent, picture_states, true_velocity
 from marsyard.scenarios.descent.landing import touchdown
@@ -17,7 +19,6 @@ from marsyard.scenarios.descent.measurement import Instruments, measure
 from marsyard.scenarios.descent.optics import camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.room import room
-from marsyard.scenarios.descent.samples import descent_samples
 from marsyard.scenarios.descent.score import (
     Pictures,
     carried_to_firing,
@@ -30,8 +31,10 @@ from marsyard.scenarios.descent.score import (
 )
 from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.estimators import VELOCITY
+from marsyard.scenarios.exposure import pixel_sample
 from marsyard.scenarios.faults import faulty_detector
 from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.optics import Optics
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredDescent, scored
 from marsyard.scenarios.provenance import rendered
@@ -82,8 +85,25 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         return TerrainBank(p.terrain, p.place.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """The pictures of a case with the truth of their pixels."""
-        return descent_samples(self.checked(parameters), streams)
+        """The pictures of a case as the detector made them, with the truth of their pixels."""
+        p = self.checked(parameters)
+        world = World.of(p)
+        states = picture_states(p, flown_descent(p, world.surface, streams))
+        optics = camera_optics(p.camera)
+        camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
+        taken = exposures(p, world, states, optics, draw_detector(p, optics, streams), streams)
+        for state, exposure in zip(states, taken, strict=True):
+            pose = exposure.frame.world_from_body
+            about: dict[str, Any] = {
+                "site": p.site or "plain",
+                "time_s": state.time_s,
+                # the camera's axes are the body's, turned by the error of its alignment
+                "position_m": np.asarray(pose.translation).tolist(),
+                "world_from_body_xyzw": pose.rotation.as_quat().tolist(),
+                "velocity_m_s": state.velocity_m_s.tolist(),
+                "sun_direction": world.sun.direction.tolist(),
+            }
+            yield pixel_sample(exposure.counts, exposure.frame, p.detector, camera, about)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One descent."""
@@ -91,6 +111,12 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         descent = Descent.simulated(p, streams)
         known = descent.conditions()
         return case_result(p.algorithms, lambda algorithm: _judge(descent, algorithm, known), known)
+
+
+def draw_detector(p: DescentScenarioParameters, optics: Optics, streams: Streams) -> Detector:
+    """The detector of a case with its faults; the response of its pixels is drawn."""
+    settings = faulty_detector(p.faults, p.detector)
+    return Detector.drawn(optics.fall_off, settings, streams.generator("detector response"))
 
 
 @dataclass(frozen=True)
@@ -128,8 +154,7 @@ class Descent:
         flown = flown_descent(p, world.surface, streams)
         states = picture_states(p, flown)
         optics = camera_optics(p.camera)
-        settings = faulty_detector(p.faults, p.detector)
-        detector = Detector.drawn(optics.fall_off, settings, streams.generator("detector response"))
+        detector = draw_detector(p, optics, streams)
         pictures = expose(p, world, states, optics, detector, streams)
         instruments = Instruments.drawn(p, world, flown, streams)
         measurements = measure(p, world, flown.motion, pictures, detector, instruments, streams)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 from pydantic import BaseModel
 
@@ -10,18 +11,18 @@ from marsyard.algorithms.answers import checked_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.base import TerrainScenario, judged_attempt
 from marsyard.scenarios.estimators import LANDING
+from marsyard.scenarios.exposure import pixel_sample
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.landing.descent import landing_row
 from marsyard.scenarios.landing.measurement import measure
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.samples import landing_samples
 from marsyard.scenarios.landing.score import conditions, map_row, motion_row, outcome_row, products, site_row, times_row
 from marsyard.scenarios.landing.truth import RenderedFlight
 from marsyard.scenarios.landing.world import KEPT_GROUNDS
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredLanding, scored
 from marsyard.scenarios.provenance import rendered
-from marsyard.scenarios.samples import Sample
+from marsyard.scenarios.samples import Sample, summed_rows
 from marsyard.scenarios.trial import Judged, attempted_with, case_result
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
@@ -58,8 +59,20 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         return TerrainBank(p.terrain, p.place.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """The two pictures of a case with the truth of their pixels."""
-        return landing_samples(RenderedFlight.of(self.checked(parameters), streams, self.load_ground))
+        """The two pictures of a case as they are delivered, with the truth of their pixels."""
+        case = RenderedFlight.of(self.checked(parameters), streams, self.load_ground)
+        p, pair = case.p, case.pair
+        for frame, image, state in zip(pair.frames, pair.images, case.flight.states, strict=True):
+            about: dict[str, Any] = {
+                "site": p.site,
+                "time_s": image.time_s,
+                "position_m": state.position_m.tolist(),
+                "world_from_body_xyzw": state.attitude.as_quat().tolist(),
+                "sun_direction": case.world.sun.direction.tolist(),
+                "lander": p.lander.model_dump(mode="json"),
+            }
+            hazard = case.truth.hazard_map(frame.points_world()[summed_rows(p.detector.rows_summed)])
+            yield pixel_sample(image.counts, frame, p.detector, image.camera, about, hazard)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One flight."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
@@ -24,6 +24,8 @@ from marsyard.sim.streams import Streams
 STEP_DIAMETERS = 0.1
 #: Room beyond the ground in sight, in diameters: footprints and landings beside it are still told.
 MARGIN_DIAMETERS = 1.5
+#: Values of a hazard map: a lander's footprint about the pixel's point is safe, is not, or is not all in sight.
+SAFE, UNSAFE, UNKNOWN = 0, 1, 255
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,21 @@ class GroundTruth:
         """From a place (x, y) to the nearest one where a lander would not stand safely; to the lattice's step."""
         unsafe = self.places[~self.footprints.safe]
         return float(np.hypot(*(unsafe - place).T).min()) if len(unsafe) else float("inf")
+
+    def hazard_map(self, points: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns"]:
+        """What a lander would stand on about each pixel's point, at the nearest of the truth's places."""
+        origin = self.places[0, 0]
+        axes = np.stack([self.places[0, 1] - origin, self.places[1, 0] - origin], axis=1)
+        cells = np.linalg.solve(axes, (points[..., :2] - origin).reshape(-1, 2).T).T
+        inside = np.asarray(np.isfinite(cells).all(axis=1))
+        columns, rows = np.rint(np.where(inside[:, None], cells, -1.0)).astype(np.int64).T
+        shape = self.covered.shape
+        inside &= (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
+        hazard = np.full(len(cells), UNKNOWN, dtype=np.uint8)
+        at = rows[inside], columns[inside]
+        known = np.where(self.footprints.safe[at], SAFE, UNSAFE)
+        hazard[inside] = np.where(self.covered[at], known, UNKNOWN)
+        return hazard.reshape(points.shape[:2])
 
     def under(self, place: Float[np.ndarray, "2"]) -> Footprints | None:
         """The ground under a lander at any place (x, y); None where it is not known."""

@@ -8,15 +8,15 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, UInt16
 from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.exchange.files import read_picture, write_picture
+from marsyard.algorithms.exchange.files import read_picture
 from marsyard.scenarios.measured.layout import TaskName
 from marsyard.scenarios.own_files import OwnFile
 from marsyard.sim.camera import BODY_FRAME, CameraModel, read_cahvor, write_cahvor
@@ -170,32 +170,19 @@ def write_cases(folder: Path, stored: StoredCases) -> Path:
     return path
 
 
-def put_picture(folder: Path, name: str, counts: UInt16[np.ndarray, "rows columns"]) -> Named:
-    """Writes a picture beside `cases.json`."""
-    (folder / "pictures").mkdir(exist_ok=True)
-    path = folder / "pictures" / f"{name}.png"
-    write_picture(path, counts)
-    return _named(folder, path)
+def put_file(folder: Path, kind: str, name: str, write: Callable[[Path], object]) -> Named:
+    """Write a file beside `cases.json`, in the folder of its kind (`pictures`, `cameras`, `flat_fields`)."""
+    path = folder / kind / name
+    path.parent.mkdir(exist_ok=True)
+    write(path)
+    return Named(file=path.relative_to(folder).as_posix(), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def put_camera(folder: Path, number: int, camera: CameraModel) -> Named:
-    """Writes a camera beside `cases.json`."""
-    (folder / "cameras").mkdir(exist_ok=True)
-    path = folder / "cameras" / f"{number:06d}.cahvor"
-    write_cahvor(camera, path, frame=BODY_FRAME)
-    return _named(folder, path)
-
-
-def put_flat_field(folder: Path, number: int, flat: Float64[np.ndarray, "rows columns"]) -> Named:
-    """Writes a flat field beside `cases.json`."""
-    (folder / "flat_fields").mkdir(exist_ok=True)
-    path = folder / "flat_fields" / f"{number:06d}.npy"
-    np.save(path, flat, allow_pickle=False)
-    return _named(folder, path)
-
-
-def _named(folder: Path, path: Path) -> Named:
-    return Named(file=path.relative_to(folder).as_posix(), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+    """Write a camera beside `cases.json`; its file states the body frame."""
+    return put_file(
+        folder, "cameras", f"{number:06d}.cahvor", lambda path: write_cahvor(camera, path, frame=BODY_FRAME)
+    )
 
 
 def _unchanged(folder: Path, named: Named) -> Path:
