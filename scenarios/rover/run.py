@@ -45,8 +45,8 @@ class Setup:
     vehicle: Vehicle
     photographer: Photographer
 
-    @classmethod
-    def of(cls, p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank) -> Setup:
+    @staticmethod
+    def prepared(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank) -> Setup:
         """The set-up of a run; all its errors are drawn."""
         rig = Rig.of(p, streams)
         world = RunWorld.of(p, rig.pixel_rad, streams, load_ground)
@@ -56,17 +56,15 @@ class Setup:
             p.exposure,
             streams.generator("detector noise"),
         )
-        return cls(world, rig, Vehicle.placed(p, world, rig, streams), photographer)
+        return Setup(world, rig, Vehicle.placed(p, world, rig, streams), photographer)
 
 
 @dataclass
-class Run:
+class Run(Setup):
     """A run in progress, or finished.
 
     Attributes
     ----------
-    world, rig, vehicle, photographer
-        As in `Setup`.
     target
         The designated point.
     stops
@@ -85,10 +83,6 @@ class Run:
         What was driven since the last stop.
     """
 
-    world: RunWorld
-    rig: Rig
-    vehicle: Vehicle
-    photographer: Photographer
     target: ChosenTarget
     stops: list[Stop] = field(default_factory=list)
     outcome: RunOutcome = RunOutcome.STUCK
@@ -173,7 +167,7 @@ def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
 
 def prepare_run(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank) -> Run:
     """A run at its start, the target chosen, before a tracker is asked."""
-    setup = Setup.of(p, streams, load_ground)
+    setup = Setup.prepared(p, streams, load_ground)
     return Run.at(setup, choose_target(p, setup.world, setup.rig, setup.vehicle.stance))
 
 

@@ -25,7 +25,7 @@ from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.route import Belief
 from marsyard.scenarios.rover.run import Run, Setup, TrackerGuide, drive_legs
 from marsyard.scenarios.rover.stops import RunOutcome, View
-from marsyard.scenarios.rover.target import Sightings, point_on, rock_of, sightings, told_by_pixel
+from marsyard.scenarios.rover.target import Sightings, choose_by_pixel, point_on, sightings
 from marsyard.scenarios.rover.world import RunWorld
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.camera import CameraModel
@@ -147,14 +147,12 @@ class SharedDrive:
 def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) -> SharedDrive:
     """Drive a run and take its pictures; its streams are named by the run and belong to no case."""
     p, streams = key.drive, Streams(key.seed, f"{key.campaign}: run {key.run}", 0)
-    setup = Setup.of(p, streams, load_ground)
+    setup = Setup.prepared(p, streams, load_ground)
     world, rig, stance = setup.world, setup.rig, setup.vehicle.stance
     world_from_mast = stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)
-    eyes = rig.eyes(world_from_mast)
-    at = _position_for_choice(p, world, eyes[0])
-    point, on_edge, lit = point_on(world, eyes, p.target.across, p.target.up, rig.pixel_rad, p.vtt, at)
-    pixel = told_by_pixel(rig.left, world_from_mast, point, (0.0, 0.0))
-    run = Run.at(setup, rock_of(world, point, pixel, on_edge, lit))
+    at = _position_for_choice(p, world, rig.eyes(world_from_mast)[0])
+    place = p.target.across, p.target.up
+    run = Run.at(setup, choose_by_pixel(world, rig, world_from_mast, (0.0, 0.0), place, p.vtt, at))
     guide = TruthGuide(key.margin_px)
     drive_legs(p, run, guide)
     return SharedDrive(key, run, tuple(guide.views))
@@ -217,13 +215,11 @@ def _box(camera: CameraModel, points: Float64[np.ndarray, "points 3"], margin_px
 
 def prepare_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
     """A run over the drive's pictures before a tracker is asked, its target chosen."""
-    first, made = drive.views[0], drive.run
-    eyes = made.rig.eyes(first.world_from_head)
-    chosen, at = p.targets[p.target], _position_for_choice(p.drive, made.world, eyes[0])
-    point, on_edge, lit = point_on(made.world, eyes, chosen.across, chosen.up, made.rig.pixel_rad, p.drive.vtt, at)
-    pixel = told_by_pixel(made.rig.left, first.world_from_head, point, first.angles_rad)
-    target = rock_of(made.world, point, pixel, on_edge, lit)
-    return Run(made.world, made.rig, made.vehicle, made.photographer, target)
+    first, made, chosen = drive.views[0], drive.run, p.targets[p.target]
+    at = _position_for_choice(p.drive, made.world, made.rig.eyes(first.world_from_head)[0])
+    place = chosen.across, chosen.up
+    target = choose_by_pixel(made.world, made.rig, first.world_from_head, first.angles_rad, place, p.drive.vtt, at)
+    return Run.at(made, target)
 
 
 def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> Run:

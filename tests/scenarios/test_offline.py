@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from marsyard.scenarios.conformance.process import fingerprint
 
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.algorithms.exchange import ExecutableLimits, read_case
@@ -15,6 +14,7 @@ from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, labels, sources_of
+from marsyard.scenarios.handover import fingerprint
 from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, answers_of
 
 LIMITS = ExecutableLimits()
