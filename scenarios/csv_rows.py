@@ -2,9 +2,39 @@
 
 from __future__ import annotations
 
+import csv
 import difflib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from marsyard.sim.files import check_regular
+
+
+def read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Names of the columns of a table, and its lines that are not empty with their numbers.
+
+    Raises
+    ------
+    ValueError
+        Where the file cannot be read, is no table with commas, or has too many rows.
+    """
+    try:
+        check_regular(path)
+        with path.open(newline="", encoding="utf-8-sig") as text:
+            reader = csv.reader(text)
+            header = [name.strip() for name in next(reader, [])]
+            lines = []
+            for cells in reader:
+                if any(cell.strip() for cell in cells):
+                    lines.append((reader.line_num, [cell.strip() for cell in cells]))
+                if len(lines) > max_rows:
+                    raise ValueError(f"{path}: has more than {max_rows} rows; divide it")
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: is no table with commas: {error}") from error
+    return header, lines
 
 
 def header_problems(header: Sequence[str], needed: Sequence[str], allowed: Sequence[str], said: str) -> Iterator[str]:

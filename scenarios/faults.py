@@ -1,21 +1,31 @@
-"""What faults of all systems have in common: each is named and has a size, 0 for none; what ails a detector."""
+"""What faults of all systems have in common: each has a name and a size, 0 for none. Ailing detectors, lost pictures.
+
+A campaign of faults draws one a case: ``"faults" = { distribution = "choice", values = [{}, { haze = 1.0 }, ...] }``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+from jaxtyping import UInt16
+from pydantic import Field
 
+from marsyard.scenarios.interface import Scalar
+from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.sensor import DetectorParameters
 
-Size = Annotated[float, Field(ge=0.0)]
+Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 
-class SizedFaults(BaseModel):
+class SizedFaults(Parameters):
     """Faults by name, each with its size. A size of 0 is no fault."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
+    bad_pixels: Annotated[
+        NonNegative, Field(le=0.5, description="share of pixels that are dead, and of those that are hot")
+    ] = 0.0
 
     @property
     def name_and_size(self) -> tuple[str, float]:
@@ -25,12 +35,48 @@ class SizedFaults(BaseModel):
             return "several", float("nan")
         return present[0] if present else ("none", 0.0)
 
+    @property
+    def columns(self) -> dict[str, Scalar]:
+        """The fault and its size as columns."""
+        name, size = self.name_and_size
+        return {"fault": name, "fault_size": size}
 
-def ailing(detector: DetectorParameters, dust_discs: int, defects: Mapping[str, float | bool]) -> DetectorParameters:
-    """The detector with so many specks of dust on its lens, and with these of its defects' parameters anew."""
-    changes: dict[str, BaseModel] = {}
-    if dust_discs:
-        changes["optics"] = detector.optics.model_copy(update={"dust_discs": dust_discs})
-    if defects:
-        changes["defects"] = detector.defects.model_copy(update=dict(defects))
+    def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
+        """Parameters of a detector that the faults change, by the detector's tables; empty tables change nothing."""
+        return {
+            "optics": {"dust_discs": self.dust_discs} if self.dust_discs else {},
+            "defects": {"dead_share": self.bad_pixels, "hot_share": self.bad_pixels} if self.bad_pixels else {},
+        }
+
+
+def faulty_detector(faults: SizedFaults, detector: DetectorParameters) -> DetectorParameters:
+    """The detector with what the faults change."""
+    changes = {
+        table: getattr(detector, table).model_copy(update=dict(changed))
+        for table, changed in faults.detector_changes().items()
+        if changed
+    }
     return detector.model_copy(update=changes)
+
+
+def deliver(pictures: Pictures, repeated: int, black: int, lost_rows: float = 0.0) -> list[np.ndarray]:
+    """The pictures as they arrive.
+
+    Parameters
+    ----------
+    repeated
+        Number, from 1, of the picture in place of which the one before it is delivered again; 0: none.
+    black
+        Number of the picture that is delivered black; 0: none.
+    lost_rows
+        Fraction of the second picture's rows that is lost, from below.
+    """
+    arrived = [one.copy() for one in pictures]
+    if repeated > 1:
+        arrived[repeated - 1] = arrived[repeated - 2].copy()
+    if black:
+        arrived[black - 1][:] = 0
+    lost = round(lost_rows * len(arrived[1])) if lost_rows else 0
+    if lost:
+        arrived[1][-lost:] = 0
+    return arrived

@@ -1,4 +1,4 @@
-"""What an algorithm is given: a copy of its own, which it cannot write to, checked when it has answered."""
+"""Inputs handed to an algorithm: its own read-only copy, which is compared after it has answered."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Given = TypeVar("Given")
 
 
 class Handover(Generic[Given]):
-    """One algorithm's copy of its inputs: data classes, arrays and poses. The original stays as it is for the others.
+    """One algorithm's copy of its inputs: data classes, arrays and poses. The original stays unchanged for the others.
 
     Attributes
     ----------
@@ -26,46 +26,57 @@ class Handover(Generic[Given]):
     """
 
     def __init__(self, original: Given) -> None:
-        self.given = _read_only_copy(original)
-        self._digest = _digest(self.given)
+        self.given = handed_copy(original)
+        self._fingerprint = fingerprint(self.given)
 
     def check(self) -> None:
         """Raises AlgorithmError (BAD_ANSWER) if the algorithm changed its copy, pictures included."""
-        if _digest(self.given) != self._digest:
+        if fingerprint(self.given) != self._fingerprint:
             raise AlgorithmError(
                 Fault.BAD_ANSWER, "it changed the measurements that it was given; allowed: to read them, or copies"
             )
 
 
-def _read_only_copy(original: Given) -> Given:
-    """A deep copy whose arrays are read-only. Single rotations and transforms cannot be changed and stay the same
-    objects: a copy of them would be normalised again and differ in its last digits.
+def handed_copy(original: Given, *, writable: bool = False) -> Given:
+    """A deep copy whose arrays are read-only, or writable to detect what is written.
+
+    Single rotations and transforms cannot be changed and stay the same objects: a copy of them would be normalised
+    again and differ in its last digits.
     """
     poses = {id(part): part for part in _parts(original) if isinstance(part, Rotation | RigidTransform)}
     made = copy.deepcopy(original, dict(poses))
     for part in _parts(made):
         if isinstance(part, np.ndarray):
-            part.flags.writeable = False
+            part.flags.writeable = writable
     return made
 
 
-def _digest(thing: Any) -> bytes:
-    """SHA-256 of all arrays, bit for bit."""
+def fingerprint(thing: Any, leave: tuple[str, ...] = ()) -> str:
+    """SHA-256 of all values, bit for bit, in arrays, poses and data classes; fields named in `leave` are left out."""
     digest = hashlib.sha256()
-    for part in _parts(thing):
+    for part in _parts(thing, leave):
         if isinstance(part, np.ndarray):
             digest.update(f"{part.dtype}{part.shape}".encode())
             digest.update(np.ascontiguousarray(part).data)
-    return digest.digest()
+        elif isinstance(part, Rotation):
+            digest.update(part.as_quat().tobytes())
+        elif isinstance(part, RigidTransform):
+            digest.update(part.as_matrix().tobytes())
+        else:
+            digest.update(repr(part).encode())
+    return digest.hexdigest()
 
 
-def _parts(thing: Any) -> Iterator[Any]:
-    """The arrays, poses and other values in data classes, lists and tuples."""
-    if is_dataclass(thing):
+def _parts(thing: Any, leave: tuple[str, ...] = ()) -> Iterator[Any]:
+    """The arrays, poses and other values in data classes, lists and tuples, and what tells these apart."""
+    if is_dataclass(thing) and not isinstance(thing, type):
+        yield type(thing).__name__
         for field in fields(thing):
-            yield from _parts(getattr(thing, field.name))
+            if field.name not in leave:
+                yield from _parts(getattr(thing, field.name), leave)
     elif isinstance(thing, list | tuple):
+        yield len(thing)
         for inner in thing:
-            yield from _parts(inner)
+            yield from _parts(inner, leave)
     else:
         yield thing

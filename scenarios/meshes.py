@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.own_files import OwnFile
 from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, expanded_bytes
-from marsyard.sim.render import Objects
+from marsyard.sim.render import Objects, Scene
 from marsyard.sim.terrain import Surface
 
 #: Largest file, and most triangles, that are read.
@@ -105,8 +105,15 @@ class Mesh:
 
 
 def standing(meshes: Sequence[MeshParameters], surface: Surface, near: tuple[float, float]) -> Objects:
-    """All meshes on the ground, each nearest to a place."""
+    """All meshes on the ground, each at its repetition nearest to a place (x, y)."""
     return Objects.joined([one.standing(surface, near) for one in meshes]) if meshes else Objects.none()
+
+
+def with_meshes(scene: Scene, meshes: Sequence[MeshParameters], near: tuple[float, float]) -> Scene:
+    """The scene with meshes on its ground; see `standing`."""
+    if not meshes:
+        return scene
+    return scene.with_objects(Objects.joined([scene.objects, standing(meshes, scene.surface, near)]))
 
 
 def read_mesh(path: str) -> Mesh:

@@ -6,7 +6,6 @@ answers what its table says of the case. All around them is a campaign as any ot
 
 from __future__ import annotations
 
-import csv
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +21,7 @@ from marsyard.algorithms.answers import checked_site, checked_velocity
 from marsyard.algorithms.exchange import write_case
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
-from marsyard.scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems
+from marsyard.scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems, read_lines
 from marsyard.scenarios.own_files import listed
 from marsyard.sim.files import check_regular
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements
@@ -32,6 +31,8 @@ EXPORT, ANSWERS = "export:", "answers:"
 #: Folder of the cases in what is exported.
 CASES = "cases"
 
+#: Rows of a table of answers, at most.
+MAX_ROWS = 10_000_000
 #: Sizes beyond which a number is taken to be in another unit than its column's name says.
 _MOST = {"_m_s": 1e3, "_m2_s2": 1e6, "_m": 1e6, "_s": 1e6}
 
@@ -212,13 +213,7 @@ def answers_of(file: Path, form: OfflineForm[Answer]) -> Mapping[int, Answer]:
 def _read(file: Path, required: tuple[str, ...], _time: int, _size: int) -> Mapping[int, Any]:
     """The answers of a file as it is now; the form goes by its columns."""
     form = next(one for one in (VELOCITY_FORM, SITE_FORM) if one.required == required)
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as text:
-            reader = csv.reader(text)
-            header = [name.strip() for name in next(reader, [])]
-            lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{file} cannot be read: {error}") from error
+    header, lines = read_lines(file, MAX_ROWS)
     problems = list(_header_problems(header, form))
     if problems:
         raise ValueError(listed(file, problems))

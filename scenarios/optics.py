@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Annotated, cast
 
 import numpy as np
 from jaxtyping import Float32
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.render import PixelRays
 from marsyard.sim.sensor import natural_fall_off
 
@@ -28,13 +30,17 @@ class Optics:
         return cls(camera, PixelRays.of(camera), natural_fall_off(camera))
 
 
-class CalibrationParameters(BaseModel):
+@lru_cache(maxsize=8)
+def camera_optics(camera: CameraModel) -> Optics:
+    """The optics of a camera in the body frame; kept, as the cases of a process share cameras."""
+    return Optics.of(camera)
+
+
+class CalibrationParameters(Parameters):
     """How far the calibrated camera, which an algorithm is given, is off the true one.
 
     Assumed: the spreads of the descent camera's calibration, in pixels and as a fraction of the focal length.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     focal_error: Annotated[
         float, Field(ge=0.0, le=0.05, description="RMS relative error of the calibrated focal length")

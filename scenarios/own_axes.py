@@ -6,10 +6,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.frames import SITE_FROM_WORLD
+from marsyard.sim.parameters import Parameters
 
 #: Rotations from a file's world axes to ours, which are east, north, up.
 _WORLD = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}
@@ -17,10 +18,8 @@ _WORLD = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}
 _CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
-class RecordedAxes(BaseModel):
+class RecordedAxes(Parameters):
     """The axes of recorded poses, and the camera's place in what was recorded."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     axes: Annotated[Literal["enu", "ned"], Field(description="world axes: east, north, up; or north, east, down")]
     attitude_of: Annotated[

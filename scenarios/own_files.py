@@ -7,7 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Protocol, runtime_checkable
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
+
+from marsyard.sim.parameters import Parameters
 
 #: Problems of a file that are told at once.
 _TOLD = 20
@@ -41,10 +43,8 @@ def _files_in(value: Any) -> Iterator[str]:
             yield from _files_in(inner)
 
 
-class OwnFile(BaseModel):
+class OwnFile(Parameters):
     """A file that a campaign is made from. The hash is filled in when the campaign is read; each case checks it."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     file: Annotated[str, Field(description="path of the file")]
     sha256: Annotated[str | None, Field(description="of the file; filled in")] = None

@@ -74,7 +74,11 @@ class SiteGround:
 
         Raises ValueError where the site has no terrain at that scale.
         """
-        terrain = site.terrain(scale)
+        return cls.from_bank(site, site.terrain(scale), seed, number)
+
+    @classmethod
+    def from_bank(cls, site: Site, terrain: TerrainParameters, seed: int, number: int) -> SiteGround:
+        """Load terrain `number` of a bank from the disk, or build it, and place its rocks."""
         bank = TerrainBank(terrain, seed)
         return cls(site, terrain, bank.terrain(number), bank.rocks(number))
 

@@ -16,7 +16,8 @@ from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.pictures import take_pictures
 from marsyard.scenarios.landing.score import map_row, motion_row
 from marsyard.scenarios.landing.truth import GroundTruth
-from marsyard.scenarios.landing.world import World, camera_optics
+from marsyard.scenarios.landing.world import World
+from marsyard.scenarios.optics import camera_optics
 from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
 from marsyard.sim.streams import Streams
 

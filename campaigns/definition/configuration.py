@@ -7,7 +7,7 @@ import types
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from marsyard.campaigns.errors import near_match
 from marsyard.campaigns.sampling.correlation import Correlation
@@ -15,6 +15,7 @@ from marsyard.campaigns.sampling.design import Design
 from marsyard.campaigns.sampling.dispersions import FRIENDLY, AnyDispersion
 from marsyard.campaigns.sampling.levels import Grid
 from marsyard.campaigns.sampling.ranges import Normal
+from marsyard.sim.parameters import Parameters
 
 #: A key in nested tables and lists, part by part.
 Key = tuple[str | int, ...]
@@ -27,7 +28,7 @@ MOST_CASES = 1_000_000_000
 POPULATIONS = ("all", "completed", "valid")
 
 
-class Requirement(BaseModel):
+class Requirement(Parameters):
     """What must hold in a stated fraction of a population of cases, with a stated confidence.
 
     With a `bound`, that the metric's absolute value is at most the bound; a case without a number fails. Without one
@@ -40,8 +41,6 @@ class Requirement(BaseModel):
     confidence. They are at best MET BY RATE, with the exit status 3, which `accept_rate` makes 0. `source` and `kind`
     say whose requirement it is.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     id: Annotated[str, Field(min_length=1)]
     statement: str = ""
@@ -77,14 +76,12 @@ class Requirement(BaseModel):
         return tuple(part for part in self.population.split(" and ") if part not in POPULATIONS)
 
 
-class Retain(BaseModel):
+class Retain(Parameters):
     """Which cases keep their products (histories, pictures, intermediate results) beside their rows.
 
     Rows are always kept. `showcase` is the case that the report shows: the answered case with the worst metric of the
     first requirement, the first case, or none.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     showcase: Literal["worst", "first", "none"] = "worst"
     products: Literal["none", "failed", "worst", "every", "all"] = Field(
@@ -103,10 +100,8 @@ class Retain(BaseModel):
 _Amount = Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)]
 
 
-class Limits(BaseModel):
+class Limits(Parameters):
     """What one case may use before it is ended; rows of cases that were ended say so in their outcome."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     case_time_s: _Amount = Field(default=600.0, description="wall-clock time of a case")
     prepare_time_s: _Amount = Field(default=3600.0, description="wall-clock time of building a shared input")
@@ -117,10 +112,8 @@ class Limits(BaseModel):
     output_mb: _Amount = Field(default=10.0, description="what a case may write to standard output and error")
 
 
-class CampaignConfiguration(BaseModel):
+class CampaignConfiguration(Parameters):
     """Everything that a campaign's rows depend on, apart from the program and the machine."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
     scenario: Annotated[str, Field(min_length=1)]
@@ -128,8 +121,8 @@ class CampaignConfiguration(BaseModel):
     cases: Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)]
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = 0
     design: Design = Design()
-    parameters: dict[str, Any] = {}
-    dispersions: dict[str, AnyDispersion] = {}
+    parameters: dict[str, Any] = Field(default_factory=dict)
+    dispersions: dict[str, AnyDispersion] = Field(default_factory=dict)
     correlations: tuple[Correlation, ...] = ()
     requirements: tuple[Requirement, ...] = ()
     retain: Retain = Retain()

@@ -9,10 +9,11 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from marsyard.campaigns.definition.configuration import Key, Requirement, key_text, problems_of
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
+from marsyard.sim.parameters import Parameters
 
 #: The requirements that ship with Marsyard.
 REQUIREMENTS_FILE = Path(__file__).resolve().parents[2] / "scenarios" / "requirements.toml"
@@ -35,9 +36,7 @@ class StatedRequirement(Requirement):
         return self.model_dump(mode="json", exclude={"campaigns"})
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+class _File(Parameters):
     requirements: Annotated[tuple[StatedRequirement, ...], Field(strict=False)]
 
 

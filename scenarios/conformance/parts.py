@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -21,9 +20,15 @@ from marsyard.algorithms.interface import (
     VelocityOutcome,
 )
 from marsyard.scenarios.conformance import inputs, trackers
-from marsyard.scenarios.conformance.findings import BreachError, Check
-from marsyard.scenarios.conformance.process import fingerprint, own_copy
-from marsyard.scenarios.conformance.shared import COPIES, process_check, seed_global_generators
+from marsyard.scenarios.conformance.checks import (
+    BreachError,
+    Check,
+    Suite,
+    answer_print,
+    seed_global_generators,
+    timed,
+)
+from marsyard.scenarios.handover import fingerprint, handed_copy
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.landing.truth import GroundTruth
 from marsyard.scenarios.parts.instruments import InstrumentTruth, checked_readings
@@ -75,53 +80,32 @@ def check_part(kind: Kind, spec: str) -> None:
 
 
 @dataclass(frozen=True)
-class PartSuite:
-    """The suite of one part, made anew for each check with the options that its class has.
-
-    Attributes
-    ----------
-    kind
-        Its kind.
-    spec
-        How it is named.
-    limit_s
-        Longest time that a case may take.
-    """
+class PartSuite(Suite):
+    """The suite of one part of a kind, made with the options that its class has."""
 
     kind: Kind
-    spec: str
-    limit_s: float
+
+    deterministic_advice = "draw from the generator that is handed over alone; keep nothing from case to case"
+    answers = "answers a case"
+    closed_to_truth = False
+
+    @classmethod
+    def of(cls, kind: Kind, spec: str, limit_s: float) -> PartSuite:
+        """The suite of a name."""
+        return cls(lambda: score_of(spec) if kind is SCORE else kind.made(spec, {}), spec, False, limit_s, kind)
 
     def checks(self) -> Iterator[Check]:
-        """All of them, the ordinary case first."""
+        """See `Suite`."""
         form = "see docs/own-parts.md for what it is handed and what it gives"
-        yield Check(
-            "answer", "gives what its kind gives, of the right shapes, finite and in order", form, self._answers
-        )
-        yield Check(
-            "columns",
-            "names the same columns in every case: identifiers, with numbers or truth values",
-            "give every column in every case; NaN where there is no number",
-            self._columns,
-        )
-        yield Check("inputs", "leaves what it is handed as it is", COPIES, self._inputs)
-        yield Check(
-            "deterministic",
-            "gives the same to the same case, whatever was asked before",
-            "draw from the generator that is handed over alone; keep nothing from case to case",
-            self._deterministic,
-        )
+        asked = "gives what its kind gives, of the right shapes, finite and in order"
+        yield Check("answer", asked, form, self._answers)
+        asked = "names the same columns in every case: identifiers, with numbers or truth values"
+        yield Check("columns", asked, "give every column in every case; NaN where there is no number", self._columns)
+        yield from self.common_checks()
         if self.kind is not SCORE:
-            yield Check(
-                "random",
-                "depends on its random stream where it says so, and else does not",
-                "set random to whether it draws, and draw from the generator that is handed over",
-                self._random,
-            )
-        yield Check(
-            "time", f"takes at most {self.limit_s:g} s", "be faster, or allow more with --time-limit", self._time
-        )
-        yield process_check(self._prepared)
+            asked = "depends on its random stream where it states so, and else does not"
+            advice = "set random to whether it draws, and draw from the generator that is handed over"
+            yield Check("random", asked, advice, self._random)
 
     def _answers(self) -> str:
         return ", ".join(_told(self._asked(case)) for case in self.cases())
@@ -134,52 +118,43 @@ class PartSuite:
             )
         return ", ".join(names[0]) or "none"
 
-    def _inputs(self) -> str:
+    def _change_inputs(self) -> str:
         for case in self.cases():
-            mine = own_copy(case, writable=True)
+            mine = handed_copy(case, writable=True)
             before = fingerprint(mine)
-            self._given(self._made(), mine, 1)
+            self._given(self.make(), mine, 1)
             if fingerprint(mine) != before:
                 raise BreachError(f"the {type(case).__name__} that it was handed is not what it was before")
         return ""
 
-    def _deterministic(self) -> str:
-        kept = self._made()
+    def _answer_again(self) -> str:
+        kept = self.make()
         for case in self.cases():
             seed_global_generators(1)
-            first = fingerprint(self._asked(case))
+            first = answer_print(self._asked(case))
             seed_global_generators(2)
-            if fingerprint(self._asked(case)) != first:
+            if answer_print(self._asked(case)) != first:
                 raise BreachError("asked twice, it gives something else for the same case and stream")
             for other in self.cases():
-                self._given(kept, own_copy(other, writable=True), 2)
-            if fingerprint(self._checked(self._given(kept, own_copy(case, writable=True), 1), case)) != first:
+                self._given(kept, handed_copy(other, writable=True), 2)
+            if answer_print(self._checked(self._given(kept, handed_copy(case, writable=True), 1), case)) != first:
                 raise BreachError("what it gives depends on the cases that it was asked before")
         return ""
 
     def _random(self) -> str:
-        claimed = bool(self._made().random)
+        claimed = bool(self.make().random)
         case = self.cases()[0]
-        differs = fingerprint(self._asked(case, 1)) != fingerprint(self._asked(case, 2))
+        differs = answer_print(self._asked(case, 1)) != answer_print(self._asked(case, 2))
         if claimed and not differs:
             raise BreachError("its random is true, but two streams give the same")
         if differs and not claimed:
             raise BreachError("its random is false, but two streams give something else")
         return "random" if claimed else "not random"
 
-    def _time(self) -> str:
+    def _taken_s(self) -> float:
         case = self.cases()[0]
         self._asked(case)
-        began = time.perf_counter()
-        self._asked(case)
-        taken = time.perf_counter() - began
-        if taken > self.limit_s:
-            raise BreachError(f"it took {taken:.3g} s")
-        return f"{taken:.3g} s"
-
-    def _prepared(self) -> Callable[[], object]:
-        part, case = self._made(), own_copy(self.cases()[0], writable=True)
-        return lambda: self._given(part, case, 1)
+        return timed(lambda: self._asked(case))
 
     def cases(self) -> Sequence[Any]:
         """What the part is asked about."""
@@ -189,9 +164,6 @@ class PartSuite:
             return truths()
         return [case for case in scored_cases() if isinstance(case, taken_by(score_of(self.spec)))]
 
-    def _made(self) -> Any:
-        return score_of(self.spec) if self.kind is SCORE else self.kind.made(self.spec, {})
-
     def _given(self, part: Any, case: Any, seed: int) -> Any:
         """What a part gives, as it gives it."""
         rng = np.random.default_rng(seed)
@@ -200,7 +172,7 @@ class PartSuite:
         return part.read(case, rng) if self.kind is INSTRUMENT else part(case)
 
     def _asked(self, case: Any, seed: int = 1) -> Any:
-        return self._checked(self._given(self._made(), own_copy(case, writable=True), seed), case)
+        return self._checked(self._given(self.make(), handed_copy(case, writable=True), seed), case)
 
     def _checked(self, given: object, case: Any) -> Any:
         """What a part gave, held against what its kind gives."""
@@ -213,7 +185,7 @@ class PartSuite:
                 checked_columns(self.spec, poses.columns)
                 return poses
             if self.kind is INSTRUMENT:
-                readings = checked_readings(self.spec, given, self._made().quantity, case.times_s.size)
+                readings = checked_readings(self.spec, given, self.make().quantity, case.times_s.size)
                 checked_columns(self.spec, readings.columns)
                 return readings
             return checked_columns(self.spec, given, texts=False)

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
-from marsyard.scenarios.conformance import estimators, inputs, parts, streams, surfaces, trackers
-from marsyard.scenarios.conformance.findings import Check, Finding
+from marsyard.scenarios.conformance import estimators, inputs, parts, surfaces, trackers
+from marsyard.scenarios.conformance.checks import Check, Finding
 from marsyard.scenarios.dotted import found_at
 from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
 from marsyard.scenarios.parts.named import KINDS
 
 _INPUTS: Mapping[str, Sequence[Callable[[], object]]] = {
-    "velocity": [inputs.descent, streams.STREAM.measurements],
+    "velocity": [inputs.descent, estimators.STREAM.measurements],
     "landing": [inputs.landing],
     "tracking": [trackers.mast, surfaces.texture],
 }
@@ -42,7 +42,7 @@ class Subject:
     def checks(self) -> Iterator[Check]:
         """The task's suite for it."""
         if self.task in KINDS:
-            return parts.PartSuite(KINDS[self.task], self.spec, self.limit_s).checks()
+            return parts.PartSuite.of(KINDS[self.task], self.spec, self.limit_s).checks()
         task: Task[Any, Any] = TASKS[self.task]
         limits = ExecutableLimits(time_s=self.limit_s)
         program = self.spec.startswith(tuple(PREFIXES))
@@ -52,16 +52,16 @@ class Subject:
 
         if task is TRACKING:
             return trackers.TrackerSuite(make, self.spec, program, self.limit_s).checks()
-        if task.takes_stream(self.spec):
-            return streams.StreamSuite(make, self.spec, program, self.limit_s).checks()
         protocol = estimators.VELOCITY if task is VELOCITY else estimators.LANDING
-        return estimators.EstimatorSuite(protocol, make, self.spec, program, self.limit_s).checks()
+        if task.takes_stream(self.spec):
+            protocol = estimators.STREAM
+        return estimators.EstimatorSuite(make, self.spec, program, self.limit_s, protocol).checks()
 
     def prepare(self) -> None:
         """Loads and compiles what the suite itself needs, and the algorithm's code."""
         check_subject(self.spec, self.task)
         if self.task in KINDS:
-            parts.PartSuite(KINDS[self.task], self.spec, self.limit_s).cases()
+            parts.PartSuite.of(KINDS[self.task], self.spec, self.limit_s).cases()
             return
         task: Task[Any, Any] = TASKS[self.task]
         for one in _INPUTS[task.name]:

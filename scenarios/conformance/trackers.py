@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
@@ -14,10 +13,16 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.answers import checked_aim, checked_update
 from marsyard.algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.pointing import mast_angles
-from marsyard.scenarios.conformance.findings import BreachError, Check
-from marsyard.scenarios.conformance.process import fingerprint, own_copy
-from marsyard.scenarios.conformance.shared import COPIES, process_checks, seed_global_generators
+from marsyard.scenarios.conformance.checks import (
+    BreachError,
+    Check,
+    Suite,
+    answer_print,
+    seed_global_generators,
+    timed,
+)
 from marsyard.scenarios.conformance.surfaces import MEAN, TexturedPlane
+from marsyard.scenarios.handover import fingerprint, handed_copy
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements
@@ -76,41 +81,23 @@ def _picture(camera: CameraModel, box: PixelBox, blank: int | None) -> MastImage
 
 
 @dataclass(frozen=True)
-class TrackerSuite:
-    """The suite of one tracker, made anew for each check. See `EstimatorSuite`."""
+class TrackerSuite(Suite):
+    """The suite of one tracker."""
 
-    make: Callable[[], Any]
-    spec: str
-    program: bool
-    limit_s: float
+    deterministic_advice = "draw from numpy.random.default_rng(a fixed seed); reset everything in clear and designate"
+    answers = "updates"
 
     def checks(self) -> Iterator[Check]:
-        """All of them, the ordinary drive first."""
+        """See `Suite`."""
         form = "see algorithms/interface.py for what aim, update and state give"
         yield Check("answer", "aims and answers well-formed at every stop of a drive", form, self._answers)
         yield Check("states", "has no target before one is designated and after it is cleared", form, self._states)
         advice = "return a TargetUpdate with the state LOST and the reasons in losses"
         for name, blank in BLANKS.items():
             yield Check(name, f"loses its target where pictures are {name}", advice, partial(self._loses, name, blank))
-        yield Check(
-            "pose",
-            "answers where the pose jumps and pictures show other ground",
-            advice,
-            self._answers_elsewhere,
-        )
-        if not self.program:
-            yield Check("inputs", "leaves its inputs as they are", COPIES, self._inputs)
-        yield Check(
-            "deterministic",
-            "gives the same answers on the same drive, also after it was cleared",
-            "draw from numpy.random.default_rng(a fixed seed); forget all in clear and designate",
-            self._deterministic,
-        )
-        yield Check(
-            "time", f"updates within {self.limit_s:g} s", "be faster, or allow more with --time-limit", self._time
-        )
-        if not self.program:
-            yield from process_checks(self.spec, self._prepared)
+        asked = "answers where the pose jumps and pictures show other ground"
+        yield Check("pose", asked, advice, self._answers_elsewhere)
+        yield from self.common_checks()
 
     def _answers(self) -> str:
         updates = drive(self.make())
@@ -119,11 +106,11 @@ class TrackerSuite:
     def _states(self) -> str:
         tracker = self.make()
         _expect(tracker, "before a target is designated", TrackingState.NO_TARGET)
-        tracker.designate(own_copy(designation()), pose(0.0))
+        tracker.designate(handed_copy(designation()), pose(0.0))
         _expect(tracker, "once a target is designated", TrackingState.NORMAL)
         tracker.clear()
         _expect(tracker, "once it is cleared", TrackingState.NO_TARGET)
-        update = checked_update(tracker.update(own_copy(taken(_box_ahead(), pose(0.0)))))
+        update = checked_update(tracker.update(handed_copy(taken(_box_ahead(), pose(0.0)))))
         if update.state is not TrackingState.NO_TARGET:
             raise BreachError(f"asked without a target, it answers {update.state.name}; allowed: NO_TARGET")
         return ""
@@ -144,52 +131,47 @@ class TrackerSuite:
         tracker = self.make()
         drive(tracker)
         measurements = replace(taken(_box_ahead(), pose(0.0)), world_from_rover=pose(3.0))
-        return checked_update(tracker.update(own_copy(measurements))).state.name
+        return checked_update(tracker.update(handed_copy(measurements))).state.name
 
-    def _inputs(self) -> str:
-        tracker, told = self.make(), own_copy(designation(), writable=True)
+    def _change_inputs(self) -> str:
+        tracker, told = self.make(), handed_copy(designation(), writable=True)
         before = fingerprint(told)
         tracker.designate(told, pose(0.0))
-        measurements = own_copy(taken(_aimed(tracker, pose(0.0)), pose(0.0)), writable=True)
+        measurements = handed_copy(taken(_aimed(tracker, pose(0.0)), pose(0.0)), writable=True)
         seen = fingerprint(measurements)
         tracker.update(measurements)
         if fingerprint(told) != before or fingerprint(measurements) != seen:
             raise BreachError("its designation or measurements are not what they were before")
         return ""
 
-    def _deterministic(self) -> str:
+    def _answer_again(self) -> str:
         seed_global_generators(1)
-        first = fingerprint(drive(self.make()))
+        first = answer_print(drive(self.make()))
         seed_global_generators(2)
         again = self.make()
-        if fingerprint(drive(again)) != first:
+        if answer_print(drive(again)) != first:
             raise BreachError("two that are made alike answer differently on the same drive")
         again.clear()
-        if fingerprint(drive(again)) != first:
-            raise BreachError("cleared and given the target anew, it answers differently")
+        if answer_print(drive(again)) != first:
+            raise BreachError("cleared and given the target again, it answers differently")
         return ""
 
-    def _time(self) -> str:
+    def _taken_s(self) -> float:
+        """The longest of a drive's updates; the first drive compiles what is compiled."""
+        drive(self.make())
         tracker = self.make()
-        tracker.designate(own_copy(designation()), pose(0.0))
+        tracker.designate(handed_copy(designation()), pose(0.0))
         times = []
         for number in range(_STOPS):
             here = pose(number * _STEP_M)
-            measurements = own_copy(taken(_aimed(tracker, here), here))
-            began = time.perf_counter()
-            tracker.update(measurements)
-            times.append(time.perf_counter() - began)
-        if max(times) > self.limit_s:
-            raise BreachError(f"an update took {max(times):.3g} s")
-        return f"{max(times[1:]):.3g} s"
-
-    def _prepared(self) -> Callable[[], object]:
-        return partial(drive, self.make())
+            measurements = handed_copy(taken(_aimed(tracker, here), here))
+            times.append(timed(lambda given=measurements: tracker.update(given)))  # type: ignore[misc]
+        return max(times)
 
 
 def drive(tracker: Any) -> Sequence[TargetUpdate]:
     """Designates the target and drives towards it; the updates at the stops, up to a failure."""
-    tracker.designate(own_copy(designation()), pose(0.0))
+    tracker.designate(handed_copy(designation()), pose(0.0))
     updates: list[TargetUpdate] = []
     for number in range(_STOPS):
         update = stop(tracker, pose(number * _STEP_M))
@@ -203,17 +185,17 @@ def drive(tracker: Any) -> Sequence[TargetUpdate]:
 
 def stop(tracker: Any, here: RigidTransform, blank: int | None = None) -> TargetUpdate | None:
     """Aims, takes pictures and updates, all held against the interface; None where there is no aim."""
-    aim = checked_aim(tracker.aim(here, own_copy(mast())), mast())
+    aim = checked_aim(tracker.aim(here, handed_copy(mast())), mast())
     if aim is None:
         return None
-    update = checked_update(tracker.update(own_copy(taken(aim, here, blank))))
+    update = checked_update(tracker.update(handed_copy(taken(aim, here, blank))))
     if tracker.state is not update.state:
         raise BreachError(f"its state is {tracker.state}, but its update says {update.state}")
     return update
 
 
 def _aimed(tracker: Any, here: RigidTransform) -> MastAim:
-    aim = checked_aim(tracker.aim(here, own_copy(mast())), mast())
+    aim = checked_aim(tracker.aim(here, handed_copy(mast())), mast())
     if aim is None:
         raise BreachError("it finds no aim at a target 8 m ahead, in full view")
     return aim

@@ -14,10 +14,11 @@ from marsyard.scenarios.descent.haze import veiled
 from marsyard.scenarios.descent.heat_shield import HeatShield
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import World
+from marsyard.scenarios.exposure import render_state
 from marsyard.scenarios.optics import Optics
 from marsyard.sim.dynamics import State
-from marsyard.sim.render import Frame, Scene, process_renderer
-from marsyard.sim.sensor import Detector, ImageMotion
+from marsyard.sim.render import Frame, Scene
+from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
 
 
@@ -51,21 +52,13 @@ def exposures(
     streams: Streams,
 ) -> Iterator[Exposure]:
     """The pictures of these states before faults of their delivery, one after the other."""
-    renderer = process_renderer(p.render.backend)
     scene = _scene(p, world, states, optics, streams)
     mounting = _mounting(p, streams)
     shield = _shield(p, states[0], streams)
     noise = streams.generator("detector noise")
     for state in states:
-        frame = renderer.render(scene, optics.rays, state.world_from_body * mounting, time_s=state.time_s)
         # the camera sits at the body's origin: its mounting turns it, but moves it nowhere
-        motion = ImageMotion.seen(
-            optics.camera,
-            frame.range_m,
-            frame.world_from_body,
-            state.velocity_m_s,
-            state.attitude.apply(state.body_rate_rad_s),
-        )
+        frame, motion = render_state(p.render.backend, scene, optics, state, mounting)
         yield Exposure(detector.expose(_light(p, world, frame, shield, state.time_s), noise, motion), frame)
 
 

@@ -1,22 +1,18 @@
-"""What can go wrong in a descent: each fault by its size, all of them off by default.
-
-A campaign of faults draws one a case: ``"faults" = { distribution = "choice", values = [{}, { haze = 1.0 }, ...] }``.
-"""
+"""What can go wrong in a descent: each fault by its size, all of them off by default."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import UInt16
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.faults import Size, SizedFaults, ailing
+from marsyard.scenarios.faults import Pictures, SizedFaults, deliver
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
+from marsyard.sim.parameters import NonNegative
 from marsyard.sim.render.clouds import CloudLayer, CloudParameters
-from marsyard.sim.sensor import DetectorParameters
 from marsyard.sim.terrain import TerrainParameters
 from marsyard.sim.terrain.landforms import Dunes
 
@@ -31,34 +27,42 @@ STRUCK = 1
 class Faults(SizedFaults):
     """Faults of a descent."""
 
-    dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
-    bad_pixels: Annotated[
-        Size, Field(le=0.5, description="share of pixels that are dead, and of those that are hot")
-    ] = 0.0
     heat_shield_deg: Annotated[
-        Size, Field(le=90.0, description="angle that the heat shield takes in the first picture, deg; it falls ahead")
+        NonNegative,
+        Field(le=90.0, description="angle that the heat shield takes in the first picture, deg; it falls ahead"),
     ] = 0.0
-    cloud_cover: Annotated[Size, Field(le=0.9, description="share of the ground in moving cloud shadows")] = 0.0
+    cloud_cover: Annotated[NonNegative, Field(le=0.9, description="share of the ground in moving cloud shadows")] = 0.0
     haze: Annotated[
-        Size, Field(le=10.0, description="optical depth of the air over 2000 m, which veils the ground")
+        NonNegative, Field(le=10.0, description="optical depth of the air over 2000 m, which veils the ground")
     ] = 0.0
-    dunes_m: Annotated[Size, Field(le=30.0, description="height of regular dunes that cover the ground, m")] = 0.0
+    dunes_m: Annotated[NonNegative, Field(le=30.0, description="height of regular dunes that cover the ground, m")] = (
+        0.0
+    )
     cable_bursts: Annotated[
-        Size, Field(le=1e4, description="mean number of noise bursts on the cable in a picture")
+        NonNegative, Field(le=1e4, description="mean number of noise bursts on the cable in a picture")
     ] = 0.0
-    late_s: Annotated[Size, Field(le=3.0, description="by how much the second picture is later than its tag, s")] = 0.0
+    late_s: Annotated[
+        NonNegative, Field(le=3.0, description="by how much the second picture is later than its tag, s")
+    ] = 0.0
     repeated_picture: Annotated[
         int, Field(ge=0, le=3, description="picture that is delivered as the one before it, 2 or 3; 0: none")
     ] = 0
     black_picture: Annotated[int, Field(ge=0, le=3, description="picture that is delivered black, 1 to 3; 0: none")] = 0
-    altitude_error: Annotated[Size, Field(le=0.9, description="share by which all altitudes are too high")] = 0.0
+    altitude_error: Annotated[NonNegative, Field(le=0.9, description="share by which all altitudes are too high")] = 0.0
     altitude_error_once: Annotated[
-        Size, Field(le=0.9, description="share by which the second altitude is too high")
+        NonNegative, Field(le=0.9, description="share by which the second altitude is too high")
     ] = 0.0
-    attitude_error_deg: Annotated[Size, Field(le=90.0, description="tilt by which all attitudes are wrong, deg")] = 0.0
+    attitude_error_deg: Annotated[
+        NonNegative, Field(le=90.0, description="tilt by which all attitudes are wrong, deg")
+    ] = 0.0
     attitude_error_once_deg: Annotated[
-        Size, Field(le=90.0, description="tilt by which the second attitude is wrong, deg")
+        NonNegative, Field(le=90.0, description="tilt by which the second attitude is wrong, deg")
     ] = 0.0
+
+    def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
+        """Also the cable that is struck."""
+        bursts = {"bursts": self.cable_bursts, "length_px": BURST_PX, "amplitude_dn": BURST_DN}
+        return {**super().detector_changes(), "bursts": bursts if self.cable_bursts else {}}
 
 
 def faulty_terrain(faults: Faults, terrain: TerrainParameters) -> TerrainParameters:
@@ -76,31 +80,14 @@ def clouds_over(faults: Faults, ground_m: float, rng: np.random.Generator) -> Cl
     return CloudLayer.drawn(CloudParameters(cover=faults.cloud_cover), rng, ground_m=ground_m)
 
 
-def faulty_detector(faults: Faults, detector: DetectorParameters) -> DetectorParameters:
-    """The detector with dust, bad pixels and a cable that is struck."""
-    bad = {"dead_share": faults.bad_pixels, "hot_share": faults.bad_pixels} if faults.bad_pixels else {}
-    ailed = ailing(detector, faults.dust_discs, bad)
-    if not faults.cable_bursts:
-        return ailed
-    bursts = {"bursts": faults.cable_bursts, "length_px": BURST_PX, "amplitude_dn": BURST_DN}
-    return ailed.model_copy(update={"bursts": detector.bursts.model_copy(update=bursts)})
-
-
 def faulty_times(faults: Faults, times_s: Sequence[float]) -> list[float]:
     """When pictures are truly taken that should be at these times."""
     return [time + faults.late_s * (number == STRUCK) for number, time in enumerate(times_s)]
 
 
-def delivered(
-    faults: Faults, pictures: Sequence[UInt16[np.ndarray, "rows columns"]]
-) -> list[UInt16[np.ndarray, "rows columns"]]:
-    """The pictures as they arrive: one may be the one before it again, one may be black."""
-    arrived = list(pictures)
-    if faults.repeated_picture > 1:
-        arrived[faults.repeated_picture - 1] = arrived[faults.repeated_picture - 2]
-    if faults.black_picture:
-        arrived[faults.black_picture - 1] = np.zeros_like(arrived[faults.black_picture - 1])
-    return arrived
+def delivered(faults: Faults, pictures: Pictures) -> list[np.ndarray]:
+    """The pictures as they arrive."""
+    return deliver(pictures, faults.repeated_picture, faults.black_picture)
 
 
 def faulty_altitudes(faults: Faults, altitudes: Sequence[AltitudeMeasurement]) -> list[AltitudeMeasurement]:

@@ -181,8 +181,3 @@ def _at_tag(motion: Trajectory, states: Sequence[State], tags_s: Sequence[float]
     if tag_s in tags_s:
         return states[list(tags_s).index(tag_s)]
     return motion.state(float(np.interp(tag_s, tags_s, [state.time_s for state in states])))
-
-
-def off_nadir_deg(state: State) -> float:
-    """Angle between the body's axis, along which the camera looks, and nadir."""
-    return float(np.degrees(np.arccos(np.clip(state.attitude.as_matrix()[2, 2], -1.0, 1.0))))

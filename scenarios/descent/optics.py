@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 from jaxtyping import Float64
 
 from marsyard.scenarios.descent.parameters import CameraParameters
 from marsyard.scenarios.optics import Optics, calibrated
+from marsyard.scenarios.optics import camera_optics as shared_optics
 from marsyard.sim.camera import Cahv, Cahvor, CameraModel
 
 
-@cache
 def camera_optics(parameters: CameraParameters) -> Optics:
     """The descent camera in the body frame: at its origin, looking down, columns to the east at zero attitude."""
-    if parameters.model is not None:
-        return Optics.of(parameters.model.camera())
-    return Optics.of(_camera(parameters, 1.0, (0.0, 0.0), 0.0))
+    own = parameters.model
+    return shared_optics(_camera(parameters, 1.0, (0.0, 0.0), 0.0) if own is None else own.camera())
 
 
 def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) -> CameraModel:

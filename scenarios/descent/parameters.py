@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, Tag, field_validator, model_validator
+from pydantic import Field, Tag, field_validator, model_validator
 
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.chosen import ChosenAlgorithms
@@ -19,6 +19,7 @@ from marsyard.scenarios.parts.named import usual_or
 from marsyard.scenarios.parts.scores import OwnScores, ScoredDescent
 from marsyard.scenarios.terrain_files import check_terrain
 from marsyard.sim.dynamics import SwingParameters
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
     ApproachParameters,
@@ -36,10 +37,8 @@ from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 PICTURES = 3
 
 
-class Place(BaseModel):
+class Place(Parameters):
     """Where over which terrain the descent happens."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     bank: Annotated[int, Field(ge=1, le=100000, description="terrains in the bank")] = 4
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
@@ -54,16 +53,14 @@ class Place(BaseModel):
         return self
 
 
-class SunParameters(BaseModel):
+class SunParameters(Parameters):
     """Where the sun stands."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 270.0
     elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="above the horizon")] = 40.0
 
 
-class LanderParameters(BaseModel):
+class LanderParameters(Parameters):
     """What of the lander shows in its own pictures.
 
     Its shadow is that of one disc at the camera's place. The canopy's is the largest by far: 15.09 m nominal, inflated
@@ -73,17 +70,13 @@ class LanderParameters(BaseModel):
     DIMES masks is 4 deg in radius.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     caster_diameter_m: Annotated[
         float, Field(ge=0.0, le=100.0, description="diameter of the disc that casts the lander's shadow, m")
     ] = 10.9
 
 
-class LandingParameters(BaseModel):
+class LandingParameters(Parameters):
     """From the answer to the ground: see `marsyard.scenarios.descent.landing`. All but the burn are assumed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     computation_s: Annotated[
         float, Field(ge=0.0, le=1000.0, description="from the third picture to the answer on the flight computer, s")
@@ -106,13 +99,11 @@ class LandingParameters(BaseModel):
     ] = 1.0
 
 
-class CameraParameters(BaseModel):
+class CameraParameters(Parameters):
     """The descent camera: 14.67 mm, 12 um pixels, 45 deg; distortion that of an Opportunity navcam (its PDS label).
 
     With `model` it is a user's own, and what is stated here of focal length, pixels and distortion is not used.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     model: Annotated[
         OwnCameraChoice | None, Field(description="an own camera: the path of its file, or a table with file")
@@ -140,10 +131,8 @@ class CameraParameters(BaseModel):
     ] = 0.3
 
 
-class RenderParameters(BaseModel):
+class RenderParameters(Parameters):
     """How pictures are drawn."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
         default_factory=default_backend
@@ -166,8 +155,6 @@ class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
     texture and rocks are the site's. A site belongs to a campaign, not to a case: it is put into `terrain` when the
     campaign is read, and cannot be dispersed.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     task = VELOCITY
     scored = ScoredDescent

@@ -10,7 +10,8 @@ from jaxtyping import Float64, UInt16
 from marsyard.algorithms.dimes import DimesDetails, propagated
 from marsyard.algorithms.dimes.binning import altitudes_at_images
 from marsyard.algorithms.interface import VelocityEstimate
-from marsyard.scenarios.descent.flight import mean_velocities, off_nadir_deg
+from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, sun_columns
+from marsyard.scenarios.descent.flight import mean_velocities
 from marsyard.scenarios.descent.landing import Touchdown, is_in_time
 from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
@@ -41,18 +42,14 @@ def conditions(
     p: DescentScenarioParameters, world: World, states: Sequence[State], at_firing: State
 ) -> dict[str, Scalar]:
     """What the case was like, read from the simulated objects."""
-    sun = world.sun.direction
-    fault, size = p.faults.name_and_size
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
     row: dict[str, Scalar] = {
         "site": p.site or "plain",
         "terrain": p.place.terrain,
-        "fault": fault,
-        "fault_size": size,
+        **p.faults.columns,
         "place_east_m": float(states[0].position_m[0]),
         "place_north_m": float(states[0].position_m[1]),
-        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0], sun[1])) % 360.0),
-        "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(sun[2], -1.0, 1.0)))),
+        **sun_columns(world.sun.direction),
         "horizontal_speed_m_s": float(np.hypot(*states[-1].velocity_m_s[:2])),
         "descent_rate_m_s": float(-np.diff([states[0].position_m[2], states[-1].position_m[2]])[0])
         / (states[-1].time_s - states[0].time_s),
@@ -61,9 +58,9 @@ def conditions(
     for number, (state, height) in enumerate(zip(states, heights, strict=True), start=1):
         row[f"altitude_{number}_m"] = float(height)
         row[f"off_nadir_{number}_deg"] = off_nadir_deg(state)
-        row[f"attitude_rate_{number}_deg_s"] = float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
+        row[f"attitude_rate_{number}_deg_s"] = attitude_rate_deg_s(state)
     row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in states)
-    row["attitude_rate_max_deg_s"] = max(float(row[f"attitude_rate_{k}_deg_s"]) for k in range(1, len(states) + 1))
+    row["attitude_rate_max_deg_s"] = max(attitude_rate_deg_s(state) for state in states)
     return row
 
 

@@ -8,10 +8,11 @@ import numpy as np
 
 from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.meshes import MeshParameters, standing
+from marsyard.scenarios.exposure import sunlight_ratio
+from marsyard.scenarios.meshes import MeshParameters, with_meshes
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.frames import direction
-from marsyard.sim.render import Objects, Photometry, Scene, Sun
+from marsyard.sim.render import Photometry, Scene, Sun
 from marsyard.sim.render.clouds import CloudLayer
 from marsyard.sim.terrain import Environment, Surface, TerrainBank
 
@@ -60,7 +61,7 @@ class World:
             return cls(surface, None, Sun(towards_sun), p.meshes)
         air = p.preset.environment
         sun = Sun(towards_sun, air.sun_radius_rad)
-        brightness = air.direct_share(elevation) * air.solar_irradiance / p.detector.sunlight
+        brightness = sunlight_ratio(air, elevation, p.detector)
         ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.place.terrain))
         return cls(surface, ground, sun, p.meshes, brightness)
 
@@ -94,7 +95,5 @@ class World:
             scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry(), mesh_finest_m=finest)
         else:
             scene = site_scene(self.ground, Eye(east_m, north_m, lowest_m, pixel_rad), self.sun)
-        if self.meshes:
-            own = standing(self.meshes, self.surface, (east_m, north_m))
-            scene = scene.with_objects(Objects.joined([scene.objects, own]))
+        scene = with_meshes(scene, self.meshes, (east_m, north_m))
         return replace(scene, caster_diameter_m=caster_diameter_m, clouds=clouds)

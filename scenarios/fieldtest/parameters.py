@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AwareDatetime, Field, field_validator, model_validator
 
 from marsyard.scenarios.chosen import ChosenAlgorithms
 from marsyard.scenarios.estimators import VELOCITY, Task
 from marsyard.scenarios.optics import CalibrationParameters
 from marsyard.scenarios.parts.scores import OwnScores, ScoredFlight
 from marsyard.sim.dynamics.helicopter import HelicopterParameters
+from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.render import CloudParameters
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import DetectorChoice, preset
@@ -19,18 +20,14 @@ from marsyard.sim.sensor.gps import POST_PROCESSED, GpsParameters
 from marsyard.sim.sensor.imu import ImuParameters
 from marsyard.sim.terrain import TerrainParameters, site, sites
 
-NonNegative = Annotated[float, Field(ge=0.0)]
-Positive = Annotated[float, Field(gt=0.0)]
 Count = Annotated[int, Field(ge=0, le=100000)]
 
 #: The camera of the field test: section III.B.
 CAMERA = "mer-descent-field"
 
 
-class RunParameters(BaseModel):
+class RunParameters(Parameters):
     """One run: where and when it was flown, and how many triples of each category were made of it."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(min_length=1, description="what the report calls the run")]
     site: Annotated[str, Field(description="preset of terrain and light")]
@@ -56,15 +53,13 @@ class RunParameters(BaseModel):
         return self.short_time + self.same_direction + self.opposite_direction
 
 
-class DriftParameters(BaseModel):
+class DriftParameters(Parameters):
     """How the gyros' bias drifts with the temperature of the inertial unit, which the air cools on the passes.
 
     The paper lays the spread of the opposite-direction triples to "temperature variations in the IMU which negated the
     constant bias assumption". How large they were it does not say: the drift is a calibration, chosen so that some of
     those triples pass 5 m/s.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     across_deg_h_k: Annotated[
         float, Field(description="bias of the gyro along the line of flight for a change of temperature, deg/h/K")
@@ -75,10 +70,8 @@ class DriftParameters(BaseModel):
     time_constant_s: Annotated[Positive, Field(description="time constant of the change, s (assumed)")] = 300.0
 
 
-class TargetParameters(BaseModel):
+class TargetParameters(Parameters):
     """The surveyed targets and how well they are seen (paper, III.D.2)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     placed: Annotated[int, Field(ge=3, le=1000, description="targets on the ground")] = 11
     used: Annotated[int, Field(ge=3, le=1000, description="targets used for attitude")] = 9
@@ -94,10 +87,8 @@ class TargetParameters(BaseModel):
         return self
 
 
-class ElevationParameters(BaseModel):
+class ElevationParameters(Parameters):
     """The elevation model that is taken off the GPS height: of the class of SRTM (paper, III.D.1)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     posting_m: Annotated[Positive, Field(description="distance of its posts, m")] = 30.0
     error_m: Annotated[NonNegative, Field(description="error of its posts, m")] = 6.0
@@ -105,10 +96,8 @@ class ElevationParameters(BaseModel):
     interpolation_m: Annotated[NonNegative, Field(description="error of interpolation between posts, m")] = 1.0
 
 
-class PictureParameters(BaseModel):
+class PictureParameters(Parameters):
     """When pictures are taken: often enough for 20 of them in less than 2 min (paper, III.D.2)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     interval_s: Annotated[Positive, Field(le=60.0, description="time between pictures, s (assumed)")] = 3.0
     clock: Annotated[ClockParameters, Field(description="errors of their time tags (assumed)")] = ClockParameters(
@@ -116,10 +105,8 @@ class PictureParameters(BaseModel):
     )
 
 
-class TripleParameters(BaseModel):
+class TripleParameters(Parameters):
     """How triples are made of a run's pictures (paper, III.D and IV)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     virtual_interval_s: Annotated[
         Positive, Field(le=60.0, description="time that is put between two pictures, s: that of the landings")

@@ -4,27 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
 
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera, worked_out
-from marsyard.scenarios.optics import Optics
+from marsyard.scenarios.base import LoadGround
+from marsyard.scenarios.exposure import render_state, sunlight_ratio
+from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera
+from marsyard.scenarios.optics import camera_optics
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.dynamics import State
-from marsyard.sim.render import Scene, Sun, process_renderer
-from marsyard.sim.sensor import Detector, ImageMotion
-from marsyard.sim.terrain import TerrainBank, site
+from marsyard.sim.render import Scene, Sun
+from marsyard.sim.sensor import Detector
+from marsyard.sim.terrain import site
 
 #: Distance of the pixels whose ground points are kept.
 GRID_PX = 32
-
-
-@cache
-def field_optics() -> Optics:
-    """The field test's camera; shared by all cases of a process."""
-    return Optics.of(field_camera())
 
 
 @dataclass(frozen=True)
@@ -43,21 +38,13 @@ class Picture:
     ground_m: Float64[np.ndarray, "m n 3"]
 
 
-def take_picture(run: Run, state: State, detector: Detector, rng: np.random.Generator) -> Picture:
-    """The picture taken in a state of the flight."""
-    optics = field_optics()
-    p = run.key.field_test
-    scene = _scene(run.key, state.time_s)
-    frame = process_renderer(p.backend).render(scene, optics.rays, state.world_from_body, state.time_s)
-    motion = ImageMotion.seen(
-        optics.camera,
-        frame.range_m,
-        frame.world_from_body,
-        state.velocity_m_s,
-        state.attitude.apply(state.body_rate_rad_s),
-    )
-    air = site(run.parameters.site).environment
-    brightness = air.direct_share(float(np.arcsin(scene.sun.direction[2]))) * air.solar_irradiance / p.detector.sunlight
+def take_picture(
+    run: Run, first_light: Scene, ground: SiteGround, state: State, detector: Detector, rng: np.random.Generator
+) -> Picture:
+    """The picture taken in a state of the flight; see `scene_at`."""
+    p, scene = run.key.field_test, scene_at(run, first_light, ground, state.time_s)
+    frame, motion = render_state(p.backend, scene, camera_optics(field_camera()), state)
+    brightness = sunlight_ratio(ground.site.environment, float(np.arcsin(scene.sun.direction[2])), p.detector)
     counts = detector.expose(frame.radiance * np.float32(brightness), rng, motion)
     return Picture(counts, frame.points_world(GRID_PX))
 
@@ -77,36 +64,26 @@ def sun_at(run: Run, time_s: float) -> Sun:
     return Sun(run.sun(time_s), site(run.parameters.site).environment.sun_radius_rad)
 
 
-# as many as the paper's field sites, for cases take turns among their runs
-@lru_cache(maxsize=3)
-def site_ground(site_name: str, samples: int, bank_seed: int) -> SiteGround:
-    """The ground of a site."""
-    preset = site(site_name)
-    terrain = preset.terrain("descent").model_copy(update={"samples": samples})
-    bank = TerrainBank(terrain, bank_seed)
-    return SiteGround(preset, terrain, bank.terrain(0), bank.rocks(0))
-
-
-def _scene(key: RunKey, time_s: float) -> Scene:
-    """The site around the middle of the line under the sun of a time.
+def scene_at(run: Run, first_light: Scene, ground: SiteGround, time_s: float) -> Scene:
+    """The run's scene as it begins, under the sun of a time.
 
     The sun may not be held from one picture to the next: shadows of clouds 2.5 km up move by a third of a metre a
     second with it, and would leap by as much as it was held for.
     """
-    sun = sun_at(worked_out(key), time_s)
-    return replace(_first_light(key), sun=sun, photometry=_ground(key).photometry(sun))
+    sun = sun_at(run, time_s)
+    return replace(first_light, sun=sun, photometry=ground.photometry(sun))
 
 
-def _ground(key: RunKey) -> SiteGround:
+def ground_of(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> SiteGround:
     """The ground that a run flies over."""
     p = key.field_test
-    return site_ground(p.runs[key.number].site, p.samples, p.bank_seed)
+    name = p.runs[key.number].site
+    return load_ground(site(name), p.terrain(name), p.bank_seed, 0)
 
 
-@lru_cache(maxsize=5)
-def _first_light(key: RunKey) -> Scene:
-    """A run's scene as it begins: what stands on the ground stays as the sun moves. Kept for each run of the paper."""
-    run, p = worked_out(key), key.field_test
+def first_light(run: Run, ground: SiteGround) -> Scene:
+    """A run's scene as it begins: what stands on the ground stays as the sun moves."""
     east, north, _ = run.flight.origin_m.tolist()
-    eye = Eye(east, north, p.helicopter.lowest_m, field_optics().rays.pixel_rad)
-    return replace(site_scene(_ground(key), eye, sun_at(run, 0.0)), clouds=run.clouds)
+    pixel_rad = camera_optics(field_camera()).rays.pixel_rad
+    eye = Eye(east, north, run.key.field_test.helicopter.lowest_m, pixel_rad)
+    return replace(site_scene(ground, eye, sun_at(run, 0.0)), clouds=run.clouds)

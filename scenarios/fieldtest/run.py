@@ -1,14 +1,12 @@
 """A run of the field test: its flight, what was logged, and what the processing made of it (paper, III.D).
 
-A run is a function of the parameters, the campaign's seed and the run's number. Processes keep the runs that they have
-worked out; which ones those are changes nothing.
+A run is a function of the parameters, the campaign's seed and the run's number.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import timedelta
-from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -89,8 +87,7 @@ class Run:
         return sun_direction(p.begins + since, p.latitude_deg, p.longitude_deg)
 
 
-@lru_cache(maxsize=16)
-def worked_out(key: RunKey) -> Run:
+def work_out(key: RunKey) -> Run:
     """A run of a field test: its flight logged and processed."""
     p, run = key.field_test, key.field_test.runs[key.number]
     streams = _RunStreams(Streams(key.seed, key.campaign, 0), run.name)

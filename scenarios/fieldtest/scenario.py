@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float64, UInt16
 from pydantic import BaseModel
 
 from marsyard.algorithms.dimes import DimesOptions
+from marsyard.scenarios.base import TerrainScenario, judged_attempt
+from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
-from marsyard.scenarios.fieldtest.pictures import cloud_transmittances, field_optics, take_picture
-from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera, worked_out
+from marsyard.scenarios.fieldtest.pictures import cloud_transmittances, first_light, ground_of, take_picture
+from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera, work_out
 from marsyard.scenarios.fieldtest.triples import Category, Triple
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.optics import draw_calibrated
+from marsyard.scenarios.optics import camera_optics, draw_calibrated
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredFlight, scored
 from marsyard.scenarios.provenance import rendered
@@ -29,9 +31,11 @@ from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, 
 from marsyard.sim.sensor import Detector
 from marsyard.sim.sensor.ranging import height_above_ground
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import TerrainBank
+from marsyard.sim.terrain import Surface, TerrainBank
 
 PICTURES = 3
+#: Grounds, runs and their scenes that a process keeps: at least those of the paper, among which cases take turns.
+KEPT_GROUNDS, KEPT_RUNS, KEPT_SCENES = 3, 16, 5
 
 
 @dataclass(frozen=True)
@@ -42,8 +46,15 @@ class Case:
     triple: Triple
     states: tuple[State, State, State]
 
+    @classmethod
+    def of(cls, run: Run, place: int) -> Case:
+        """The triple at a place among a run's."""
+        triple = run.triples[place]
+        first, second, third = (run.flight.state(float(time)) for time in run.truth.times_s[list(triple.pictures)])
+        return cls(run, triple, (first, second, third))
 
-class FieldTestScenario:
+
+class FieldTestScenario(TerrainScenario[FieldTestParameters]):
     """Triples of pictures of a helicopter's flights, measured as the paper did and given to an estimator: DIMES."""
 
     name = "fieldtest"
@@ -52,46 +63,50 @@ class FieldTestScenario:
     algorithm_table = ()
     part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
+    def __init__(self) -> None:
+        super().__init__(KEPT_GROUNDS)
+        self._run = lru_cache(maxsize=KEPT_RUNS)(work_out)
+        self._first_light = lru_cache(maxsize=KEPT_SCENES)(
+            lambda key: first_light(self._run(key), ground_of(key, self.load_ground))
+        )
+
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the sites."""
-        return tuple(range(len(_checked(parameters).site_names)))
-
-    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """Builds the terrain of one site."""
-        _bank(parameters, shared_input).terrain(0)
+        return tuple(range(len(self.checked(parameters).site_names)))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """The site of the case's run. Raises ValueError where the runs have no triple of this number."""
-        p = _checked(parameters)
-        number, _ = case_order(p)[_place(p, case)]
+        p = self.checked(parameters)
+        number, _ = _run_and_place(p, case)
         return (p.site_names.index(p.runs[number].site),)
 
-    def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
-        """Bytes of a site's terrain that is not on disk."""
-        return _bank(parameters, shared_input).missing_bytes(0)
+    def input_terrain(self, p: FieldTestParameters, shared_input: int) -> tuple[TerrainBank, int]:
+        """The terrain of a site."""
+        return TerrainBank(p.terrain(p.site_names[shared_input]), p.bank_seed), 0
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One triple."""
-        p = _checked(parameters)
-        case = chosen_case(p, streams)
+        p = self.checked(parameters)
+        number, place = _run_and_place(p, streams.case)
+        key = RunKey(p, number, streams.seed, streams.campaign)
+        case, ground = Case.of(self._run(key), place), ground_of(key, self.load_ground)
         # one camera took all pictures
         response = Streams(streams.seed, streams.campaign, 0).generator("detector response")
-        detector = Detector.drawn(field_optics().fall_off, p.detector, response)
-        noise = streams.generator("detector noise")
-        taken = [take_picture(case.run, state, detector, noise) for state in case.states]
+        detector = Detector.drawn(camera_optics(field_camera()).fall_off, p.detector, response)
+        noise, scene = streams.generator("detector noise"), self._first_light(key)
+        taken = [take_picture(case.run, scene, ground, state, detector, noise) for state in case.states]
         pictures = [one.counts for one in taken]
         measurements = measure(p, case, pictures, detector, calibrated_camera(p, streams))
-        truth = truth_velocities(p, case)[1, :2]
         known = {
-            **_conditions(p, case, measurements),
+            **_conditions(p, case, measurements, ground.surface),
             **_clouding(case, taken[1].ground_m),
             **rendered(p.backend, pictures),
         }
 
         def judge(algorithm: str) -> Judged:
-            estimator = partial(VELOCITY.make, algorithm, DimesOptions(), p.executable, streams.case)
+            truth = truth_velocities(p, case)[1, :2]
             attempt = attempted_with(
-                lambda given: estimator().estimate(given),
+                lambda given: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(given),
                 lambda answer: checked_last_interval(answer, measurements),
                 measurements,
             )
@@ -107,20 +122,9 @@ class FieldTestScenario:
                     motion=case.run.flight,
                 )
                 row |= scored(p.scores, flown, {*row, *known})
-            return Judged(
-                outcome=attempt.outcome(lambda answer: answer.outcome.name),
-                answered=velocity is not None,
-                row=row,
-                products=velocity_products(pictures, estimate, truth),
-                failure=attempt.failure,
-            )
+            return judged_attempt(attempt, velocity is not None, row, velocity_products(pictures, estimate, truth))
 
         return case_result(p.algorithms, judge, known)
-
-
-def _bank(parameters: BaseModel, site_number: int) -> TerrainBank:
-    p = _checked(parameters)
-    return TerrainBank(p.terrain(p.site_names[site_number]), p.bank_seed)
 
 
 def calibrated_camera(p: FieldTestParameters, streams: Streams) -> CameraModel:
@@ -129,33 +133,12 @@ def calibrated_camera(p: FieldTestParameters, streams: Streams) -> CameraModel:
     return draw_calibrated(field_camera(), p.calibration, rng).binned(columns=1, rows=p.detector.rows_summed)
 
 
-def _checked(parameters: BaseModel) -> FieldTestParameters:
-    if not isinstance(parameters, FieldTestParameters):
-        raise TypeError(f"the field test takes FieldTestParameters, not {type(parameters).__name__}")
-    return parameters
-
-
-def chosen_case(p: FieldTestParameters, streams: Streams) -> Case:
-    """The triple of a case.
-
-    Raises
-    ------
-    ValueError
-        If the runs have no triple of this number.
-    """
-    number, place = case_order(p)[_place(p, streams.case)]
-    run = worked_out(RunKey(p, number, streams.seed, streams.campaign))
-    triple = run.triples[place]
-    times = run.truth.times_s[list(triple.pictures)]
-    first, second, third = (run.flight.state(float(time)) for time in times)
-    return Case(run, triple, (first, second, third))
-
-
-def _place(p: FieldTestParameters, case: int) -> int:
+def _run_and_place(p: FieldTestParameters, case: int) -> tuple[int, int]:
+    """The run of a case and its place among the run's triples. Raises ValueError where there is no such triple."""
     total = sum(run.triples for run in p.runs)
     if case >= total:
         raise ValueError(f"case {case} is asked for, but the runs state {total} triples; allowed: 0 to {total - 1}")
-    return case
+    return case_order(p)[case]
 
 
 def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
@@ -206,11 +189,11 @@ def measure(
     )
 
 
-def _conditions(p: FieldTestParameters, case: Case, measurements: DescentMeasurements) -> dict[str, Scalar]:
+def _conditions(
+    p: FieldTestParameters, case: Case, measurements: DescentMeasurements, surface: Surface
+) -> dict[str, Scalar]:
     """What the case was like, read from the simulated objects."""
     run, numbers = case.run, list(case.triple.pictures)
-    sun = measurements.sun_direction
-    surface = TerrainBank(p.terrain(run.parameters.site), p.bank_seed).terrain(0)
     true_altitudes = height_above_ground(surface, np.stack([state.position_m for state in case.states]))
     row: dict[str, Scalar] = {
         "run": run.parameters.name,
@@ -221,8 +204,7 @@ def _conditions(p: FieldTestParameters, case: Case, measurements: DescentMeasure
         "terrain": p.site_names.index(run.parameters.site),
         "place_east_m": float(case.states[1].position_m[0]),
         "place_north_m": float(case.states[1].position_m[1]),
-        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0], sun[1])) % 360.0),
-        "sun_elevation_deg": float(np.degrees(np.arcsin(sun[2]))),
+        **sun_columns(measurements.sun_direction),
         "horizontal_speed_m_s": float(np.hypot(*case.states[1].velocity_m_s[:2])),
     }
     errors = []
@@ -233,14 +215,14 @@ def _conditions(p: FieldTestParameters, case: Case, measurements: DescentMeasure
         row[f"pass_{number}"] = int(run.pictures.flown[numbers[number - 1]])
         row[f"altitude_{number}_m"] = float(true)
         row[f"altitude_error_{number}_m"] = altitude.altitude_m - float(true)
-        row[f"off_nadir_{number}_deg"] = _off_nadir_deg(state)
-        row[f"attitude_rate_{number}_deg_s"] = float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
+        row[f"off_nadir_{number}_deg"] = off_nadir_deg(state)
+        row[f"attitude_rate_{number}_deg_s"] = attitude_rate_deg_s(state)
         row[f"attitude_error_{number}_deg"] = float(np.degrees(np.linalg.norm(errors[-1])))
     for pair in (1, 2):
         row[f"attitude_change_{pair}_deg"] = float(np.degrees(np.linalg.norm(errors[pair] - errors[pair - 1])))
         row[f"apart_{pair}_s"] = abs(case.states[pair].time_s - case.states[pair - 1].time_s)
-    row["off_nadir_max_deg"] = max(_off_nadir_deg(state) for state in case.states)
-    row["attitude_rate_max_deg_s"] = max(float(row[f"attitude_rate_{k}_deg_s"]) for k in range(1, PICTURES + 1))
+    row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in case.states)
+    row["attitude_rate_max_deg_s"] = max(attitude_rate_deg_s(state) for state in case.states)
     return row
 
 
@@ -253,8 +235,3 @@ def _clouding(case: Case, ground_m: Float64[np.ndarray, "m n 3"]) -> dict[str, S
     for pair in (1, 2):
         row[f"cloud_change_{pair}"] = float(np.nanmean(np.abs(passed[pair] - passed[pair - 1])))
     return row
-
-
-def _off_nadir_deg(state: State) -> float:
-    """Angle between the camera's axis and nadir."""
-    return float(np.degrees(np.arccos(np.clip(state.attitude.as_matrix()[2, 2], -1.0, 1.0))))

@@ -1,23 +1,18 @@
-"""What can go wrong in a flight: each fault by its size, all of them off by default.
-
-A campaign of faults draws one a case: ``"faults" = { distribution = "choice", values = [{}, { dropout = 2 }, ...] }``.
-"""
+"""What can go wrong in a flight: each fault by its size, all of them off by default."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt16
+from jaxtyping import Float64, Int64
 from pydantic import Field
 
-from marsyard.scenarios.faults import Size, SizedFaults, ailing
+from marsyard.scenarios.faults import Pictures, SizedFaults, deliver
 from marsyard.scenarios.landing.helicopter import HelicopterParameters
-from marsyard.sim.sensor import DetectorParameters
+from marsyard.sim.parameters import NonNegative
 from marsyard.sim.sensor.rtk import Outage
-
-Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 
 class Faults(SizedFaults):
@@ -31,33 +26,36 @@ class Faults(SizedFaults):
         int, Field(ge=0, le=1, description="1: the first picture is delivered again in place of the second")
     ] = 0
     lost_rows: Annotated[
-        Size, Field(le=1.0, description="share of the second picture's rows that is lost, from below")
+        NonNegative, Field(le=1.0, description="share of the second picture's rows that is lost, from below")
     ] = 0.0
     lost_pictures: Annotated[
         float, Field(ge=0.0, le=1.0, description="share of a flight's pictures that is lost; two always arrive")
     ] = 0.0
     laser_silent: Annotated[int, Field(ge=0, le=1, description="1: the altimeter gives no range, to the ground")] = 0
     laser_stuck: Annotated[
-        Size,
+        NonNegative,
         Field(
             le=5.0, description="share by which the range that a stuck altimeter repeats is above the flight's height"
         ),
     ] = 0.0
     gps_outage_s: Annotated[
-        Size,
+        NonNegative,
         Field(le=300.0, description="how long the receiver has been silent at the first picture, and stays so, s"),
     ] = 0.0
-    bad_pixels: Annotated[
-        Size, Field(le=0.5, description="share of pixels that are dead, and of those that are hot")
-    ] = 0.0
     listed_bad_pixels: Annotated[
-        Size, Field(le=0.5, description="the same, where the camera has a list of them and fills them")
+        NonNegative, Field(le=0.5, description="the same, where the camera has a list of them and fills them")
     ] = 0.0
-    dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
     own_shadow_m: Annotated[
-        Size,
+        NonNegative,
         Field(le=100.0, description="diameter of the disc that casts the own shadow, m; the sun is nearer the zenith"),
     ] = 0.0
+
+    def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
+        """Bad pixels are filled where the camera has a list of them."""
+        share = max(self.bad_pixels, self.listed_bad_pixels)
+        listed = share == self.listed_bad_pixels
+        defects = {"dead_share": share, "hot_share": share, "listed": listed} if share else {}
+        return {**super().detector_changes(), "defects": defects}
 
 
 def faulty_sun_deg(faults: Faults, elevation_deg: float) -> float:
@@ -66,13 +64,6 @@ def faulty_sun_deg(faults: Faults, elevation_deg: float) -> float:
     A camera that looks down sees the shadow only if the sun is nearer to the zenith than half of its angle of view.
     """
     return 90.0 - 0.25 * (90.0 - elevation_deg) if faults.own_shadow_m else elevation_deg
-
-
-def faulty_detector(faults: Faults, detector: DetectorParameters) -> DetectorParameters:
-    """The detector with dust and bad pixels."""
-    share = max(faults.bad_pixels, faults.listed_bad_pixels)
-    bad = {"dead_share": share, "hot_share": share, "listed": share == faults.listed_bad_pixels} if share else {}
-    return ailing(detector, faults.dust_discs, bad)
 
 
 def faulty_helicopter(faults: Faults, helicopter: HelicopterParameters) -> HelicopterParameters:
@@ -98,17 +89,9 @@ def arrived_numbers(faults: Faults, count: int, rng: np.random.Generator) -> Int
     return np.sort(rng.permutation(count)[:kept]).astype(np.int64)
 
 
-def delivered(faults: Faults, pictures: Pictures) -> list[UInt16[np.ndarray, "rows columns"]]:
+def delivered(faults: Faults, pictures: Pictures) -> list[np.ndarray]:
     """The pictures as they arrive."""
-    arrived = [one.copy() for one in pictures]
-    if faults.repeated_picture:
-        arrived[1] = arrived[0].copy()
-    if faults.black_picture:
-        arrived[faults.black_picture - 1][:] = 0
-    lost = round(faults.lost_rows * len(arrived[1]))
-    if lost:
-        arrived[1][-lost:] = 0
-    return arrived
+    return deliver(pictures, 2 * faults.repeated_picture, faults.black_picture, faults.lost_rows)
 
 
 def faulty_ranges(faults: Faults, ranges_m: Float64[np.ndarray, "n"], height_m: float) -> Float64[np.ndarray, "n"]:

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from marsyard.sim.dynamics import Resting, State, Trajectory
 from marsyard.sim.dynamics.rotorcraft import (
@@ -32,6 +32,7 @@ from marsyard.sim.dynamics.rotorcraft import (
     transit_flight,
 )
 from marsyard.sim.measurements import PoseMeasurement
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.sensor.clock import Clock, ClockParameters
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from marsyard.sim.sensor.navigation import FilterParameters, FilterState, NavigationFilter, NavigationSolution
@@ -44,10 +45,8 @@ from marsyard.sim.streams import Streams
 MOST_TURNS, STILL_M = 8, 1e-3
 
 
-class HelicopterParameters(BaseModel):
+class HelicopterParameters(Parameters):
     """A flight of the helicopter: vehicle, air, what is commanded, and the classes of its instruments."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     craft: RotorcraftParameters = RotorcraftParameters()
     air: AirParameters = AirParameters()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -87,41 +88,52 @@ def _least_absolute_plane(x: Array, y: Array, z: Array, weights: Array) -> Array
     return plane
 
 
+class Disc(NamedTuple):
+    """Points of a footprint from its middle (rows, columns): all, and those through which planes are laid."""
+
+    offsets: NDArray[np.int64]
+    fitted: NDArray[np.int64]
+
+
 @njit(cache=True)
 def footprints(
-    heights: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], offsets: NDArray[np.int64],
-    fitted: NDArray[np.int64], spacing: float, limit: float, slopes: Array, roughness: Array, exceeding: Array,
-) -> None:  # fmt: skip
+    heights: Array, spacing: float, middles: NDArray[np.int64], disc: Disc, limit: float
+) -> tuple[Array, Array, Array]:
     """Slope, greatest distance from the plane (upwards or downwards), and area farther than `limit`, of footprints.
 
     Parameters
     ----------
     heights, spacing
         The grid, metres.
-    rows, columns
-        The grid's point in the middle of each footprint; a footprint lies within the grid.
-    offsets, fitted
-        Points of a footprint from its middle (rows, columns): all, and those through which planes are laid.
+    middles
+        The grid's point (row, column) in the middle of each footprint; a footprint lies within the grid.
+    disc
+        The footprint.
     limit
         Distance above which area is counted.
-    slopes, roughness, exceeding
-        Filled with the angles (radians), distances (metres) and areas (square metres).
+
+    Returns
+    -------
+    Angles (radians), distances (metres) and areas (square metres).
     """
+    offsets, fitted = disc.offsets, disc.fitted
+    slopes, roughness, exceeding = np.empty(len(middles)), np.empty(len(middles)), np.empty(len(middles))
     n = fitted.shape[0]
     x, y, z, weights = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     for m in range(n):
         y[m], x[m] = fitted[m, 0] * spacing, fitted[m, 1] * spacing
-    for k in range(rows.size):
+    for k in range(len(middles)):
+        row, column = middles[k, 0], middles[k, 1]
         for m in range(n):
-            z[m] = heights[rows[k] + fitted[m, 0], columns[k] + fitted[m, 1]]
+            z[m] = heights[row + fitted[m, 0], column + fitted[m, 1]]
         plane = _least_absolute_plane(x, y, z, weights)
         most, over = 0.0, 0
         for m in range(offsets.shape[0]):
             i, j = offsets[m, 0], offsets[m, 1]
-            above = heights[rows[k] + i, columns[k] + j]
-            away = abs(above - plane[0] - plane[1] * j * spacing - plane[2] * i * spacing)
+            away = abs(heights[row + i, column + j] - plane[0] - plane[1] * j * spacing - plane[2] * i * spacing)
             most = max(most, away)
             over += away > limit
         slopes[k] = math.atan(math.hypot(plane[1], plane[2]))
         roughness[k] = most
         exceeding[k] = over * spacing * spacing
+    return slopes, roughness, exceeding

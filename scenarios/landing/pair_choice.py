@@ -12,19 +12,18 @@ from typing import Annotated
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import PoseMeasurement
+from marsyard.sim.parameters import Parameters
 
 
-class PairParameters(BaseModel):
+class PairParameters(Parameters):
     """The criterion. The paper names baseline and overlap; how they are weighed is assumed.
 
     A pair is worth its overlap times its baseline, which counts up to `wanted_share` of the range.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     wanted_share: Annotated[
         float, Field(gt=0.0, le=2.0, description="baseline over range beyond which more is worth nothing")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.hda import HdaOptions, TrackSeed
 from marsyard.scenarios.chosen import ChosenAlgorithms
@@ -21,6 +21,7 @@ from marsyard.scenarios.optics import CalibrationParameters
 from marsyard.scenarios.parts.scores import OwnScores, ScoredLanding
 from marsyard.scenarios.terrain_files import check_terrain
 from marsyard.sim.camera import CameraModel
+from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.sensor import (
     PRESETS,
     AutoExposureParameters,
@@ -32,15 +33,10 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 
-Size = Annotated[float, Field(ge=0.0)]
 Angle = Annotated[float, Field(ge=-720.0, le=720.0)]
 
 
-class _Parameters(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class PassParameters(_Parameters):
+class PassParameters(Parameters):
     """Where the camera is at the two pictures: at one height over a straight line, as far as nothing else is asked for.
 
     The change between the pictures that tracking must bear is stated by its parts: along the course, up, and turned
@@ -64,21 +60,29 @@ class PassParameters(_Parameters):
     roll_deg: Annotated[Angle, Field(description="turn about the optical axis between the pictures")] = 0.0
     pitch_deg: Annotated[Angle, Field(description="turn about the picture's columns' direction, its right")] = 0.0
     yaw_deg: Annotated[Angle, Field(description="turn about the picture's rows' direction, its upper edge's")] = 0.0
-    rate_deg_s: Annotated[Size, Field(le=100.0, description="RMS attitude rate per axis at a picture")] = 0.0
+    rate_deg_s: Annotated[NonNegative, Field(le=100.0, description="RMS attitude rate per axis at a picture")] = 0.0
 
 
-class NavigationParameters(_Parameters):
+class NavigationParameters(Parameters):
     """Errors of the on-board poses and of the inclinometers, drawn for a case; one standard deviation per axis."""
 
-    position_m: Annotated[Size, Field(le=100.0, description="of the position, the same at both pictures, m")] = 0.02
-    motion_m: Annotated[Size, Field(le=10.0, description="of the motion between the pictures, m")] = 0.01
-    tilt_deg: Annotated[Size, Field(le=30.0, description="of the attitude's roll and pitch, common to both, deg")] = 0.3
-    azimuth_deg: Annotated[Size, Field(le=30.0, description="of the attitude's azimuth, common to both, deg")] = 1.0
-    turn_deg: Annotated[Size, Field(le=10.0, description="of the turn between the pictures, deg")] = 0.1
-    inclinometer_deg: Annotated[Size, Field(le=30.0, description="of the inclinometers' roll and pitch, deg")] = 0.2
+    position_m: Annotated[NonNegative, Field(le=100.0, description="of the position, the same at both pictures, m")] = (
+        0.02
+    )
+    motion_m: Annotated[NonNegative, Field(le=10.0, description="of the motion between the pictures, m")] = 0.01
+    tilt_deg: Annotated[
+        NonNegative, Field(le=30.0, description="of the attitude's roll and pitch, common to both, deg")
+    ] = 0.3
+    azimuth_deg: Annotated[
+        NonNegative, Field(le=30.0, description="of the attitude's azimuth, common to both, deg")
+    ] = 1.0
+    turn_deg: Annotated[NonNegative, Field(le=10.0, description="of the turn between the pictures, deg")] = 0.1
+    inclinometer_deg: Annotated[
+        NonNegative, Field(le=30.0, description="of the inclinometers' roll and pitch, deg")
+    ] = 0.2
 
 
-class LanderParameters(_Parameters):
+class LanderParameters(Parameters):
     """The lander: what it can stand on, and the shadow that it casts."""
 
     diameter_m: Annotated[
@@ -89,7 +93,7 @@ class LanderParameters(_Parameters):
         float, Field(gt=0.0, le=100.0, description="farthest that ground may be off that plane, m")
     ] = 0.2
     caster_diameter_m: Annotated[
-        Size, Field(le=100.0, description="diameter of the disc that casts its shadow into the picture; 0: none")
+        NonNegative, Field(le=100.0, description="diameter of the disc that casts its shadow into the picture; 0: none")
     ] = 0.0
 
     @property
@@ -116,7 +120,7 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
     place: Place = Place()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
     texture: Annotated[
-        Size, Field(le=10.0, description="contrast of ground finer than the terrain, over the site's own")
+        NonNegative, Field(le=10.0, description="contrast of ground finer than the terrain, over the site's own")
     ] = 1.0
     sun: SunParameters = SunParameters()
     camera: Annotated[

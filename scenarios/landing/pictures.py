@@ -7,15 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from marsyard.scenarios.landing.faults import delivered, faulty_detector
+from marsyard.scenarios.exposure import render_state
+from marsyard.scenarios.faults import faulty_detector
+from marsyard.scenarios.landing.faults import delivered
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.world import World
 from marsyard.scenarios.optics import Optics
 from marsyard.scenarios.views import Eye
 from marsyard.sim.measurements import DetectorImage
-from marsyard.sim.render import Frame, process_renderer
-from marsyard.sim.sensor import Detector, ImageMotion, auto_expose
+from marsyard.sim.render import Frame
+from marsyard.sim.sensor import Detector, auto_expose
 from marsyard.sim.streams import Streams
 
 
@@ -57,14 +59,9 @@ def take_pictures(p: LandingScenarioParameters, world: World, flight: Flight, op
     caster = max(p.lander.caster_diameter_m, p.faults.own_shadow_m)
     lower = min(flight.states, key=lambda state: float(state.position_m[2]))
     scene = world.scene(Eye.of(optics.rays, lower.world_from_body, world.ground.surface), caster)
-    renderer = process_renderer(p.render.backend)
     noise = streams.generator("detector noise")
-    frames, motions = [], []
-    for state in flight.states:
-        frame = renderer.render(scene, optics.rays, state.world_from_body, state.time_s)
-        rate = state.attitude.apply(state.body_rate_rad_s)
-        frames.append(frame)
-        motions.append(ImageMotion.seen(optics.camera, frame.range_m, frame.world_from_body, state.velocity_m_s, rate))
+    seen = [render_state(p.render.backend, scene, optics, state) for state in flight.states]
+    frames, motions = zip(*seen, strict=True)
     light = [frame.radiance * np.float32(world.brightness) for frame in frames]
     detector = auto_expose(detector, light[0], p.exposure, streams.generator("test pictures")).detector
     counts = [detector.expose(one, noise, motion) for one, motion in zip(light, motions, strict=True)]

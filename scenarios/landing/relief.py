@@ -15,7 +15,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from marsyard.scenarios.landing import kernels
 from marsyard.scenarios.meshes import MeshParameters
@@ -131,28 +131,23 @@ class Relief:
         ValueError
             If a footprint does not lie within the grid.
         """
-        offsets, fitted = _disc(round(0.5 * limits.diameter_m / self.spacing_m))
+        disc = _disc(round(0.5 * limits.diameter_m / self.spacing_m))
         middles = np.rint(self.cells(places)).astype(np.int64).reshape(-1, 2)
-        reach = int(offsets.max())
+        reach = int(disc.offsets.max())
         if np.any(middles < reach) or np.any(middles >= np.array(self.heights_m.shape) - reach):
             raise ValueError("a footprint reaches beyond the ground whose heights are known")
-        slopes, roughness, exceeding = (np.empty(len(middles)) for _ in range(3))
-        rows, columns = middles.T.copy()
-        kernels.footprints(
-            self.heights_m, rows, columns, offsets, fitted, self.spacing_m, limits.max_roughness_m,
-            slopes, roughness, exceeding,
-        )  # fmt: skip
-        shape = places.shape[:-1]
-        safe = (slopes <= limits.max_slope_rad) & (roughness <= limits.max_roughness_m)
-        return Footprints(
-            slopes.reshape(shape), roughness.reshape(shape), exceeding.reshape(shape), safe.reshape(shape)
+        slopes, roughness, exceeding = (
+            values.reshape(places.shape[:-1])
+            for values in kernels.footprints(self.heights_m, self.spacing_m, middles, disc, limits.max_roughness_m)
         )
+        safe = (slopes <= limits.max_slope_rad) & (roughness <= limits.max_roughness_m)
+        return Footprints(slopes, roughness, exceeding, safe)
 
 
 @lru_cache(maxsize=4)
-def _disc(radius: int) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, "m 2"]]:
+def _disc(radius: int) -> kernels.Disc:
     """Points of a disc from its middle (row, column): all of them, and those through which planes are laid."""
     across = np.arange(-radius, radius + 1)
     points = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1).reshape(-1, 2)
     points = points[np.hypot(*points.T) <= radius]
-    return points, points[np.all(points % FITTED_EVERY == 0, axis=1)].copy()
+    return kernels.Disc(points, points[np.all(points % FITTED_EVERY == 0, axis=1)].copy())

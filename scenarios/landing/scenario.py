@@ -3,33 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 from pydantic import BaseModel
 
 from marsyard.algorithms.answers import checked_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
+from marsyard.scenarios.base import TerrainScenario, judged_attempt
 from marsyard.scenarios.estimators import LANDING
-from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.exposure import pixel_sample
+from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.landing.descent import landing_row
-from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.measurement import measure
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import take_pictures
-from marsyard.scenarios.landing.samples import landing_samples
 from marsyard.scenarios.landing.score import conditions, map_row, motion_row, outcome_row, products, site_row, times_row
-from marsyard.scenarios.landing.truth import GroundTruth
-from marsyard.scenarios.landing.world import KEPT_GROUNDS, World, camera_optics
+from marsyard.scenarios.landing.truth import RenderedFlight
+from marsyard.scenarios.landing.world import KEPT_GROUNDS
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredLanding, scored
 from marsyard.scenarios.provenance import rendered
-from marsyard.scenarios.samples import Sample
+from marsyard.scenarios.samples import Sample, summed_rows
 from marsyard.scenarios.trial import Judged, attempted_with, case_result
 from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
 
-class LandingScenario:
+class LandingScenario(TerrainScenario[LandingScenarioParameters]):
     """Two pictures of the ground from a moving camera, given to an estimator of landing sites."""
 
     name = "landing"
@@ -38,85 +39,85 @@ class LandingScenario:
     algorithm_table = ()
     part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
+    def __init__(self) -> None:
+        super().__init__(KEPT_GROUNDS)
+
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains; none of a bank so large that hardly two flights have the same one.
 
         Those are built by the flights that need them, in a tenth of a core-second each.
         """
-        bank = _checked(parameters).place.bank
+        bank = self.checked(parameters).place.bank
         return tuple(range(bank)) if bank <= KEPT_GROUNDS else ()
-
-    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """Builds one terrain of the bank."""
-        _bank(parameters).terrain(shared_input)
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """The terrain below the flight."""
-        return (_checked(parameters).place.terrain,)
+        return (self.checked(parameters).place.terrain,)
 
-    def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
-        """Bytes of a terrain that is not on disk."""
-        return _bank(parameters).missing_bytes(shared_input)
+    def input_terrain(self, p: LandingScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
+        """A terrain of the bank."""
+        return TerrainBank(p.terrain, p.place.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """The two pictures of a case with the truth of their pixels."""
-        return landing_samples(_checked(parameters), streams)
+        """The two pictures of a case as they are delivered, with the truth of their pixels."""
+        case = RenderedFlight.of(self.checked(parameters), streams, self.load_ground)
+        p, pair = case.p, case.pair
+        for frame, image, state in zip(pair.frames, pair.images, case.flight.states, strict=True):
+            about: dict[str, Any] = {
+                "site": p.site,
+                "time_s": image.time_s,
+                "position_m": state.position_m.tolist(),
+                "world_from_body_xyzw": state.attitude.as_quat().tolist(),
+                "sun_direction": case.world.sun.direction.tolist(),
+                "lander": p.lander.model_dump(mode="json"),
+            }
+            hazard = case.truth.hazard_map(frame.points_world()[summed_rows(p.detector.rows_summed)])
+            yield pixel_sample(image.counts, frame, p.detector, image.camera, about, hazard)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One flight."""
-        p = _checked(parameters)
-        world = World.of(p)
-        flight = Flight.of(p, world.ground.surface, streams)
-        pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
-        measurements = measure(p, flight, pair, streams)
-        truth = GroundTruth.of(world, flight, pair, p.lander.limits)
-        known = {**conditions(p, world, flight, pair, measurements, truth), **rendered(p.render.backend, pair.counts)}
-        # what is left to land on where an algorithm fails to answer
-        nothing = SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
-
-        def judge(algorithm: str) -> Judged:
-            attempt = attempted_with(
-                lambda given: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(given),
-                checked_site,
-                measurements,
-            )
-            estimate = nothing if attempt.answer is None else attempt.answer
-            row = {
-                **({} if attempt.answer is None else outcome_row(attempt.answer)),
-                **site_row(estimate, flight, truth),
-                **landing_row(p, estimate, flight, truth, streams),
-                **motion_row(estimate.details, flight, pair),
-                **map_row(p, estimate, flight, truth),
-                **times_row(estimate.details),
-                **attempt.row,
-            }
-            if attempt.answer is not None:
-                first, second = (rigid(state.attitude, state.position_m) for state in flight.states)
-                case = ScoredLanding(
-                    measurements=measurements,
-                    answer=attempt.answer,
-                    true_poses=(first, second),
-                    states=flight.states,
-                    ground=truth,
-                )
-                row |= scored(p.scores, case, {*row, *known})
-            return Judged(
-                outcome=attempt.outcome(lambda answer: answer.outcome.name),
-                answered=attempt.answer is not None and estimate.outcome.converged,
-                row=row,
-                products=products(p, estimate, flight, pair, truth),
-                failure=attempt.failure,
-            )
-
-        return case_result(p.algorithms, judge, known)
+        p = self.checked(parameters)
+        case = RenderedFlight.of(p, streams, self.load_ground)
+        measurements = measure(p, case.flight, case.pair, streams)
+        known = {**conditions(case, measurements), **rendered(p.render.backend, case.pair.counts)}
+        return case_result(p.algorithms, lambda algorithm: _judge(case, measurements, streams, algorithm, known), known)
 
 
-def _bank(parameters: BaseModel) -> TerrainBank:
-    p = _checked(parameters)
-    return TerrainBank(p.terrain, p.place.bank_seed)
-
-
-def _checked(parameters: BaseModel) -> LandingScenarioParameters:
-    if not isinstance(parameters, LandingScenarioParameters):
-        raise TypeError(f"the landing scenario takes LandingScenarioParameters, not {type(parameters).__name__}")
-    return parameters
+def _judge(
+    case: RenderedFlight,
+    measurements: LandingMeasurements,
+    streams: Streams,
+    algorithm: str,
+    known: Mapping[str, Scalar],
+) -> Judged:
+    """Ask one algorithm, and score its answer and the landing that it leads to."""
+    p, flight, truth = case.p, case.flight, case.truth
+    attempt = attempted_with(
+        lambda given: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(given),
+        checked_site,
+        measurements,
+    )
+    # what is left to land on where an algorithm fails to answer
+    nothing = SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
+    estimate = nothing if attempt.answer is None else attempt.answer
+    row = {
+        **({} if attempt.answer is None else outcome_row(attempt.answer)),
+        **site_row(estimate, flight, truth),
+        **landing_row(p, estimate, flight, truth, streams),
+        **motion_row(estimate.details, flight, case.pair),
+        **map_row(p, estimate, flight, truth),
+        **times_row(estimate.details),
+        **attempt.row,
+    }
+    if attempt.answer is not None:
+        first, second = (rigid(state.attitude, state.position_m) for state in flight.states)
+        answered = ScoredLanding(
+            measurements=measurements,
+            answer=attempt.answer,
+            true_poses=(first, second),
+            states=flight.states,
+            ground=truth,
+        )
+        row |= scored(p.scores, answered, {*row, *known})
+    converged = attempt.answer is not None and estimate.outcome.converged
+    return judged_attempt(attempt, converged, row, products(case, estimate))

@@ -10,14 +10,14 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.hda import STAGES, HdaDetails, hda_products
 from marsyard.algorithms.hda.view import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
+from marsyard.scenarios.conditions import sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.confusion import MapAtPlaces, hazard_counts, map_errors
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.motion import motion_errors, solved_row
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.pictures import Pair
-from marsyard.scenarios.landing.truth import GroundTruth
-from marsyard.scenarios.landing.world import World
+from marsyard.scenarios.landing.truth import GroundTruth, RenderedFlight
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground
 
@@ -167,61 +167,27 @@ def map_row(
     return {**map_errors(ground, flight, at, truth), **hazard_counts(ground, at, truth)}
 
 
-def conditions(
-    p: LandingScenarioParameters,
-    world: World,
-    flight: Flight,
-    pair: Pair,
-    measurements: LandingMeasurements,
-    truth: GroundTruth,
-) -> dict[str, Scalar]:
+def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[str, Scalar]:
     """What the case was like, read from the simulated objects."""
-    fault, size = p.faults.name_and_size
-    sun = world.sun.direction
-    states, poses = flight.states, flight.poses
-    heights = height_above_ground(world.ground.surface, np.stack([state.position_m for state in states]))
-    moved = states[1].position_m - states[0].position_m
-    turned = (states[0].attitude.inv() * states[1].attitude).as_rotvec(degrees=True)
-    errors = [
-        (pose.world_from_body.rotation * state.attitude.inv()).as_rotvec()
-        for pose, state in zip(poses, states, strict=True)
-    ]
-    upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
-    level = float(np.arccos(np.clip(upright @ measurements.up_body, -1.0, 1.0)))
-    motion_error = np.array(poses[1].world_from_body.translation) - states[1].position_m - flight.position_error_m
+    p, pair, truth = case.p, case.pair, case.truth
     covered = truth.covered
     return {
         "site": p.site,
         "terrain": p.place.terrain,
-        "fault": fault,
-        "fault_size": size,
+        **p.faults.columns,
         "place_east_m": p.place.east_m,
         "place_north_m": p.place.north_m,
-        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0], sun[1])) % 360.0),
-        "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(sun[2], -1.0, 1.0)))),
-        "height_m": float(heights[0]),
-        "baseline_m": float(np.linalg.norm(moved)),
-        "height_change_share": float(moved[2] / heights[0]),
-        "baseline_share": float(np.hypot(*moved[:2]) / heights[0]),
-        "turned_deg": float(np.linalg.norm(turned)),
-        "pitch_deg": float(turned[0]),
-        "yaw_deg": float(turned[1]),
-        "roll_deg": float(turned[2]),
-        "off_nadir_deg": float(np.degrees(np.arccos(np.clip(upright[2], -1.0, 1.0)))),
+        **sun_columns(case.world.sun.direction),
+        **_true_motion_columns(case),
         "exposure_s": pair.images[0].calibration.exposure_s,
         "picture_median_dn": float(np.median(pair.counts[0])),
         "range_m": pair.axis_range_m,
         "range_error_m": measurements.slant_range_m - pair.axis_range_m,
-        "level_error_deg": float(np.degrees(level)),
-        "pose_position_error_m": float(np.linalg.norm(flight.position_error_m)),
-        "pose_motion_error_m": float(np.linalg.norm(motion_error)),
-        "pose_tilt_error_deg": float(np.degrees(np.hypot(*errors[0][:2]))),
-        "pose_azimuth_error_deg": float(np.degrees(errors[0][2])),
-        "pose_turn_error_deg": float(np.degrees(np.linalg.norm(errors[1] - errors[0]))),
+        **_navigation_errors(case.flight, measurements),
         "covered_m2": float(covered.sum() * truth.step_m**2),
         **site_populations(truth),
         "truly_safe_share": float(truth.safe.sum() / max(int(covered.sum()), 1)),
-        "within_limits": _within_limits(true_motion(flight, pair), flight, pair.axis_range_m),
+        "within_limits": _within_limits(true_motion(case.flight, pair), case.flight, pair.axis_range_m),
         "true_slope_median_deg": _median_deg(truth, covered),
         "texture": p.texture,
         "grid_px": p.hda.grid_px,
@@ -231,13 +197,51 @@ def conditions(
     }
 
 
+def _true_motion_columns(case: RenderedFlight) -> dict[str, Scalar]:
+    """Where the camera was at the first picture, and how it moved and turned to the second."""
+    states = case.flight.states
+    heights = height_above_ground(case.world.ground.surface, np.stack([state.position_m for state in states]))
+    moved = states[1].position_m - states[0].position_m
+    turned = (states[0].attitude.inv() * states[1].attitude).as_rotvec(degrees=True)
+    upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
+    return {
+        "height_m": float(heights[0]),
+        "baseline_m": float(np.linalg.norm(moved)),
+        "height_change_share": float(moved[2] / heights[0]),
+        "baseline_share": float(np.hypot(*moved[:2]) / heights[0]),
+        "turned_deg": float(np.linalg.norm(turned)),
+        "pitch_deg": float(turned[0]),
+        "yaw_deg": float(turned[1]),
+        "roll_deg": float(turned[2]),
+        "off_nadir_deg": float(np.degrees(np.arccos(np.clip(upright[2], -1.0, 1.0)))),
+    }
+
+
+def _navigation_errors(flight: Flight, measurements: LandingMeasurements) -> dict[str, Scalar]:
+    """Errors of the on-board poses and of the inclinometers' vertical."""
+    states, poses = flight.states, flight.poses
+    first, second = (
+        (pose.world_from_body.rotation * state.attitude.inv()).as_rotvec()
+        for pose, state in zip(poses, states, strict=True)
+    )
+    upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
+    level = float(np.arccos(np.clip(upright @ measurements.up_body, -1.0, 1.0)))
+    motion_error = np.array(poses[1].world_from_body.translation) - states[1].position_m - flight.position_error_m
+    return {
+        "level_error_deg": float(np.degrees(level)),
+        "pose_position_error_m": float(np.linalg.norm(flight.position_error_m)),
+        "pose_motion_error_m": float(np.linalg.norm(motion_error)),
+        "pose_tilt_error_deg": float(np.degrees(np.hypot(*first[:2]))),
+        "pose_azimuth_error_deg": float(np.degrees(first[2])),
+        "pose_turn_error_deg": float(np.degrees(np.linalg.norm(second - first))),
+    }
+
+
 def _median_deg(truth: GroundTruth, covered: np.ndarray) -> float:
     return float(np.degrees(np.median(truth.footprints.slope_rad[covered]))) if np.any(covered) else NAN
 
 
-def products(
-    p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, pair: Pair, truth: GroundTruth
-) -> dict[str, Any]:
+def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
     """Arrays from which the case's figures are drawn.
 
     Those of `marsyard.algorithms.hda.hda_products` (Figs. 1-5 and 7), and
@@ -250,6 +254,7 @@ def products(
     - `limits`: the algorithm's limits of slope (radians) and roughness (metres), and the lander's diameter;
     - `site_true`: world x, y to which the handed-over coordinates lead (see `site_row`).
     """
+    p, flight, pair, truth = case.p, case.flight, case.pair, case.truth
     kept: dict[str, Any] = {"image_1": pair.counts[0], "image_2": pair.counts[1]}
     if isinstance(estimate.details, HdaDetails):
         kept |= hda_products(estimate.details)

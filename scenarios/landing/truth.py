@@ -6,19 +6,26 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.landing.flight import Flight
-from marsyard.scenarios.landing.pictures import Pair, seen_by_both
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.pictures import Pair, seen_by_both, take_pictures
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
 from marsyard.scenarios.landing.world import World
+from marsyard.scenarios.optics import camera_optics
+from marsyard.scenarios.views import SiteGround
+from marsyard.sim.streams import Streams
 
 #: Distance of the places at which the truth is asked for, in diameters of the footprint: 20 cm for 2 m.
 STEP_DIAMETERS = 0.1
 #: Room beyond the ground in sight, in diameters: footprints and landings beside it are still told.
 MARGIN_DIAMETERS = 1.5
+#: Values of a hazard map: a lander's footprint about the pixel's point is safe, is not, or is not all in sight.
+SAFE, UNSAFE, UNKNOWN = 0, 1, 255
 
 
 @dataclass(frozen=True)
@@ -97,12 +104,48 @@ class GroundTruth:
         unsafe = self.places[~self.footprints.safe]
         return float(np.hypot(*(unsafe - place).T).min()) if len(unsafe) else float("inf")
 
+    def hazard_map(self, points: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns"]:
+        """What a lander would stand on about each pixel's point, at the nearest of the truth's places."""
+        origin = self.places[0, 0]
+        axes = np.stack([self.places[0, 1] - origin, self.places[1, 0] - origin], axis=1)
+        cells = np.linalg.solve(axes, (points[..., :2] - origin).reshape(-1, 2).T).T
+        inside = np.asarray(np.isfinite(cells).all(axis=1))
+        columns, rows = np.rint(np.where(inside[:, None], cells, -1.0)).astype(np.int64).T
+        shape = self.covered.shape
+        inside &= (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
+        hazard = np.full(len(cells), UNKNOWN, dtype=np.uint8)
+        at = rows[inside], columns[inside]
+        known = np.where(self.footprints.safe[at], SAFE, UNSAFE)
+        hazard[inside] = np.where(self.covered[at], known, UNKNOWN)
+        return hazard.reshape(points.shape[:2])
+
     def under(self, place: Float[np.ndarray, "2"]) -> Footprints | None:
         """The ground under a lander at any place (x, y); None where it is not known."""
         try:
             return self.relief.footprints(place[None], self.limits)
         except ValueError:
             return None
+
+
+@dataclass(frozen=True)
+class RenderedFlight:
+    """A flight with its world, its pictures, and the truth about the ground that they show."""
+
+    p: LandingScenarioParameters
+    world: World
+    flight: Flight
+    pair: Pair
+    truth: GroundTruth
+
+    @classmethod
+    def of(
+        cls, p: LandingScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank
+    ) -> RenderedFlight:
+        """Fly a case and take its pictures."""
+        world = World.of(p, load_ground)
+        flight = Flight.of(p, world.ground.surface, streams)
+        pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
+        return cls(p, world, flight, pair, GroundTruth.of(world, flight, pair, p.lander.limits))
 
 
 def _horizontal_axes(attitude: Rotation) -> Float[np.ndarray, "2 2"]:

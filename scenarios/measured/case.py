@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.hda.view import camera_pose
+from marsyard.scenarios.base import BaseScenario
 from marsyard.scenarios.chosen import ChosenAlgorithms
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.measured.parameters import MeasuredParameters
@@ -21,12 +22,12 @@ from marsyard.scenarios.trial import Attempt, attempted_with
 from marsyard.sim.measurements import DetectorImage
 
 Answer = TypeVar("Answer")
-Parameters = TypeVar("Parameters", bound=BaseModel)
+Stated = TypeVar("Stated", bound=BaseModel)
 
 NAN = float("nan")
 
 
-class MeasuredScenario:
+class MeasuredScenario(BaseScenario[Stated]):
     """A scenario whose cases are files that are there."""
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
@@ -35,13 +36,6 @@ class MeasuredScenario:
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Nothing."""
-
-
-def checked(parameters: BaseModel, kind: type[Parameters]) -> Parameters:
-    """The parameters of a scenario. Raises TypeError where they are another's."""
-    if not isinstance(parameters, kind):
-        raise TypeError(f"the scenario takes {kind.__name__}, not {type(parameters).__name__}")
-    return parameters
 
 
 def tried(

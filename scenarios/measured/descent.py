@@ -11,9 +11,10 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.dimes import DimesDetails
 from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.scenarios.base import judged_attempt
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
-from marsyard.scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, tried
+from marsyard.scenarios.measured.case import NAN, MeasuredScenario, about, distance, tried
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
 from marsyard.scenarios.measured.parameters import MeasuredVelocityParameters
 from marsyard.scenarios.measured.store import StoredCase, descent_measurements, images_of
@@ -26,7 +27,7 @@ from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.streams import Streams
 
 
-class MeasuredVelocityScenario(MeasuredScenario):
+class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
     """Three real pictures of a descent with measurements, given to a velocity estimator."""
 
     name = "measured-velocity"
@@ -37,7 +38,7 @@ class MeasuredVelocityScenario(MeasuredScenario):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One descent."""
-        p = checked(parameters, MeasuredVelocityParameters)
+        p = self.checked(parameters)
         images = images_of(p.cases, p.case)
         measurements = descent_measurements(p.case, images)
         matches = matched(images)
@@ -60,13 +61,8 @@ class MeasuredVelocityScenario(MeasuredScenario):
                 case = ScoredVelocity(measurements=measurements, answer=attempt.answer, true_velocity_m_s=truth)
                 row |= scored(p.scores, case, {*row, *known})
             kept = velocity_products([image.counts for image in images], attempt.answer, _true(p.case))
-            return Judged(
-                outcome=attempt.outcome(lambda answer: answer.outcome.name),
-                answered=_velocity(attempt.answer) is not None,
-                row=row,
-                products={**kept, **agreement_products(images, pairs)},
-                failure=attempt.failure,
-            )
+            products = {**kept, **agreement_products(images, pairs)}
+            return judged_attempt(attempt, _velocity(attempt.answer) is not None, row, products)
 
         return case_result(p.algorithms, judge, known)
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
+from marsyard.algorithms.exchange.files import write_picture
 from marsyard.scenarios.measured.layout import (
     INGEST_FILE,
     LANDING,
@@ -33,13 +34,18 @@ from marsyard.scenarios.measured.store import (
     StoredTruth,
     Vector,
     put_camera,
-    put_flat_field,
-    put_picture,
+    put_file,
     write_cases,
 )
 from marsyard.scenarios.measured.table import CaseRows, PictureRow, read_table
 from marsyard.scenarios.own_files import listed
-from marsyard.sim.camera import CameraModel, Pds3Product, looking_down, read_cameras, read_pds3_product
+from marsyard.sim.camera import (
+    CameraModel,
+    Pds3Product,
+    looking_down,
+    read_cameras,
+    read_pds3_product,
+)
 from marsyard.sim.camera.pds_labels import is_pds3
 from marsyard.sim.files import npy_header
 from marsyard.sim.frames import SITE_FROM_WORLD
@@ -274,7 +280,8 @@ def _flat(folder: _Folder, row: PictureRow, counts: UInt16[np.ndarray, "rows col
     path = folder.source / stated
     if path not in folder.flat_fields:
         response = _flat_field(path)
-        named = put_flat_field(folder.target, len(folder.flat_fields), response)
+        name = f"{len(folder.flat_fields):06d}.npy"
+        named = put_file(folder.target, "flat_fields", name, lambda path: np.save(path, response, allow_pickle=False))
         folder.flat_fields[path] = named, response.shape
     named, shape = folder.flat_fields[path]
     if shape != counts.shape:
@@ -296,7 +303,7 @@ def _check_view(folder: _Folder, row: PictureRow, camera: CameraModel, attitude:
         )
 
 
-def _stored(folder: _Folder, name: str, taken: _Taken) -> StoredPicture:
+def _stored(folder: _Folder, picture: str, taken: _Taken) -> StoredPicture:
     camera = folder.cameras.get(taken.camera)
     if camera is None:
         camera = folder.cameras[taken.camera] = put_camera(folder.target, len(folder.cameras), taken.camera)
@@ -307,7 +314,7 @@ def _stored(folder: _Folder, name: str, taken: _Taken) -> StoredPicture:
     return StoredPicture(
         source=row.texts["file"],
         size=taken.camera.size,
-        counts=put_picture(folder.target, name, taken.counts),
+        counts=put_file(folder.target, "pictures", f"{picture}.png", lambda path: write_picture(path, taken.counts)),
         camera=camera,
         flat_field=_flat(folder, row, taken.counts),
         time_s=taken.time_s,

@@ -13,10 +13,11 @@ from marsyard.algorithms.answers import checked_site
 from marsyard.algorithms.hda import HdaDetails, hda_products
 from marsyard.algorithms.hda.view import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
+from marsyard.scenarios.base import judged_attempt
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
 from marsyard.scenarios.landing.motion import motion_errors, solved_row
-from marsyard.scenarios.measured.case import NAN, MeasuredScenario, about, checked, distance, pose, tried
+from marsyard.scenarios.measured.case import NAN, MeasuredScenario, about, distance, pose, tried
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
 from marsyard.scenarios.measured.parameters import MeasuredLandingParameters
 from marsyard.scenarios.measured.store import StoredCase, images_of, landing_measurements, pose_of
@@ -27,7 +28,7 @@ from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.streams import Streams
 
 
-class MeasuredLandingScenario(MeasuredScenario):
+class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
     """Two real pictures of the ground with measured poses, given to an estimator of landing sites."""
 
     name = "measured-landing"
@@ -38,7 +39,7 @@ class MeasuredLandingScenario(MeasuredScenario):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One flight."""
-        p = checked(parameters, MeasuredLandingParameters)
+        p = self.checked(parameters)
         images = images_of(p.cases, p.case)
         measurements = landing_measurements(p.case, images)
         pairs = agreements(images, matched(images), [pose(picture) for picture in p.case.pictures])
@@ -57,13 +58,9 @@ class MeasuredLandingScenario(MeasuredScenario):
             if attempt.answer is not None:
                 case = ScoredSite(measurements=measurements, answer=attempt.answer, true_poses=_true_poses(p.case))
                 row |= scored(p.scores, case, {*row, *known})
-            return Judged(
-                outcome=attempt.outcome(lambda answer: answer.outcome.name),
-                answered=attempt.answer is not None and attempt.answer.outcome.converged,
-                row=row,
-                products={**(hda_products(details) if isinstance(details, HdaDetails) else {}), **shown},
-                failure=attempt.failure,
-            )
+            products = {**(hda_products(details) if isinstance(details, HdaDetails) else {}), **shown}
+            converged = attempt.answer is not None and attempt.answer.outcome.converged
+            return judged_attempt(attempt, converged, row, products)
 
         return case_result(p.algorithms, judge, known)
 

@@ -10,11 +10,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from marsyard.scenarios.own_axes import RecordedAxes
 from marsyard.sim.files import check_regular
 from marsyard.sim.frames import direction
+from marsyard.sim.parameters import Parameters
 
 #: The two files of every folder.
 INGEST_FILE, TABLE_FILE = "ingest.toml", "pictures.csv"
@@ -30,10 +31,8 @@ class IngestError(ValueError):
     """A folder that cannot be used; the message names the file, the line or key, and what is allowed."""
 
 
-class CameraTable(BaseModel):
+class CameraTable(Parameters):
     """The camera of all pictures that name none of their own."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     file: Annotated[str | None, Field(description="camera file; none needed for PDS3 products, whose labels are")] = (
         None
@@ -51,10 +50,8 @@ class CameraTable(BaseModel):
     ] = False
 
 
-class DetectorTable(BaseModel):
+class DetectorTable(Parameters):
     """What is known of the detector."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     bits: Annotated[int, Field(ge=1, le=16, description="of a count; the largest count is 2^bits - 1")]
     offset_dn: Annotated[float, Field(ge=0.0, le=65535.0, description="counts delivered for no light")] = 0.0
@@ -78,10 +75,8 @@ class DetectorTable(BaseModel):
     ] = None
 
 
-class SunTable(BaseModel):
+class SunTable(Parameters):
     """Where the sun stands, for all cases whose rows do not say."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")]
     elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="above the horizon")]
@@ -92,10 +87,8 @@ class SunTable(BaseModel):
         return direction(float(np.radians(self.azimuth_deg)), float(np.radians(self.elevation_deg)))
 
 
-class IngestFile(BaseModel):
+class IngestFile(Parameters):
     """`ingest.toml`: what holds for the whole folder."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100, description="of the campaign")]
     task: Annotated[

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel
 
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.measured.case import MeasuredScenario, about, checked, pose
+from marsyard.scenarios.measured.case import MeasuredScenario, about, pose
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, agreements, matched
 from marsyard.scenarios.measured.parameters import MatchingParameters
 from marsyard.scenarios.measured.store import images_of
@@ -15,7 +15,7 @@ from marsyard.sim.streams import Streams
 MATCHED, TOO_FEW = "MATCHED", "TOO_FEW_MATCHES"
 
 
-class MatchingScenario(MeasuredScenario):
+class MatchingScenario(MeasuredScenario[MatchingParameters]):
     """Two or more real pictures, held against their measured poses."""
 
     name = "measured-matching"
@@ -23,7 +23,7 @@ class MatchingScenario(MeasuredScenario):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One case."""
-        p = checked(parameters, MatchingParameters)
+        p = self.checked(parameters)
         images = images_of(p.cases, p.case)
         pairs = agreements(images, matched(images), [pose(picture) for picture in p.case.pictures])
         told = all(pair.residuals_px.size for pair in pairs)

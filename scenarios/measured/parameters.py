@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.algorithms.hda import HdaOptions
@@ -14,12 +14,11 @@ from marsyard.scenarios.estimators import LANDING, VELOCITY
 from marsyard.scenarios.measured.layout import TaskName
 from marsyard.scenarios.measured.store import CasesFile, StoredCase
 from marsyard.scenarios.parts.scores import OwnScores, ScoredSite, ScoredVelocity
+from marsyard.sim.parameters import Parameters
 
 
-class MeasuredParameters(BaseModel):
+class MeasuredParameters(Parameters):
     """What all tasks have in common."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     cases: Annotated[CasesFile, Field(description="`cases.json` of `marsyard ingest`")]
     number: Annotated[int, Field(ge=0, description="of the case in it; a grid over all")] = 0

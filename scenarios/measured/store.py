@@ -8,15 +8,15 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, UInt16
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.exchange.files import read_picture, write_picture
+from marsyard.algorithms.exchange.files import read_picture
 from marsyard.scenarios.measured.layout import TaskName
 from marsyard.scenarios.own_files import OwnFile
 from marsyard.sim.camera import BODY_FRAME, CameraModel, read_cahvor, write_cahvor
@@ -31,6 +31,7 @@ from marsyard.sim.measurements import (
     LandingMeasurements,
     PoseMeasurement,
 )
+from marsyard.sim.parameters import Parameters
 
 #: Version of `cases.json`, and its name.
 SCHEMA = 1
@@ -40,18 +41,14 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
-class _Plain(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Named(_Plain):
+class Named(Parameters):
     """A file beside `cases.json`, and the hash of its contents."""
 
     file: str
     sha256: str
 
 
-class StoredPicture(_Plain):
+class StoredPicture(Parameters):
     """One picture, its size (columns, rows), and what was measured when it was taken."""
 
     source: str
@@ -72,7 +69,7 @@ class StoredPicture(_Plain):
         return Rotation.from_quat(np.array(self.world_from_body_xyzw))
 
 
-class StoredTruth(_Plain):
+class StoredTruth(Parameters):
     """What is known beyond what was measured.
 
     Attributes
@@ -87,7 +84,7 @@ class StoredTruth(_Plain):
     poses: tuple[tuple[Vector, Quaternion], ...] | None = None
 
 
-class StoredCase(_Plain):
+class StoredCase(Parameters):
     """One case."""
 
     name: str
@@ -99,7 +96,7 @@ class StoredCase(_Plain):
     truth: StoredTruth = StoredTruth()
 
 
-class StoredDetector(_Plain):
+class StoredDetector(Parameters):
     """What is known of the detector of all pictures."""
 
     offset_dn: float
@@ -109,7 +106,7 @@ class StoredDetector(_Plain):
     rows_summed: int
 
 
-class StoredCases(_Plain):
+class StoredCases(Parameters):
     """`cases.json`."""
 
     schema_version: int
@@ -173,32 +170,19 @@ def write_cases(folder: Path, stored: StoredCases) -> Path:
     return path
 
 
-def put_picture(folder: Path, name: str, counts: UInt16[np.ndarray, "rows columns"]) -> Named:
-    """Writes a picture beside `cases.json`."""
-    (folder / "pictures").mkdir(exist_ok=True)
-    path = folder / "pictures" / f"{name}.png"
-    write_picture(path, counts)
-    return _named(folder, path)
+def put_file(folder: Path, kind: str, name: str, write: Callable[[Path], object]) -> Named:
+    """Write a file beside `cases.json`, in the folder of its kind (`pictures`, `cameras`, `flat_fields`)."""
+    path = folder / kind / name
+    path.parent.mkdir(exist_ok=True)
+    write(path)
+    return Named(file=path.relative_to(folder).as_posix(), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def put_camera(folder: Path, number: int, camera: CameraModel) -> Named:
-    """Writes a camera beside `cases.json`."""
-    (folder / "cameras").mkdir(exist_ok=True)
-    path = folder / "cameras" / f"{number:06d}.cahvor"
-    write_cahvor(camera, path, frame=BODY_FRAME)
-    return _named(folder, path)
-
-
-def put_flat_field(folder: Path, number: int, flat: Float64[np.ndarray, "rows columns"]) -> Named:
-    """Writes a flat field beside `cases.json`."""
-    (folder / "flat_fields").mkdir(exist_ok=True)
-    path = folder / "flat_fields" / f"{number:06d}.npy"
-    np.save(path, flat, allow_pickle=False)
-    return _named(folder, path)
-
-
-def _named(folder: Path, path: Path) -> Named:
-    return Named(file=path.relative_to(folder).as_posix(), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+    """Write a camera beside `cases.json`; its file states the body frame."""
+    return put_file(
+        folder, "cameras", f"{number:06d}.cahvor", lambda path: write_cahvor(camera, path, frame=BODY_FRAME)
+    )
 
 
 def _unchanged(folder: Path, named: Named) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,10 +11,9 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems
+from marsyard.scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems, read_lines
 from marsyard.scenarios.measured.layout import COLUMNS, PICTURES, TEXTS, IngestError
 from marsyard.scenarios.own_files import listed
-from marsyard.sim.files import check_regular
 
 #: A quaternion's length may be off 1 by this, as written with three digits.
 UNIT_TOLERANCE = 5e-3
@@ -77,7 +75,10 @@ def read_table(path: Path, task: str) -> tuple[CaseRows, ...]:
     IngestError
         Where it cannot be read, or holds anything that is not allowed; all that is wrong is told, by line.
     """
-    header, lines = _lines(path)
+    try:
+        header, lines = read_lines(path, MOST_ROWS)
+    except ValueError as error:
+        raise IngestError(str(error)) from error
     problems = list(_header_problems(header, task))
     if problems:
         raise IngestError(listed(path, problems))
@@ -95,26 +96,6 @@ def read_table(path: Path, task: str) -> tuple[CaseRows, ...]:
     if problems:
         raise IngestError(listed(path, problems))
     return cases
-
-
-def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Names of the columns, and the lines that are not empty with their numbers."""
-    try:
-        check_regular(path)
-        with path.open(newline="", encoding="utf-8-sig") as text:
-            reader = csv.reader(text)
-            header = [name.strip() for name in next(reader, [])]
-            lines = []
-            for cells in reader:
-                if any(cell.strip() for cell in cells):
-                    lines.append((reader.line_num, [cell.strip() for cell in cells]))
-                if len(lines) > MOST_ROWS:
-                    raise IngestError(f"{path}: has more than {MOST_ROWS} rows; divide it")
-    except OSError as error:
-        raise IngestError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise IngestError(f"{path}: is no table with commas: {error}") from error
-    return header, lines
 
 
 def _header_problems(header: Sequence[str], task: str) -> Iterator[str]:

@@ -13,12 +13,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, JsonValue, ValidationError, model_validator
+from pydantic import BaseModel, Discriminator, Field, JsonValue, ValidationError, model_validator
 
 from marsyard.scenarios.dotted import found_at
 from marsyard.scenarios.interface import Scalar
+from marsyard.sim.parameters import Parameters
 
 Options = Mapping[str, Any]
 
@@ -122,21 +123,19 @@ def _said(error: Exception) -> str:
     return str(error) if isinstance(error, TypeError | ValueError) else f"{type(error).__name__}: {error}"
 
 
-class OwnPart(BaseModel):
+class OwnPart(Parameters):
     """A table that names a class of a user's own, in the key `named_by`, and states its options.
 
     Options that are not stated are filled in from the class when the campaign is read, so that each is in the
     campaign's record and can be dispersed.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     kind: ClassVar[Kind]
     named_by: ClassVar[str]
 
-    options: Annotated[
-        dict[str, JsonValue], Field(description="handed to the class by name; each can be dispersed")
-    ] = {}
+    options: dict[str, JsonValue] = Field(
+        default_factory=dict, description="handed to the class by name; each can be dispersed"
+    )
 
     @property
     def spec(self) -> str:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import SiteEstimate, TargetUpdate, VelocityEstimate
@@ -27,6 +27,7 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.named import SCORE, checked_columns
 from marsyard.sim.dynamics import State, Trajectory
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, RoverMeasurements
+from marsyard.sim.parameters import Parameters
 
 if TYPE_CHECKING:
     from marsyard.scenarios.landing.truth import GroundTruth
@@ -190,10 +191,8 @@ def score_of(spec: str, kind: type[Any] | None = None) -> Any:
     return found
 
 
-class OwnScores(BaseModel):
+class OwnScores(Parameters):
     """What the parameters of scenarios hold whose cases a user's own scores can be asked about."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     scored: ClassVar[type[Any]]
 

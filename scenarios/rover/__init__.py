@@ -7,8 +7,8 @@ the pictures of one drive.
 
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run import Run, run_case
-from marsyard.scenarios.rover.scenario import RoverScenario
-from marsyard.scenarios.rover.shared import SharedDriveParameters, SharedDriveScenario
+from marsyard.scenarios.rover.scenario import RoverScenario, SharedDriveScenario
+from marsyard.scenarios.rover.shared import SharedDriveParameters
 from marsyard.scenarios.rover.stops import RunOutcome
 
 __all__ = [

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.chosen import ChosenAlgorithms
@@ -15,6 +15,7 @@ from marsyard.scenarios.parts.scores import OwnScores, ScoredRun
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import SlipParameters
 from marsyard.sim.measurements import MastCalibration
+from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.render import CloudParameters
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
@@ -32,15 +33,8 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.terrain import site, sites
 
-Positive = Annotated[float, Field(gt=0.0)]
-NonNegative = Annotated[float, Field(ge=0.0)]
 
-
-class _Parameters(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class InclineParameters(_Parameters):
+class InclineParameters(Parameters):
     """An even slope about the target that climbs to the east, and how the way to the target lies on it."""
 
     name: Annotated[str, Field(min_length=1, description="what the report calls such ground")] = "flat ground"
@@ -51,7 +45,7 @@ class InclineParameters(_Parameters):
     ] = 0.0
 
 
-class WorldParameters(_Parameters):
+class WorldParameters(Parameters):
     """The ground: one terrain of a site's bank, rocks that would stand in the way taken out."""
 
     site: Annotated[str, Field(description="preset of terrain, rocks, texture and light")] = "mars-yard"
@@ -97,7 +91,7 @@ class WorldParameters(_Parameters):
         return self
 
 
-class ObstacleParameters(_Parameters):
+class ObstacleParameters(Parameters):
     """A rock in or beside the way, placed from the target."""
 
     towards_start_m: Annotated[float, Field(description="distance from the target towards the start, m")] = 4.0
@@ -106,7 +100,7 @@ class ObstacleParameters(_Parameters):
     height_m: Annotated[Positive | None, Field(description="by default half the diameter")] = None
 
 
-class TargetParameters(_Parameters):
+class TargetParameters(Parameters):
     """The rock that is driven to, the point on it, and how that is told to the rover.
 
     The point is picked where the rock is seen from the start: `across` from its left (-1) to its right (1) outline at
@@ -124,7 +118,7 @@ class TargetParameters(_Parameters):
     ] = "pixel"
 
 
-class StartParameters(_Parameters):
+class StartParameters(Parameters):
     """Where the rover stands at first, seen from the target."""
 
     distance_m: Annotated[
@@ -138,7 +132,7 @@ class StartParameters(_Parameters):
     ] = 0.0
 
 
-class LegParameters(_Parameters):
+class LegParameters(Parameters):
     """A part of a run. After each of its steps the target is tracked.
 
     ========== ========================================================================================================
@@ -193,7 +187,7 @@ class LegParameters(_Parameters):
         return self
 
 
-class SunParameters(_Parameters):
+class SunParameters(Parameters):
     """Where the sun stands at the start, and how it moves."""
 
     azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 225.0
@@ -205,7 +199,7 @@ class SunParameters(_Parameters):
     held_s: Annotated[Positive, Field(description="time for which it is held in the pictures' light, s")] = 120.0
 
 
-class TimingParameters(_Parameters):
+class TimingParameters(Parameters):
     """How long a run's activities take (Table IV, means)."""
 
     track_s: Annotated[NonNegative, Field(description="a tracking update, s")] = 45.0
@@ -214,7 +208,7 @@ class TimingParameters(_Parameters):
     drive_s: Annotated[NonNegative, Field(description="a step's motion, s (19 min for 15 steps in section 7.2)")] = 30.0
 
 
-class ExposureParameters(_Parameters):
+class ExposureParameters(Parameters):
     """How the pictures are exposed (section 4.5)."""
 
     of: Annotated[
@@ -224,7 +218,7 @@ class ExposureParameters(_Parameters):
     auto: AutoExposureParameters = AutoExposureParameters()
 
 
-class OwnPair(_Parameters):
+class OwnPair(Parameters):
     """A stereo pair of one's own on the mast's head: where files put the cameras does not matter."""
 
     left: Annotated[OwnCameraChoice, Field(description="camera file: a path, or a table with file")]
@@ -245,7 +239,7 @@ class OwnPair(_Parameters):
         return on_head(self.left.camera(), right.camera(), self.baseline_m, self.toe_in_deg)
 
 
-class CameraParameters(_Parameters):
+class CameraParameters(Parameters):
     """The stereo pair on the mast."""
 
     preset: Annotated[
@@ -289,7 +283,7 @@ class CameraParameters(_Parameters):
         return preset(self.preset).detector if self.detector is None else self.detector
 
 
-class ScoreParameters(_Parameters):
+class ScoreParameters(Parameters):
     """What counts as tracked, and what of each update is stored."""
 
     tracked_px: Annotated[

@@ -1,15 +1,23 @@
-"""One closed loop: at each stop visual odometry, tracking, navigation, drive, in the order of the paper's Fig. 12."""
+"""The rover's loop: at each stop visual odometry, tracking, navigation, drive, in the order of the paper's Fig. 12.
+
+A guide decides where the mast points at a stop, and where the target is believed to be: a tracker (`TrackerGuide`), or
+the truth, for drives whose pictures many trackers share (`marsyard.scenarios.rover.shared`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import MastAim, TrackingState
 from marsyard.algorithms.navigation import NavigationOutcome
 from marsyard.algorithms.vtt import GoalReached, HandOffOutcome, hand_off
+from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.rover.guarded import GuardedTracker
 from marsyard.scenarios.rover.mapping import Mapper
@@ -17,10 +25,11 @@ from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioPara
 from marsyard.scenarios.rover.pictures import Detectors, Photographer
 from marsyard.scenarios.rover.rig import Rig
 from marsyard.scenarios.rover.route import GOAL_TOLERANCE_M, Belief, commands, finished
-from marsyard.scenarios.rover.stops import RunOutcome, Stop
+from marsyard.scenarios.rover.stops import RunOutcome, Stop, View
 from marsyard.scenarios.rover.target import ChosenTarget, choose_target
 from marsyard.scenarios.rover.vehicle import Vehicle
 from marsyard.scenarios.rover.world import RunWorld
+from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics.driving import Drive
 from marsyard.sim.frames import composed
 from marsyard.sim.measurements import DriveCommand
@@ -28,13 +37,34 @@ from marsyard.sim.streams import Streams
 
 
 @dataclass
-class Run:
-    """A run under way, or over.
+class Setup:
+    """A rover at its start, before a target is chosen, with what takes its pictures."""
+
+    world: RunWorld
+    rig: Rig
+    vehicle: Vehicle
+    photographer: Photographer
+
+    @staticmethod
+    def prepared(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank) -> Setup:
+        """The set-up of a run; all its errors are drawn."""
+        rig = Rig.of(p, streams)
+        world = RunWorld.of(p, rig.pixel_rad, streams, load_ground)
+        photographer = Photographer(
+            p.backend,
+            Detectors.drawn(p.camera, streams.generator("detector response")),
+            p.exposure,
+            streams.generator("detector noise"),
+        )
+        return Setup(world, rig, Vehicle.placed(p, world, rig, streams), photographer)
+
+
+@dataclass
+class Run(Setup):
+    """A run in progress, or finished.
 
     Attributes
     ----------
-    world, rig, vehicle
-        What it happens with.
     target
         The designated point.
     stops
@@ -53,9 +83,6 @@ class Run:
         What was driven since the last stop.
     """
 
-    world: RunWorld
-    rig: Rig
-    vehicle: Vehicle
     target: ChosenTarget
     stops: list[Stop] = field(default_factory=list)
     outcome: RunOutcome = RunOutcome.STUCK
@@ -66,162 +93,176 @@ class Run:
     time_s: float = 0.0
     pending: list[Drive] = field(default_factory=list)
 
+    @classmethod
+    def at(cls, setup: Setup, target: ChosenTarget) -> Run:
+        """A run towards a target that has not begun."""
+        return cls(setup.world, setup.rig, setup.vehicle, setup.photographer, target)
+
+    def truth_belief(self) -> Belief:
+        """Where the target truly is from here."""
+        return self._belief(self.vehicle.stance.world_from_rover.inv().apply(self.target.point_world.copy()))
+
+    def tracked_belief(self) -> Belief:
+        """Where the target is believed to be from here: as last reported, moved by the estimate of the pose."""
+        stop = self.stops[-1]
+        if stop.update.position_rover is None:
+            raise ValueError("the target was not seen yet")
+        here = composed(self.vehicle.estimated.inv(), stop.estimated)
+        return self._belief(here.apply(np.array(stop.update.position_rover)))
+
+    def _belief(self, position_rover: Float64[np.ndarray, "3"]) -> Belief:
+        position = np.asarray(position_rover)
+        return Belief(position, self.rig.range_m(position))
+
+
+class Guide(Protocol):
+    """What a run is guided by."""
+
+    def aim(self, run: Run) -> MastAim | None:
+        """Where the mast points, and which parts of the frames are taken; None where the target is out of reach."""
+
+    def observe(self, run: Run, view: View) -> RunOutcome | None:
+        """Take the pictures of a stop; why the run is over, or None."""
+
+    def belief(self, run: Run) -> Belief:
+        """Where the target is believed to be."""
+
+
+@dataclass(frozen=True)
+class TrackerGuide:
+    """A run is guided by the tracker under test."""
+
+    tracker: GuardedTracker
+
+    @classmethod
+    def of(cls, p: RoverScenarioParameters, run: Run, estimated: RigidTransform) -> TrackerGuide:
+        """The tracker of the parameters; the run's target is designated at the rover's estimated pose."""
+        tracker = GuardedTracker(TRACKING.make(p.algorithm, p.vtt, p.executable), run.rig.calibrated)
+        tracker.designate(run.target.designation, estimated)
+        return cls(tracker)
+
+    def aim(self, run: Run) -> MastAim | None:
+        """See `Guide`."""
+        return self.tracker.aim(run.vehicle.estimated)
+
+    def observe(self, run: Run, view: View) -> RunOutcome | None:
+        """Update the tracker and append the stop to the run."""
+        update, taken_s = self.tracker.update(view.pictures, view.angles_rad, view.estimated)
+        run.stops.append(Stop.of(view, run.target.point_world, run.rig.left, update, taken_s))
+        if update.state is TrackingState.FAILURE:
+            return RunOutcome.LOST
+        return RunOutcome.NOT_SEEDED if update.position_rover is None else None
+
+    def belief(self, run: Run) -> Belief:
+        """See `Guide`."""
+        return run.tracked_belief()
+
 
 def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
     """A run, from the designation of the target to its end."""
     run = prepare_run(p, streams)
-    track_target(p, run, streams)
+    track_target(p, run)
     return run
 
 
-def prepare_run(p: RoverScenarioParameters, streams: Streams) -> Run:
-    """A run before a tracker has been asked: everything in its place, the target chosen."""
-    rig = Rig.of(p, streams)
-    world = RunWorld.of(p, rig.pixel_rad, streams)
-    vehicle = Vehicle.placed(p, world, rig, streams)
-    return Run(world, rig, vehicle, choose_target(p, world, rig, vehicle.stance))
+def prepare_run(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank) -> Run:
+    """A run at its start, the target chosen, before a tracker is asked."""
+    setup = Setup.prepared(p, streams, load_ground)
+    return Run.at(setup, choose_target(p, setup.world, setup.rig, setup.vehicle.stance))
 
 
-def track_target(p: RoverScenarioParameters, run: Run, streams: Streams) -> None:
-    """Drives a prepared run to its end by what the tracker of the parameters answers."""
-    photographer = Photographer(
-        p.backend,
-        Detectors.drawn(p.camera, streams.generator("detector response")),
-        p.exposure,
-        streams.generator("detector noise"),
+def track_target(p: RoverScenarioParameters, run: Run) -> None:
+    """Drive a prepared run to its end, guided by the tracker of the parameters."""
+    failed = drive_legs(p, run, TrackerGuide.of(p, run, run.vehicle.estimated))
+    if failed is not None:
+        run.outcome = failed
+    elif not run.stops[-1].update.found:
+        run.outcome = RunOutcome.LOST
+    else:
+        run.outcome = RunOutcome.COMPLETED if _is_at_goal(p.legs[-1], run.tracked_belief()) else RunOutcome.STUCK
+    last = p.legs[-1]
+    if run.outcome is RunOutcome.COMPLETED and last.motion == "approach":
+        reached = GoalReached(last.goal_m, 2.0 * GOAL_TOLERANCE_M)
+        handed = hand_off(run.stops[-1].update, reached, run.rig.calibrated)
+        run.handed_over = handed.outcome is HandOffOutcome.HANDED_OVER
+
+
+def drive_legs(p: RoverScenarioParameters, run: Run, guide: Guide) -> RunOutcome | None:
+    """Go through all legs; why the run ended before, or None."""
+    failed = visit_stop(p, run, guide, -1)
+    for number, leg in enumerate(p.legs):
+        done = 0
+        if leg.maps_first and failed is None:
+            _map(p, run, leg, guide.belief(run))
+        while failed is None and not finished(leg, done, guide.belief(run)):
+            failed = _step(p, run, guide, leg, done) or visit_stop(p, run, guide, number)
+            done += 1
+    return failed
+
+
+def visit_stop(p: RoverScenarioParameters, run: Run, guide: Guide, leg: int) -> RunOutcome | None:
+    """Point, take pictures, and hand them to the guide; why the run is over, or None."""
+    run.time_s += p.timing.track_s
+    aim = guide.aim(run)
+    if aim is None:
+        return RunOutcome.OUT_OF_REACH
+    view = _take_view(p, run, aim, leg)
+    run.pending = []
+    return guide.observe(run, view)
+
+
+def _take_view(p: RoverScenarioParameters, run: Run, aim: MastAim, leg: int) -> View:
+    world, rig, vehicle, time_s = run.world, run.rig, run.vehicle, run.time_s
+    rig.point(aim.azimuth_rad, aim.elevation_rad)
+    stance, point = vehicle.stance, run.target.point_world
+    world_from_head = composed(stance.world_from_rover, rig.rover_from_head)
+    shading = None
+    if p.rover_shadow:
+        shading = world.shading(vehicle.rover, stance, rig.calibrated.geometry, rig.state.true_rad, point, time_s)
+    light = world.brightness(time_s)
+    pictures = run.photographer.take(
+        world.scene(time_s), shading, world_from_head, (rig.left, rig.right), (aim.left, aim.right), light, time_s
     )
-    tracker = GuardedTracker(TRACKING.make(p.algorithm, p.vtt, p.executable), run.rig.calibrated)
-    tracker.designate(run.target.designation, run.vehicle.estimated)
-    run.outcome = _Loop(p, run, tracker, photographer).outcome()
-    if run.outcome is RunOutcome.COMPLETED:
-        last = p.legs[-1]
-        if last.motion == "approach":
-            reached = GoalReached(last.goal_m, 2.0 * GOAL_TOLERANCE_M)
-            handed = hand_off(run.stops[-1].update, reached, run.rig.calibrated)
-            run.handed_over = handed.outcome is HandOffOutcome.HANDED_OVER
+    angles = rig.state.readings_rad
+    return View(leg, time_s, stance, vehicle.estimated, angles, world_from_head, pictures, tuple(run.pending))
 
 
-@dataclass
-class _Loop:
-    """The parts of the loop, and what they share."""
-
-    p: RoverScenarioParameters
-    run: Run
-    tracker: GuardedTracker
-    photographer: Photographer
-
-    def outcome(self) -> RunOutcome:
-        """Goes through all legs; how the run ends."""
-        failed = self._track(-1)
-        if failed is not None:
-            return failed
-        for number, leg in enumerate(self.p.legs):
-            done = 0
-            if leg.maps_first:
-                self._map(leg)
-            while not finished(leg, done, self._belief()):
-                failed = self._step(number, leg, done)
-                if failed is not None:
-                    return failed
-                done += 1
-        if not self.run.stops[-1].update.found:
-            return RunOutcome.LOST
-        return RunOutcome.COMPLETED if _reached(self.p.legs[-1], self._belief()) else RunOutcome.STUCK
-
-    def _step(self, number: int, leg: LegParameters, done: int) -> RunOutcome | None:
-        """One step of a leg and the update after it."""
-        told: Iterable[DriveCommand] = commands(leg, done, self._belief())
-        if leg.autonav:
-            self._map(leg)
-            plan = self.run.mapper.plan(leg, self._belief(), self.run.vehicle.estimated)
-            if plan.outcome not in (NavigationOutcome.PATH, NavigationOutcome.AT_GOAL):
-                return RunOutcome.NO_PATH
-            told = plan.commands
-        for command in told:
-            self._drive(leg, command)
-        return self._track(number)
-
-    def _map(self, leg: LegParameters) -> None:
-        """Takes the pictures of a navigation update."""
-        run, vehicle = self.run, self.run.vehicle
-        run.autonav_updates += 1
-        run.time_s += self.p.timing.autonav_s
-        run.mapper.sense(leg, self._belief(), run.world, vehicle.rover, vehicle.stance, vehicle.estimated)
-
-    def _drive(self, leg: LegParameters, command: DriveCommand) -> None:
-        run, timing = self.run, self.p.timing
-        parts = max(1, int(np.ceil(command.length_m / leg.visual_odometry_step_m - 1e-9))) if leg.visual_odometry else 1
-        for _ in range(parts):
-            run.pending.append(run.vehicle.drive(command.part(1.0 / parts), leg.visual_odometry))
-        if leg.visual_odometry:
-            run.visual_odometry_updates += parts
-            run.time_s += parts * timing.visual_odometry_s
-        run.time_s += timing.drive_s
-
-    def _belief(self) -> Belief:
-        """Where the target is believed to be from here: as last reported, carried along by the pose estimate."""
-        run = self.run
-        stop = run.stops[-1]
-        if stop.update.position_rover is None:
-            raise ValueError("the target was not seen yet")
-        here = composed(run.vehicle.estimated.inv(), stop.estimated)
-        position = np.asarray(here.apply(np.array(stop.update.position_rover)))
-        return Belief(position, run.rig.range_m(position))
-
-    def _track(self, leg: int) -> RunOutcome | None:
-        """Points, takes pictures, updates. Why the run is over, or None."""
-        run = self.run
-        run.time_s += self.p.timing.track_s
-        aim = self.tracker.aim(run.vehicle.estimated)
-        if aim is None:
-            return RunOutcome.OUT_OF_REACH
-        stop = self._stop(leg, aim)
-        run.stops.append(stop)
-        run.pending = []
-        if stop.update.state is TrackingState.FAILURE:
-            return RunOutcome.LOST
-        if stop.update.position_rover is None:
-            return RunOutcome.NOT_SEEDED
-        return None
-
-    def _stop(self, leg: int, aim: MastAim) -> Stop:
-        run, world, rig, stance = self.run, self.run.world, self.run.rig, self.run.vehicle.stance
-        rig.point(aim.azimuth_rad, aim.elevation_rad)
-        angles, world_from_head = rig.state.readings_rad, composed(stance.world_from_rover, rig.rover_from_head)
-        body, mast, point = run.vehicle.rover, rig.calibrated.geometry, run.target.point_world
-        shading = (
-            world.shading(body, stance, mast, rig.state.true_rad, point, run.time_s) if self.p.rover_shadow else None
-        )
-        brightness = world.brightness(run.time_s)
-        scene = world.scene(run.time_s)
-        pictures = self.photographer.take(
-            scene, shading, world_from_head, (rig.left, rig.right), (aim.left, aim.right), brightness, run.time_s
-        )
-        update, taken = self.tracker.update(pictures, angles, run.vehicle.estimated)
-        in_head = np.asarray(world_from_head.inv().apply(run.target.point_world.copy()))
-        return Stop(
-            leg=leg,
-            time_s=run.time_s,
-            stance=stance,
-            estimated=run.vehicle.estimated,
-            angles_rad=angles,
-            world_from_head=world_from_head,
-            pictures=pictures,
-            update=update,
-            point_px=np.asarray(rig.left.project(in_head)[0]),
-            point_rover=np.asarray(stance.world_from_rover.inv().apply(run.target.point_world.copy())),
-            range_m=float(np.linalg.norm(in_head - rig.left.c)),
-            drives=tuple(run.pending),
-            track_time_s=taken,
-        )
+def _step(p: RoverScenarioParameters, run: Run, guide: Guide, leg: LegParameters, done: int) -> RunOutcome | None:
+    """Drive one step of a leg; why the run is over, or None."""
+    belief = guide.belief(run)
+    planned: Iterable[DriveCommand] = commands(leg, done, belief)
+    if leg.autonav:
+        _map(p, run, leg, belief)
+        plan = run.mapper.plan(leg, belief, run.vehicle.estimated)
+        if plan.outcome not in (NavigationOutcome.PATH, NavigationOutcome.AT_GOAL):
+            return RunOutcome.NO_PATH
+        planned = plan.commands
+    for command in planned:
+        _drive(p, run, leg, command)
+    return None
 
 
-def _reached(leg: LegParameters, belief: Belief) -> bool:
+def _map(p: RoverScenarioParameters, run: Run, leg: LegParameters, belief: Belief) -> None:
+    """Take the pictures of a navigation update."""
+    vehicle = run.vehicle
+    run.autonav_updates += 1
+    run.time_s += p.timing.autonav_s
+    run.mapper.sense(leg, belief, run.world, vehicle.rover, vehicle.stance, vehicle.estimated)
+
+
+def _drive(p: RoverScenarioParameters, run: Run, leg: LegParameters, command: DriveCommand) -> None:
+    """Drive a command, in parts that visual odometry joins where the leg has it."""
+    parts = 1
+    if leg.visual_odometry:
+        parts = max(1, int(np.ceil(command.length_m / leg.visual_odometry_step_m - 1e-9)))
+        run.visual_odometry_updates += parts
+        run.time_s += parts * p.timing.visual_odometry_s
+    run.pending += [run.vehicle.drive(command.part(1.0 / parts), leg.visual_odometry) for _ in range(parts)]
+    run.time_s += p.timing.drive_s
+
+
+def _is_at_goal(leg: LegParameters, belief: Belief) -> bool:
     """Whether the last leg has come to its goal, if it has one; those before end with their steps too."""
-    if leg.ends_with_steps:
+    if leg.ends_with_steps or leg.motion not in ("approach", "back-off"):
         return True
-    if leg.motion == "approach":
-        return belief.distance_m <= leg.goal_m + GOAL_TOLERANCE_M
-    if leg.motion == "back-off":
-        return belief.distance_m >= leg.goal_m - GOAL_TOLERANCE_M
-    return True
+    return finished(leg, 0, belief)

@@ -1,18 +1,21 @@
-"""One run of the closed loop as a case."""
+"""Runs of a rover as cases: one run of the closed loop, or one target tracked over the pictures of a shared drive."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import lru_cache, partial
 from typing import cast
 
 from pydantic import BaseModel
 
+from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import scored
-from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters, WorldParameters
 from marsyard.scenarios.rover.run import Run, prepare_run, track_target
 from marsyard.scenarios.rover.score import (
     fixed_conditions,
@@ -25,6 +28,14 @@ from marsyard.scenarios.rover.score import (
     stored_updates,
     tracking,
 )
+from marsyard.scenarios.rover.shared import (
+    DriveKey,
+    SharedDriveParameters,
+    render_drive,
+    sightings_along,
+    track_views,
+)
+from marsyard.scenarios.rover.shared import prepare_run as prepare_shared_run
 from marsyard.scenarios.rover.stops import RunOutcome
 from marsyard.scenarios.rover.world import terrain_parameters
 from marsyard.scenarios.trial import Judged, attempted, case_result
@@ -33,9 +44,11 @@ from marsyard.sim.terrain import TerrainBank
 
 #: Terrains of a bank that are built before its runs; a larger bank's are built by the runs that need them.
 PREPARED_TERRAINS = 64
+#: Grounds, shared drives with their pictures, and targets' sightings along drives that a process keeps.
+KEPT_GROUNDS, KEPT_DRIVES, KEPT_SIGHTINGS = 4, 1, 128
 
 
-class RoverScenario:
+class RoverScenario(TerrainScenario[RoverScenarioParameters]):
     """A rover drives to, around or away from what it sees, and tracks it at every stop."""
 
     name = "rover"
@@ -44,68 +57,136 @@ class RoverScenario:
     algorithm_table = ()
     part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
+    def __init__(self) -> None:
+        super().__init__(KEPT_GROUNDS)
+
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains; none of a bank so large that hardly two runs have the same one."""
-        bank = _checked(parameters).world.bank
+        bank = self.checked(parameters).world.bank
         return tuple(range(bank)) if bank <= PREPARED_TERRAINS else ()
-
-    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """Builds one terrain of the bank."""
-        _bank(parameters).terrain(shared_input)
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """The terrain that the rover drives on."""
-        return (_checked(parameters).world.terrain,)
+        return (self.checked(parameters).world.terrain,)
 
-    def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
-        """Bytes of a terrain that is not on disk."""
-        return _bank(parameters).missing_bytes(shared_input)
+    def input_terrain(self, p: RoverScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
+        """A terrain of the bank."""
+        return _bank(p.world), shared_input
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """One run; each algorithm that is compared makes one of its own, with the same draws."""
-        p = _checked(parameters)
-
+        p = self.checked(parameters)
         started = time.process_time()
-        first = prepare_run(p, streams)
+        first = prepare_run(p, streams, self.load_ground)
         known = fixed_conditions(p, first)
 
         def judge(algorithm: str) -> Judged:
             judged = algorithm == p.algorithm
             mine = p.model_copy(update={"algorithm": algorithm})
-            began, run = (started, first) if judged else (time.process_time(), prepare_run(mine, streams))
-            attempt = attempted(lambda: _tracked(mine, run, streams), lambda row: cast(dict[str, Scalar], row))
-            if attempt.answer is None:
-                return Judged(attempt.outcome(lambda _: run.outcome.name), False, {}, failure=attempt.failure)
-            row = {**attempt.answer, "run_time_s": time.process_time() - began}
-            if judged:
-                row |= {
-                    **stored_updates(run, p.score.stored_updates),
-                    **run_conditions(p, run),
-                    **sighted(p, run),
-                    **provenance(p, run),
-                }
-            row |= scored(p.scores, scored_run(run), {*row, *known})
-            return _judged(run, row, products(p, run) if judged else None)
+            began = started if judged else time.process_time()
+            run = first if judged else prepare_run(mine, streams, self.load_ground)
+
+            def ask() -> Run:
+                track_target(mine, run)
+                return run
+
+            def further(made: Run) -> dict[str, Scalar]:
+                return {"run_time_s": time.process_time() - began, **(sighted(p, made) if judged else {})}
+
+            return _judge(p, ask, known, judged, further)
 
         return case_result(p.algorithms, judge, known)
 
 
-def _tracked(p: RoverScenarioParameters, run: Run, streams: Streams) -> dict[str, Scalar]:
-    """A prepared run of the closed loop driven to its end, and its score."""
-    track_target(p, run, streams)
-    return {**score(p, run), **tracking(run)}
+class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
+    """Many targets tracked over the pictures of one drive."""
+
+    name = "rover-drive"
+    parameters_type = SharedDriveParameters
+    task = TRACKING
+    algorithm_table = ("drive",)
+    part_keys: Mapping[str, Kind] = {"drive.scores": SCORE}
+
+    def __init__(self) -> None:
+        super().__init__(KEPT_GROUNDS)
+        self._drive = lru_cache(maxsize=KEPT_DRIVES)(partial(render_drive, load_ground=self.load_ground))
+        self._sightings = lru_cache(maxsize=KEPT_SIGHTINGS)(
+            lambda key, point, options: sightings_along(self._drive(key), point, options)
+        )
+
+    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
+        """Numbers of the bank's terrains that runs use."""
+        return tuple(sorted({one.terrain for one in self.checked(parameters).variants}))
+
+    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
+        """The terrain of the case's run."""
+        p = self.checked(parameters)
+        return (p.variants[p.run].terrain,)
+
+    def input_terrain(self, p: SharedDriveParameters, shared_input: int) -> tuple[TerrainBank, int]:
+        """A terrain of the bank."""
+        return _bank(p.drive.world), shared_input
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """One target of one run, tracked with one step; all algorithms see the same pictures."""
+        p = self.checked(parameters)
+        key = DriveKey.of(p, streams)
+        drive = self._drive(key)
+        own = {"algorithm": p.drive.algorithm, "vtt": p.drive.vtt}
+        case = key.drive.model_copy(update=own)
+        seen = self._sightings(key, p.targets[p.target], p.drive.vtt)
+        on_face = seen.in_view and (p.face_deg is None or seen.obliquity_max_deg <= p.face_deg)
+        chosen = fixed_conditions(case, prepare_shared_run(p, drive))
+        known = {**chosen, **_case_columns(p), **asdict(seen), "on_face": on_face}
+
+        def judge(algorithm: str) -> Judged:
+            return _judge(case, lambda: track_views(p, drive, algorithm), known, algorithm == p.drive.algorithm)
+
+        return case_result(p.drive.algorithms, judge, known)
 
 
-def _judged(run: Run, row: Mapping[str, Scalar], kept: Mapping[str, object] | None = None) -> Judged:
-    return Judged(run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, kept or {})
+def _judge(
+    p: RoverScenarioParameters,
+    ask: Callable[[], Run],
+    known: Mapping[str, Scalar],
+    judged: bool,
+    further: Callable[[Run], dict[str, Scalar]] = lambda run: {},
+) -> Judged:
+    """Score a run; `judged` is the run of the algorithm under test, whose conditions and products are stored."""
+    made: list[Run] = []
+
+    def ask_and_score() -> dict[str, Scalar]:
+        made.append(ask())
+        return {**score(p, made[0]), **tracking(made[0])}
+
+    attempt = attempted(ask_and_score, lambda row: cast(dict[str, Scalar], row))
+    if attempt.answer is None:
+        return Judged(attempt.outcome(str), False, attempt.row, failure=attempt.failure)
+    run, row = made[0], {**attempt.answer, **further(made[0])}
+    if judged:
+        updates = stored_updates(run, p.score.stored_updates)
+        row |= {**updates, **run_conditions(p, run), **provenance(p, run)}
+    row |= scored(p.scores, scored_run(run), {*row, *known})
+    kept = products(p, run) if judged else {}
+    return Judged(run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, kept)
 
 
-def _bank(parameters: BaseModel) -> TerrainBank:
-    w = _checked(parameters).world
+def _case_columns(p: SharedDriveParameters) -> dict[str, Scalar]:
+    """What makes a case, whatever tracks in it."""
+    chosen = p.targets[p.target]
+    bands: dict[str, Scalar] = {one.name: bool(one.least <= p.step <= one.most) for one in p.bands}
+    return {
+        "run": p.run,
+        "target": p.target,
+        "point_across": chosen.across,
+        "point_up": chosen.up,
+        "skip": p.skip,
+        "step": p.step,
+        "with_scale": p.drive.algorithm != "pure-ncc" and p.drive.vtt.scale,
+        "pure_ncc": p.drive.algorithm == "pure-ncc",
+        **bands,
+    }
+
+
+def _bank(w: WorldParameters) -> TerrainBank:
     return TerrainBank(terrain_parameters(w), w.bank_seed)
-
-
-def _checked(parameters: BaseModel) -> RoverScenarioParameters:
-    if not isinstance(parameters, RoverScenarioParameters):
-        raise TypeError(f"the rover scenario takes RoverScenarioParameters, not {type(parameters).__name__}")
-    return parameters

@@ -174,7 +174,7 @@ def stored_updates(run: Run, count: int) -> dict[str, Scalar]:
 
 def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     """What is known of a run before its tracker is asked, read from the simulated objects."""
-    chosen, rock = run.target, run.target.rock
+    chosen, rocks, number = run.target, run.world.rocks, run.world.target_number
     return {
         "site": p.world.site,
         "terrain": p.world.terrain,
@@ -182,10 +182,10 @@ def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "navcam": p.camera.name.endswith("navcam"),
         "pancam": p.camera.name.endswith("pancam"),
         "search_px": p.vtt.search_px,
-        "rock_diameter_m": rock.diameter_m,
-        "rock_height_m": rock.height_m,
-        "rock_shape": rock.shape,
-        "rock_yaw_deg": rock.yaw_deg,
+        "rock_diameter_m": float(rocks.diameter_m[number]),
+        "rock_height_m": float(rocks.height_m[number]),
+        "rock_shape": int(rocks.shape[number]),
+        "rock_yaw_deg": float(np.degrees(rocks.yaw_rad[number])),
         "point_across": p.target.across,
         "point_up": p.target.up,
         "point_on_edge": chosen.on_edge,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 
 import numpy as np
@@ -30,8 +30,8 @@ class RunOutcome(Enum):
 
 
 @dataclass(frozen=True)
-class Stop:
-    """A stop at which the target was tracked.
+class View:
+    """The pictures of a stop, and where they were taken.
 
     Attributes
     ----------
@@ -42,25 +42,15 @@ class Stop:
     stance
         The rover as it stands.
     estimated
-        World pose of the rover as it believes.
+        World pose of the rover as estimated on board.
     angles_rad
         Azimuth and elevation that the mast's encoders read.
     world_from_head
         True pose of the mast's head.
     pictures
         As delivered.
-    update
-        The tracker's answer.
-    point_px
-        Where the left camera truly shows the designated point, full-frame (u, v); NaN where it does not.
-    point_rover
-        The designated point in the rover's true frame, metres.
-    range_m
-        From the left camera's true centre to it.
     drives
         The commands driven since the stop before.
-    track_time_s
-        Processor time of the update.
     """
 
     leg: int
@@ -70,12 +60,47 @@ class Stop:
     angles_rad: tuple[float, float]
     world_from_head: RigidTransform
     pictures: StereoPictures
+    drives: tuple[Drive, ...]
+
+
+@dataclass(frozen=True)
+class Stop(View):
+    """A stop at which the target was tracked.
+
+    Attributes
+    ----------
+    update
+        The tracker's answer.
+    track_time_s
+        Processor time of the update.
+    point_px
+        Where the left camera truly shows the designated point, full-frame (u, v); NaN where it does not.
+    point_rover
+        The designated point in the rover's true frame, metres.
+    range_m
+        From the left camera's true centre to it.
+    """
+
     update: TargetUpdate
+    track_time_s: float
     point_px: Float64[np.ndarray, "2"]
     point_rover: Float64[np.ndarray, "3"]
     range_m: float
-    drives: tuple[Drive, ...]
-    track_time_s: float
+
+    @classmethod
+    def of(
+        cls, view: View, point_m: Float64[np.ndarray, "3"], left: CameraModel, update: TargetUpdate, track_time_s: float
+    ) -> Stop:
+        """A view with a tracker's answer; `point_m` is the designated point in the world, `left` the true camera."""
+        in_head = np.asarray(view.world_from_head.inv().apply(point_m.copy()))
+        return cls(
+            **{one.name: getattr(view, one.name) for one in fields(View)},
+            update=update,
+            track_time_s=track_time_s,
+            point_px=np.asarray(left.project(in_head)[0]),
+            point_rover=np.asarray(view.stance.world_from_rover.inv().apply(point_m.copy())),
+            range_m=float(np.linalg.norm(in_head - left.c)),
+        )
 
     @property
     def details(self) -> VttDetails | None:

@@ -31,16 +31,6 @@ BEHIND_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class Rock:
-    """The target's rock as it is."""
-
-    diameter_m: float
-    height_m: float
-    shape: int
-    yaw_deg: float
-
-
-@dataclass(frozen=True)
 class ChosenTarget:
     """The point that is driven to.
 
@@ -50,8 +40,6 @@ class ChosenTarget:
         The designated point of the rock's surface, world, metres.
     designation
         How it is told to the rover.
-    rock
-        The rock that it is on.
     on_edge
         Whether the template about it, as either camera sees it from the start, shows what lies well behind the rock.
     lit
@@ -60,7 +48,6 @@ class ChosenTarget:
 
     point_world: Float64[np.ndarray, "3"]
     designation: TargetDesignation
-    rock: Rock
     on_edge: bool
     lit: bool
 
@@ -101,7 +88,7 @@ def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance:
     world_from_head = stance.world_from_rover * rig.rover_from_head
     point, on_edge, lit = point_on(world, rig.eyes(world_from_head), p.target.across, p.target.up, rig.pixel_rad, p.vtt)
     told = _told(p, rig, stance.world_from_rover, world_from_head, point)
-    return rock_of(world, point, told, on_edge, lit)
+    return ChosenTarget(point, told, on_edge, lit)
 
 
 def point_on(
@@ -150,22 +137,19 @@ def _clear(world: RunWorld, eye: Float64[np.ndarray, "3"], point: Float64[np.nda
     return not _on_edge(near, float(world.rocks.position_m[world.target_number, 2]), eye, point, reach_rad)
 
 
-def rock_of(
+def choose_by_pixel(
     world: RunWorld,
-    point: Float64[np.ndarray, "3"],
-    designation: TargetDesignation,
-    on_edge: bool,
-    lit: bool,
+    rig: Rig,
+    world_from_head: RigidTransform,
+    angles_rad: tuple[float, float],
+    place: tuple[float, float],
+    options: VttOptions,
+    picked_from: Float64[np.ndarray, "3"],
 ) -> ChosenTarget:
-    """A chosen point with the rock that it is on."""
-    rocks, number = world.rocks, world.target_number
-    rock = Rock(
-        float(rocks.diameter_m[number]),
-        float(rocks.height_m[number]),
-        int(rocks.shape[number]),
-        float(np.degrees(rocks.yaw_rad[number])),
-    )
-    return ChosenTarget(point, designation, rock, on_edge, lit)
+    """The point at a place (across, up) of the rock's face as seen from a position, designated by its true pixel."""
+    eyes = rig.eyes(world_from_head)
+    point, on_edge, lit = point_on(world, eyes, *place, rig.pixel_rad, options, picked_from)
+    return ChosenTarget(point, told_by_pixel(rig.left, world_from_head, point, angles_rad), on_edge, lit)
 
 
 def told_by_pixel(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
 from marsyard.scenarios.rover.points import Sight
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
@@ -23,7 +23,6 @@ from marsyard.sim.terrain import (
     RockParameters,
     Site,
     Surface,
-    TerrainBank,
     TerrainParameters,
     site,
 )
@@ -63,13 +62,6 @@ def terrain_parameters(w: WorldParameters) -> TerrainParameters:
             slope_deg=w.incline.slope_deg, length_m=RAMP_SHARE * w.samples * base.spacing_m
         ).model_dump()
     return base.changed(changes)
-
-
-@lru_cache(maxsize=4)
-def _bare_ground(terrain: TerrainParameters, site_name: str, bank_seed: int, number: int) -> SiteGround:
-    """A terrain of the bank with its own rocks; kept, as the runs of a process share terrains."""
-    bank = TerrainBank(terrain, bank_seed)
-    return SiteGround(site(site_name), terrain, bank.terrain(number), bank.rocks(number))
 
 
 @dataclass(frozen=True)
@@ -121,10 +113,17 @@ class RunWorld:
     _latest: tuple[int, Scene] | None = field(default=None, repr=False)
 
     @classmethod
-    def of(cls, p: RoverScenarioParameters, pixel_rad: float, streams: Streams) -> RunWorld:
-        """The world of a run; its terrain comes from the disk, or is built."""
+    def of(
+        cls,
+        p: RoverScenarioParameters,
+        pixel_rad: float,
+        streams: Streams,
+        load_ground: LoadGround = SiteGround.from_bank,
+    ) -> RunWorld:
+        """The world of a run."""
         w = p.world
-        ground = furnished(p, streams.generator("placed rocks"))
+        bare = load_ground(site(w.site), terrain_parameters(w), w.bank_seed, w.terrain)
+        ground = furnished(p, bare, streams.generator("placed rocks"))
         path = SunPath(p.sun)
         reach = p.start.distance_m + BACKGROUND_M
         middle, half = p.bearing_rad + np.pi, np.radians(w.background_half_deg)
@@ -215,10 +214,8 @@ class RunWorld:
         return air.direct_share(elevation) * air.solar_irradiance
 
 
-def furnished(p: RoverScenarioParameters, rng: np.random.Generator) -> SiteGround:
+def furnished(p: RoverScenarioParameters, bare: SiteGround, rng: np.random.Generator) -> SiteGround:
     """The ground with the target's rock and the obstacles; the bank's own rocks make room for them and for the way."""
-    w = p.world
-    bare = _bare_ground(terrain_parameters(w), w.site, w.bank_seed, w.terrain)
     field = RockField.on(bare.surface, RockParameters(abundance=0.0, placed=placed_rocks(p)), rng)
     if bare.rocks is None:
         return replace(bare, rocks=field)

@@ -23,14 +23,13 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.dynamics.rover import Ground, RoverParameters, Stance, settle
 from marsyard.sim.frames import composed, turn_matrix
 from marsyard.sim.measurements import DriveCommand
-
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
+from marsyard.sim.parameters import Fraction, Parameters
 
 #: Longest part of a command: metres of path, and radians of turn.
 PART_M, PART_RAD = 0.2, np.radians(5.0)
@@ -38,24 +37,24 @@ PART_M, PART_RAD = 0.2, np.radians(5.0)
 _NO_PATH_M = 1e-9
 
 
-class SlipParameters(BaseModel):
+class SlipParameters(Parameters):
     """How wheels slip. Shares of what is commanded; see the module for the curve and its sources."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    flat: Annotated[Share, Field(description="share of the path lost on level ground")] = 0.01
+    flat: Annotated[Fraction, Field(description="share of the path lost on level ground")] = 0.01
     full_slope_deg: Annotated[
         float, Field(gt=0.0, lt=90.0, description="slope on which nothing of the path is gained, deg")
     ] = 20.0
     exponent: Annotated[float, Field(ge=1.0, le=100.0, description="of the curve from level ground to that slope")] = (
         2.4
     )
-    downhill: Annotated[Share, Field(description="how far the rover runs on downhill, over what it loses uphill")] = 0.3
-    across: Annotated[Share, Field(description="how far it slides across, over what it would lose uphill")] = 0.5
-    turn: Annotated[Share, Field(description="share of a turn lost to scrubbing wheels on level ground")] = 0.03
-    turn_slope: Annotated[Share, Field(description="share of a turn lost on a slope, over what a climb would lose")] = (
-        0.5
-    )
+    downhill: Annotated[
+        Fraction, Field(description="how far the rover runs on downhill, over what it loses uphill")
+    ] = 0.3
+    across: Annotated[Fraction, Field(description="how far it slides across, over what it would lose uphill")] = 0.5
+    turn: Annotated[Fraction, Field(description="share of a turn lost to scrubbing wheels on level ground")] = 0.03
+    turn_slope: Annotated[
+        Fraction, Field(description="share of a turn lost on a slope, over what a climb would lose")
+    ] = 0.5
     soil_spread: Annotated[
         float, Field(ge=0.0, le=1.0, description="RMS of the logarithm of the soil's factor, common to a run")
     ] = 0.15
@@ -160,7 +159,7 @@ class Drive:
 
     @property
     def slip(self) -> float:
-        """Share of the commanded path that was not gained along it; NaN for a turn in place. Negative: it ran on."""
+        """Fraction of the commanded path that was not gained along it; NaN for a turn in place. Negative: it ran on."""
         if self.command.length_m < _NO_PATH_M:
             return float("nan")
         gained = sum(_along(part) for part in self.parts)

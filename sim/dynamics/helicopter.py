@@ -17,24 +17,21 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics.angles import turning
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory
+from marsyard.sim.parameters import Parameters, Positive
 
-Positive = Annotated[float, Field(gt=0.0)]
 
-
-class HelicopterParameters(BaseModel):
+class HelicopterParameters(Parameters):
     """A flight. Numbers are the field test paper's (III.C, III.D) unless they are called assumed.
 
     At 1 m/s on passes of 100 s, with turns of 60 s, ten passes climb from 1000 m to 2000 m in 27 min: the paper says
     1 to 2 m/s, about 30 min of pictures, and about 40 min between the passes over the targets.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     passes: Annotated[int, Field(ge=1, le=100, description="passes along the line")] = 10
     pass_s: Annotated[Positive, Field(le=1000.0, description="duration of a pass, s (assumed)")] = 100.0

@@ -24,12 +24,13 @@ from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.dynamics.kernels import suspension
 from marsyard.sim.frames import rigid, turn_matrix
+from marsyard.sim.parameters import Parameters
 
 Metres = Annotated[float, Field(gt=0.0, le=5.0)]
 
@@ -57,7 +58,7 @@ class Ground(Protocol):
         ...
 
 
-class RoverParameters(BaseModel):
+class RoverParameters(Parameters):
     """Shape of a rover. The defaults are a MER's.
 
     Wheels: 0.25 m across (press kit: 26 cm with cleats; Opportunity's odometer counts 0.8 m a turn), 0.16 m wide; the
@@ -65,8 +66,6 @@ class RoverParameters(BaseModel):
     pivots are is assumed. The body's size is the press kit's (1.6 m long, 2.3 m wide with its solar panels; the mast
     carries the cameras at 1.54 m, Maki et al. 2003).
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     wheel_radius_m: Annotated[Metres, Field(description="radius of a wheel, m")] = 0.125
     wheel_width_m: Annotated[Metres, Field(description="width of a wheel's tread, m")] = 0.16

@@ -21,10 +21,11 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.files import check_regular
+from marsyard.sim.parameters import Parameters
 
 #: How such a file's name ends.
 SUFFIX = ".spice.toml"
@@ -32,10 +33,8 @@ SUFFIX = ".spice.toml"
 MOST_POSES = 1_000_000
 
 
-class SpiceFlight(BaseModel):
+class SpiceFlight(Parameters):
     """What is to be read from kernels."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     kernels: Annotated[tuple[str, ...], Field(min_length=1, description="paths, relative to the file")]
     target: Annotated[str, Field(description="whose positions: a name or number that the kernels know")]

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from marsyard.sim.dynamics.kernels.swing import WindField, winds
+from marsyard.sim.parameters import Parameters
 
 #: Shortest gusts, m: two diameters of the canopy, which feels the mean over its own width.
 SHORTEST_WAVE_M = 30.0
@@ -18,10 +19,8 @@ LONGEST_WAVE_SCALES = 20.0
 WAVES = 24
 
 
-class WindParameters(BaseModel):
+class WindParameters(Parameters):
     """Mean wind above the boundary layer, the layer's profile, and gusts."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     wind_east_m_s: Annotated[float, Field(ge=-60.0, le=60.0, description="mean wind to the east, m/s")] = 0.0
     wind_north_m_s: Annotated[float, Field(ge=-60.0, le=60.0, description="mean wind to the north, m/s")] = 0.0

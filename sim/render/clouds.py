@@ -7,10 +7,11 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtri
 
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.render.photometry import Sun
 
 #: Cells along each side of the periodic layer, and its period in mean sizes of a cloud.
@@ -19,10 +20,8 @@ CELLS, PERIOD_SIZES = 1024, 32.0
 OCTAVES = ((1.0, 1.0), (0.5, 1.0 / 16.0), (0.25, 1.0 / 256.0))
 
 
-class CloudParameters(BaseModel):
+class CloudParameters(Parameters):
     """Fair-weather clouds. The defaults are small cumuli over a desert at noon; they are assumed, not from a paper."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     base_m: Annotated[float, Field(gt=0.0, le=20000.0, description="height of the layer above the ground, m")] = 2500.0
     cover: Annotated[float, Field(ge=0.0, le=0.9, description="share of the ground in the clouds' shadows")] = 0.3

@@ -18,15 +18,13 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.sensor.imu import Imu
 from marsyard.sim.sensor.inertial import NavigationErrors
 from marsyard.sim.sensor.quaternions import products
-
-NonNegative = Annotated[float, Field(ge=0.0)]
-Positive = Annotated[float, Field(gt=0.0)]
 
 #: Steps of the propagation per second: at 2 rpm the midpoint rule's error is 5e-5 of what spin averages out.
 STEPS_PER_S = 5.0
@@ -34,14 +32,12 @@ STEPS_PER_S = 5.0
 _MEAN_SIN4 = 3.0 / 8.0
 
 
-class ApproachParameters(BaseModel):
+class ApproachParameters(Parameters):
     """From the last star reference to the descent. Defaults are nominal times and speeds of the MER landings.
 
     Times and speeds: Desai and Knocke (2007), rounded. The reference's errors, and what is left of the spin axis's
     scale factor after its calibration against the stars in cruise, are assumed.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     attitude_sd_deg: Annotated[NonNegative, Field(description="error of the star reference per axis, deg")] = 0.05
     velocity_sd_m_s: Annotated[NonNegative, Field(description="error of the velocity known by then, per axis")] = 1.0

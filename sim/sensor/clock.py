@@ -7,15 +7,15 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from marsyard.sim.parameters import Parameters
 
 Spread = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
-class ClockParameters(BaseModel):
+class ClockParameters(Parameters):
     """Errors of time tags: tagged less true time."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     offset_s: Annotated[float, Field(ge=-10.0, le=10.0, description="mean of the constant offset, s")] = 0.0
     offset_sd_s: Annotated[Spread, Field(description="spread of the constant offset between units, s")] = 0.0

@@ -26,24 +26,19 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from marsyard.sim.files import open_regular
+from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.sensor.optics import OpticsParameters
 from marsyard.sim.sensor.parameters import DetectorParameters
 from marsyard.sim.sensor.radiometry import LENS_TRANSMISSION, LightPath, bright_exposure_s
 
-Positive = Annotated[float, Field(gt=0.0)]
-NonNegative = Annotated[float, Field(ge=0.0)]
 #: No datasheet is larger.
 _MOST_BYTES = 1 << 20
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class QuantumEfficiency(_Part):
+class QuantumEfficiency(Parameters):
     """Electrons per photon by wavelength, straight between the points and zero outside of them."""
 
     wavelength_nm: Annotated[tuple[float, ...], Field(min_length=2)]
@@ -60,7 +55,7 @@ class QuantumEfficiency(_Part):
         return self
 
 
-class Lens(_Part):
+class Lens(Parameters):
     """What lies before the detector."""
 
     f_number: Annotated[float, Field(gt=0.0, le=100.0)]
@@ -74,7 +69,7 @@ class Lens(_Part):
         return self
 
 
-class Datasheet(_Part):
+class Datasheet(Parameters):
     """The figures of a detector's datasheet."""
 
     name: str = ""

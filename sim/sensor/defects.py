@@ -6,32 +6,27 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt16
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.ndimage import uniform_filter
 
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-NonNegative = Annotated[float, Field(ge=0.0)]
+from marsyard.sim.parameters import Fraction, NonNegative, Parameters
 
 
-class DefectParameters(BaseModel):
+class DefectParameters(Parameters):
     """Pixels that do not work as the others. None by default."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    hot_share: Annotated[Share, Field(description="share of hot pixels")] = 0.0
+    hot_share: Annotated[Fraction, Field(description="share of hot pixels")] = 0.0
     hot_e_s: Annotated[
         NonNegative, Field(description="mean dark current of a hot pixel at 0 deg C, electrons per second")
     ] = 20000.0
-    dead_share: Annotated[Share, Field(description="share of pixels without response")] = 0.0
+    dead_share: Annotated[Fraction, Field(description="share of pixels without response")] = 0.0
     listed: Annotated[
         bool, Field(description="whether the camera has a list of them all, and fills them from their neighbours")
     ] = False
 
 
-class BurstParameters(BaseModel):
+class BurstParameters(Parameters):
     """Bursts of noise on the cable while the picture is read out. None by default."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     bursts: Annotated[NonNegative, Field(le=1e4, description="mean number of bursts in a picture")] = 0.0
     length_px: Annotated[float, Field(gt=0.0, le=1e7, description="mean length of a burst, delivered pixels")] = 2000.0

@@ -7,16 +7,15 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float32, UInt16
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.sensor.detector import Detector
 from marsyard.sim.sensor.motion import ImageMotion
 
 
-class AutoExposureParameters(BaseModel):
+class AutoExposureParameters(Parameters):
     """Auto-exposure by a percentile of the counts, as on the MER rovers (Maki et al. 2003); the numbers are assumed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     percentile: Annotated[float, Field(gt=0.0, lt=100.0, description="percentile of the counts that is judged")] = 98.0
     target: Annotated[

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.sensor.clock import Clock, ClockParameters
 from marsyard.sim.sensor.instrument import Readings, Sampling
 from marsyard.sim.sensor.stochastic import GaussMarkov
@@ -17,10 +18,8 @@ from marsyard.sim.sensor.stochastic import GaussMarkov
 NonNegative = Annotated[float, Field(ge=0.0, le=1000.0)]
 
 
-class GpsParameters(BaseModel):
+class GpsParameters(Parameters):
     """A receiver. Spreads are one standard deviation per axis; the vertical is worse than the horizontal."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rate_hz: Annotated[float, Field(gt=0.0, le=1000.0, description="fixes per second")] = 10.0
     horizontal_noise_m: Annotated[NonNegative, Field(description="new in every fix, m")] = 0.3

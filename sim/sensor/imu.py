@@ -15,17 +15,15 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.sensor.clock import Clock, ClockParameters
 from marsyard.sim.sensor.quaternions import products
 from marsyard.sim.sensor.stochastic import GaussMarkov
-
-NonNegative = Annotated[float, Field(ge=0.0)]
-Positive = Annotated[float, Field(gt=0.0)]
 
 #: Standard gravity, in which accelerometers are specified.
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -33,10 +31,8 @@ DEG_H = np.radians(1.0) / 3600.0
 DEG_SQRT_H = np.radians(1.0) / 60.0
 
 
-class WarmUp(BaseModel):
+class WarmUp(Parameters):
     """Temperature of the unit less that at which it was calibrated: none, then an exponential approach to a change."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     start_s: Annotated[float, Field(description="time at which the change begins, s")] = 0.0
     change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="change in the end, K")] = 0.0
@@ -48,15 +44,13 @@ class WarmUp(BaseModel):
         return np.asarray(-self.change_k * np.expm1(-since / self.time_constant_s))
 
 
-class ImuParameters(BaseModel):
+class ImuParameters(Parameters):
     """An inertial measurement unit of the class of Litton's LN-200; spreads are one standard deviation per axis.
 
     Repeatability of bias (1 deg/h to 3 deg/h, 0.2 mg to 1 mg), its wander in operation (0.35 deg/h over 100 s,
     0.05 mg over 60 s), random walk, scale factors (100 ppm, 300 ppm) and misalignment: LN-200's data sheet, Northrop
     Grumman. Size of the counts: NovAtel's table of raw inertial data. Change with temperature and time tags: assumed.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rate_hz: Annotated[Positive, Field(le=10000.0, description="samples per second")] = 400.0
     gyro_bias_deg_h: Annotated[NonNegative, Field(description="constant gyro bias, deg/h")] = 1.0

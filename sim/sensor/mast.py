@@ -18,12 +18,13 @@ from typing import Annotated, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastGeometry
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.sensor.presets import preset
 
 Degrees = Annotated[float, Field(ge=0.0, le=10.0)]
@@ -49,14 +50,12 @@ RESEARCH_MAST = MastGeometry(
 MASTS = {"mer-navcam": MER_MAST, "research-navcam": RESEARCH_MAST, "research-pancam": RESEARCH_MAST}
 
 
-class PointingParameters(BaseModel):
+class PointingParameters(Parameters):
     """How a mast misses where it is told to point. Both axes alike; spreads are one standard deviation.
 
     Requested and measured angles differ by 0.0004 to 0.015 deg in the labels of two of Opportunity's navcam pictures;
     the other numbers are assumed.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     zero_deg: Annotated[Degrees, Field(description="error of the encoder's zero, fixed to a run, deg")] = 0.1
     backlash_deg: Annotated[Degrees, Field(description="full width of the gears' play, deg")] = 0.1
@@ -64,10 +63,8 @@ class PointingParameters(BaseModel):
     count_deg: Annotated[Degrees, Field(description="the encoder's count, deg; 0: no rounding")] = 0.005
 
 
-class StereoCalibrationParameters(BaseModel):
+class StereoCalibrationParameters(Parameters):
     """How far a stereo pair's calibrated cameras differ from the true ones. Spreads are one standard deviation."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     disparity_error_px: Annotated[
         Pixels,

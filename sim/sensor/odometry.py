@@ -28,50 +28,48 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.dynamics import Drive
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand
+from marsyard.sim.parameters import Fraction, Parameters
 
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Degrees = Annotated[float, Field(ge=0.0, le=30.0)]
 
 
-class VisualOdometryParameters(BaseModel):
+class VisualOdometryParameters(Parameters):
     """Visual odometry. Spreads are one standard deviation.
 
     With the defaults the position error is 2 % of the distance, rms, on 8 m (the paper's figure; how it divides into
     what is common to a run and what is new is assumed), and 3 % on 2 m.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    scale_error: Annotated[Share, Field(description="share of the distance, common to a run (stereo calibration)")] = (
-        0.015
-    )
+    scale_error: Annotated[
+        Fraction, Field(description="share of the distance, common to a run (stereo calibration)")
+    ] = 0.015
     walk_m: Annotated[
         float, Field(ge=0.0, le=1.0, description="error per axis on the first metre, growing as the distance's root, m")
     ] = 0.02
     floor_m: Annotated[float, Field(ge=0.0, le=1.0, description="error per axis new with every drive, m")] = 0.002
-    failure_share: Annotated[Share, Field(description="share of drives on which it does not converge")] = 0.0
+    failure_share: Annotated[Fraction, Field(description="share of drives on which it does not converge")] = 0.0
 
 
-class OdometryParameters(BaseModel):
+class OdometryParameters(Parameters):
     """Wheel odometry with an inertial unit, and the visual odometry that may be added.
 
     Spreads are one standard deviation. The unit is of the class of MER's LN-200; all numbers are assumed. On flat, hard
     ground they make 1.1 % of 8 m: slip, which comes on top, is the motion's (`marsyard.sim.dynamics.driving`).
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    scale_error: Annotated[Share, Field(description="share of the path, common to a run (the wheels' radius)")] = 0.01
+    scale_error: Annotated[Fraction, Field(description="share of the path, common to a run (the wheels' radius)")] = (
+        0.01
+    )
     walk_m: Annotated[
         float, Field(ge=0.0, le=1.0, description="error along and across on the first metre, growing as the root, m")
     ] = 0.01
-    heading_scale_error: Annotated[Share, Field(description="share of what is turned, common to a run")] = 0.002
+    heading_scale_error: Annotated[Fraction, Field(description="share of what is turned, common to a run")] = 0.002
     heading_drift_deg_m: Annotated[Degrees, Field(description="drift along the path, common to a run, deg/m")] = 0.03
     heading_walk_deg: Annotated[
         Degrees, Field(description="error on the first metre, growing as the path's root, deg")

@@ -8,11 +8,11 @@ from typing import Annotated
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from marsyard.sim.camera import Cahvore, CameraModel
+from marsyard.sim.parameters import NonNegative, Parameters
 
-NonNegative = Annotated[float, Field(ge=0.0)]
 #: Half size of the point spread's kernel, pixels.
 REACH_PX = 6
 #: Share of the field angle by which a fisheye's pupil is foreshortened: a MER front hazcam's, measured on the sky of
@@ -20,10 +20,8 @@ REACH_PX = 6
 PUPIL_SHARE = 0.95
 
 
-class OpticsParameters(BaseModel):
+class OpticsParameters(Parameters):
     """Point spread and dust. The defaults are an f/12 lens at 700 nm on 12 um pixels, without dust."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     diffraction_px: Annotated[
         NonNegative, Field(le=5.0, description="wavelength times f-number over pixel pitch; 0 for no diffraction")

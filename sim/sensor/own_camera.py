@@ -12,22 +12,21 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel, looking_down, read_cameras
+from marsyard.sim.parameters import Parameters
 
 Vector = tuple[float, float, float]
 _FILES = ("file", "number", "subframe_folded_in", "size")
 
 
-class OwnCamera(BaseModel):
+class OwnCamera(Parameters):
     """A camera of the CAHV family in the body frame: at its origin, looking along -z, columns along +x.
 
     Stated as ``{ file = "camera.yaml" }`` (any file that `marsyard.sim.camera.read_cameras` reads), or the path alone;
     all else is then filled in. Where a file puts a camera does not matter: it is mounted so that A looks down.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     file: Annotated[str | None, Field(description="camera file that the model was read from")] = None
     number: Annotated[int, Field(ge=0, description="which of the file's cameras, from 0")] = 0

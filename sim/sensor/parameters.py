@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.sensor.defects import BurstParameters, DefectParameters
 from marsyard.sim.sensor.optics import OpticsParameters
 
-NonNegative = Annotated[float, Field(ge=0.0)]
 
-
-class DetectorParameters(BaseModel):
+class DetectorParameters(Parameters):
     """An image detector without shutter. The defaults are those of the MER descent camera as flown.
 
     Full well, gain, read noise and readout rate: Maki et al. 2003. Responsivity and dark current are calibrations (see
     `marsyard.sim.sensor.radiometry`). How fast the detector is cleared is assumed.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="exposure time, s")] = 0.004
     responsivity_e_s: Annotated[

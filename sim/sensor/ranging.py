@@ -7,8 +7,9 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.sensor.clock import Clock, ClockParameters
 from marsyard.sim.sensor.instrument import Readings, Sampling
 from marsyard.sim.terrain import Surface
@@ -17,10 +18,8 @@ from marsyard.sim.terrain import Surface
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
-class RangingParameters(BaseModel):
+class RangingParameters(Parameters):
     """Errors of a ranging instrument. Shares of the range are one standard deviation."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 10.0
     scale_error: Annotated[

@@ -12,23 +12,21 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.parameters import Parameters, Positive
 from marsyard.sim.sensor.clock import Clock, ClockParameters
 from marsyard.sim.sensor.instrument import Sampling
 from marsyard.sim.sensor.stochastic import GaussMarkov
 
 NonNegative = Annotated[float, Field(ge=0.0, le=1000.0)]
-Positive = Annotated[float, Field(gt=0.0)]
 #: East, north, up.
 PerAxis = tuple[NonNegative, NonNegative, NonNegative]
 
 
-class SolutionErrors(BaseModel):
+class SolutionErrors(Parameters):
     """Errors of one kind of solution, one standard deviation towards east, north and up."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     wander_m: Annotated[PerAxis, Field(description="wanders with the correlation time, m")]
     noise_m: Annotated[PerAxis, Field(description="new in every solution, m")]
@@ -40,23 +38,19 @@ class SolutionErrors(BaseModel):
         return np.hypot(self.wander_m, self.noise_m)
 
 
-class Outage(BaseModel):
+class Outage(Parameters):
     """A time without solutions."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     start_s: Annotated[float, Field(description="true time at which it begins, s")]
     duration_s: Annotated[Positive, Field(description="how long it lasts, s")]
 
 
-class RtkParameters(BaseModel):
+class RtkParameters(Parameters):
     """A receiver of the class of NovAtel's RT2.
 
     Fixed: 2 cm, the class's specification. Floating: within the deviations of the landing paper's Table II, 0.35 to
     0.7 m. All else is assumed.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rate_hz: Annotated[Positive, Field(le=100.0, description="solutions per second")] = 10.0
     latency_s: Annotated[float, Field(ge=0.0, le=2.0, description="from a solution's time to its delivery, s")] = 0.07

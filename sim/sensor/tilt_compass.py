@@ -14,13 +14,13 @@ from typing import Annotated
 import numpy as np
 import scipy  # its signal is slow to import, and so left until it is called
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.sensor.clock import Clock, ClockParameters
 from marsyard.sim.sensor.instrument import Sampling
 
-NonNegative = Annotated[float, Field(ge=0.0)]
 Degrees = Annotated[NonNegative, Field(le=90.0)]
 #: Steps of the lag per second: twenty within the time constant that is the default.
 LAG_STEPS_PER_S = 100.0
@@ -28,14 +28,12 @@ LAG_STEPS_PER_S = 100.0
 SETTLED = 12.0
 
 
-class TiltCompassParameters(BaseModel):
+class TiltCompassParameters(Parameters):
     """A unit of the class of Precision Navigation's TCM2; spreads are one standard deviation.
 
     Accuracy of 0.2 deg in tilt and 1 deg in heading, 16 readings per second, counts of 0.1 deg: the class's
     specification. How they divide into parts, the lag and what the vehicle adds are assumed.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rate_hz: Annotated[float, Field(gt=0.0, le=100.0, description="readings per second")] = 16.0
     tilt_bias_deg: Annotated[Degrees, Field(description="constant error of each inclinometer, mounting included")] = 0.2

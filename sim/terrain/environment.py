@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from marsyard.sim.parameters import Parameters
 
 #: Lowest sun for which a plane-parallel atmosphere is used.
 LOWEST_SUN_SINE = 0.05
@@ -13,10 +15,8 @@ LOWEST_SUN_SINE = 0.05
 SUN_RADIUS_AT_1_AU_RAD = 0.00465
 
 
-class Environment(BaseModel):
+class Environment(Parameters):
     """A planet's gravity, rotation, sunlight and dusty air at a site."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     planet: Annotated[str, Field(description="which planet")] = "Mars"
     gravity_m_s2: Annotated[float, Field(gt=0.0, description="gravity, m/s2")] = 3.72

@@ -8,15 +8,17 @@ from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.ndimage import distance_transform_edt
+
+from marsyard.sim.parameters import Parameters
 
 
 class TerrainFileError(ValueError):
     """A terrain file cannot be used; the message says which, why, and what is allowed."""
 
 
-class RealTerrain(BaseModel):
+class RealTerrain(Parameters):
     """A digital terrain model (DTM) from a file, in place of the fractal ground where it reaches.
 
     The file is a GeoTIFF (rows from north to south, projected, metres; needs the extra `geo`) or an ``.npz`` with
@@ -26,8 +28,6 @@ class RealTerrain(BaseModel):
 
     Posts without height are filled smoothly, up to `max_hole_fraction` of them; ground that is filled is not real.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     dtm: Annotated[Path, Field(description="GeoTIFF or .npz with the heights")]
     ortho: Annotated[Path | None, Field(description="GeoTIFF with the picture; an .npz has its own")] = None

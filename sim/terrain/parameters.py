@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
+from marsyard.sim.parameters import Parameters, Positive
 from marsyard.sim.terrain.imported import RealTerrain
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
 from marsyard.sim.terrain.rocks.population import RockParameters
 
-Positive = Annotated[float, Field(gt=0.0)]
 
-
-class TerrainParameters(BaseModel):
+class TerrainParameters(Parameters):
     """A synthetic terrain: fractal ground and craters, and landforms where asked for. Lengths in metres."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side, a power of two")] = 4096
     spacing_m: Annotated[float, Field(gt=0.0, le=100.0, description="distance between samples, m")] = 1.5

@@ -10,16 +10,15 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.terrain.environment import Environment
 from marsyard.sim.terrain.parameters import TerrainParameters
 
 
-class SitePhotometry(BaseModel):
+class SitePhotometry(Parameters):
     """Parameters of the Lunar-Lambert law with an opposition surge, as `marsyard.sim.render.Photometry` takes them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     lunar_share: Annotated[float, Field(ge=0.0, le=1.0, description="L: 0 Lambert, 1 Lommel-Seeliger")] = 0.55
     surge_amplitude: Annotated[float, Field(ge=0.0, le=3.0, description="B0")] = 0.7
@@ -28,14 +27,12 @@ class SitePhotometry(BaseModel):
     source: Annotated[str, Field(description="where these come from")] = "assumed"
 
 
-class SiteTexture(BaseModel):
+class SiteTexture(Parameters):
     """Albedo finer than the terrain's posts: octaves of noise, as `marsyard.sim.render.Texture` takes them.
 
     Amplitudes are of the natural logarithm of albedo, the coarsest octave first; each octave is half as large as the
     one before.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     coarsest_m: Annotated[float, Field(gt=0.0, description="size of the coarsest octave's cells, m")]
     amplitudes: Annotated[tuple[float, ...], Field(description="amplitude of each octave")]
@@ -51,14 +48,12 @@ def texture(coarsest_m: float, finest_m: float, amplitude: float, decay: float =
     return SiteTexture(coarsest_m=coarsest_m, amplitudes=tuple(octaves))
 
 
-class Site(BaseModel):
+class Site(Parameters):
     """A place to land, drive or fly.
 
     `descent` is its terrain from parachute heights (posts of metres over kilometres), `ground` from a mast or a
     helicopter (posts of centimetres over 100-200 m); a site has at least one.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     description: str

@@ -13,8 +13,8 @@ from marsyard.algorithms.faults import AlgorithmError
 from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.conformance.process import fingerprint
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, labels, sources_of
+from marsyard.scenarios.handover import fingerprint
 from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, answers_of
 
 LIMITS = ExecutableLimits()

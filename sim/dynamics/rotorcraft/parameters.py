@@ -5,32 +5,27 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from marsyard.sim.dynamics.rotorcraft.kernels import Craft
+from marsyard.sim.parameters import NonNegative, Parameters, Positive
 
-NonNegative = Annotated[float, Field(ge=0.0)]
-Positive = Annotated[float, Field(gt=0.0)]
 Gain = Annotated[float, Field(gt=0.0, le=10.0)]
 
 
-class VibrationParameters(BaseModel):
+class VibrationParameters(Parameters):
     """What the main rotor shakes: a sine along and about each axis, of drawn phase. All assumed.
 
     A rotor of 1.8 m at 22 turns per second has a tip speed of 125 m/s, usual for its size.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     rate_hz: Annotated[Positive, Field(le=45.0, description="turns of the rotor per second")] = 22.0
     acceleration_m_s2: Annotated[NonNegative, Field(le=20.0, description="amplitude along each world axis, m/s2")] = 1.5
     angle_deg: Annotated[NonNegative, Field(le=1.0, description="amplitude of yaw, pitch and roll, deg")] = 0.03
 
 
-class AirParameters(BaseModel):
+class AirParameters(Parameters):
     """The wind at the helicopter: a mean, and gusts correlated in time (first-order, as Dryden's along the flow)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     east_m_s: Annotated[float, Field(ge=-15.0, le=15.0, description="mean wind towards the east, m/s")] = 1.0
     north_m_s: Annotated[float, Field(ge=-15.0, le=15.0, description="mean wind towards the north, m/s")] = 1.0
@@ -41,14 +36,12 @@ class AirParameters(BaseModel):
     correlation_s: Annotated[Positive, Field(le=60.0, description="correlation time of the gusts, s")] = 2.0
 
 
-class RotorcraftParameters(BaseModel):
+class RotorcraftParameters(Parameters):
     """A helicopter of the class of JPL's (2 m long, gas powered) with its autopilot.
 
     The paper gives no figure of either. All assumed: an attitude loop of about 1 Hz and position loops several times
     slower, as such helicopters fly.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     drag_s: Annotated[Positive, Field(description="time in which drag alone halts it by 1/e, s")] = 5.0
     attitude_hz: Annotated[Positive, Field(le=5.0, description="natural frequency of pitch and roll, 1/s")] = 0.9
@@ -93,13 +86,11 @@ class RotorcraftParameters(BaseModel):
         )
 
 
-class TransitParameters(BaseModel):
+class TransitParameters(Parameters):
     """The flight at constant height while pictures are taken (paper, V). Height and the number of pictures are its own.
 
     "Several seconds" are taken as five. Time 0 is the first picture's.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     height_m: Annotated[Positive, Field(le=200.0, description="height above the ground below the first picture, m")] = (
         10.0
@@ -117,15 +108,13 @@ class TransitParameters(BaseModel):
         return self.hover_s + self.speed_m_s / self.acceleration_m_s2 + self.settle_s
 
 
-class LandingGuidance(BaseModel):
+class LandingGuidance(Parameters):
     """From the pictures to the ground (paper, V).
 
     The distances of 2 m and 1.5 m are the paper's, the wait is its run time; the rest is assumed. The paper says of the
     descent that it goes on reducing the distance from the site, and of what follows below 1.5 m only that the blades'
     pitch is slowly changed: there it stops its drift, but goes for the site no more.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     wait_s: Annotated[NonNegative, Field(le=60.0, description="from the last picture until the site is known, s")] = 1.8
     approach_m_s: Annotated[Positive, Field(le=15.0, description="greatest commanded speed to the site, m/s")] = 2.0

@@ -22,22 +22,19 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.frames import rigid
+from marsyard.sim.parameters import Parameters, Positive
 from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, STANDARD_GRAVITY_M_S2, ImuIncrements, ImuParameters
 from marsyard.sim.sensor.navigation import kernels
 from marsyard.sim.sensor.rtk import RtkParameters, RtkSolutions, SolutionErrors
 from marsyard.sim.sensor.tilt_compass import TiltCompassParameters, TiltCompassReadings
 
-Positive = Annotated[float, Field(gt=0.0)]
 
-
-class FilterParameters(BaseModel):
+class FilterParameters(Parameters):
     """What the filter takes for granted beyond the classes of its instruments."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     first_place_m: Annotated[Positive, Field(description="deviation of position before the first solution, m")] = 30.0
     first_speed_m_s: Annotated[Positive, Field(description="deviation of velocity before that, m/s")] = 3.0

@@ -6,18 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32
-from pydantic import BaseModel, ConfigDict
 
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.terrain.landforms.kernels import add_refined
 
 #: Smallest side of a grid on which a landform is made.
 SMALLEST_SIDE = 16
 
 
-class LandformParameters(BaseModel):
+class LandformParameters(Parameters):
     """What all landforms' parameters have in common."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 @dataclass(frozen=True)

@@ -6,18 +6,16 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from marsyard.sim.parameters import Parameters, Positive
 
 #: Rocks beyond this number on one terrain are a mistake of the configuration.
 MOST_ROCKS = 2_000_000
 
-Positive = Annotated[float, Field(gt=0.0)]
 
-
-class PlacedRock(BaseModel):
+class PlacedRock(Parameters):
     """A rock put at a stated place: a rover's target, a landing hazard."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(min_length=1, description="what scenarios call it; unique on its terrain")]
     east_m: Annotated[float, Field(description="x of its centre, m, on the periodic terrain")]
@@ -32,15 +30,13 @@ class PlacedRock(BaseModel):
     yaw_deg: Annotated[float | None, Field(description="turn about its vertical, deg; drawn where not given")] = None
 
 
-class RockParameters(BaseModel):
+class RockParameters(Parameters):
     """Rocks of a terrain: the size-frequency distribution of Golombek & Rapp (1997), and rocks at stated places.
 
     The share of the ground covered by rocks of at least diameter D is ``F_k(D) = k exp(-q D)``,
     ``q = 1.79 + 0.152 / k`` (D in metres), fitted to the Viking landing sites and used for all Mars landers since.
     The number of rocks per area and diameter follows: ``n(D) = -dF/dD / (pi D**2 / 4)``.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     abundance: Annotated[float, Field(ge=0.0, le=0.4, description="k, share of the ground covered by all rocks")] = 0.05
     smallest_m: Annotated[Positive, Field(description="diameter of the smallest rocks that are made, m")] = 0.05

@@ -14,7 +14,6 @@ from marsyard.scenarios.descent.faults import (
     delivered,
     faulty_altitudes,
     faulty_attitudes,
-    faulty_detector,
     faulty_terrain,
     faulty_times,
 )
@@ -24,6 +23,7 @@ from marsyard.scenarios.descent.heat_shield import DIAMETER_M, HeatShield
 from marsyard.scenarios.descent.optics import calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
 from marsyard.scenarios.descent.world import World
+from marsyard.scenarios.faults import faulty_detector
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement

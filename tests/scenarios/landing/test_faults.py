@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from marsyard.scenarios.faults import faulty_detector
 from marsyard.scenarios.landing.faults import (
     Faults,
     arrived_numbers,
-    faulty_detector,
     faulty_helicopter,
     faulty_ranges,
     stuck_range_m,

@@ -85,18 +85,11 @@ def bad(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
             "its columns change",
         ),
         ("columns", False, "return Poses(*poses(place), {'a b': 1.0})", "names a column 'a b'"),
-        (
-            "process",
-            False,
-            "os.environ['X_OF_A_PART'] = '1'\nreturn Poses(*poses(place))",
-            "changed environment variables",
-        ),
     ],
 )
 def test_what_a_motion_must_not_do(
     check: str, random: bool, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("X_OF_A_PART", "0")
     body = f"class Bad:\n    random = {random}\n    def fly(self, place, rng):\n" + textwrap.indent(lines, " " * 8)
     name = bad(tmp_path, monkeypatch, body)
     (found,) = findings(f"{name}:Bad", check).values()

@@ -10,7 +10,7 @@ from marsyard.scenarios.rover import (
     SharedDriveScenario,
     run_case,
 )
-from marsyard.scenarios.rover.shared import shared_drive, tracked
+from marsyard.scenarios.rover.shared import DriveKey, render_drive, track_views
 from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT
@@ -178,8 +178,8 @@ def test_trackers_share_the_pictures_of_a_drive() -> None:
         (True, True),
         (True, False),
     ]
-    drive = shared_drive(fine.of_run(), fine.margin_px, 1, "rover tests", 0)
-    other = tracked(SharedDriveParameters.model_validate({**stated, "target": 1}), drive)
+    drive = render_drive(DriveKey.of(fine, streams(0)))
+    other = track_views(SharedDriveParameters.model_validate({**stated, "target": 1}), drive)
     assert other.stops[0].point_px[0] > drive.views[0].pictures.left.corner[0]
     assert other.stops[0].pictures is drive.views[0].pictures
     # The camera keeps its distance from the targets' middle and goes around it.

@@ -1,0 +1,17 @@
+"""The base class of all parameters, and the types that many of their fields have."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class Parameters(BaseModel):
+    """Values that a user may state: an unknown key is an error, and a validated object does not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
