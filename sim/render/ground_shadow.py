@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from marsyard.sim.render.kernels.ground import Bounds, greatest_rises
-from marsyard.sim.render.kernels.sun import Shadow, heights_in_rows, sweep_shadow
+from marsyard.sim.render.kernels.ground import greatest_rises
+from marsyard.sim.render.kernels.structs import Bounds, GroundShadow
+from marsyard.sim.render.kernels.sun import heights_in_rows, sweep_shadow
 from marsyard.sim.render.photometry import Sun
 from marsyard.sim.render.reach import Cone
 from marsyard.sim.terrain import Surface
@@ -16,7 +17,9 @@ from marsyard.sim.terrain import Surface
 #: Most posts along a side of the grid on which the shadow is swept.
 SHADOW_SIDE = 4096
 #: What there is without a shadow.
-NO_SHADOW = ((np.full((1, 1), -np.inf, dtype=np.float32), np.zeros((1, 1), dtype=np.uint8), False), 1.0, 0)
+NO_SHADOW = GroundShadow(
+    np.full((1, 1), -np.inf, dtype=np.float32), np.zeros((1, 1), dtype=np.uint8), False, 1.0, 0, 1.0, 1.0, 0.0
+)
 #: Directions along a cone's rim from which the ground in it is found, and by how much, as a share of it, the ground is
 #: wider than their hull. Where they cover more than a period, nothing is gained.
 _RIM, _WIDER = 64, 0.01
@@ -49,7 +52,7 @@ def _lowest_ray(sun: Sun) -> float:
 
 def ground_shadow(
     surface: Surface, sun: Sun, height_range_m: tuple[float, float], shown_m: Bounds | None = None
-) -> tuple[Shadow, float, int]:
+) -> GroundShadow:
     """Sweeps the shadow along whichever axis the sun's azimuth is nearer to.
 
     Parameters
@@ -64,8 +67,8 @@ def ground_shadow(
 
     Returns
     -------
-    The shadow on the grid of a level of the surface, the grid's spacing, and the level. A grid that covers a part of
-    the ground only repeats as the whole does, after fewer posts.
+    The shadow on the grid of a level of the surface. A grid that covers a part of the ground only repeats as the whole
+    does, after fewer posts.
     """
     level = int(np.argmax([one.shape[0] <= SHADOW_SIDE for one in surface.levels]))
     field, spacing = surface.levels[level], surface.spacing_m * 2.0**level
@@ -90,7 +93,8 @@ def ground_shadow(
             rows, columns = (_wrapped(first, count) & (len(field) - 1) for first in (y[0], x[0]))
     height = heights_in_rows(field, rows, columns, along_x)
     swept, casters = sweep_shadow(height, float(np.sign(main)), drop, slip, reach)
-    return (swept, casters, along_x), spacing, level
+    row_m, across = spacing / abs(main), float(np.hypot(east, north))
+    return GroundShadow(swept, casters, along_x, spacing, level, row_m, across, height_range_m[1])
 
 
 def _posts(shown_m: Float64[np.ndarray, "2"], away_m: float, spacing_m: float, most: int) -> tuple[int, int]:

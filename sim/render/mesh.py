@@ -60,9 +60,8 @@ def ground_mesh(
 
     if spans is None:
         spans = np.tile([0, x.size - 1], (y.size - 1, 1))
-    levels, _top = pyramid(surface)
     on_x, on_y = _levels_of_lines(surface, x), _levels_of_lines(surface, y)
-    vertices, faces = lay_out(levels, surface.spacing_m, x, y, on_x, on_y, spans)
+    vertices, faces = lay_out(pyramid(surface), surface.spacing_m, x, y, on_x, on_y, spans)
     return trimesh.Trimesh(vertices, faces, process=False, validate=False)
 
 

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
-from marsyard.sim.render.kernels.bodies import body_spheres, facing, triangles_of
 from marsyard.sim.render.kernels.hierarchy import Hierarchy, morton_codes, node_boxes
+from marsyard.sim.render.kernels.triangles import body_spheres, select_facing
 
 #: Triangle numbers are drawn as colours of 24 bits, of which 0 is the ground.
 MOST_TRIANGLES = 2**24 - 2
@@ -112,13 +112,13 @@ class Objects:
     ) -> Int64[np.ndarray, "kept"]:
         """Numbers of the triangles that face the tip of a cone, of all bodies whose spheres reach into it."""
         kept = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
-        numbers: Int64[np.ndarray, "kept"] = facing(self.triangles, triangles_of(kept, self.first_triangle), *apex)
+        numbers: Int64[np.ndarray, "kept"] = select_facing(self.triangles, self._triangles_of(kept), *apex)
         return numbers
 
     def only(self, kept: Bool[np.ndarray, "bodies"]) -> Objects:
         """Some of the bodies, which are counted anew."""
         counts = np.diff(self.first_triangle)
-        triangles = triangles_of(kept, self.first_triangle)
+        triangles = self._triangles_of(kept)
         some = Objects(
             triangles=np.take(self.triangles, triangles, axis=0),
             normals=np.take(self.normals, triangles, axis=0),
@@ -128,6 +128,10 @@ class Objects:
             names=self.names[kept],
         )
         return _with_spheres(some, self.spheres[kept])
+
+    def _triangles_of(self, kept: Bool[np.ndarray, "bodies"]) -> Int64[np.ndarray, "kept"]:
+        """Numbers of the triangles of some bodies."""
+        return np.flatnonzero(np.repeat(kept, np.diff(self.first_triangle)))
 
     @cached_property
     def hierarchy(self) -> Hierarchy:

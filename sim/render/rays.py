@@ -13,6 +13,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import turn_matrix
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.kernels.rays import extent, least_along, pixel_angles, summed
+from marsyard.sim.render.kernels.structs import Rays
 from marsyard.sim.render.reach import Cone
 
 #: Samples along each side of the pinhole views: a camera takes the first that leaves `_SPARE_PX` of them beside its own
@@ -24,23 +25,6 @@ _SPARE_PX = 16
 MARGIN_PX = 2.0
 #: Widest angle from its axis that a view is given; a wider field is cut into quarters.
 WIDEST_HALF_ANGLE_RAD = np.radians(52.0)
-
-
-@dataclass(frozen=True)
-class RayBundle:
-    """Rays in body axes, relative to a camera's centre.
-
-    Attributes
-    ----------
-    origins, directions
-        Shape (rays, 3), float32; directions are unit vectors.
-    pixel_angles
-        Angle that the pixel of each ray takes, radians.
-    """
-
-    origins: Float32[np.ndarray, "rays 3"]
-    directions: Float32[np.ndarray, "rays 3"]
-    pixel_angles: Float32[np.ndarray, "rays"]
 
 
 @dataclass(frozen=True)
@@ -78,9 +62,9 @@ class PixelRays:
     view_of_pixel: UInt8[np.ndarray, "pixels"]
 
     @property
-    def bundle(self) -> RayBundle:
+    def rays(self) -> Rays:
         """The rays alone."""
-        return RayBundle(self.origins, self.directions, self.pixel_angles)
+        return Rays(self.origins, self.directions, self.pixel_angles)
 
     @cached_property
     def axis(self) -> Float64[np.ndarray, "3"]:

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation
 
-from marsyard.sim.render.kernels.casters import Casters, listed_casters
-from marsyard.sim.render.kernels.shading import Reach
+from marsyard.sim.render.kernels.casters import Casters, list_casters
+from marsyard.sim.render.kernels.structs import Footprint
 from marsyard.sim.render.objects import Objects, spheres_in_cone
 from marsyard.sim.render.photometry import Sun
 
@@ -16,10 +16,12 @@ Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]
 #: Most cells along a side.
 SIDE = 512
 #: No place is spared the search.
-EVERYWHERE: Reach = (np.ones((1, 1), dtype=np.bool_), 0.0, 0.0, 0.0)
+EVERYWHERE = Footprint(np.ones((1, 1), dtype=np.bool_), 0.0, 0.0, 0.0)
 
 
-def shade_reach(spheres: Float64[np.ndarray, "bodies 4"], sun: Float64[np.ndarray, "3"], lowest_m: float) -> Reach:
+def shadow_footprint(
+    spheres: Float64[np.ndarray, "bodies 4"], sun: Float64[np.ndarray, "3"], lowest_m: float
+) -> Footprint:
     """A grid of places, true where a body may hide the sun from ground that is nowhere lower than `lowest_m`.
 
     The shadow of a sphere falls along the sun's azimuth between the point below its middle and the place where the ray
@@ -50,7 +52,8 @@ def shade_reach(spheres: Float64[np.ndarray, "bodies 4"], sun: Float64[np.ndarra
     touched = np.zeros((rows, columns), dtype=np.bool_)
     column, row = np.floor((places - corner) / cell).astype(int).T
     touched[row, column] = True
-    return binary_dilation(touched, np.ones((3, 3), dtype=np.bool_)), float(corner[0]), float(corner[1]), 1.0 / cell
+    wider = binary_dilation(touched, np.ones((3, 3), dtype=np.bool_))
+    return Footprint(wider, float(corner[0]), float(corner[1]), 1.0 / cell)
 
 
 def casters_towards(objects: Objects, sun: Sun) -> Casters:
@@ -60,11 +63,11 @@ def casters_towards(objects: Objects, sun: Sun) -> Casters:
     across /= np.linalg.norm(across)
     # the kernel's rays run exactly along the sun's direction, as the third axis
     axes = np.stack([across, np.cross(towards, across), towards])
-    casters: Casters = listed_casters(objects.triangles, objects.first_triangle, axes)
+    casters: Casters = list_casters(objects.triangles, objects.first_triangle, axes)
     return casters
 
 
-def concerned(
+def potentially_visible(
     spheres: Float64[np.ndarray, "bodies 4"],
     sun: Float64[np.ndarray, "3"],
     lowest_m: float,

@@ -8,23 +8,28 @@ Distortion is therefore exact and not a resampling of a pinhole picture.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.frames import turn_matrix
 from marsyard.sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
-from marsyard.sim.render.edges import Sight, edge_pixels, look_within, rays_within
+from marsyard.sim.render.edges import edge_pixels, rays_within
 from marsyard.sim.render.heap import keep_freed_memory, return_freed_memory
+from marsyard.sim.render.kernels.edges import trace_subpixel_rays
+from marsyard.sim.render.kernels.primary import GRAZING, trace_primary_rays
 from marsyard.sim.render.kernels.shading import shade
-from marsyard.sim.render.kernels.sight import GRAZING, look
+from marsyard.sim.render.kernels.structs import Ground, Hits, Light, Picture, Pose, Rays, Views
 from marsyard.sim.render.mesh import cells_in_hull, ground_mesh, lines_in_view
-from marsyard.sim.render.pyramid import ceilings, pyramid
-from marsyard.sim.render.rays import VIEW_SIDE_PX, PixelRays, RayBundle
-from marsyard.sim.render.scene import Light, Scene
+from marsyard.sim.render.pyramid import ground_struct
+from marsyard.sim.render.rays import VIEW_SIDE_PX, PixelRays
+from marsyard.sim.render.scene import Scene
 from marsyard.sim.render.threads import in_parts
 
 
@@ -111,62 +116,41 @@ class Renderer:
         RenderingError
             The camera is at or below the ground.
         """
-        position = world_from_body.apply(rays.centre)
-        clearance = position[2] - float(scene.surface.height(position[0], position[1]))
+        pose = Pose(turn_matrix(world_from_body), world_from_body.apply(rays.centre))
+        clearance = pose.position[2] - float(scene.surface.height(pose.position[0], pose.position[1]))
         if clearance <= 0.0:
-            raise RenderingError(f"the camera is {-clearance:.2f} m below the ground at {position}")
-        rotation = turn_matrix(world_from_body)
-        self._load(scene, rays, rotation, position)
-        depth, numbers = self._draw(scene, rays, rotation, position, clearance)
+            raise RenderingError(f"the camera is {-clearance:.2f} m below the ground at {pose.position}")
+        self._load(scene, rays, pose)
+        views = self._draw(scene, rays, pose, clearance)
         columns, rows = rays.size
-        light = scene.light(time_s)
-        sight = Sight.unseen(rows * columns, scene.objects)
-        (levels, top_level), hierarchy = pyramid(scene.surface), scene.objects.hierarchy
-        highest_ray = np.arcsin(np.clip((rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
-        tops = ceilings(scene.surface, wanted=bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -GRAZING))
+        highest_ray = np.arcsin(np.clip((pose.rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
+        flat = bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -GRAZING)
+        ground = ground_struct(scene.surface, scene.extent_m, ceilings=flat)
+        hits, light = _room_for_hits(rows * columns, scene), scene.light(time_s)
 
-        def look_at(part: slice) -> None:
-            look(
-                levels,
-                tops,
-                top_level,
-                scene.surface.spacing_m,
-                scene.extent_m,
-                depth,
-                numbers,
-                rays.focal_px,
-                rays.view_from_body,
-                rays.view_of_pixel[part],
-                rotation,
-                position,
-                rays.origins[part],
-                rays.directions[part],
-                rays.pixel_angles[part],
-                hierarchy,
-                sight.distance[part],
-                sight.triangle[part],
-                sight.weights[part],
-                sight.level[part],
+        def trace(part: slice) -> None:
+            seen = views._replace(view_of_pixel=rays.view_of_pixel[part])
+            trace_primary_rays(
+                ground, seen, pose, Rays(*_part(rays.rays, part)), scene.objects.hierarchy, Hits(*_part(hits, part))
             )
 
-        in_parts(look_at, rows * columns)
-        radiance, body, normal = _shaded(scene, rotation, position, rays.bundle, sight, light)
+        in_parts(trace, rows * columns)
+        picture = _shade(scene, ground, pose, rays.rays, hits, light)
         frame = Frame(
-            radiance.reshape(rows, columns),
-            sight.distance.reshape(rows, columns),
-            body.reshape(rows, columns),
-            normal.reshape(rows, columns, 3),
+            picture.radiance.reshape(rows, columns),
+            hits.distance.reshape(rows, columns),
+            picture.body.reshape(rows, columns),
+            picture.normal.reshape(rows, columns, 3),
             world_from_body,
             rays,
         )
         if scene.edge_rays > 1:
             pixels = edge_pixels(frame.radiance, frame.range_m, frame.body)
             within = rays_within(rays, pixels, scene.edge_rays)
-            seen = look_within(
-                scene.surface, tops, scene.extent_m, scene.objects, rotation, position, columns, pixels, within, sight
-            )
-            finer, _, _ = _shaded(scene, rotation, position, within, seen, light)
-            radiance[pixels] = finer.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)
+            met = _room_for_hits(len(within.directions), scene)
+            trace_subpixel_rays(ground, pose, scene.objects.hierarchy, columns, pixels, within, hits, met)
+            finer = _shade(scene, ground, pose, within, met, light).radiance
+            picture.radiance[pixels] = finer.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)
         return frame
 
     def close(self) -> None:
@@ -181,19 +165,13 @@ class Renderer:
             self._views[side_px] = DepthRenderer(side_px, self._backend)
         return self._views[side_px]
 
-    def _load(
-        self,
-        scene: Scene,
-        rays: PixelRays,
-        rotation: Float64[np.ndarray, "3 3"],
-        position: Float64[np.ndarray, "3"],
-    ) -> None:
-        """Loads the ground and the objects that this picture shows."""
-        places = _seen(scene, rays, rotation, position)
+    def _load(self, scene: Scene, rays: PixelRays, pose: Pose) -> None:
+        """Load the ground and the objects that this picture shows."""
+        places = _ground_in_view(scene, rays, pose)
         (west, south), (east, north) = places.min(axis=0), places.max(axis=0)
         x = lines_in_view(scene.centre_m[0] + scene.mesh_offsets, west, east)
         y = lines_in_view(scene.centre_m[1] + scene.mesh_offsets, south, north)
-        numbers = scene.objects.in_cone(position, rotation @ rays.axis, rays.half_angle_rad)
+        numbers = scene.objects.in_cone(pose.position, pose.rotation @ rays.axis, rays.half_angle_rad)
         ground = ground_mesh(scene.surface, x, y, cells_in_hull(x, y, places))
         self._view_renderer(rays.view_side_px).load(ground, scene.objects.triangles[numbers], numbers)
         if self._last is not scene:
@@ -202,85 +180,57 @@ class Renderer:
             if self._scenes % _SCENES_KEPT == 0:
                 return_freed_memory()
 
-    def _draw(
-        self,
-        scene: Scene,
-        rays: PixelRays,
-        rotation: Float64[np.ndarray, "3 3"],
-        position: Float64[np.ndarray, "3"],
-        clearance_m: float,
-    ) -> tuple[Float32[np.ndarray, "views side side"], Int32[np.ndarray, "views side side"]]:
+    def _draw(self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float) -> Views:
         """Depth and triangle numbers of the camera's pinhole views."""
         renderer = self._view_renderer(rays.view_side_px)
         drawn = []
         for view_from_body, focal in zip(rays.view_from_body, rays.focal_px, strict=True):
-            pose = np.eye(4)
-            pose[:3, :3] = rotation @ view_from_body.T
-            pose[:3, 3] = position
-            # A twentieth of the height above the ground leaves room for relief and things before the camera; depth is
+            world_from_view = np.eye(4)
+            world_from_view[:3, :3] = pose.rotation @ view_from_body.T
+            world_from_view[:3, 3] = pose.position
+            # A twentieth of the height above the ground leaves room for relief and objects before the camera; depth is
             # only the first guess, so that its coarseness far away does no harm.
             far = 2.0 * scene.mesh_reach_m + clearance_m
-            drawn.append(renderer.draw(PinholeView(pose, float(focal), near_m=0.05 * clearance_m, far_m=far)))
-        if len(drawn) == 1:
-            depth, numbers = drawn[0]
-            return depth[np.newaxis], numbers[np.newaxis]
-        return np.stack([depth for depth, _ in drawn]), np.stack([numbers for _, numbers in drawn])
+            drawn.append(renderer.draw(PinholeView(world_from_view, float(focal), 0.05 * clearance_m, far)))
+        # one view, the usual case, is not copied
+        depth, numbers = (
+            pictures[0][np.newaxis] if len(pictures) == 1 else np.stack(pictures)
+            for pictures in zip(*drawn, strict=True)
+        )
+        return Views(depth, numbers, rays.focal_px, rays.view_from_body, rays.view_of_pixel)
 
 
-def _shaded(
-    scene: Scene,
-    rotation: Float64[np.ndarray, "3 3"],
-    position: Float64[np.ndarray, "3"],
-    rays: RayBundle,
-    sight: Sight,
-    light: Light,
-) -> tuple[Float32[np.ndarray, "rays"], Int32[np.ndarray, "rays"], Float32[np.ndarray, "rays 3"]]:
+def _room_for_hits(count: int, scene: Scene) -> Hits:
+    """Arrays for what so many rays meet."""
+    weighed = count if len(scene.objects) > 0 else 0
+    return Hits(
+        np.empty(count), np.empty(count, np.int32), np.empty((weighed, 2), np.float32), np.empty(count, np.int8)
+    )
+
+
+def _part(arrays: Iterable[NDArray[Any]], part: slice) -> list[NDArray[Any]]:
+    return [array[part] for array in arrays]
+
+
+def _shade(scene: Scene, ground: Ground, pose: Pose, rays: Rays, hits: Hits, light: Light) -> Picture:
     """Radiance factor, body's number and normal of what rays meet."""
     count = len(rays.directions)
-    radiance = np.empty(count, dtype=np.float32)
-    body = np.empty(count, dtype=np.int32)
-    normal = np.empty((count, 3), dtype=np.float32)
-    levels, shadow, textures = pyramid(scene.surface), scene.shadow, (scene.ground_texture, scene.object_texture)
-    casters, reach = scene.casters, scene.reach
+    picture = Picture(np.empty(count, np.float32), np.empty(count, np.int32), np.empty((count, 3), np.float32))
+    occluders, materials = scene.occluders, scene.materials
 
     def shade_part(part: slice) -> None:
-        shade(
-            *levels,
-            scene.surface.spacing_m,
-            sight.distance[part],
-            sight.triangle[part],
-            sight.weights[part],
-            sight.level[part],
-            rotation,
-            position,
-            rays.origins[part],
-            rays.directions[part],
-            rays.pixel_angles[part],
-            *light,
-            *shadow,
-            scene.height_range_m[1],
-            *(texture.arrays() for texture in textures),
-            scene.objects.normals,
-            scene.objects.body_of_triangle,
-            scene.objects.albedo,
-            casters,
-            reach,
-            radiance[part],
-            body[part],
-            normal[part],
-        )
+        some_rays, some_hits, some_pixels = (_part(arrays, part) for arrays in (rays, hits, picture))
+        shade(ground, pose, Rays(*some_rays), Hits(*some_hits), light, occluders, materials, Picture(*some_pixels))
 
     in_parts(shade_part, count)
-    return radiance, body, normal
+    return picture
 
 
 #: Rays along each side of a picture from which the ground that it shows is found.
 _PROBES = 9
 
 
-def _seen(
-    scene: Scene, rays: PixelRays, rotation: Float64[np.ndarray, "3 3"], position: Float64[np.ndarray, "3"]
-) -> Float64[np.ndarray, "places 2"]:
+def _ground_in_view(scene: Scene, rays: PixelRays, pose: Pose) -> Float64[np.ndarray, "places 2"]:
     """Places whose convex hull holds the ground that a picture can show.
 
     The ground lies between two planes; a ray that meets the lower one has seen nothing beyond. A ray that never does
@@ -288,7 +238,8 @@ def _seen(
     """
     columns, rows = rays.size
     probes = np.ix_(np.linspace(0, rows - 1, _PROBES).astype(int), np.linspace(0, columns - 1, _PROBES).astype(int))
-    directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ rotation.T
+    directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ pose.rotation.T
+    position = pose.position
     low, high = scene.height_range_m
     farthest = 2.0 * scene.mesh_reach_m
     falls = np.minimum(directions[:, 2], -1e-9)

@@ -11,23 +11,19 @@ from jaxtyping import Float64
 
 from marsyard.sim.render.clouds import CloudLayer, no_cover
 from marsyard.sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
-from marsyard.sim.render.kernels.casters import Casters
-from marsyard.sim.render.kernels.ground import Bounds, Extent, height_range
-from marsyard.sim.render.kernels.shading import Clouds, Reach
-from marsyard.sim.render.kernels.sun import Shadow
+from marsyard.sim.render.kernels.ground import height_range
+from marsyard.sim.render.kernels.shading import Occluders
+from marsyard.sim.render.kernels.structs import Bounds, Extent, Footprint, GroundShadow, Light, Materials
 from marsyard.sim.render.mesh import graded_offsets
 from marsyard.sim.render.objects import Objects
 from marsyard.sim.render.photometry import Photometry, Sun, Texture
-from marsyard.sim.render.reach import EVERYWHERE, Cone, casters_towards, concerned, shade_reach
+from marsyard.sim.render.reach import EVERYWHERE, Cone, casters_towards, potentially_visible, shadow_footprint
 from marsyard.sim.terrain import Surface
 
 #: By how much a mean of heights may stand above the highest of them, metres: single precision rounds at a few km.
 ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
 NO_CLOUDS = (no_cover(), np.zeros(5))
-
-#: Direction of the sun, the numbers of the law and of the sky, and clouds, as the kernel takes them.
-Light = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "8"], Float64[np.ndarray, "4"], Clouds]
 
 
 @dataclass(frozen=True)
@@ -110,7 +106,7 @@ class Scene:
         sun, lowest = np.asarray(self.sun.direction, dtype=np.float64), self.height_range_m[0]
         kept = np.zeros(len(self.objects), dtype=np.bool_)
         for cone in cones:
-            kept |= concerned(self.objects.spheres, sun, lowest, cone)
+            kept |= potentially_visible(self.objects.spheres, sun, lowest, cone)
         less = replace(self, objects=self.objects.only(kept), shown_m=ground_in_cones(cones, lowest))
         return self._knowing(less, "mesh_offsets", "height_range_m", "steepest")
 
@@ -133,27 +129,34 @@ class Scene:
         return slope_bounds(self.surface, self.sun)
 
     @cached_property
-    def shadow(self) -> tuple[Shadow, float, int]:
-        """The ground's shadow on the grid of a level of the surface, the grid's spacing, and the level."""
+    def shadow(self) -> GroundShadow:
+        """The ground's shadow on the grid of a level of the surface."""
         if not self.ground_shadows or self.sun.direction[2] <= 0.0 or sun_over_slopes(self.sun, self.steepest):
             return NO_SHADOW
         return ground_shadow(self.surface, self.sun, self.height_range_m, self.shown_m)
 
     @cached_property
-    def casters(self) -> Casters:
-        """The objects' triangles as shadows look for them."""
-        return casters_towards(self.objects, self.sun)
-
-    @cached_property
-    def reach(self) -> Reach:
+    def footprint(self) -> Footprint:
         """Where objects may shade the ground."""
         if self.among_objects:
             return EVERYWHERE
         towards = np.asarray(self.sun.direction, dtype=np.float64)
-        return shade_reach(self.objects.spheres, towards, self.height_range_m[0])
+        return shadow_footprint(self.objects.spheres, towards, self.height_range_m[0])
+
+    @cached_property
+    def occluders(self) -> Occluders:
+        """What hides the sun, for kernels."""
+        return Occluders(self.shadow, casters_towards(self.objects, self.sun), self.footprint)
+
+    @cached_property
+    def materials(self) -> Materials:
+        """How ground and objects look, for kernels."""
+        objects = self.objects
+        textures = self.ground_texture.arrays(), self.object_texture.arrays()
+        return Materials(*textures, objects.normals, objects.body_of_triangle, objects.albedo)
 
     def light(self, time_s: float) -> Light:
-        """What the kernel takes: direction of the sun, the law's numbers, the sky's, and the clouds at a time."""
+        """The light at a time, for kernels."""
         photometry, drifting = self.photometry, NO_CLOUDS
         if self.clouds is not None:
             more = self.clouds.parameters.sky_light(self.sun)
@@ -162,4 +165,4 @@ class Scene:
         # clouds are not drawn: the sky between them is as bright as ever
         sky = self.photometry.sky_numbers(self.sun)
         towards = np.asarray(self.sun.direction, dtype=np.float64)
-        return towards, photometry.law(self.sun, self.caster_diameter_m), sky, drifting
+        return Light(towards, photometry.law(self.sun, self.caster_diameter_m), sky, *drifting)

@@ -12,9 +12,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from marsyard.sim.render.kernels.strips import Longs, numbers, times
+from marsyard.sim.render.kernels.strips import numbers, times
+from marsyard.sim.render.kernels.structs import Flags, Longs
 from marsyard.sim.terrain.kernels import Array
 
 #: Cells of a grid: least u and v, cells a metre along u and v; columns, rows; the first item of each cell, and one more
@@ -93,97 +93,90 @@ def _cell(value: float, low: float, per_metre: float, count: int) -> int:
 
 
 @njit(cache=True)
-def _count(
-    bounds: Array, n: int, grid: tuple[float, float, float, float], side: int, first: int, counts: Longs
-) -> None:
-    """Counts a row of bounds in each cell that it touches."""
-    u0, v0, per_u, per_v = grid
-    for i in range(_cell(bounds[n, 1], v0, per_v, side), _cell(bounds[n, 3], v0, per_v, side) + 1):
-        for j in range(_cell(bounds[n, 0], u0, per_u, side), _cell(bounds[n, 2], u0, per_u, side) + 1):
-            counts[first + i * side + j] += 1
+def _enter(bounds: Array, n: int, outline: Array, side: int, first: int, ends: Longs, items: Longs) -> None:
+    """Enter a row of bounds in the list of each cell that it touches, of a grid over an outline.
 
-
-@njit(cache=True)
-def _list(
-    bounds: Array, n: int, grid: tuple[float, float, float, float], side: int, first: int, ends: Longs, items: Longs
-) -> None:
-    """Lists a row of bounds in each cell that it touches; `ends` are where the cells' lists begin, moved on."""
-    u0, v0, per_u, per_v = grid
-    for i in range(_cell(bounds[n, 1], v0, per_v, side), _cell(bounds[n, 3], v0, per_v, side) + 1):
-        for j in range(_cell(bounds[n, 0], u0, per_u, side), _cell(bounds[n, 2], u0, per_u, side) + 1):
+    `first` is the grid's first cell; `ends` are where cells' lists end so far, moved on. Where there is no room for
+    items, they are only counted.
+    """
+    for i in range(
+        _cell(bounds[n, 1], outline[1], outline[3], side), _cell(bounds[n, 3], outline[1], outline[3], side) + 1
+    ):
+        for j in range(
+            _cell(bounds[n, 0], outline[0], outline[2], side), _cell(bounds[n, 2], outline[0], outline[2], side) + 1
+        ):
             cell = first + i * side + j
-            items[ends[cell]] = n
+            if items.size > 0:
+                items[ends[cell]] = n
             ends[cell] += 1
 
 
 @njit(cache=True)
-def _starts(counts: Longs) -> Longs:
-    """Where the list of each cell begins, and where the last one ends."""
-    starts = np.zeros(counts.size + 1, dtype=np.int64)
-    for k in range(counts.size):
-        starts[k + 1] = starts[k] + counts[k]
-    return starts
+def _list_in_cells(
+    bounds: Array, first_row: Longs, outlines: Array, sides: Longs, first_cells: Longs
+) -> tuple[Longs, Longs]:
+    """List rows of bounds in the cells of grids: rows from `first_row[g]` to the next belong to grid g.
+
+    Returns where the list of each cell begins and where the last one ends, and the items.
+    """
+    grids = sides.size
+    cells = first_cells[-1] + sides[-1] ** 2 if grids > 0 else 0
+    starts = np.zeros(cells + 1, dtype=np.int64)
+    items = np.empty(0, dtype=np.int64)
+    for filling in range(2):
+        # first counted, one cell ahead, then listed
+        ends = starts[:-1].copy() if filling else starts[1:]
+        for grid in range(grids):
+            for n in range(first_row[grid], first_row[grid + 1]):
+                _enter(bounds, n, outlines[grid], sides[grid], first_cells[grid], ends, items)
+        if not filling:
+            for k in range(cells):
+                starts[k + 1] += starts[k]
+            items = np.empty(starts[-1], dtype=np.int64)
+    return starts, items
 
 
 @njit(cache=True)
-def listed_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Casters:
-    """The lists for bodies of triangles that follow each other, and a sun in the direction of the third axis."""
+def _outline(rect: Array, side: int) -> tuple[float, float, float, float, float]:
+    """Least u and v, cells a metre along both, and greatest s of a grid over some bounds."""
+    return rect[0], rect[1], side / (rect[2] - rect[0]), side / (rect[3] - rect[1]), rect[4]
+
+
+@njit(cache=True)
+def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Casters:
+    """The lists for bodies, contiguous ranges of triangles, and a sun in the direction of the third axis."""
     bodies = first_triangle.size - 1
     bounds, linear = _as_the_sun_sees(triangles, axes)
-    outlines = np.empty((bodies, 5))
-    sides = np.empty(bodies, dtype=np.int64)
-    first_cells = np.empty(bodies, dtype=np.int64)
     rects = np.empty((bodies, 5))
+    outlines = np.empty((bodies, 5))
+    shapes = np.empty((bodies, 2), dtype=np.int64)
     cells = 0
     for body in range(bodies):
         first, end = first_triangle[body], first_triangle[body + 1]
-        u0, v0, u1, v1, s1 = _joint(bounds, first, end)
         side = _side((end - first) / TO_A_CELL)
-        rects[body, 0], rects[body, 1], rects[body, 2], rects[body, 3], rects[body, 4] = u0, v0, u1, v1, s1
-        outlines[body, 0], outlines[body, 1] = u0, v0
-        outlines[body, 2], outlines[body, 3], outlines[body, 4] = side / (u1 - u0), side / (v1 - v0), s1
-        sides[body], first_cells[body] = side, cells
+        rects[body] = _joint(bounds, first, end)
+        outlines[body] = _outline(rects[body], side)
+        shapes[body, 0], shapes[body, 1] = side, cells
         cells += side * side
-    counts = np.zeros(cells, dtype=np.int64)
-    for body in range(bodies):
-        grid = (outlines[body, 0], outlines[body, 1], outlines[body, 2], outlines[body, 3])
-        for n in range(first_triangle[body], first_triangle[body + 1]):
-            _count(bounds, n, grid, sides[body], first_cells[body], counts)
-    starts = _starts(counts)
-    items = np.empty(starts[-1], dtype=np.int64)
-    ends = starts[:-1].copy()
-    for body in range(bodies):
-        grid = (outlines[body, 0], outlines[body, 1], outlines[body, 2], outlines[body, 3])
-        for n in range(first_triangle[body], first_triangle[body + 1]):
-            _list(bounds, n, grid, sides[body], first_cells[body], ends, items)
+    starts, items = _list_in_cells(bounds, first_triangle, outlines, shapes[:, 0].copy(), shapes[:, 1].copy())
     tops = np.empty(items.size)
     for k in range(items.size):
         tops[k] = bounds[items[k], 4]
-    shapes = np.empty((bodies, 2), dtype=np.int64)
-    shapes[:, 0], shapes[:, 1] = sides, first_cells
-    return linear, axes, _listed_bodies(rects), (outlines, shapes, starts, items, tops)
+    # one grid over all bodies
+    sides = np.array([_side(float(bodies))])
+    whole = np.empty((1, 5))
+    whole[0] = (0.0, 0.0, 1.0, 1.0, 0.0)
+    if bodies > 0:
+        rects_of_all = np.empty((1, 5))
+        rects_of_all[0] = _joint(rects, 0, bodies)
+        whole[0] = _outline(rects_of_all[0], sides[0])
+    first_items, bodies_listed = _list_in_cells(rects, np.array([0, bodies]), whole, sides, np.zeros(1, dtype=np.int64))
+    grid: Grid = (whole[0, :4].copy(), sides, first_items, bodies_listed)
+    return linear, axes, grid, (outlines, shapes, starts, items, tops)
 
 
 @njit(cache=True)
-def _listed_bodies(rects: Array) -> Grid:
-    """The grid over all bodies."""
-    bodies = rects.shape[0]
-    side = _side(float(bodies))
-    u0, v0, u1, v1, _s1 = _joint(rects, 0, bodies)
-    grid = (u0, v0, side / (u1 - u0), side / (v1 - v0)) if bodies > 0 else (0.0, 0.0, 1.0, 1.0)
-    counts = np.zeros(side * side, dtype=np.int64)
-    for body in range(bodies):
-        _count(rects, body, grid, side, 0, counts)
-    starts = _starts(counts)
-    items = np.empty(starts[-1], dtype=np.int64)
-    ends = starts[:-1].copy()
-    for body in range(bodies):
-        _list(rects, body, grid, side, 0, ends, items)
-    return np.array(grid), np.array([side]), starts, items
-
-
-@njit(cache=True)
-def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: NDArray[np.bool_]) -> None:
+def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) -> None:
     """Whether a triangle stands between each of some places and the sun; `hidden` is the output.
 
     All places in one call: handing over so many arrays takes longer than most places do.

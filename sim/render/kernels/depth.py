@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Array32 = NDArray[np.float32]
+from marsyard.sim.render.kernels.structs import Array32
 
 
 @njit(cache=True, error_model="numpy")

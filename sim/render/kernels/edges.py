@@ -6,15 +6,25 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from marsyard.sim.render.kernels.ground import Array32, Extent, cross_ground, way_in, way_out, world_ray
-from marsyard.sim.render.kernels.hierarchy import Hierarchy, in_beam, nearest_hit
-from marsyard.sim.render.kernels.intersection import hit_triangle
-from marsyard.sim.render.kernels.sight import Ints
-from marsyard.sim.terrain.kernels import Array, Level
+from marsyard.sim.render.kernels.ground import cross_ground, way_in, way_out
+from marsyard.sim.render.kernels.hierarchy import Hierarchy, list_in_beam, nearest_hit
+from marsyard.sim.render.kernels.structs import (
+    Array32,
+    Flags,
+    Ground,
+    Hits,
+    Ints,
+    Longs,
+    Pose,
+    Ray,
+    Rays,
+    ground_level,
+    world_ray,
+)
+from marsyard.sim.render.kernels.triangles import TriangleHit, nearer_hit
+from marsyard.sim.terrain.kernels import Array
 
-Longs = NDArray[np.int64]
 #: Difference of brightness, as a share of the brighter, from which an edge between two things matters: four times
 #: the noise of a picture of SNR 100:1.
 EDGE_CONTRAST = 0.04
@@ -57,7 +67,7 @@ def _differ(
     far_beside: Array,
     body: Ints,
     body_beside: Ints,
-    differs: NDArray[np.bool_],
+    differs: Flags,
 ) -> None:
     """Whether pixels of a line differ enough for an edge from those beside them, in all that one needs; few do."""
     for j in range(beside.size):
@@ -71,7 +81,7 @@ def _differ(
 
 
 @njit(cache=True)
-def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: NDArray[np.bool_]) -> None:
+def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: Flags) -> None:
     """Marks the pixels to both sides of every visible edge: of a thing, of ground before ground, of a shadow.
 
     Parameters
@@ -118,7 +128,7 @@ def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: NDArray[n
 
 
 @njit(cache=True)
-def split_rays(rays: Array32, rows: int, columns: int, pixels: Longs, side: int, unit: bool, out: Array32) -> None:
+def split_rays(rays: Array32, size: tuple[int, int], pixels: Longs, side: int, unit: bool, out: Array32) -> None:
     """Vectors at side x side places within each of some pixels, from those at all pixels' middles.
 
     The places are a square grid turned so that no two share a row or a column: an edge along either is found to a
@@ -128,8 +138,8 @@ def split_rays(rays: Array32, rows: int, columns: int, pixels: Longs, side: int,
     ----------
     rays
         A vector for each pixel, shape (rows * columns, 3).
-    rows, columns
-        Size of the picture.
+    size
+        Rows and columns of the picture.
     pixels, side
         Numbers of the pixels, and places along each side of one.
     unit
@@ -137,6 +147,7 @@ def split_rays(rays: Array32, rows: int, columns: int, pixels: Longs, side: int,
     out
         Output, shape (pixels * side**2, 3).
     """
+    rows, columns = size
     number = 0
     for pixel in pixels:
         i = pixel // columns
@@ -166,183 +177,141 @@ def split_rays(rays: Array32, rows: int, columns: int, pixels: Longs, side: int,
                 number += 1
 
 
-@njit(cache=True)
-def _nearest_listed(
-    tree: Hierarchy,
-    listed: Longs,
-    count: int,
-    x: float,
-    y: float,
-    z: float,
-    dx: float,
-    dy: float,
-    dz: float,
-) -> tuple[float, int, float, float]:
-    """As `nearest_hit`, among some triangles."""
-    best = math.inf
-    best_triangle = -1
-    best_second = 0.0
-    best_third = 0.0
-    for k in range(count):
-        t, second, third = hit_triangle(tree[0], listed[k], x, y, z, dx, dy, dz)
-        if 0.0 < t < best and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
-            best = t
-            best_triangle = listed[k]
-            best_second = second
-            best_third = third
-    return best, best_triangle, best_second, best_third
+# Fused multiplications round differently, but the same way every time on the same processor: below, "contract".
 
 
-# Fused multiplications round differently, but the same way every time on the same processor.
 @njit(cache=True, fastmath={"contract"})
-def look_closely(
-    levels: tuple[Level, ...],
-    ceilings: tuple[Array32, ...],
-    spacing: float,
-    extent: Extent,
-    tree: Hierarchy,
-    world_from_body: Array,
-    position: Array,
-    columns: int,
-    pixels: Longs,
-    share: int,
-    origins: Array32,
-    directions: Array32,
-    pixel_angles: Array32,
-    distance: Array,
-    triangle_of_pixel: Ints,
-    level_of_pixel: NDArray[np.int8],
-    weights: Array32,
-    near: Array,
-    triangle_of_ray: Ints,
-    weights_of_ray: Array32,
-    level_of_ray: NDArray[np.int8],
+def _gather_neighbours(
+    hits: Hits, pixel: int, columns: int, ranges: Array, levels: Longs
+) -> tuple[int, bool, bool, float]:
+    """Places where a pixel and the eight around it meet the ground, in order of range, and the level of each.
+
+    Returns how many, whether one of the pixels sees the sky, whether one sees an object, and the greatest range.
+    """
+    row = pixel // columns
+    column = pixel - row * columns
+    count = 0
+    sky = False
+    objects = False
+    farthest = 0.0
+    for i in range(max(row - 1, 0), min(row + 2, hits.distance.size // columns)):
+        for j in range(max(column - 1, 0), min(column + 2, columns)):
+            n = i * columns + j
+            distance = hits.distance[n]
+            if distance == math.inf:
+                sky = True
+                continue
+            farthest = max(farthest, distance)
+            if hits.triangle[n] >= 0:
+                objects = True
+                continue
+            position = count
+            while position > 0 and ranges[position - 1] > distance:
+                ranges[position] = ranges[position - 1]
+                levels[position] = levels[position - 1]
+                position -= 1
+            ranges[position] = distance
+            levels[position] = hits.level[n]
+            count += 1
+    return count, sky, objects, farthest
+
+
+@njit(cache=True, fastmath={"contract"})
+def _middle_ray(pose: Pose, rays: Rays, first: int, last: int, origin: Array32, direction: Array32) -> Ray:
+    """The ray through a pixel's middle, which lies between its first ray and its last; room for it in body axes."""
+    for axis in range(3):
+        origin[0, axis] = 0.5 * (rays.origins[first, axis] + rays.origins[last, axis])
+        direction[0, axis] = 0.5 * (rays.directions[first, axis] + rays.directions[last, axis])
+    return world_ray(pose, Rays(origin, direction, rays.pixel_angles), 0)
+
+
+@njit(cache=True, inline="always")
+def _first_stretch(
+    ground: Ground, ray: Ray, ranges: Array, levels: Longs, sky: bool, farthest: float
+) -> tuple[float, int]:
+    """Distance at which a ray meets the ground where pixels around have met it, infinite for none, and the level.
+
+    Places met on one level are one stretch; it begins where the stretch before has ended. Ground beyond `farthest` is
+    hidden by an object.
+    """
+    t = math.inf
+    level = 0
+    end = math.inf
+    c = 0
+    while c < ranges.size and t == math.inf:
+        level = levels[c]
+        start = max(min(AHEAD * ranges[c], end), way_in(ground.extent, ray))
+        if start >= farthest:
+            break
+        while c + 1 < ranges.size and levels[c + 1] == level:
+            c += 1
+        end = (TO_HORIZON if sky and c + 1 == ranges.size else BEYOND) * ranges[c]
+        end = min(end, way_out(ground.extent, ray))
+        t = cross_ground(ground_level(ground, max(level, 0)), ray, start, min(end, farthest))
+        c += 1
+    return t, level
+
+
+@njit(cache=True, fastmath={"contract"})
+def trace_subpixel_rays(
+    ground: Ground, pose: Pose, tree: Hierarchy, columns: int, pixels: Longs, rays: Rays, seen: Hits, hits: Hits
 ) -> None:
-    """What every ray within some pixels meets, among what these pixels and the eight around each see.
+    """Trace the rays within some pixels, among what these pixels and the eight around each see.
 
     Triangles are sought among those that a beam around the pixel may meet, and the ground where a pixel around has met
     it, on the level on which it did, so that neighbouring pixels show one ground.
 
     Parameters
     ----------
-    levels, ceilings, spacing, extent, world_from_body, position
-        As for `look`.
-    tree
-        Triangles that stand on the ground, and their hierarchy.
-    columns
-        Columns of the picture.
-    pixels, share
-        Numbers of the pixels, and how many rays each has.
-    origins, directions, pixel_angles
-        The rays in body axes, shape (pixels * share, 3), and the angle that the pixel of each takes.
-    distance, triangle_of_pixel, level_of_pixel, weights
-        What the picture's pixels meet, from `look`.
-    near, triangle_of_ray, weights_of_ray, level_of_ray
-        The same of the rays: outputs.
+    ground, pose, tree
+        As for `trace_primary_rays`.
+    columns, pixels
+        Columns of the picture, and numbers of the pixels.
+    rays
+        As many of each pixel, one pixel after the other.
+    seen
+        What the picture's pixels meet.
+    hits
+        Output: what the rays meet.
     """
-    inverse_spacing = 1.0 / spacing
-    rows = distance.size // columns
+    share = rays.directions.shape[0] // max(pixels.size, 1)
     ranges = np.empty(9)
-    found = np.empty(9, dtype=np.int8)
+    levels = np.empty(9, dtype=np.int64)
     listed = np.empty(MOST_LISTED, dtype=np.int64)
-    middle_origin = np.empty((1, 3))
-    middle_direction = np.empty((1, 3))
+    origin, direction = np.empty((1, 3), dtype=np.float32), np.empty((1, 3), dtype=np.float32)
     for k in range(pixels.size):
         pixel = pixels[k]
-        row = pixel // columns
-        column = pixel - row * columns
-        count = 0
-        sky = False
-        things = False
-        farthest = 0.0
-        for i in range(max(row - 1, 0), min(row + 2, rows)):
-            for j in range(max(column - 1, 0), min(column + 2, columns)):
-                n = i * columns + j
-                if distance[n] < math.inf:
-                    farthest = max(farthest, distance[n])
-                if distance[n] == math.inf:
-                    sky = True
-                elif triangle_of_pixel[n] >= 0:
-                    things = True
-                else:
-                    # kept in order of range
-                    place = count
-                    while place > 0 and ranges[place - 1] > distance[n]:
-                        ranges[place] = ranges[place - 1]
-                        found[place] = found[place - 1]
-                        place -= 1
-                    ranges[place] = distance[n]
-                    found[place] = level_of_pixel[n]
-                    count += 1
+        count, sky, objects, farthest = _gather_neighbours(seen, pixel, columns, ranges, levels)
         in_list = -1
-        if things:
-            # the pixel's middle lies between its first ray and its last
-            a = k * share
-            b = a + share - 1
-            for axis in range(3):
-                middle_origin[0, axis] = 0.5 * (origins[a, axis] + origins[b, axis])
-                middle_direction[0, axis] = 0.5 * (directions[a, axis] + directions[b, axis])
-            x0, y0, z0, dx, dy, dz = world_ray(world_from_body, position, middle_origin, middle_direction, 0)
-            in_list = in_beam(
-                tree,
-                x0,
-                y0,
-                z0,
-                dx,
-                dy,
-                dz,
-                BEAM_PX * pixel_angles[a],
-                math.inf if sky else BEYOND * farthest,
-                listed,
-            )
-        for n in range(k * share, (k + 1) * share):
-            x0, y0, z0, dx, dy, dz = world_ray(world_from_body, position, origins, directions, n)
-            t_thing = math.inf
-            triangle = -1
-            second = 0.0
-            third = 0.0
-            if in_list >= 0:
-                t_thing, triangle, second, third = _nearest_listed(tree, listed, in_list, x0, y0, z0, dx, dy, dz)
-            t = math.inf
-            level = 0
-            end = math.inf
-            c = 0
-            while c < count and t == math.inf:
-                # places met on one level are one stretch; it begins where the stretch before has ended
-                level = found[c]
-                start = max(min(AHEAD * ranges[c], end), way_in(extent, z0, dz))
-                # ground behind a thing is not looked for
-                if start >= t_thing:
-                    break
-                while c + 1 < count and found[c + 1] == level:
-                    c += 1
-                end = (TO_HORIZON if sky and c + 1 == count else BEYOND) * ranges[c]
-                end = min(end, way_out(extent, x0, y0, dx, dy))
-                smooth = max(level, 0)
-                scale = inverse_spacing / (1 << smooth)
-                last = min(end, t_thing)
-                t = cross_ground(levels[smooth], ceilings[smooth], scale, x0, y0, z0, dx, dy, dz, start, last)
-                c += 1
-            if in_list < 0 and things:
-                t_thing, triangle, second, third = nearest_hit(tree, x0, y0, z0, dx, dy, dz, t)
-            if t_thing < t:
-                t = t_thing
-            else:
-                triangle = -1
-            if t == math.inf and count > 0 and not sky:
-                # grazes the ground without dipping below it
-                t = ranges[count - 1]
-            elif t == math.inf and not sky:
-                # a sliver of ground that no pixel around sees
-                t = distance[pixel]
-                triangle = triangle_of_pixel[pixel]
-                level = level_of_pixel[pixel]
-                if triangle >= 0:
-                    second = weights[pixel, 0]
-                    third = weights[pixel, 1]
-            near[n] = t
-            triangle_of_ray[n] = triangle
-            level_of_ray[n] = level
-            if triangle >= 0:
-                weights_of_ray[n, 0] = second
-                weights_of_ray[n, 1] = third
+        first, last = k * share, (k + 1) * share
+        if objects:
+            middle = _middle_ray(pose, rays, first, last - 1, origin, direction)
+            spread = BEAM_PX * rays.pixel_angles[first]
+            in_list = list_in_beam(tree, middle, spread, math.inf if sky else BEYOND * farthest, listed)
+        for n in range(first, last):
+            ray = world_ray(pose, rays, n)
+            hit = TriangleHit(math.inf, -1, 0.0, 0.0)
+            for m in range(in_list):
+                hit = nearer_hit(hit, tree[0], listed[m], ray, 0.0)
+            t, level = _first_stretch(ground, ray, ranges[:count], levels[:count], sky, hit.distance)
+            if in_list < 0 and objects:
+                hit = nearest_hit(tree, ray, t)
+            if not hit.distance < t:
+                hit = TriangleHit(t, -1, 0.0, 0.0)
+            if hit.distance == math.inf and not sky:
+                if count > 0:
+                    # grazes the ground without dipping below it
+                    hit = TriangleHit(ranges[count - 1], -1, 0.0, 0.0)
+                else:
+                    # a sliver of ground that no pixel around sees
+                    level = int(seen.level[pixel])
+                    triangle, second, third = np.int64(seen.triangle[pixel]), 0.0, 0.0
+                    if triangle >= 0:
+                        second, third = float(seen.weights[pixel, 0]), float(seen.weights[pixel, 1])
+                    hit = TriangleHit(seen.distance[pixel], triangle, second, third)
+            hits.distance[n] = hit.distance
+            hits.triangle[n] = hit.triangle
+            hits.level[n] = level
+            if hit.triangle >= 0:
+                hits.weights[n, 0] = hit.second
+                hits.weights[n, 1] = hit.third

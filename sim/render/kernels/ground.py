@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from marsyard.sim.terrain.kernels import CEILING_BLOCK, Array, Level, sample
+from marsyard.sim.render.kernels.structs import Extent, GroundLevel, Ray
+from marsyard.sim.terrain.kernels import CEILING_BLOCK, Level, sample
 
-Array32 = NDArray[np.float32]
-#: Least and greatest x, least and greatest y, metres.
-Bounds = tuple[float, float, float, float]
-#: Where the ground that is drawn ends: these, and greatest z.
-Extent = tuple[float, float, float, float, float]
 #: Shortest step along a ray that looks for the ground, as a share of the distance: a quarter of what a navcam's pixel
 #: takes in at 10 deg, for crests hide what is behind them however little they stand out.
 FINEST_STEP = 0.00125
@@ -28,50 +24,33 @@ CUBIC_LOOKS, MOST_LOOKS = 3, 40
 CLOSING = -1e-3
 
 
-@njit(cache=True, inline="always")
-def turned(rotation: Array, vectors: Array | Array32, n: int) -> tuple[float, float, float]:
-    """The n-th of some vectors in the axes that a rotation matrix turns it to."""
-    x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
-    return (
-        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
-        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
-        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
-    )
+class Clearance(NamedTuple):
+    """How far a ray is above the ground at a distance along it, metres, and how fast that changes with the distance."""
+
+    t: float
+    height: float
+    rate: float
 
 
 @njit(cache=True, inline="always")
-def world_ray(
-    world_from_body: Array, position: Array, origins: Array | Array32, directions: Array | Array32, n: int
-) -> tuple[float, float, float, float, float, float]:
-    """Origin and direction in world axes of the n-th of some rays, whose origins are relative to `position`."""
-    dx, dy, dz = turned(world_from_body, directions, n)
-    x, y, z = turned(world_from_body, origins, n)
-    return position[0] + x, position[1] + y, position[2] + z, dx, dy, dz
+def clearance_at(level: GroundLevel, ray: Ray, t: float) -> Clearance:
+    """Clearance of a ray over a level of the ground at a distance."""
+    height, slope_x, slope_y, _albedo = sample(level.field, level.per_metre, ray.x + t * ray.dx, ray.y + t * ray.dy)
+    return Clearance(t, ray.z + t * ray.dz - height, ray.dz - slope_x * ray.dx - slope_y * ray.dy)
 
 
 @njit(cache=True)
-def pass_over(
-    ceiling: Array32,
-    inverse_spacing: float,
-    x0: float,
-    y0: float,
-    z0: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    start: float,
-    farthest: float,
-) -> float:
-    """Distance at which a ray comes into the first block of the ground that it may not be clear of, from a distance on.
+def skip_empty_blocks(level: GroundLevel, ray: Ray, start: float, farthest: float) -> float:
+    """Distance at which a ray enters the first block of the ground that it may not be clear of, from `start` on.
 
-    At least `farthest` where it is clear of all on its way. The blocks are those of `Surface.ceilings`; they are gone
-    through one by one (Amanatides & Woo 1987).
+    At least `farthest` where it is clear of all on its way. The blocks are those of `Surface.ceilings`, traversed one
+    by one (Amanatides & Woo 1987).
     """
-    per_metre = inverse_spacing / CEILING_BLOCK
-    mask = ceiling.shape[0] - 1
-    gx, gy = (x0 + start * dx) * per_metre, (y0 + start * dy) * per_metre
+    per_metre = level.per_metre / CEILING_BLOCK
+    mask = level.ceiling.shape[0] - 1
+    gx, gy = (ray.x + start * ray.dx) * per_metre, (ray.y + start * ray.dy) * per_metre
     j, i = math.floor(gx), math.floor(gy)
-    across, along = dx * per_metre, dy * per_metre
+    across, along = ray.dx * per_metre, ray.dy * per_metre
     step_x = 1.0 / abs(across) if across != 0.0 else math.inf
     step_y = 1.0 / abs(along) if along != 0.0 else math.inf
     next_x = start + ((j + 1 - gx) if across > 0.0 else (gx - j)) * step_x if across != 0.0 else math.inf
@@ -80,56 +59,39 @@ def pass_over(
     t = start
     while t < farthest:
         out = min(next_x, next_y)
-        lowest = z0 + (out if dz < 0.0 else t) * dz
-        if lowest <= ceiling[i & mask, j & mask]:
+        lowest = ray.z + (out if ray.dz < 0.0 else t) * ray.dz
+        if lowest <= level.ceiling[i & mask, j & mask]:
             break
         t = out
-        # chosen, not branched to: which side a ray leaves a block by cannot be foretold
-        beside = next_x < next_y
-        j += right if beside else 0
-        i += 0 if beside else up
-        next_x = next_x + step_x if beside else next_x
-        next_y = next_y if beside else next_y + step_y
+        # selections in place of branches: which side a ray leaves a block by cannot be predicted
+        through_side = next_x < next_y
+        j += right if through_side else 0
+        i += 0 if through_side else up
+        next_x = next_x + step_x if through_side else next_x
+        next_y = next_y if through_side else next_y + step_y
     return t
 
 
 @njit(cache=True)
-def _crest_over(
-    field: Level,
-    inverse_spacing: float,
-    x0: float,
-    y0: float,
-    z0: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    near: float,
-    above_near: float,
-    rate_near: float,
-    far: float,
-    above_far: float,
-    rate_far: float,
-) -> tuple[float, float, float]:
-    """A place below a crest between two that are above the ground, its clearance, 0 where there is none, and its rate.
+def find_occluding_crest(level: GroundLevel, ray: Ray, near: Clearance, far: Clearance) -> Clearance:
+    """Bracket a crest between two places above the ground by tangent intersection.
 
-    The ray nears the ground at the first and leaves it at the second. A crest between stands no higher than where the
-    tangents of the clearance meet; while that is below the ground, the place is looked at and takes that side's part.
+    The ray approaches the ground at `near` and leaves it at `far`. A crest between stands no higher than where the
+    tangents of the clearance meet; while that is below the ground, the place is sampled and replaces that side.
+    Returns a place below the crest; its height is 0 where there is none.
     """
     for _ in range(CREST_LOOKS):
-        step = (rate_far * (far - near) - above_far + above_near) / (rate_far - rate_near)
-        if above_near + rate_near * step >= 0.0:
+        step = (far.rate * (far.t - near.t) - far.height + near.height) / (far.rate - near.rate)
+        if near.height + near.rate * step >= 0.0:
             break
-        t = near + step
-        height, slope_x, slope_y, _albedo = sample(field, inverse_spacing, x0 + t * dx, y0 + t * dy)
-        clearance = z0 + t * dz - height
-        rate = dz - slope_x * dx - slope_y * dy
-        if clearance < 0.0:
-            return t, clearance, rate
-        if rate < 0.0:
-            near, above_near, rate_near = t, clearance, rate
+        here = clearance_at(level, ray, near.t + step)
+        if here.height < 0.0:
+            return here
+        if here.rate < 0.0:
+            near = here
         else:
-            far, above_far, rate_far = t, clearance, rate
-    return far, 0.0, 0.0
+            far = here
+    return Clearance(far.t, 0.0, 0.0)
 
 
 @njit(cache=True, inline="always")
@@ -149,143 +111,109 @@ def _down_through(above: float, rate_above: float, below: float, rate_below: flo
 
 
 @njit(cache=True)
-def cross_ground(
-    field: Level,
-    ceiling: Array32,
-    inverse_spacing: float,
-    x0: float,
-    y0: float,
-    z0: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    start: float,
-    farthest: float,
-) -> float:
+def _close_in(level: GroundLevel, ray: Ray, above: Clearance, below: Clearance) -> float:
+    """Distance of the crossing between a place above the ground and one below it.
+
+    The root of the cubic of clearance and rate at both ends, then false position (Illinois), to a thousandth of a
+    sample; a final step of Newton's method needs no further sample.
+    """
+    spacing = 1.0 / level.per_metre
+    before, above_height, above_rate = above.t, above.height, above.rate
+    t, below_height, below_rate = below.t, below.height, below.rate
+    middle = below
+    for look in range(MOST_LOOKS):
+        share = above_height / (above_height - below_height)
+        kept = 0.5
+        if look < CUBIC_LOOKS:
+            share = _down_through(
+                above_height, above_rate * (t - before), below_height, below_rate * (t - before), share
+            )
+            kept = 1.0
+        middle = clearance_at(level, ray, before + (t - before) * share)
+        if abs(middle.height) < 1e-3 * spacing * max(-ray.dz, 1e-3) or t - before <= 0.01 * spacing:
+            break
+        if middle.height < 0.0:
+            t, below_height, below_rate = middle.t, middle.height, middle.rate
+            above_height *= kept
+        else:
+            before, above_height, above_rate = middle.t, middle.height, middle.rate
+            below_height *= kept
+    polished = middle.t - middle.height / middle.rate if middle.rate < CLOSING else middle.t
+    return polished if before < polished < t else middle.t
+
+
+@njit(cache=True)
+def cross_ground(level: GroundLevel, ray: Ray, start: float, farthest: float) -> float:
     """Distance at which a ray first dips below the ground between two distances; infinite where it does not.
 
-    The ray is followed by steps of a sample, longer far away; blocks of ground that it is clear of by their ceilings
-    are passed over, or, where no ceilings are known (a single one), longer steps are taken high above the ground. Where
-    it nears the ground at the beginning of a step and leaves it at the end, the crest between is looked for. The
-    crossing is closed in on where the cubic of clearance and closing at both ends is 0, then by false position
-    (Illinois), to a thousandth of a sample; a step of Newton's method, which needs no further look, ends it.
+    The ray is followed by steps of a sample, longer far away. Blocks of ground that it is clear of by their ceilings
+    are skipped, or, where no ceilings are known (a single one), longer steps are taken high above the ground. Where it
+    approaches the ground at the beginning of a step and leaves it at the end, a crest between is searched for.
     """
     if start >= farthest:
         return math.inf
-    spacing = 1.0 / inverse_spacing
-    bounded = ceiling.shape[0] > 1
+    spacing = 1.0 / level.per_metre
+    bounded = level.ceiling.shape[0] > 1
     t = start
     if bounded:
-        t = pass_over(ceiling, inverse_spacing, x0, y0, z0, dx, dy, dz, start, farthest)
+        t = skip_empty_blocks(level, ray, start, farthest)
         if t >= farthest:
             return math.inf
-    before = t
-    above = 0.0
-    below = 0.0
-    rate_before = 0.0
-    rate = 0.0
-    leapt = True
+    before = Clearance(t, 0.0, 0.0)
+    skipped = True
     while True:
-        height, slope_x, slope_y, _albedo = sample(field, inverse_spacing, x0 + t * dx, y0 + t * dy)
-        below = z0 + t * dz - height
-        rate = dz - slope_x * dx - slope_y * dy
-        if below < 0.0:
+        here = clearance_at(level, ray, t)
+        if here.height < 0.0:
             break
-        if not leapt and rate_before < 0.0 and rate > 0.0:
-            crest, under, rate_under = _crest_over(
-                field, inverse_spacing, x0, y0, z0, dx, dy, dz, before, above, rate_before, t, below, rate
-            )
-            if under < 0.0:
-                t = crest
-                below = under
-                rate = rate_under
+        if not skipped and before.rate < 0.0 and here.rate > 0.0:
+            crest = find_occluding_crest(level, ray, before, here)
+            if crest.height < 0.0:
+                here = crest
                 break
         if t >= farthest:
             return math.inf
-        before = t
-        above = below
-        rate_before = rate
-        leapt = False
+        before = here
+        skipped = False
         step = max(spacing, FINEST_STEP * t)
         if not bounded:
-            step = max(step, 1.5 * above)
-        elif above > spacing:
-            clear = pass_over(ceiling, inverse_spacing, x0, y0, z0, dx, dy, dz, t, farthest)
+            step = max(step, 1.5 * here.height)
+        elif here.height > spacing:
+            clear = skip_empty_blocks(level, ray, t, farthest)
             if clear >= farthest:
                 return math.inf
             if clear > t + step:
                 step = clear - t
-                leapt = True
+                skipped = True
         t = min(t + step, farthest)
-    if t == before:
-        return math.inf
-    middle = t
-    clearance = below
-    closing = 0.0
-    for look in range(MOST_LOOKS):
-        share = above / (above - below)
-        kept = 0.5
-        if look < CUBIC_LOOKS:
-            share = _down_through(above, rate_before * (t - before), below, rate * (t - before), share)
-            kept = 1.0
-        middle = before + (t - before) * share
-        height, slope_x, slope_y, _albedo = sample(field, inverse_spacing, x0 + middle * dx, y0 + middle * dy)
-        clearance = z0 + middle * dz - height
-        closing = dz - slope_x * dx - slope_y * dy
-        if abs(clearance) < 1e-3 * spacing * max(-dz, 1e-3) or t - before <= 0.01 * spacing:
-            break
-        if clearance < 0.0:
-            t = middle
-            below = clearance
-            rate = closing
-            above *= kept
-        else:
-            before = middle
-            above = clearance
-            rate_before = closing
-            below *= kept
-    polished = middle - clearance / closing if closing < CLOSING else middle
-    return polished if before < polished < t else middle
+    return math.inf if here.t == before.t else _close_in(level, ray, before, here)
 
 
 @njit(cache=True, inline="always")
-def way_out(extent: Extent, x: float, y: float, dx: float, dy: float) -> float:
+def way_out(extent: Extent, ray: Ray) -> float:
     """Distance along a ray to where it leaves the ground's extent, in which it begins."""
-    along_x = ((extent[1] if dx > 0.0 else extent[0]) - x) / dx if dx != 0.0 else math.inf
-    along_y = ((extent[3] if dy > 0.0 else extent[2]) - y) / dy if dy != 0.0 else math.inf
+    along_x = ((extent[1] if ray.dx > 0.0 else extent[0]) - ray.x) / ray.dx if ray.dx != 0.0 else math.inf
+    along_y = ((extent[3] if ray.dy > 0.0 else extent[2]) - ray.y) / ray.dy if ray.dy != 0.0 else math.inf
     return min(along_x, along_y)
 
 
 @njit(cache=True, inline="always")
-def way_in(extent: Extent, z: float, dz: float) -> float:
-    """Distance along a ray from which it may meet the ground: where it comes below all that stands highest."""
-    if z <= extent[4]:
+def way_in(extent: Extent, ray: Ray) -> float:
+    """Distance along a ray from which it may meet the ground: where it comes below the highest ground."""
+    if ray.z <= extent[4]:
         return 0.0
-    return (extent[4] - z) / dz if dz < 0.0 else math.inf
+    return (extent[4] - ray.z) / ray.dz if ray.dz < 0.0 else math.inf
 
 
 @njit(cache=True)
-def first_ground(
-    field: Level,
-    ceiling: Array32,
-    inverse_spacing: float,
-    extent: Extent,
-    x0: float,
-    y0: float,
-    z0: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    guess: float,
-) -> float:
+def first_ground(level: GroundLevel, extent: Extent, ray: Ray, guess: float) -> float:
     """Distance at which a flat ray first dips below the ground, from four fifths of the way to a guess to past it.
 
     The mesh that gives the guess does not hold every crest. The guess itself where the ray does not dip within the
     extent.
     """
-    start = max(0.8 * guess, way_in(extent, z0, dz))
-    farthest = min(1.25 * guess + 4.0 / inverse_spacing, way_out(extent, x0, y0, dx, dy))
-    met = cross_ground(field, ceiling, inverse_spacing, x0, y0, z0, dx, dy, dz, start, farthest)
+    start = max(0.8 * guess, way_in(extent, ray))
+    farthest = min(1.25 * guess + 4.0 / level.per_metre, way_out(extent, ray))
+    met = cross_ground(level, ray, start, farthest)
     return met if met < math.inf else guess
 
 
@@ -329,20 +257,3 @@ def greatest_rises(field: Level, most: float, along_x: float, along_y: float) ->
             if rise_x * along_x + rise_y * along_y > most:
                 return math.inf, math.inf
     return rise_x, rise_y
-
-
-__all__ = [
-    "Array",
-    "Array32",
-    "Bounds",
-    "Extent",
-    "Level",
-    "cross_ground",
-    "first_ground",
-    "greatest_rises",
-    "height_range",
-    "turned",
-    "way_in",
-    "way_out",
-    "world_ray",
-]

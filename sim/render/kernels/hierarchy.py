@@ -10,22 +10,18 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from marsyard.sim.render.kernels.intersection import hit_triangle
+from marsyard.sim.render.kernels.structs import Array32, Longs, Ray
+from marsyard.sim.render.kernels.triangles import TriangleHit, nearer_hit
 from marsyard.sim.terrain.kernels import Array
 
-Longs = NDArray[np.int64]
-Boxes = NDArray[np.float32]
 #: Triangles, their order along the curve, and the boxes of the tree's nodes: node k has the children 2 k + 1, 2 k + 2.
-Hierarchy = tuple[Array, Longs, Boxes]
+Hierarchy = tuple[Array, Longs, Array32]
 #: A side of a frustum: its outward normal, where it lies along that, and which numbers of a box make its innermost
 #: corner.
 Plane = tuple[float, float, float, float, int, int, int]
 #: Triangles of a leaf.
 LEAF = 4
-#: Deep enough for 2**40 triangles.
-_STACK = 64
 
 
 @njit(cache=True)
@@ -62,8 +58,8 @@ def morton_codes(triangles: Array) -> Longs:
 
 
 @njit(cache=True)
-def node_boxes(triangles: Array, order: Longs) -> Boxes:
-    """Boxes (low x, y, z, high x, y, z) of a complete tree over the triangles in this order."""
+def node_boxes(triangles: Array, order: Longs) -> Array32:
+    """Array32 (low x, y, z, high x, y, z) of a complete tree over the triangles in this order."""
     leaves = 1
     while leaves * LEAF < order.size:
         leaves *= 2
@@ -94,79 +90,55 @@ def node_boxes(triangles: Array, order: Longs) -> Boxes:
 
 
 @njit(cache=True, inline="always")
-def _entry(boxes: Boxes, node: int, x: float, y: float, z: float, ix: float, iy: float, iz: float) -> float:
-    """Distance at which a ray enters a node's box, 0 from within; infinite where it does not."""
-    a = (boxes[node, 0] - x) * ix
-    b = (boxes[node, 3] - x) * ix
-    near = min(a, b)
-    far = max(a, b)
-    a = (boxes[node, 1] - y) * iy
-    b = (boxes[node, 4] - y) * iy
-    near = max(near, min(a, b))
-    far = min(far, max(a, b))
-    a = (boxes[node, 2] - z) * iz
-    b = (boxes[node, 5] - z) * iz
-    near = max(max(near, min(a, b)), 0.0)
-    far = min(far, max(a, b))
-    return near if far >= near else math.inf
-
-
-@njit(cache=True)
-def nearest_hit(
-    tree: Hierarchy, x: float, y: float, z: float, dx: float, dy: float, dz: float, farthest: float
-) -> tuple[float, int, float, float]:
-    """Distance to the nearest triangle that a ray meets, its number, and the weights of its second and third corner.
-
-    The number is -1 where no triangle is nearer than `farthest`, and the distance then that one.
-    """
-    triangles, order, boxes = tree
-    best = farthest
-    best_triangle = -1
-    best_second = 0.0
-    best_third = 0.0
-    if order.size == 0:
-        return best, best_triangle, best_second, best_third
-    ix = 1.0 / (dx if abs(dx) > 1e-12 else 1e-12)
-    iy = 1.0 / (dy if abs(dy) > 1e-12 else 1e-12)
-    iz = 1.0 / (dz if abs(dz) > 1e-12 else 1e-12)
-    first_leaf = boxes.shape[0] // 2
-    stack = np.empty(_STACK, dtype=np.int64)
-    entries = np.empty(_STACK)
-    stack[0] = 0
-    entries[0] = _entry(boxes, 0, x, y, z, ix, iy, iz)
-    waiting = 1
-    while waiting > 0:
-        waiting -= 1
-        if entries[waiting] >= best:
-            continue
-        node = stack[waiting]
-        if node < first_leaf:
-            left = 2 * node + 1
-            to_left = _entry(boxes, left, x, y, z, ix, iy, iz)
-            to_right = _entry(boxes, left + 1, x, y, z, ix, iy, iz)
-            # the nearer child is looked at first
-            near_left = to_left <= to_right
-            for turn in range(2):
-                is_left = near_left == (turn == 1)
-                entry = to_left if is_left else to_right
-                if entry < best:
-                    stack[waiting] = left if is_left else left + 1
-                    entries[waiting] = entry
-                    waiting += 1
-            continue
-        start = (node - first_leaf) * LEAF
-        for k in range(start, min(start + LEAF, order.size)):
-            t, second, third = hit_triangle(triangles, order[k], x, y, z, dx, dy, dz)
-            if 0.0 < t < best and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
-                best = t
-                best_triangle = order[k]
-                best_second = second
-                best_third = third
-    return best, best_triangle, best_second, best_third
+def _next_node(node: int) -> int:
+    """The node after this one and all below it, depth first; 0 after the last."""
+    while node > 0 and node % 2 == 0:
+        node = (node - 1) // 2
+    return node + 1 if node > 0 else 0
 
 
 @njit(cache=True, inline="always")
-def _box_outside(boxes: Boxes, node: int, plane: Plane) -> bool:
+def _entry(boxes: Array32, node: int, ray: Ray, inverse: tuple[float, float, float]) -> float:
+    """Distance at which a ray enters a box, 0 from within, infinite where it does not."""
+    a, b = (boxes[node, 0] - ray.x) * inverse[0], (boxes[node, 3] - ray.x) * inverse[0]
+    near, far = min(a, b), max(a, b)
+    a, b = (boxes[node, 1] - ray.y) * inverse[1], (boxes[node, 4] - ray.y) * inverse[1]
+    near, far = max(near, min(a, b)), min(far, max(a, b))
+    a, b = (boxes[node, 2] - ray.z) * inverse[2], (boxes[node, 5] - ray.z) * inverse[2]
+    near, far = max(max(near, min(a, b)), 0.0), min(far, max(a, b))
+    return near if far >= near else math.inf
+
+
+@njit(cache=True, inline="always")
+def _inverse(component: float) -> float:
+    return 1.0 / (component if abs(component) > 1e-12 else 1e-12)
+
+
+@njit(cache=True)
+def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
+    """The nearest triangle that a ray meets; `farthest` and the number -1 where none is nearer than that."""
+    triangles, order, boxes = tree
+    best = TriangleHit(farthest, -1, 0.0, 0.0)
+    if order.size == 0:
+        return best
+    inverse = (_inverse(ray.dx), _inverse(ray.dy), _inverse(ray.dz))
+    first_leaf = boxes.shape[0] // 2
+    node = 0
+    while True:
+        if _entry(boxes, node, ray, inverse) < best.distance:
+            if node < first_leaf:
+                node = 2 * node + 1
+                continue
+            start = (node - first_leaf) * LEAF
+            for k in range(start, min(start + LEAF, order.size)):
+                best = nearer_hit(best, triangles, order[k], ray, 0.0)
+        node = _next_node(node)
+        if node == 0:
+            return best
+
+
+@njit(cache=True, inline="always")
+def _box_outside(boxes: Array32, node: int, plane: Plane) -> bool:
     """Whether a node's box lies wholly outside a side of a frustum."""
     nx, ny, nz, offset, ix, iy, iz = plane
     return bool(nx * boxes[node, ix] + ny * boxes[node, iy] + nz * boxes[node, iz] > offset)
@@ -183,13 +155,13 @@ def _triangle_outside(triangles: Array, n: int, plane: Plane) -> bool:
 
 
 @njit(cache=True, inline="always")
-def _plane(x: float, y: float, z: float, nx: float, ny: float, nz: float, beyond: float) -> Plane:
-    """The plane across a direction, so far beyond a place along it."""
+def _plane(ray: Ray, nx: float, ny: float, nz: float, beyond: float) -> Plane:
+    """The plane across a direction, so far beyond a ray's origin along it."""
     return (
         nx,
         ny,
         nz,
-        nx * x + ny * y + nz * z + beyond,
+        nx * ray.x + ny * ray.y + nz * ray.z + beyond,
         0 if nx > 0.0 else 3,
         1 if ny > 0.0 else 4,
         2 if nz > 0.0 else 5,
@@ -197,37 +169,27 @@ def _plane(x: float, y: float, z: float, nx: float, ny: float, nz: float, beyond
 
 
 @njit(cache=True)
-def in_beam(
-    tree: Hierarchy,
-    x: float,
-    y: float,
-    z: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    spread: float,
-    farthest: float,
-    found: Longs,
-) -> int:
-    """Lists the triangles that rays of one origin may meet whose directions differ from this one by up to `spread`.
+def list_in_beam(tree: Hierarchy, ray: Ray, spread: float, farthest: float, listed: Longs) -> int:
+    """List the triangles that rays from a ray's origin may meet whose directions differ from its by up to `spread`.
 
-    Returns how many there are, -1 where they are more than `found` holds.
+    Returns how many there are, -1 where they are more than `listed` holds.
     """
     triangles, order, boxes = tree
     if order.size == 0:
         return 0
     # a frustum around the beam: two directions across it, four sides and the far one
+    dx, dy, dz = ray.dx, ray.dy, ray.dz
     rx, ry, rz = (dy, -dx, 0.0) if abs(dz) < 0.9 else (0.0, dz, -dy)
     length = math.sqrt(rx * rx + ry * ry + rz * rz)
     rx, ry, rz = rx / length, ry / length, rz / length
     ux, uy, uz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
     widening = math.tan(spread)
     sx, sy, sz = widening * dx, widening * dy, widening * dz
-    right = _plane(x, y, z, rx - sx, ry - sy, rz - sz, 0.0)
-    left = _plane(x, y, z, -rx - sx, -ry - sy, -rz - sz, 0.0)
-    above = _plane(x, y, z, ux - sx, uy - sy, uz - sz, 0.0)
-    below = _plane(x, y, z, -ux - sx, -uy - sy, -uz - sz, 0.0)
-    end = _plane(x, y, z, dx, dy, dz, farthest)
+    right = _plane(ray, rx - sx, ry - sy, rz - sz, 0.0)
+    left = _plane(ray, -rx - sx, -ry - sy, -rz - sz, 0.0)
+    above = _plane(ray, ux - sx, uy - sy, uz - sz, 0.0)
+    below = _plane(ray, -ux - sx, -uy - sy, -uz - sz, 0.0)
+    end = _plane(ray, dx, dy, dz, farthest)
     first_leaf = boxes.shape[0] // 2
     count = 0
     node = 0
@@ -246,20 +208,18 @@ def in_beam(
             start = (node - first_leaf) * LEAF
             for k in range(start, min(start + LEAF, order.size)):
                 n = order[k]
-                beside = (
+                outside = (
                     _triangle_outside(triangles, n, right)
                     or _triangle_outside(triangles, n, left)
                     or _triangle_outside(triangles, n, above)
                     or _triangle_outside(triangles, n, below)
                 )
-                if beside:
+                if outside:
                     continue
-                if count == found.size:
+                if count == listed.size:
                     return -1
-                found[count] = n
+                listed[count] = n
                 count += 1
-        while node > 0 and node % 2 == 0:
-            node = (node - 1) // 2
+        node = _next_node(node)
         if node == 0:
             return count
-        node += 1

@@ -8,9 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from marsyard.sim.render.kernels.structs import Longs
 from marsyard.sim.terrain.kernels import Array, Level, sample
-
-Longs = NDArray[np.int64]
 
 
 @njit(cache=True)

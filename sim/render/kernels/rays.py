@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from marsyard.sim.render.kernels.ground import Array32
+from marsyard.sim.render.kernels.structs import Array32
 from marsyard.sim.terrain.kernels import Array
 
 

@@ -3,42 +3,42 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from marsyard.sim.render.kernels.casters import Casters, sun_hidden
-from marsyard.sim.render.kernels.sight import FLATTEST, Ints
+from marsyard.sim.render.kernels.primary import FLATTEST
 from marsyard.sim.render.kernels.sky import sky_brightness
-from marsyard.sim.render.kernels.strips import (
-    ROW,
-    STRIP,
+from marsyard.sim.render.kernels.strips import ROW, STRIP, Matrix, Near, fetch_levels, no_cells, numbers, spline, times
+from marsyard.sim.render.kernels.structs import (
     Array32,
-    Matrix,
-    Near,
-    fetch_levels,
-    no_cells,
-    numbers,
-    spline,
-    times,
+    Flags,
+    Footprint,
+    Ground,
+    GroundShadow,
+    Hits,
+    Ints,
+    Light,
+    Longs,
+    Materials,
+    Picture,
+    Pose,
+    Rays,
 )
 from marsyard.sim.render.kernels.sun import (
     UNSURE,
-    Shadow,
     cloud_cover,
     disc_above,
     disc_overlap,
+    penumbra,
     shadow_clearance,
-    sun_over_ground,
+    visible_sun_fraction,
 )
 from marsyard.sim.render.kernels.texture import add_texture
-from marsyard.sim.terrain.kernels import Array, Level, sample
+from marsyard.sim.terrain.kernels import Array, sample
 
-#: Cover of a layer of clouds, and its numbers.
-Clouds = tuple[Array32, Array]
-#: Places on the ground that things may shade: a grid, its west and south border, and cells a metre; 0: everywhere.
-Reach = tuple[NDArray[np.bool_], float, float, float]
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
 #: Footprint, in samples, up to which the finest level is taken: the B-spline itself holds nothing finer than this.
@@ -51,19 +51,40 @@ X, Y, Z, DX, DY, DZ, FOOTPRINT, HEIGHT, SLOPE_X, SLOPE_Y, ALBEDO, NX, NY, NZ, CH
 )
 #: Rows of the ground's level: its samples to the metre, the share of the next coarser level, and the terrain there.
 SCALE, BLEND, COARSE_HEIGHT, COARSE_SLOPE_X, COARSE_SLOPE_Y, COARSE_ALBEDO = (ROW * n for n in range(19, 25))
-#: Rows of things alone: places, footprints and changes.
-THING_X, THING_Y, THING_Z, THING_FOOTPRINT, THING_CHANGE = (ROW * n for n in range(25, 30))
+#: Rows of objects alone: places, footprints and changes.
+OBJECT_X, OBJECT_Y, OBJECT_Z, OBJECT_FOOTPRINT, OBJECT_CHANGE = (ROW * n for n in range(25, 30))
 ROWS = 30
 
 
+class Occluders(NamedTuple):
+    """What hides the sun: the ground by its shadow, triangles by their lists, and where the latter may matter."""
+
+    shadow: GroundShadow
+    casters: Casters
+    footprint: Footprint
+
+
+class _Strip(NamedTuple):
+    """What is kept of a strip of pixels: the rows above; the level of the ground that each sees; numbers of the pixels
+    that see the ground, of those whose levels are blended, and of others; which places are hidden from the sun.
+    """
+
+    work: Array
+    level: Longs
+    ground: Longs
+    blended: Longs
+    other: Longs
+    hidden: Flags
+
+
 @njit(cache=True, inline="always")
-def _in_reach(reach: Reach, x: float, y: float) -> bool:
-    """Whether a thing may hide the sun from the ground at this place."""
-    cells, west, south, per_metre = reach
-    if per_metre == 0.0:
+def _in_footprint(footprint: Footprint, x: float, y: float) -> bool:
+    """Whether an object may hide the sun from the ground at this place."""
+    if footprint.per_metre == 0.0:
         return True
-    column = math.floor((x - west) * per_metre)
-    row = math.floor((y - south) * per_metre)
+    cells = footprint.cells
+    column = math.floor((x - footprint.west) * footprint.per_metre)
+    row = math.floor((y - footprint.south) * footprint.per_metre)
     return bool(0 <= row < cells.shape[0] and 0 <= column < cells.shape[1] and cells[row, column])
 
 
@@ -131,7 +152,7 @@ def _face(width: int, work: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _thing(normals: Array, triangle: int, second: float, third: float, k: int, work: Array) -> None:
+def _interpolate_normal(normals: Array, triangle: int, second: float, third: float, k: int, work: Array) -> None:
     """Normal of a triangle at a place with these weights of its second and third corner."""
     rest = 1.0 - second - third
     nx = rest * normals[triangle, 0, 0] + second * normals[triangle, 1, 0] + third * normals[triangle, 2, 0]
@@ -144,15 +165,15 @@ def _thing(normals: Array, triangle: int, second: float, third: float, k: int, w
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _thing_footprint(across: float, k: int, work: Array) -> float:
-    """Footprint on a thing of a pixel that is so wide across its line of sight."""
+def _object_footprint(across: float, k: int, work: Array) -> float:
+    """Footprint on an object of a pixel that is so wide across its line of sight."""
     facing = -(work[DX + k] * work[NX + k] + work[DY + k] * work[NY + k] + work[DZ + k] * work[NZ + k])
     footprint: float = across / math.sqrt(max(facing, 0.05))
     return footprint
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _lean(sun: tuple[float, float, float], width: int, work: Array) -> None:
+def _photometric_angles(sun: tuple[float, float, float], width: int, work: Array) -> None:
     """Cosines of incidence, emission and phase."""
     for k in range(min(width, STRIP)):
         dx, dy, dz = work[DX + k], work[DY + k], work[DZ + k]
@@ -185,256 +206,250 @@ def _keep_normals(width: int, work: Array, normal: Array32) -> None:
         normal[3 * k + 2] = work[NZ + k]
 
 
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _select_levels(ground: Ground, hits: Hits, strip: _Strip) -> tuple[int, int, int]:
+    """Select the level of the ground for each pixel: as far apart as its footprint, blended between the two nearest.
+
+    Returns how many pixels see the ground, how many of them blend levels, and how many do not see the ground.
+    """
+    work = strip.work
+    n_ground = 0
+    n_blended = 0
+    n_other = 0
+    for k in range(hits.distance.size):
+        work[BLEND + k] = 0.0
+        if hits.distance[k] == math.inf or hits.triangle[k] >= 0:
+            strip.other[n_other] = k
+            n_other += 1
+            continue
+        lower = 0
+        if hits.level[k] > 0 or work[FOOTPRINT + k] > SHARP_UNTIL * ground.spacing:
+            suited = math.log2(max(work[FOOTPRINT + k] / (SHARP_UNTIL * ground.spacing), 1.0))
+            fractional = max(suited, float(hits.level[k]))
+            lower = min(int(fractional), ground.top_level)
+            if lower < ground.top_level and fractional > lower:
+                work[BLEND + k] = min(fractional - lower, 1.0)
+                strip.blended[n_blended] = k
+                n_blended += 1
+        strip.level[k] = lower
+        work[SCALE + k] = 1.0 / ground.spacing / (1 << lower)
+        strip.ground[n_ground] = k
+        n_ground += 1
+    return n_ground, n_blended, n_other
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _sample_ground(ground: Ground, n_ground: int, n_blended: int, width: int, strip: _Strip, near: Near) -> None:
+    """Slopes, albedo and normals of the ground that the pixels of a strip see."""
+    work, per_metre = strip.work, 1.0 / ground.spacing
+    if n_ground > 0:
+        x, y = work[X : X + ROW], work[Y : Y + ROW]
+        fetch_levels(ground.levels, per_metre, strip.level, strip.ground, n_ground, x, y, near)
+        _ground(near, width, work[HEIGHT : HEIGHT + 4 * ROW])
+        if n_blended > 0:
+            for m in range(n_blended):
+                strip.level[strip.blended[m]] += 1
+            fetch_levels(ground.levels, per_metre, strip.level, strip.blended, n_blended, x, y, near)
+            _ground(near, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
+        _blend(width, work)
+    _face(width, work)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _sample_objects(
+    materials: Materials, hits: Hits, pixel_angles: Array32, n_other: int, strip: _Strip, body: Ints
+) -> int:
+    """Normals, albedo and footprints where pixels of a strip see objects; the sky has none.
+
+    Returns how many see objects; their numbers become the first of `strip.other`.
+    """
+    work = strip.work
+    seen = 0
+    for m in range(n_other):
+        k = strip.other[m]
+        work[FOOTPRINT + k] = math.inf
+        triangle = hits.triangle[k]
+        if hits.distance[k] == math.inf:
+            body[k] = SKY
+            work[NX + k] = 0.0
+            work[NY + k] = 0.0
+            work[NZ + k] = 0.0
+            continue
+        _interpolate_normal(materials.normals, triangle, hits.weights[k, 0], hits.weights[k, 1], k, work)
+        body[k] = materials.body_of_triangle[triangle]
+        work[ALBEDO + k] = materials.albedo[body[k]]
+        work[OBJECT_X + seen] = work[X + k]
+        work[OBJECT_Y + seen] = work[Y + k]
+        work[OBJECT_Z + seen] = work[Z + k]
+        work[OBJECT_FOOTPRINT + seen] = _object_footprint(hits.distance[k] * pixel_angles[k], k, work)
+        work[OBJECT_CHANGE + seen] = 0.0
+        strip.other[seen] = k
+        seen += 1
+    return seen
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _apply_texture(materials: Materials, width: int, seen: int, strip: _Strip) -> None:
+    """Change the albedo of ground and objects by their textures."""
+    work = strip.work
+    coarsest, amplitudes = materials.ground_texture
+    x, y, z = work[X : X + width], work[Y : Y + width], work[Z : Z + width]
+    add_texture(x, y, z, work[FOOTPRINT : FOOTPRINT + width], coarsest, amplitudes, work[CHANGE : CHANGE + width])
+    if seen > 0:
+        coarsest, amplitudes = materials.object_texture
+        x, y, z = work[OBJECT_X : OBJECT_X + seen], work[OBJECT_Y : OBJECT_Y + seen], work[OBJECT_Z : OBJECT_Z + seen]
+        footprint, change = OBJECT_FOOTPRINT, OBJECT_CHANGE
+        add_texture(x, y, z, work[footprint : footprint + seen], coarsest, amplitudes, work[change : change + seen])
+        for m in range(seen):
+            work[CHANGE + strip.other[m]] = work[OBJECT_CHANGE + m]
+    for k in range(width):
+        if work[CHANGE + k] != 0.0:
+            work[ALBEDO + k] *= math.exp(work[CHANGE + k])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _light_over_ground(ground: Ground, shadow: GroundShadow, light: Light, hits: Hits, k: int, work: Array) -> float:
+    """Fraction of the sun that a pixel's place sees over the ground.
+
+    A place on smoothed ground is lifted onto the terrain itself, whose bumps must not shade it.
+    """
+    sun, radius = light.sun, light.law[7]
+    on_object = hits.triangle[k] >= 0
+    met = hits.level[k] == 0
+    x, y, z = work[X + k], work[Y + k], work[Z + k]
+    if not on_object and not met:
+        height, _slope_x, _slope_y, _albedo = sample(ground.levels[shadow.level], 1.0 / shadow.spacing, x, y)
+        z = max(z, height)
+        work[Z + k] = z
+    clear, rows = shadow_clearance(shadow, x, y, z)
+    soft = penumbra(shadow, radius, 0.0, rows)
+    if on_object or not met:
+        fraction: float = disc_above(clear / soft)
+        return fraction
+    if clear <= -UNSURE * shadow.spacing - soft:
+        return 0.0
+    if clear < UNSURE * shadow.spacing + soft:
+        # at the shadow's edge the swept grid is too coarse: search towards the sun from here
+        seen: float = visible_sun_fraction(ground.levels[0], 1.0 / ground.spacing, shadow, (x, y, z), sun, radius)
+        return seen
+    return 1.0
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _cast_shadows(
+    ground: Ground, hits: Hits, pixel_angles: Array32, light: Light, occluders: Occluders, body: Ints, strip: _Strip
+) -> None:
+    """Fraction of the sun that each pixel's place sees past the ground and past objects."""
+    work = strip.work
+    shadowed = occluders.shadow.height.shape[0] > 1
+    objects = occluders.casters[0].shape[0] > 0
+    asked = 0
+    for k in range(hits.distance.size):
+        if work[COS_I + k] <= 0.0 or body[k] == SKY:
+            continue
+        lit = _light_over_ground(ground, occluders.shadow, light, hits, k, work) if shadowed else 1.0
+        work[LIT + k] = lit
+        on_object = hits.triangle[k] >= 0
+        if lit > 0.0 and objects and (on_object or _in_footprint(occluders.footprint, work[X + k], work[Y + k])):
+            # lifted off its own facet, so that this and its neighbours do not shade it by rounding
+            lift = 1e-4 + (0.05 * hits.distance[k] * pixel_angles[k] if on_object else 0.0)
+            work[OBJECT_X + asked] = work[X + k] + lift * work[NX + k]
+            work[OBJECT_Y + asked] = work[Y + k] + lift * work[NY + k]
+            work[OBJECT_Z + asked] = work[Z + k] + lift * work[NZ + k]
+            strip.other[asked] = k
+            asked += 1
+    if asked > 0:
+        x, y, z = OBJECT_X, OBJECT_Y, OBJECT_Z
+        sun_hidden(occluders.casters, work[x : x + asked], work[y : y + asked], work[z : z + asked], strip.hidden)
+        for m in range(asked):
+            work[LIT + strip.other[m]] *= 0.0 if strip.hidden[m] else 1.0
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _dim_sun(light: Light, distance: Array, work: Array) -> None:
+    """What a round body at the camera's place and clouds leave of the sun."""
+    sun, law, drift = light.sun, light.law, light.drift
+    for k in range(distance.size):
+        if work[COS_I + k] <= 0.0:
+            continue
+        cos_g = work[COS_G + k]
+        if law[6] > 0.0 and cos_g > 0.9:
+            work[LIT + k] *= 1.0 - disc_overlap(0.5 * law[6] / distance[k], law[7], math.acos(cos_g))
+        if drift[4] > 0.0:
+            up = max(drift[1] - work[Z + k], 0.0) / sun[2]
+            x, y = work[X + k] + up * sun[0] - drift[2], work[Y + k] + up * sun[1] - drift[3]
+            work[LIT + k] *= 1.0 - drift[4] * cloud_cover(light.cover, drift[0], x, y)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _draw_sky(light: Light, pixel_angles: Array32, body: Ints, work: Array, radiance: Array32) -> None:
+    """Radiance factor of the pixels that see the sky."""
+    sun = light.sun
+    for k in range(body.size):
+        if body[k] == SKY:
+            cos_g = work[DX + k] * sun[0] + work[DY + k] * sun[1] + work[DZ + k] * sun[2]
+            radiance[k] = sky_brightness(light.sky, sun[2], light.law[7], work[DZ + k], cos_g, pixel_angles[k])
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def shade(
-    levels: tuple[Level, ...],
-    top_level: int,
-    spacing: float,
-    distance: Array,
-    triangle_of_pixel: Ints,
-    weights: Array32,
-    level_of_pixel: NDArray[np.int8],
-    world_from_body: Array,
-    position: Array,
-    origins: Array32,
-    directions: Array32,
-    pixel_angles: Array32,
-    sun: Array,
-    law: Array,
-    sky: Array,
-    clouds: Clouds,
-    shadow: Shadow,
-    shadow_spacing: float,
-    shadow_level: int,
-    highest: float,
-    ground_texture: tuple[float, Array],
-    object_texture: tuple[float, Array],
-    normals: Array,
-    body_of_triangle: Ints,
-    albedos: Array,
-    casters: Casters,
-    reach: Reach,
-    radiance: Array32,
-    body: Ints,
-    normal: Array32,
+    ground: Ground,
+    pose: Pose,
+    rays: Rays,
+    hits: Hits,
+    light: Light,
+    occluders: Occluders,
+    materials: Materials,
+    picture: Picture,
 ) -> None:
-    """Radiance factor and truth of every pixel.
+    """Compute radiance factor and truth of every pixel: geometry, texture, illumination, then photometry.
 
     Parameters
     ----------
-    levels, top_level, spacing
-        The surface's pyramid (`marsyard.sim.render.pyramid`), its coarsest level, and the spacing of its level 0.
-    distance, triangle_of_pixel, weights, level_of_pixel
-        What each ray meets, as `look` finds it.
-    world_from_body, position
-        Rotation matrix of the body, and world position of the centre of projection.
-    origins, directions
-        Each pixel's ray in body axes relative to `position`, shape (n, 3), float32; directions are unit.
-    pixel_angles
-        Angle that each pixel takes, radians.
-    sun
-        Unit vector to the sun, world axes.
-    law
-        Lunar share, surge amplitude, surge width, normalisation, sky share, light from the surrounding ground, diameter
-        of what casts a shadow from the body's place, angular radius of the sun.
-    sky
-        What the sky's brightness comes from, as `sky_brightness` takes it.
-    clouds
-        Cover of a layer of clouds, and its numbers: cells a metre, height, drift to east and north, share of the sun
-        that a cloud keeps; the last is 0 where there are no clouds.
-    shadow, shadow_spacing, shadow_level
-        The ground's shadow on the grid of a level of the surface; one side is 1 where there is none.
-    highest
-        Height that no ground exceeds.
-    ground_texture, object_texture
-        Coarsest cell and amplitudes of octaves.
-    normals, body_of_triangle, albedos, casters
-        Triangles that stand on the ground: normals at their corners, the body of each, the bodies' albedos, and the
-        lists in which shadows look for them.
-    reach
-        Where the ground may lie in those shadows: a grid, its west and south border, and cells a metre; 0: everywhere.
-    radiance, body, normal
-        Outputs: radiance factor; number of the thing seen (GROUND, SKY); unit normal in world axes.
+    ground
+        The ground.
+    pose, rays, hits
+        The camera, each pixel's ray, and what it meets.
+    light, occluders, materials
+        The light, what hides the sun, and how surfaces look.
+    picture
+        Output.
     """
-    towards = (sun[0], sun[1], sun[2])
-    rotation = numbers(world_from_body)
-    centre = (position[0], position[1], position[2])
+    towards = (light.sun[0], light.sun[1], light.sun[2])
+    rotation = numbers(pose.rotation)
+    centre = (pose.position[0], pose.position[1], pose.position[2])
+    law = light.law
     reflectance = (law[0], law[1], law[2], law[3], law[4], law[5])
-    caster, sun_radius = law[6], law[7]
-    cover, drift = clouds
-    dimmed = drift[4] > 0.0
-    across = math.sqrt(sun[0] * sun[0] + sun[1] * sun[1])
-    row_m = shadow_spacing / max(abs(sun[0]), abs(sun[1]), 1e-9)
-    inverse_spacing = 1.0 / spacing
-    shadowed = shadow[0].shape[0] > 1
-    finest = levels[0]
-    things = casters[0].shape[0] > 0
-    flat_origins, flat_directions, flat_normals = origins.reshape(-1), directions.reshape(-1), normal.reshape(-1)
-    work = np.empty(ROWS * ROW)
+    origins, directions, normals = rays.origins.reshape(-1), rays.directions.reshape(-1), picture.normal.reshape(-1)
     near = no_cells()
-    level_of = np.empty(STRIP, dtype=np.int64)
-    ground = np.empty(STRIP, dtype=np.int64)
-    mixed = np.empty(STRIP, dtype=np.int64)
-    other = np.empty(STRIP, dtype=np.int64)
-    hidden = np.empty(STRIP, dtype=np.bool_)
-    count = directions.shape[0]
+    work = np.empty(ROWS * ROW)
+    strip = _Strip(
+        work,
+        np.empty(STRIP, dtype=np.int64),
+        np.empty(STRIP, dtype=np.int64),
+        np.empty(STRIP, dtype=np.int64),
+        np.empty(STRIP, dtype=np.int64),
+        np.empty(STRIP, dtype=np.bool_),
+    )
+    count = rays.directions.shape[0]
     for first in range(0, count, STRIP):
-        width = min(STRIP, count - first)
-        last = first + width
-        _place(
-            rotation,
-            centre,
-            flat_origins[3 * first : 3 * last],
-            flat_directions[3 * first : 3 * last],
-            pixel_angles[first:last],
-            distance[first:last],
-            width,
-            work,
+        last = min(first + STRIP, count)
+        width = last - first
+        angles, body, radiance = rays.pixel_angles[first:last], picture.body[first:last], picture.radiance[first:last]
+        met = Hits(
+            hits.distance[first:last], hits.triangle[first:last], hits.weights[first:last], hits.level[first:last]
         )
-        n_ground = 0
-        n_other = 0
-        n_mixed = 0
-        for k in range(width):
-            n = first + k
-            body[n] = GROUND
-            work[BLEND + k] = 0.0
-            if distance[n] == math.inf or triangle_of_pixel[n] >= 0:
-                other[n_other] = k
-                n_other += 1
-                continue
-            # the level whose samples are as far apart as the pixel's footprint, blended between the two nearest
-            lower = 0
-            if level_of_pixel[n] > 0 or work[FOOTPRINT + k] > SHARP_UNTIL * spacing:
-                suited = math.log2(max(work[FOOTPRINT + k] / (SHARP_UNTIL * spacing), 1.0))
-                fractional = max(suited, float(level_of_pixel[n]))
-                lower = min(int(fractional), top_level)
-                if lower < top_level and fractional > lower:
-                    work[BLEND + k] = min(fractional - lower, 1.0)
-                    mixed[n_mixed] = k
-                    n_mixed += 1
-            level_of[k] = lower
-            work[SCALE + k] = inverse_spacing / (1 << lower)
-            ground[n_ground] = k
-            n_ground += 1
-        if n_ground > 0:
-            x, y = work[X : X + ROW], work[Y : Y + ROW]
-            fetch_levels(levels, inverse_spacing, level_of, ground, n_ground, x, y, near)
-            _ground(near, width, work[HEIGHT : HEIGHT + 4 * ROW])
-            if n_mixed > 0:
-                for m in range(n_mixed):
-                    level_of[mixed[m]] += 1
-                fetch_levels(levels, inverse_spacing, level_of, mixed, n_mixed, x, y, near)
-                _ground(near, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
-            _blend(width, work)
-        _face(width, work)
-        seen = 0
-        for m in range(n_other):
-            k = other[m]
-            n = first + k
-            if distance[n] == math.inf:
-                body[n] = SKY
-                work[FOOTPRINT + k] = math.inf
-                work[NX + k] = 0.0
-                work[NY + k] = 0.0
-                work[NZ + k] = 0.0
-            elif triangle_of_pixel[n] >= 0:
-                _thing(normals, triangle_of_pixel[n], weights[n, 0], weights[n, 1], k, work)
-                body[n] = body_of_triangle[triangle_of_pixel[n]]
-                work[ALBEDO + k] = albedos[body[n]]
-                work[FOOTPRINT + k] = math.inf
-                work[THING_X + seen] = work[X + k]
-                work[THING_Y + seen] = work[Y + k]
-                work[THING_Z + seen] = work[Z + k]
-                work[THING_FOOTPRINT + seen] = _thing_footprint(distance[n] * pixel_angles[n], k, work)
-                work[THING_CHANGE + seen] = 0.0
-                other[seen] = k
-                seen += 1
-        _lean(towards, width, work)
-        add_texture(
-            work[X : X + width],
-            work[Y : Y + width],
-            work[Z : Z + width],
-            work[FOOTPRINT : FOOTPRINT + width],
-            ground_texture[0],
-            ground_texture[1],
-            work[CHANGE : CHANGE + width],
-        )
-        if seen > 0:
-            add_texture(
-                work[THING_X : THING_X + seen],
-                work[THING_Y : THING_Y + seen],
-                work[THING_Z : THING_Z + seen],
-                work[THING_FOOTPRINT : THING_FOOTPRINT + seen],
-                object_texture[0],
-                object_texture[1],
-                work[THING_CHANGE : THING_CHANGE + seen],
-            )
-            for m in range(seen):
-                work[CHANGE + other[m]] = work[THING_CHANGE + m]
-        for k in range(width):
-            if work[CHANGE + k] != 0.0:
-                work[ALBEDO + k] *= math.exp(work[CHANGE + k])
-        asked = 0
-        for k in range(width):
-            n = first + k
-            if work[COS_I + k] <= 0.0 or body[n] == SKY:
-                continue
-            px, py, pz = work[X + k], work[Y + k], work[Z + k]
-            triangle = triangle_of_pixel[n]
-            met = level_of_pixel[n] == 0
-            lit = 1.0
-            if shadowed:
-                if triangle < 0 and not met:
-                    # the terrain itself, where the pixel saw it smoothed: its own bumps must not shade a smooth ground
-                    height, _slope_x, _slope_y, _albedo = sample(levels[shadow_level], 1.0 / shadow_spacing, px, py)
-                    pz = max(pz, height)
-                    work[Z + k] = pz
-                clear, rows = shadow_clearance(shadow, 1.0 / shadow_spacing, px, py, pz)
-                # half the depth of the penumbra, which a disc casts past what is so far away
-                soft = sun_radius * rows * row_m / across
-                if triangle >= 0 or not met:
-                    lit = disc_above(clear / soft)
-                elif clear <= -UNSURE * shadow_spacing - soft:
-                    lit = 0.0
-                elif clear < UNSURE * shadow_spacing + soft:
-                    # at the shadow's edge the swept grid is too coarse: look towards the sun from here
-                    lit = sun_over_ground(
-                        finest, inverse_spacing, shadow, shadow_spacing, row_m, px, py, pz, sun, sun_radius, highest
-                    )
-            work[LIT + k] = lit
-            if lit > 0.0 and things and (triangle >= 0 or _in_reach(reach, px, py)):
-                # lifted off its own facet, so that this and those beside do not shade it by rounding
-                lift = 1e-4 + (0.05 * distance[n] * pixel_angles[n] if triangle >= 0 else 0.0)
-                work[THING_X + asked] = px + lift * work[NX + k]
-                work[THING_Y + asked] = py + lift * work[NY + k]
-                work[THING_Z + asked] = pz + lift * work[NZ + k]
-                other[asked] = k
-                asked += 1
-        if asked > 0:
-            x, y, z = work[THING_X : THING_X + asked], work[THING_Y : THING_Y + asked], work[THING_Z : THING_Z + asked]
-            sun_hidden(casters, x, y, z, hidden)
-            for m in range(asked):
-                work[LIT + other[m]] *= 0.0 if hidden[m] else 1.0
-        if caster > 0.0 or dimmed:
-            for k in range(width):
-                if work[COS_I + k] <= 0.0:
-                    continue
-                cos_g = work[COS_G + k]
-                if caster > 0.0 and cos_g > 0.9:
-                    seen_wide = 0.5 * caster / distance[first + k]
-                    work[LIT + k] *= 1.0 - disc_overlap(seen_wide, sun_radius, math.acos(cos_g))
-                if dimmed:
-                    up = max(drift[1] - work[Z + k], 0.0) / sun[2]
-                    work[LIT + k] *= 1.0 - drift[4] * cloud_cover(
-                        cover,
-                        drift[0],
-                        work[X + k] + up * sun[0] - drift[2],
-                        work[Y + k] + up * sun[1] - drift[3],
-                    )
-        _reflect(reflectance, width, work, radiance[first:last])
-        _keep_normals(width, work, flat_normals[3 * first : 3 * last])
-        for k in range(width):
-            n = first + k
-            if body[n] == SKY:
-                cos_g = work[DX + k] * sun[0] + work[DY + k] * sun[1] + work[DZ + k] * sun[2]
-                radiance[n] = sky_brightness(sky, sun[2], sun_radius, work[DZ + k], cos_g, pixel_angles[n])
+        body[:] = GROUND
+        here, there = 3 * first, 3 * last
+        _place(rotation, centre, origins[here:there], directions[here:there], angles, met.distance, width, work)
+        n_ground, n_blended, n_other = _select_levels(ground, met, strip)
+        _sample_ground(ground, n_ground, n_blended, width, strip, near)
+        seen = _sample_objects(materials, met, angles, n_other, strip, body)
+        _photometric_angles(towards, width, work)
+        _apply_texture(materials, width, seen, strip)
+        _cast_shadows(ground, met, angles, light, occluders, body, strip)
+        if law[6] > 0.0 or light.drift[4] > 0.0:
+            _dim_sun(light, met.distance, work)
+        _reflect(reflectance, width, work, radiance)
+        _keep_normals(width, work, normals[here:there])
+        _draw_sky(light, angles, body, work, radiance)

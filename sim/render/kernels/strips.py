@@ -11,12 +11,10 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from marsyard.sim.render.kernels.structs import Array32, Longs
 from marsyard.sim.terrain.kernels import Array, Level, bspline_weights
 
-Array32 = NDArray[np.float32]
-Longs = NDArray[np.int64]
 #: Control values around the places of a strip, the places' shares of their cells, and room for numbers of places.
 Near = tuple[Array32, Array, Longs]
 #: Nine numbers of a matrix, row by row.

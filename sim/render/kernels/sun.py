@@ -6,14 +6,10 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from marsyard.sim.render.kernels.ground import Array32
+from marsyard.sim.render.kernels.structs import Array32, Bytes, GroundShadow, Longs
 from marsyard.sim.terrain.kernels import Array, Level, sample
 
-Longs = NDArray[np.int64]
-#: Height and reach of the ground's shadow on the posts of a grid (`sweep_shadow`), and whether its rows run along x.
-Shadow = tuple[Array32, NDArray[np.uint8], bool]
 #: Rows of the grid that one unit of a shadow's stored reach stands for.
 REACH_ROWS = 4
 #: Height over a shadow's edge, in spacings of its grid, within which the grid is not believed.
@@ -49,9 +45,7 @@ def heights_in_rows(field: Level, rows: Longs, columns: Longs, along_x: bool) ->
 
 
 @njit(cache=True)
-def sweep_shadow(
-    height: Array32, along: float, drop: float, slip: float, reach: int
-) -> tuple[Array32, NDArray[np.uint8]]:
+def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach: int) -> tuple[Array32, Bytes]:
     """Height of the shadow over every post of a periodic grid: below it the ground hides the sun's middle.
 
     The sun stands towards growing rows. A shadow falls by `drop` and shifts by `-slip` columns from one row to the one
@@ -127,13 +121,19 @@ def _between(
 
 
 @njit(cache=True, inline="always")
-def shadow_clearance(shadow: Shadow, inverse_spacing: float, x: float, y: float, z: float) -> tuple[float, float]:
+def shadow_clearance(shadow: GroundShadow, x: float, y: float, z: float) -> tuple[float, float]:
     """How far a place lies above the ground's shadow, metres, and how many rows away what casts the shadow is."""
-    height, away, along_x = shadow
-    across, along = (y, x) if along_x else (x, y)
-    edge, (i0, i1), (j0, j1) = _between(height, inverse_spacing, across, along)
+    across, along = (y, x) if shadow.along_x else (x, y)
+    edge, (i0, i1), (j0, j1) = _between(shadow.height, 1.0 / shadow.spacing, across, along)
+    away = shadow.reach
     farthest = max(max(away[i0, j0], away[i0, j1]), max(away[i1, j0], away[i1, j1]))
     return z - edge, float(farthest * REACH_ROWS)
+
+
+@njit(cache=True, inline="always")
+def penumbra(shadow: GroundShadow, radius: float, distance: float, rows: float) -> float:
+    """Half the depth of the penumbra that the sun's disc casts past what is a distance and some rows away, metres."""
+    return radius * (distance + rows * shadow.row_m) / shadow.across
 
 
 @njit(cache=True, inline="always")
@@ -161,15 +161,16 @@ def disc_overlap(first: float, second: float, apart: float) -> float:
 
 @njit(cache=True)
 def _lowest_near(
-    field: Level, inverse_spacing: float, x: float, y: float, z: float, sun: Array, nearest: float
+    field: Level, per_metre: float, place: tuple[float, float, float], sun: Array, nearest: float
 ) -> float:
     """Least clearance over distance of the line to the sun about a place on it: the vertex of a parabola there."""
-    step = min(0.25 / inverse_spacing, 0.5 * nearest)
+    x, y, z = place
+    step = min(0.25 / per_metre, 0.5 * nearest)
     before, middle, after = 0.0, 0.0, 0.0
     at = nearest
     for k in range(4):
         t = nearest + (k - 1) * step if k < 3 else at
-        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, x + t * sun[0], y + t * sun[1])
+        height, _slope_x, _slope_y, _albedo = sample(field, per_metre, x + t * sun[0], y + t * sun[1])
         ratio = (z + t * sun[2] - height) / t
         if k == 0:
             before = ratio
@@ -186,55 +187,42 @@ def _lowest_near(
 
 
 @njit(cache=True)
-def sun_over_ground(
-    field: Level,
-    inverse_spacing: float,
-    shadow: Shadow,
-    shadow_spacing: float,
-    row_m: float,
-    x: float,
-    y: float,
-    z: float,
-    sun: Array,
-    radius: float,
-    highest: float,
+def visible_sun_fraction(
+    field: Level, per_metre: float, shadow: GroundShadow, place: tuple[float, float, float], sun: Array, radius: float
 ) -> float:
-    """Share of the sun's disc that a place on the ground sees over the ground, by steps towards the sun.
+    """Fraction of the sun's disc that a place on the ground sees over the ground, by steps towards the sun.
 
-    The smallest angle between the sun's middle and the ground below it, in radii of the sun, tells the share, as if
-    the skyline were straight and level across the disc. Ground turned from the sun's middle has none of it. The walk
-    ends where the swept shadow says that all the rest is clear.
+    The smallest angle between the sun's middle and the ground below it, in radii of the sun, gives the fraction, as if
+    the skyline were straight and level across the disc. Ground turned from the sun's middle has none of it. The search
+    ends where the swept shadow shows that all the rest is clear.
 
     Parameters
     ----------
-    field, inverse_spacing
-        The finest level.
-    shadow, shadow_spacing
-        The ground's shadow, and the spacing of its grid.
-    row_m
-        Distance along the sun's direction from one row of the shadow's grid to the next.
-    x, y, z
-        The place.
+    field, per_metre
+        The finest level, and its samples to the metre.
+    shadow
+        The ground's shadow.
+    place
+        World coordinates.
     sun, radius
         Unit vector to the sun, and the angle that half its disc takes.
-    highest
-        Height that no ground exceeds.
     """
-    spacing = 1.0 / inverse_spacing
-    _height, slope_x, slope_y, _albedo = sample(field, inverse_spacing, x, y)
+    x, y, z = place
+    spacing = 1.0 / per_metre
+    _height, slope_x, slope_y, _albedo = sample(field, per_metre, x, y)
     if sun[2] - slope_x * sun[0] - slope_y * sun[1] <= 0.0:
         return 0.0
-    across = math.sqrt(sun[0] * sun[0] + sun[1] * sun[1])
+    across = shadow.across
     lowest = radius
     nearest = 0.0
     t = 0.25 * spacing
     steps = 0
-    farthest = (highest - z) / max(sun[2] - radius, 1e-3)
+    farthest = (shadow.highest - z) / max(sun[2] - radius, 1e-3)
     while t < farthest:
         px = x + t * sun[0]
         py = y + t * sun[1]
         pz = z + t * sun[2]
-        height, _slope_x, _slope_y, _albedo = sample(field, inverse_spacing, px, py)
+        height, _slope_x, _slope_y, _albedo = sample(field, per_metre, px, py)
         clearance = pz - height
         if clearance * across / t < lowest:
             lowest = clearance * across / t
@@ -243,15 +231,15 @@ def sun_over_ground(
             return 0.0
         steps += 1
         if steps % 4 == 0:
-            clear, rows = shadow_clearance(shadow, 1.0 / shadow_spacing, px, py, pz)
-            if clear > UNSURE * shadow_spacing + radius * (t + rows * row_m) / across:
+            clear, rows = shadow_clearance(shadow, px, py, pz)
+            if clear > UNSURE * shadow.spacing + penumbra(shadow, radius, t, rows):
                 break
         # half the clearance: no slope up to 60 deg is stepped over
         t += max(0.5 * spacing, 0.5 * (clearance - radius * t))
     if lowest < radius:
-        lowest = min(lowest, _lowest_near(field, inverse_spacing, x, y, z, sun, nearest) * across)
-    share: float = disc_above(lowest / radius)
-    return share
+        lowest = min(lowest, _lowest_near(field, per_metre, place, sun, nearest) * across)
+    fraction: float = disc_above(lowest / radius)
+    return fraction
 
 
 @njit(cache=True, inline="always")

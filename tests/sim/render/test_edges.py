@@ -13,6 +13,7 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, PixelRays, Scene, Sun
 from marsyard.sim.render.edges import edge_pixels, rays_within
 from marsyard.sim.render.kernels.hierarchy import nearest_hit
+from marsyard.sim.render.kernels.structs import Ray
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
@@ -84,7 +85,7 @@ def test_the_nearest_triangle_is_that_of_an_exhaustive_search(rocky) -> None:
     rays = pose.rotation.apply(rocky.rays(rocky.camera).directions[::37].astype(np.float64))
     starts = np.broadcast_to(pose.translation, rays.shape)
     expected = meet_triangles(objects, starts, rays)
-    found = np.array([nearest_hit(objects.hierarchy, *pose.translation, *ray, np.inf)[0] for ray in rays])
+    found = np.array([nearest_hit(objects.hierarchy, Ray(*pose.translation, *ray), np.inf).distance for ray in rays])
     assert 0.05 < np.mean(np.isfinite(expected)) < 0.95
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 

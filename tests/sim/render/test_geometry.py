@@ -11,8 +11,9 @@ from marsyard.sim.camera import Cahvor
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, PixelRays, Scene, Sun
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.kernels.ground import cross_ground, pass_over, way_in, way_out
-from marsyard.sim.render.pyramid import ceilings
+from marsyard.sim.render.kernels.ground import cross_ground, skip_empty_blocks, way_in, way_out
+from marsyard.sim.render.kernels.structs import GroundLevel, Ray
+from marsyard.sim.render.pyramid import NO_CEILING
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 
@@ -145,12 +146,12 @@ def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough, bounded
     origins = np.column_stack([rng.uniform(0.0, rough.period_m, (count, 2)), np.full(count, ground.highest + 60.0)])
     rays = np.array([direction(a, -np.radians(e)) for a, e in rng.uniform([-np.pi, 2.5], [np.pi, 5.0], (count, 2))])
     expected = ground.cast(origins, rays, 4000.0, 0.05)
-    level, scale, ceiling = rough.levels[0], 1.0 / rough.spacing_m, ceilings(rough, bounded)[0]
+    level = GroundLevel(rough.levels[0], rough.ceilings[0] if bounded else NO_CEILING, 1.0 / rough.spacing_m)
     # by ceilings all of the way is cheap to go
     begin = 0.0 if bounded else 0.8
     found = np.array(
         [
-            cross_ground(level, ceiling, scale, *origin, *ray, begin * t, 1.25 * t)
+            cross_ground(level, Ray(*origin, *ray), begin * t, 1.25 * t)
             for origin, ray, t in zip(origins, rays, expected, strict=True)
         ]
     )
@@ -165,36 +166,36 @@ def test_ground_is_met_up_to_the_very_end_of_the_search_and_none_beyond(rough, b
     """Without ceilings steps are longer than what is left: ground before a thing was passed over with the thing."""
     rng = np.random.default_rng(4)
     ground = Ground(rough)
-    level, scale, ceiling = rough.levels[0], 1.0 / rough.spacing_m, ceilings(rough, bounded)[0]
+    level = GroundLevel(rough.levels[0], rough.ceilings[0] if bounded else NO_CEILING, 1.0 / rough.spacing_m)
     for azimuth, elevation in rng.uniform([-np.pi, np.radians(20.0)], [np.pi, np.radians(50.0)], (50, 2)):
         origin = np.array([*rng.uniform(0.0, rough.period_m, 2), ground.highest + 80.0])
         ray = direction(azimuth, -elevation)
         t = float(ground.cast(origin[None], ray[None], 2000.0, 0.05)[0])
         near = t - 4.0 * rough.spacing_m
-        assert cross_ground(level, ceiling, scale, *origin, *ray, near, t + 1e-3) == pytest.approx(t, rel=1e-6)
-        assert cross_ground(level, ceiling, scale, *origin, *ray, near, t - 1e-3) == np.inf
+        assert cross_ground(level, Ray(*origin, *ray), near, t + 1e-3) == pytest.approx(t, rel=1e-6)
+        assert cross_ground(level, Ray(*origin, *ray), near, t - 1e-3) == np.inf
 
 
 def test_a_ray_meets_no_ground_before_it_is_as_low_as_the_highest() -> None:
     extent = (-10.0, 10.0, -20.0, 20.0, 3.0)
-    assert way_in(extent, 5.0, -0.1) == pytest.approx(20.0)
-    assert way_in(extent, 3.0, -0.1) == 0.0
-    assert way_in(extent, 1.0, 0.1) == 0.0
-    assert way_in(extent, 5.0, 0.1) == np.inf
-    assert way_in(extent, 5.0, 0.0) == np.inf
-    assert way_out(extent, 2.0, -1.0, 0.5, -0.1) == pytest.approx(16.0)
+    assert way_in(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, -0.1)) == pytest.approx(20.0)
+    assert way_in(extent, Ray(0.0, 0.0, 3.0, 1.0, 0.0, -0.1)) == 0.0
+    assert way_in(extent, Ray(0.0, 0.0, 1.0, 1.0, 0.0, 0.1)) == 0.0
+    assert way_in(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, 0.1)) == np.inf
+    assert way_in(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, 0.0)) == np.inf
+    assert way_out(extent, Ray(2.0, -1.0, 0.0, 0.5, -0.1, 0.0)) == pytest.approx(16.0)
 
 
-def test_a_ray_passes_over_the_ground_that_it_is_clear_of(rough) -> None:
+def test_a_ray_skips_the_blocks_of_ground_that_it_is_clear_of(rough) -> None:
     """To the first block whose ceiling it is not above, in all directions and over the border of the period."""
     ceiling = rough.ceilings[0]
-    scale, block = 1.0 / rough.spacing_m, CEILING_BLOCK * rough.spacing_m
+    level, block = GroundLevel(rough.levels[0], ceiling, 1.0 / rough.spacing_m), CEILING_BLOCK * rough.spacing_m
     rng = np.random.default_rng(5)
     for azimuth in [*rng.uniform(-np.pi, np.pi, 60), 0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi]:
         origin = np.array([*rng.uniform(0.0, rough.period_m, 2), float(ceiling.max()) + 5.0])
         ray = direction(azimuth, -np.radians(rng.uniform(1.0, 20.0)))
         start = rng.uniform(0.0, 50.0)
-        clear = pass_over(ceiling, scale, *origin, *ray, start, 5000.0)
+        clear = skip_empty_blocks(level, Ray(*origin, *ray), start, 5000.0)
         t = np.arange(start, clear + 3.0 * block, 0.01 * block)
         places = origin + t[:, None] * ray
         a, b = (np.floor(places[:, axis] / block).astype(int) % len(ceiling) for axis in (1, 0))

@@ -6,7 +6,8 @@ import pytest
 from benchmarks.validation.raycast import meet_triangles
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects
-from marsyard.sim.render.kernels.hierarchy import in_beam, nearest_hit
+from marsyard.sim.render.kernels.hierarchy import list_in_beam, nearest_hit
+from marsyard.sim.render.kernels.structs import Ray
 
 EYE = np.array([0.3, -0.2, 1.1])
 
@@ -29,7 +30,7 @@ def _rays(rng: np.random.Generator, count: int) -> np.ndarray:
 def test_the_nearest_triangle_is_that_of_all(thicket: Objects) -> None:
     rays = _rays(np.random.default_rng(7), 800)
     expected = meet_triangles(thicket, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
-    found = np.array([nearest_hit(thicket.hierarchy, *EYE, *ray, np.inf)[0] for ray in rays])
+    found = np.array([nearest_hit(thicket.hierarchy, Ray(*EYE, *ray), np.inf).distance for ray in rays])
     assert 0.05 < np.mean(np.isfinite(expected)) < 0.9
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
@@ -41,7 +42,7 @@ def test_a_beam_lists_all_triangles_that_its_rays_meet(thicket: Objects, axis: n
     farthest = 9.0
     rng = np.random.default_rng(9)
     room = np.empty(1500, dtype=np.int64)
-    listed = set(room[: in_beam(thicket.hierarchy, *EYE, *axis, spread, farthest, room)].tolist())
+    listed = set(room[: list_in_beam(thicket.hierarchy, Ray(*EYE, *axis), spread, farthest, room)].tolist())
     across = np.cross(axis, _rays(rng, 400))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     angles = spread * rng.uniform(0.0, 1.0, (400, 1))
@@ -63,11 +64,11 @@ def test_a_beam_lists_all_triangles_that_its_rays_meet(thicket: Objects, axis: n
 def test_a_beam_tells_where_triangles_are_more_than_it_has_room_for(thicket: Objects) -> None:
     ahead = direction(1.0, 0.2)
     room = np.empty(1500, dtype=np.int64)
-    count = in_beam(thicket.hierarchy, *EYE, *ahead, 0.3, 9.0, room)
+    count = list_in_beam(thicket.hierarchy, Ray(*EYE, *ahead), 0.3, 9.0, room)
     assert count > 5
-    assert in_beam(thicket.hierarchy, *EYE, *ahead, 0.3, 9.0, room[:count].copy()) == count
-    assert in_beam(thicket.hierarchy, *EYE, *ahead, 0.3, 9.0, room[: count - 1].copy()) == -1
-    assert in_beam(Objects.none().hierarchy, *EYE, *ahead, 0.3, 9.0, room) == 0
+    assert list_in_beam(thicket.hierarchy, Ray(*EYE, *ahead), 0.3, 9.0, room[:count].copy()) == count
+    assert list_in_beam(thicket.hierarchy, Ray(*EYE, *ahead), 0.3, 9.0, room[: count - 1].copy()) == -1
+    assert list_in_beam(Objects.none().hierarchy, Ray(*EYE, *ahead), 0.3, 9.0, room) == 0
 
 
 def _all_met(objects: Objects, ray: np.ndarray, farthest: float) -> set[int]:

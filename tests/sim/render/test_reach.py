@@ -9,21 +9,21 @@ from marsyard.scenarios.views import Eye, SiteGround, mast_pose, nadir_pose, sit
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
-from marsyard.sim.render.reach import EVERYWHERE, shade_reach
+from marsyard.sim.render.reach import EVERYWHERE, shadow_footprint
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import RockParameters, TerrainParameters, site
 
 ROCKY = TerrainParameters(samples=512, spacing_m=3.0, rocks=RockParameters(abundance=0.15, smallest_m=1.0))
 
 
-def _told(reach, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    cells, west, south, per_metre = reach
+def _inside(footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    cells, west, south, per_metre = footprint
     column = np.floor((x - west) * per_metre).astype(int)
     row = np.floor((y - south) * per_metre).astype(int)
     inside = (column >= 0) & (column < cells.shape[1]) & (row >= 0) & (row < cells.shape[0])
-    told = np.zeros(x.shape, dtype=bool)
-    told[inside] = cells[row[inside], column[inside]]
-    return told
+    marked = np.zeros(x.shape, dtype=bool)
+    marked[inside] = cells[row[inside], column[inside]]
+    return marked
 
 
 @pytest.mark.parametrize("elevation", [0.2, 0.7, 1.5])
@@ -34,7 +34,7 @@ def test_every_place_in_a_shadow_is_in_reach(elevation) -> None:
         [rng.uniform(-900.0, 900.0, (40, 2)), rng.uniform(-30.0, 30.0, 40), rng.uniform(0.5, 3.0, 40)]
     )
     sun = direction(rng.uniform(0.0, 6.0), elevation)
-    reach = shade_reach(spheres, sun, -40.0)
+    footprint = shadow_footprint(spheres, sun, -40.0)
     # from points within the spheres back along the sun's rays, down to any height
     inside = np.repeat(spheres, 500, axis=0)
     away = rng.standard_normal((len(inside), 3))
@@ -42,16 +42,16 @@ def test_every_place_in_a_shadow_is_in_reach(elevation) -> None:
     points = inside[:, :3] + inside[:, 3:] * away
     fall = rng.random(len(points)) * (points[:, 2] + 40.0)
     ground = points - (fall / sun[2])[:, None] * sun
-    assert _told(reach, ground[:, 0], ground[:, 1]).all()
+    assert _inside(footprint, ground[:, 0], ground[:, 1]).all()
     anywhere = rng.uniform(-1000.0, 1000.0, (20000, 2))
     # shadows of 70 m / tan(elevation), some cells wide, of 40 things on 4 km2
-    assert _told(reach, *anywhere.T).mean() < 0.15 + 0.1 / np.tan(elevation)
+    assert _inside(footprint, *anywhere.T).mean() < 0.15 + 0.1 / np.tan(elevation)
 
 
 def test_without_things_or_sun_nothing_is_said() -> None:
     one = np.array([[0.0, 0.0, 0.0, 1.0]])
-    assert shade_reach(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is EVERYWHERE
-    assert shade_reach(one, direction(0.0, -0.1), 0.0) is EVERYWHERE
+    assert shadow_footprint(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is EVERYWHERE
+    assert shadow_footprint(one, direction(0.0, -0.1), 0.0) is EVERYWHERE
 
 
 def test_pictures_are_the_same_with_and_without() -> None:
@@ -63,10 +63,10 @@ def test_pictures_are_the_same_with_and_without() -> None:
     assert len(scene.objects) > 50
     limited = process_renderer(default_backend()).render(scene, rays, pose)
     unlimited = replace(scene)
-    unlimited.__dict__["reach"] = EVERYWHERE
+    unlimited.__dict__["footprint"] = EVERYWHERE
     whole = process_renderer(default_backend()).render(unlimited, rays, pose)
     np.testing.assert_array_equal(limited.radiance, whole.radiance)
-    assert not scene.reach[0].all()
+    assert not scene.footprint.cells.all()
 
 
 @pytest.mark.parametrize("elevation", [0.25, 1.0])

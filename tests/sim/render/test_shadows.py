@@ -129,12 +129,12 @@ def test_a_shadow_swept_where_it_is_seen_is_the_whole_ground_s_there(rough: Surf
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(35.0)))
     heights = height_range(rough.levels[0])
     shown = (-40.0, 60.0, 700.0, 760.0)
-    (whole, _, along_x), spacing, level = ground_shadow(rough, sun, heights)
-    (part, _, part_along_x), part_spacing, part_level = ground_shadow(rough, sun, heights, shown)
-    assert (along_x, spacing, level) == (part_along_x, part_spacing, part_level)
+    everywhere, in_view = ground_shadow(rough, sun, heights), ground_shadow(rough, sun, heights, shown)
+    whole, part, spacing = everywhere.height, in_view.height, everywhere.spacing
+    assert everywhere[2:] == in_view[2:]
     assert len(part) < len(whole)
     x, y = (np.arange(int(a / spacing) - 1, int(b / spacing) + 3) for a, b in (shown[:2], shown[2:]))
-    rows, columns = (x, y) if along_x else (y, x)
+    rows, columns = (x, y) if everywhere.along_x else (y, x)
     of_whole, of_part = (each[np.ix_(rows & (len(each) - 1), columns & (len(each) - 1))] for each in (whole, part))
     np.testing.assert_array_equal(of_part, of_whole)
 
@@ -159,9 +159,9 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_de
     assert not sun_over_slopes(just_below, steepest)
     assert slope_bounds(rough, just_below) == (np.inf, np.inf)
     # the sweep finds no shadow either, but for the rounding of its numbers
-    (swept, _, along_x), _, level = ground_shadow(rough, just_above, height_range(rough.levels[0]))
-    heights = rough.levels[level][..., 0].T if along_x else rough.levels[level][..., 0]
-    assert np.all(swept < heights + 1e-3)
+    shadow = ground_shadow(rough, just_above, height_range(rough.levels[0]))
+    heights = rough.levels[shadow.level][..., 0].T if shadow.along_x else rough.levels[shadow.level][..., 0]
+    assert np.all(shadow.height < heights + 1e-3)
     scene = Scene(rough, (0.0, 0.0), just_above, Photometry())
     assert scene.shadow is NO_SHADOW
     assert scene.in_light(just_below, Photometry()).shadow is not NO_SHADOW
