@@ -4,14 +4,10 @@ import numpy as np
 import pytest
 from short_run import SHORT
 
-from marsyard.scenarios.rover import (
-    RoverScenario,
-    RoverScenarioParameters,
-    SharedDriveParameters,
-    SharedDriveScenario,
-    run_case,
-)
-from marsyard.scenarios.rover.shared import shared_drive, tracked
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.run import run_case
+from marsyard.scenarios.rover.scenario import RoverScenario
+from marsyard.scenarios.rover.shared import SharedDriveParameters, SharedDriveScenario, shared_drive, tracked
 from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.streams import Streams
 
