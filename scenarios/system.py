@@ -11,6 +11,26 @@ SCENARIOS_FOLDER = Path(__file__).resolve().parent
 
 
 @dataclass(frozen=True)
+class Ingested:
+    """Cases made of recorded data.
+
+    Attributes
+    ----------
+    campaign
+        The text of the campaign file over them.
+    cases, pictures
+        How many there are.
+    note
+        What the user should check; empty for nothing.
+    """
+
+    campaign: str
+    cases: int
+    pictures: int
+    note: str = ""
+
+
+@dataclass(frozen=True)
 class System:
     """Everything that Marsyard needs to know of a system; plain data, so that reading it imports nothing.
 
@@ -45,7 +65,9 @@ class System:
         Templates of `marsyard new`, each a `marsyard.scenarios.template.CampaignTemplate` as ``module:NAME``, by the
         names that ``--system`` takes.
     ingest
-        A function as ``module:NAME`` that makes cases of recorded data (`marsyard ingest`); empty for none.
+        A function as ``module:NAME`` that makes cases of recorded data (`marsyard ingest`), called with the folder of
+        the data, a folder to write into, and the folder where that will lie in the end; it returns `Ingested`. Empty
+        for none.
     report
         A `marsyard.reports.presentation.Presentation` as ``module:NAME``: report sections, and the pictures of a case.
         Empty for the sections that every campaign has.

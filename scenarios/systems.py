@@ -67,6 +67,11 @@ def scenario_paths() -> Mapping[str, str]:
     return {name: path for system in systems() for name, path in system.scenarios.items()}
 
 
+def template_paths() -> Mapping[str, str]:
+    """The templates of `marsyard new` as ``module:NAME``, by the names of its option ``--system``."""
+    return {name: path for system in systems() for name, path in system.templates.items()}
+
+
 def system_of(scenario: str) -> System | None:
     """The system that has a scenario of this name, or of this ``module:Class``; None where no system has it."""
     found = (one for one in systems() if scenario in one.scenarios or scenario in one.scenarios.values())
