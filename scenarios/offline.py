@@ -205,13 +205,12 @@ def answers_of(file: Path, form: OfflineForm[Answer]) -> Mapping[int, Answer]:
         status = check_regular(file)
     except OSError as error:
         raise ValueError(f"{file}: {error.strerror or error}") from error
-    return _read(file, form.required, status.st_mtime_ns, status.st_size)
+    return _read(file, form, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=4)
-def _read(file: Path, required: tuple[str, ...], _time: int, _size: int) -> Mapping[int, Any]:
-    """The answers of a file as it is now; the form goes by its columns."""
-    form = next(one for one in (VELOCITY_FORM, SITE_FORM) if one.required == required)
+def _read(file: Path, form: OfflineForm[Any], _time: int, _size: int) -> Mapping[int, Any]:
+    """The answers of a file as it is now."""
     try:
         with file.open(newline="", encoding="utf-8-sig") as text:
             reader = csv.reader(text)

@@ -37,6 +37,12 @@ def scenario(name: str) -> Scenario:
     return _from_path(path)
 
 
+def scenario_source(name: str) -> str:
+    """``module:Class`` of a scenario whose code is not Marsyard's; the name itself of any other."""
+    path = scenario_paths().get(name, name)
+    return name if path.startswith("marsyard.") else path
+
+
 def _from_path(path: str) -> Scenario:
     """An instance of the class at ``module:Class``."""
     try:

@@ -13,9 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from marsyard.campaigns.definition.configuration import Key, Requirement, key_text, problems_of
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
-
-#: The requirements that ship with Marsyard.
-REQUIREMENTS_FILE = Path(__file__).resolve().parents[2] / "scenarios" / "requirements.toml"
+from marsyard.scenarios.systems import systems
 
 #: What a campaign that names a stated requirement may say of it anew.
 RESTATED = ("statement", "population", "probability", "confidence", "decide_by", "accept_rate")
@@ -67,8 +65,21 @@ def read_requirements(path: Path) -> tuple[StatedRequirement, ...]:
 
 @cache
 def shipped_requirements() -> Mapping[str, StatedRequirement]:
-    """The requirements that ship with Marsyard, by id."""
-    return {one.id: one for one in read_requirements(REQUIREMENTS_FILE)}
+    """The requirements of all systems, by id; where two systems share an id, the one that is read first."""
+    return _stated()[0]
+
+
+@cache
+def _stated() -> tuple[Mapping[str, StatedRequirement], tuple[str, ...]]:
+    """The requirements of the systems' files, and what is wrong with files that cannot be used."""
+    found: dict[str, StatedRequirement] = {}
+    problems: list[str] = []
+    for path in dict.fromkeys(system.requirements for system in systems() if system.requirements):
+        try:
+            found = {one.id: one for one in read_requirements(path)} | found
+        except ConfigurationError as error:
+            problems.append(str(error))
+    return found, tuple(problems)
 
 
 def applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:
@@ -93,9 +104,9 @@ def completed(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key
         named = shipped_requirements().get(str(entry["id"]))
         wrong = [key for key in entry if key not in ("id", *RESTATED)]
         if named is None:
-            message = not_allowed("requirement", str(entry["id"]), shipped_requirements())
+            message = "; ".join((not_allowed("requirement", str(entry["id"]), shipped_requirements()), *_stated()[1]))
             problems.append((("requirements", place, "id"), f"{message}; or state a metric"))
-        problems += [(("requirements", place, key), f"is stated in {REQUIREMENTS_FILE.name} already") for key in wrong]
+        problems += [(("requirements", place, key), "is stated in requirements.toml already") for key in wrong]
         if named is not None and not wrong:
             filled.append({**named.plain(), **entry})
     return {**tables, "requirements": filled}, problems

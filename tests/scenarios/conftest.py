@@ -44,5 +44,7 @@ def _rows_have_the_columns_that_are_stated() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name, path in scenario_paths().items():
             kind = found_at(path)
-            patch.setattr(kind, "run", _checked(kind.run, stated_columns()[name]))
+            stated = stated_columns(name)
+            assert stated is not None
+            patch.setattr(kind, "run", _checked(kind.run, stated))
         yield
