@@ -67,7 +67,10 @@ def list_campaigns(
     """List the campaigns of the catalogue."""
     from marsyard.campaigns.definition.catalogue import catalogue
     from marsyard.cli.listing import catalogue_data, catalogue_table
+    from marsyard.scenarios.systems import problems
 
+    for problem in problems():
+        typer.echo(f"warning: {problem}", err=True)
     if as_json:
         typer.echo(json.dumps(catalogue_data(catalogue()), indent=2))
         return
