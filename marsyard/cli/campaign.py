@@ -233,7 +233,7 @@ def _write_products(target: Path, replayed: Replay, *, step: bool) -> list[str]:
     """Writes the products, stages and figures of a replayed case, all of them or none; returns lines that name them."""
     from marsyard.campaigns.store.products import PackedProducts, replaced_files, unpack_products, write_packed
     from marsyard.cli.steps import write_steps
-    from marsyard.reports.systems import write_case_figures
+    from marsyard.reports.cases import write_case_figures
 
     packed = replayed.products or PackedProducts.nothing()
     products = unpack_products(packed)

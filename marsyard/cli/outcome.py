@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from marsyard.reports.judged import Judged
+    from marsyard.reports.evaluation import Judged
     from marsyard.reports.verdicts import Verdict
 
 
@@ -65,7 +65,7 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
         Where the folder holds no campaign with rows, or the report cannot be written.
     """
     from marsyard.reports.campaign import write_judged
-    from marsyard.reports.judged import judged
+    from marsyard.reports.evaluation import judged
 
     found = judged(directory, requirements)
     if requirements is None and found.run.said("state") == "finished":

@@ -70,7 +70,7 @@ def compare(
     Exit status 0 in any event: a difference is no verdict.
     """
     from marsyard.cli.showing import grid_table
-    from marsyard.reports.between import contrast_data, contrast_grid, contrasts, same_grounds
+    from marsyard.reports.comparison import contrast_data, contrast_grid, contrasts, same_grounds
     from marsyard.reports.stored import read_run
 
     runs = [read_run(directory) for directory in (first, second)]
