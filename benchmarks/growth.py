@@ -30,7 +30,8 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, R
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.crew import Crew
 from marsyard.campaigns.running.engine import run_campaign
-from marsyard.scenarios.descent import CameraParameters, camera_optics
+from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.descent.parameters import CameraParameters
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.render.backend import default_backend

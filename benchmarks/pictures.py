@@ -15,7 +15,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.timing import Figure, core_seconds
 from marsyard.algorithms.processes import used_memory
-from marsyard.scenarios.descent import CameraParameters, DescentScenarioParameters, camera_optics, flown_descent
+from marsyard.scenarios.descent.flight import flown_descent
+from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
 from marsyard.scenarios.views import Eye, SiteGround, nadir_pose, site_scene
 from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import direction, rigid

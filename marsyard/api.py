@@ -129,7 +129,7 @@ def results(directory: str | Path) -> pd.DataFrame:
 def verdicts(directory: str | Path) -> Sequence[Verdict]:
     """The requirements of a campaign that was run, judged on its rows."""
     from marsyard.campaigns.store.table import refresh_table
-    from marsyard.reports.judged import judged
+    from marsyard.reports.evaluation import judged
 
     refresh_table(Path(directory))
     return judged(Path(directory)).verdicts

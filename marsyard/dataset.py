@@ -24,6 +24,7 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.running.inputs import plan_inputs
+from marsyard.scenarios.registry import scenario, scenario_names
 from marsyard.scenarios.samples import GivesSamples, Sample
 
 MANIFEST = "dataset.json"
@@ -39,7 +40,8 @@ def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: 
     """
     if not isinstance(campaign.scenario, GivesSamples):
         named = campaign.configuration.scenario
-        raise CampaignError(f"the scenario '{named}' gives no samples to learn from; allowed: descent, landing")
+        allowed = ", ".join(name for name in scenario_names() if isinstance(scenario(name), GivesSamples))
+        raise CampaignError(f"the scenario '{named}' gives no samples to learn from; allowed: {allowed}")
     _claim(campaign, folder, cases_per_shard)
     total = campaign.configuration.total_cases
     starts = range(0, total, cases_per_shard)

@@ -111,6 +111,7 @@ def examine() -> Iterator[Check]:
     yield from check_disk()
     yield check_machine()
     yield check_threads(os.environ, _cores())
+    yield from check_systems()
 
 
 # --- Python and its packages ------------------------------------------------------------------------------------------
@@ -364,6 +365,21 @@ def check_threads(environment: Mapping[str, str], cores: int) -> Check:
     if any(not value.isdigit() or int(value) > cores for value in asked.values()):
         return Check("threads", found, Verdict.WARN, f"unset {' '.join(asked)}")
     return Check("threads", found)
+
+
+def check_systems() -> Iterator[Check]:
+    """The systems under test: those of Marsyard and of other packages, and those that are left out."""
+    try:
+        from marsyard.scenarios.systems import BUILT_IN, registry
+
+        found = registry()
+    except ImportError as error:
+        yield Check("systems", f"cannot be read: {error}", Verdict.FAIL, REINSTALL)
+        return
+    others = ", ".join(one.name for one in found.systems[len(BUILT_IN) :])
+    yield Check("systems", f"{len(BUILT_IN)} of Marsyard; of other packages: {others or 'none'}")
+    for problem in found.problems:
+        yield Check("systems", problem, Verdict.WARN, "correct or uninstall the package that has the system")
 
 
 def _cores() -> int:

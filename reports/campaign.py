@@ -14,54 +14,34 @@ import numpy as np
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from marsyard.reports import gallery, sections
-from marsyard.reports.algorithms import algorithms_of
-from marsyard.reports.answers import answers_section
+from marsyard.reports import page_figures, sections
+from marsyard.reports.cases import shown_cases
 from marsyard.reports.columns import label, numbers, primary_metric
+from marsyard.reports.common_sections import (
+    answers_section,
+    consistency_section,
+    convergence_section,
+    drivers_section,
+    faults_section,
+    scatter_section,
+)
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
-from marsyard.reports.consistency import consistency_section
-from marsyard.reports.convergence import convergence_section
-from marsyard.reports.dimes.carried import carried_section
-from marsyard.reports.dimes.fieldtest import field_test_section
-from marsyard.reports.dimes.landing import landing_section
-from marsyard.reports.dimes.sensitivity import sensitivity_section
-from marsyard.reports.drivers import drivers_section
-from marsyard.reports.explorer import embedded, explorer_data, script_hash
-from marsyard.reports.explorer import script as explorer_script
-from marsyard.reports.faults import faults_section
-from marsyard.reports.hda.every import HDA_SECTIONS
-from marsyard.reports.judged import Judged, judged
-from marsyard.reports.measured.agreement import agreement_section
-from marsyard.reports.overall import Overall
+from marsyard.reports.evaluation import Judged, Overall, judged
+from marsyard.reports.page_figures import embedded, explorer_data, script_hash
+from marsyard.reports.page_figures import script as explorer_script
+from marsyard.reports.presentation import presentations
 from marsyard.reports.sampled import sampled
-from marsyard.reports.scatter import scatter_section
-from marsyard.reports.section import Section, SectionMaker, Subject
+from marsyard.reports.section import Grid, Section, SectionMaker, Subject
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.systems import shown_cases
-from marsyard.reports.tables import error_summaries, outcome_counts
-from marsyard.reports.traceability import evidence_of, junit_xml, verification_csv
+from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
+from marsyard.reports.traceability import algorithms_of, evidence_of, junit_xml, verification_csv
 from marsyard.reports.twin import SCHEMA
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.vtt.beside import beside_section
-from marsyard.reports.vtt.goal import goal_section
-from marsyard.reports.vtt.kinds import regression_section, terrains_section
-from marsyard.reports.vtt.steps import steps_section
-from marsyard.reports.vtt.table_1 import table_1_section
-from marsyard.reports.vtt.updates import updates_section
 from marsyard.reports.wording import number
 
-#: Sections that a page has where the rows hold their columns, in the page's order.
-FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
-    field_test_section,
-    agreement_section,
-    table_1_section,
-    beside_section,
-    updates_section,
-    steps_section,
-    terrains_section,
-    regression_section,
-    goal_section,
+#: Sections of every campaign whose rows hold their columns, in the page's order; `conditions_section` ends the page.
+COMMON_SECTIONS: tuple[SectionMaker, ...] = (
     answers_section,
     comparison_section,
     scatter_section,
@@ -69,11 +49,6 @@ FURTHER_SECTIONS: tuple[SectionMaker, ...] = (
     convergence_section,
     consistency_section,
     faults_section,
-    carried_section,
-    landing_section,
-    *HDA_SECTIONS,
-    sensitivity_section,
-    conditions_section,
 )
 
 #: Sites and algorithms that the twin names, at most.
@@ -117,7 +92,7 @@ def write_judged(found: Judged) -> Path:
     metric = primary_metric(drawn.frame, run.requirements)
     bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
     subject = Subject(drawn, metric, bound)
-    further = [section for make in FURTHER_SECTIONS if (section := make(subject)) is not None]
+    further = [section for make in section_makers() if (section := make(subject)) is not None]
     twin = summary(found, subject, further)
     algorithms = algorithms_of(run.record)
     write_whole(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
@@ -127,6 +102,13 @@ def write_judged(found: Judged) -> Path:
     context = page_context(run, subject, verdicts, whole, further)
     write_whole(page, page_environment().get_template("report.html.j2").render(context))
     return page
+
+
+def section_makers() -> list[SectionMaker]:
+    """The makers of all further sections, those of every campaign and of every system, in the order of the page."""
+    systems = presentations()
+    first = [make for system in systems for make in system.first]
+    return [*first, *COMMON_SECTIONS, *(make for system in systems for make in system.sections), conditions_section]
 
 
 def page_context(
@@ -145,7 +127,7 @@ def page_context(
         "bound": bound,
         "further": further,
         "outcomes": sections.outcome_grid(run.whole),
-        "outcome_plates": gallery.outcome_plates(run.whole),
+        "outcome_plates": page_figures.outcome_plates(run.whole),
         "crashed": sections.crashed_rows(run),
         "dispersions": sections.dispersion_grid(subject.run),
         "shown": shown_cases(run),
@@ -249,12 +231,12 @@ def _error_sections(run: StoredRun, metric: str | None, bound: float | None, pic
     """What is said of the page's metric; empty where no column is one."""
     if metric is None:
         none = sections.CaseTable((), ())
-        grid = sections.Grid((), ())
+        grid = Grid((), ())
         return {"error_plates": [], "driver_plates": [], "statistics": grid, "worst": none, "silent": none}
     return {
-        "error_plates": gallery.error_plates(run.frame, run.whole, metric, bound),
-        "driver_plates": gallery.driver_plates(run.frame, metric, bound),
-        "statistics": sections.statistics_grid(run.whole, metric),
+        "error_plates": page_figures.error_plates(run.frame, run.whole, metric, bound),
+        "driver_plates": page_figures.driver_plates(run.frame, metric, bound),
+        "statistics": statistics_grid(run.whole, metric),
         "worst": sections.worst_cases(run, metric, pictured),
         "silent": sections.silent_cases(run, metric, pictured),
     }

@@ -12,11 +12,10 @@ import pandas as pd
 from jaxtyping import Bool, Float
 from scipy import stats
 
-from marsyard.reports.answers import CONFIDENCE, Share, share_of
 from marsyard.reports.columns import axis_columns, label, numbers, split_unit
 from marsyard.reports.populations import is_flag, members, terrain_groups
-from marsyard.reports.section import Block, Section, Subject
-from marsyard.reports.sections import Grid
+from marsyard.reports.rates import CONFIDENCE, Share, range_text, share_of
+from marsyard.reports.section import Block, Grid, Section, Subject, grid_of
 from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.wording import number, percent, stated
 
@@ -170,19 +169,17 @@ def terrain_spread(frame: pd.DataFrame, part: str) -> TerrainSpread | None:
 
 
 def _spread_grid(spread: Sequence[TerrainSpread]) -> Grid:
-    head = ["", "Terrains", "SD within", "SD between", "Share of variance between", "p"]
-    rows = [
-        [
-            label(one.part),
-            f"{one.terrains:,}",
-            number(one.within_sd),
-            number(one.between_sd),
-            percent(one.share),
-            number(one.p_value),
-        ]
-        for one in spread
-    ]
-    return Grid(head, rows)
+    return grid_of(
+        spread,
+        {
+            "": lambda one: label(one.part),
+            "Terrains": lambda one: f"{one.terrains:,}",
+            "SD within": lambda one: number(one.within_sd),
+            "SD between": lambda one: number(one.between_sd),
+            "Share of variance between": lambda one: percent(one.share),
+            "p": lambda one: number(one.p_value),
+        },
+    )
 
 
 def _kinds(values: pd.Series) -> list[tuple[str, Bool[np.ndarray, " n"]]]:
@@ -233,7 +230,7 @@ def _grid(frame: pd.DataFrame, metric: str, bins: Sequence[Bin]) -> Grid:
         of_parts = [number(value) for pair in zip(one.means, one.sds, strict=True) for value in pair]
         share = one.answered
         ends = [number(one.quantile_bound) if np.isfinite(one.quantile_bound) else "n too small", number(one.largest)]
-        interval = f"{percent(share.sound_lower)} to {percent(share.sound_upper)}"
+        interval = range_text(share.sound_lower, share.sound_upper)
         rows.append([one.name, f"{share.n:,}", percent(share.share), interval, *of_parts, *ends])
     return Grid(head, rows)
 

@@ -1,50 +1,96 @@
-"""The errors' scatter in numbers: the ellipse that the next error lies in, and circular errors about the truth."""
+"""Responses against conditions as a part of a declared section: points, medians of bins, and rank correlations."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from marsyard.reports.columns import axis_columns, label, numbers, split_unit
-from marsyard.reports.figures import ELLIPSE
+from marsyard.reports.charts import Panel, scatter_panels
+from marsyard.reports.kinds import Drawn, Quantity, Rows, condition_bins
 from marsyard.reports.populations import terrain_groups
-from marsyard.reports.section import Block, Section, Subject
-from marsyard.reports.sections import Grid
-from marsyard.reports.statistics.plane import circular_error, error_ellipse
-from marsyard.reports.wording import interval, number, percent, stated
-
-#: Shares of the errors within the radii, and the confidence of the radii's bounds.
-SHARES, CONFIDENCE = (0.5, 0.95, 0.99), 0.9
+from marsyard.reports.rates import CONFIDENCE, varies
+from marsyard.reports.section import Block, Grid, Subject, plate
+from marsyard.reports.statistics.drivers import FEWEST_CASES, driver
+from marsyard.reports.wording import NOTHING, coefficient, stated
 
 
-def scatter_section(subject: Subject) -> Section | None:
-    """Ellipse and circular errors of a metric of two parts; None where it has none, or too few cases do."""
-    metric = subject.metric
-    if metric is None:
-        return None
-    parts = axis_columns(metric, [str(name) for name in subject.whole.columns])[:2]
-    if len(parts) < 2:
-        return None
-    errors = np.column_stack([numbers(subject.whole, part) for part in parts])
-    ellipse = error_ellipse(errors, ELLIPSE)
-    if ellipse is None:
-        return None
-    groups = terrain_groups(subject.whole)
-    circles = [circular_error(errors, share, CONFIDENCE, groups) for share in SHARES]
-    unit = split_unit(metric)[1]
-    x, y = (number(value) for value in ellipse.centre)
-    text = (
-        f"{stated(ELLIPSE)} ellipse, for normal errors: centre {x}, {y} {unit}, half axes {number(ellipse.semi_major)} "
-        f"and {number(ellipse.semi_minor)} {unit}, major axis at {number(ellipse.angle_deg)} deg from "
-        f"{label(parts[0])} towards {label(parts[1])}. {percent(ellipse.inside)} of these errors lie inside."
-    )
-    rows = [[stated(one.probability), number(one.estimate), interval(one.lower, one.upper)] for one in circles]
-    grid = Grid(["Share of errors", f"Radius ({unit})", f"Bounds, {stated(CONFIDENCE)} each"], rows)
-    note = (
-        "Radius about the truth that holds the share; that of 50 % is the circular error probable. Bounds by order "
-        "statistics: of whole terrains, or of the effective number of cases, where cases share terrains. The ellipse "
-        "holds the next error with its probability, however few cases there are."
-    )
-    data = {"ellipse": asdict(ellipse), "circles": [asdict(one) for one in circles]}
-    return Section("scatter", "Scatter", "Scatter of the errors", [Block(text=text, grid=grid, note=note)], data)
+@dataclass(frozen=True)
+class Effect:
+    """What a condition does to a response: Spearman's correlation with its interval, and medians in bins of it."""
+
+    driver: str
+    error: str
+    rank_correlation: float
+    lower: float
+    upper: float
+    centres: Sequence[float]
+    medians: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Responses against conditions: points, medians of bins, and rank correlations.
+
+    Attributes
+    ----------
+    x, y
+        Conditions and responses. A condition that does not vary is left out.
+    logarithmic
+        Whether the responses' axes are.
+    """
+
+    x: Sequence[Quantity]
+    y: Sequence[Quantity]
+    caption: str
+    heading: str = ""
+    logarithmic: bool = False
+
+    def effects(self, frame: Rows) -> list[Effect]:
+        """The effect of every condition that varies on every response."""
+        effects, groups = [], terrain_groups(frame)
+        for one in (one for one in self.x if varies(frame, one.column)):
+            for response in self.y:
+                x, y = one.values(frame), response.values(frame)
+                bins = condition_bins(np.where(np.isfinite(y), x, np.nan))
+                medians = [[float(np.median(values[chosen])) for chosen in bins] for values in (x, y)]
+                ranks = driver(x, y, groups, CONFIDENCE)
+                of_ranks = (math.nan,) * 3 if ranks is None else (ranks.correlation, ranks.lower, ranks.upper)
+                effects.append(Effect(one.title, response.title, *of_ranks, *medians))
+        return effects
+
+    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
+        """The panels and the rank correlations; nothing where no condition varies."""
+        del subject
+        effects = self.effects(frame)
+        if not effects:
+            return [], {}
+        columns = {one.title: one.values(frame) for one in (*self.x, *self.y)}
+        panels = {
+            (one.driver, one.error): Panel((columns[one.driver], columns[one.error]), (one.centres, one.medians))
+            for one in effects
+        }
+        texts: dict[str, list[str]] = {}
+        for one in effects:
+            texts.setdefault(one.driver, []).append(correlation_text(one))
+        grid = Grid(
+            ["Rank correlation", *(one.title for one in self.y)], [[name, *cells] for name, cells in texts.items()]
+        )
+        figure = scatter_panels(panels, logarithmic=self.logarithmic)
+        note = (
+            f"Intervals at {stated(CONFIDENCE)} confidence; a dash for fewer than {FEWEST_CASES} cases, or where "
+            "nothing varies."
+        )
+        plates = [plate(figure, key, self.caption, wide=len(effects) > 1)]
+        return [Block(heading=self.heading, plates=plates, grid=grid, note=note)], {
+            "effects": [asdict(e) for e in effects]
+        }
+
+
+def correlation_text(effect: Effect) -> str:
+    """A rank correlation with its interval; a dash where there is none."""
+    if math.isnan(effect.rank_correlation):
+        return NOTHING
+    return f"{coefficient(effect.rank_correlation)} ({coefficient(effect.lower)} to {coefficient(effect.upper)})"

@@ -1,21 +1,52 @@
-"""What further sections of a report are made of, and what makes them.
+"""What sections of a report are made of: tables, figures with captions, blocks, and the subject they are about.
 
-A section has a module of its own with a function that takes a `Subject` and returns the `Section`, or None where the
-rows hold none of its columns. `marsyard.reports.campaign.FURTHER_SECTIONS` lists these functions in the order of the
-page.
+A section is made by a function that takes a `Subject` and returns the `Section`, or None where the rows hold none of
+its columns. `marsyard.reports.kinds` has such functions as data.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import pandas as pd
+from markupsafe import Markup
+from matplotlib.figure import Figure
 
-from marsyard.reports.plates import Plate
-from marsyard.reports.sections import Grid
 from marsyard.reports.stored import StoredRun
+from marsyard.reports.svg import svg_markup
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table of texts: headings, rows, and how many rows were left out."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left_out: int = 0
+
+
+def grid_of(records: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> Grid:
+    """A table of records: each column's heading, and the function that makes its text from a record."""
+    return Grid([*columns], [[text(record) for text in columns.values()] for record in records])
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A figure as SVG, its caption, and whether it takes the page's whole width."""
+
+    svg: Markup
+    caption: str
+    wide: bool = False
+
+
+def plate(figure: Figure, key: str, caption: str, *, wide: bool = False) -> Plate:
+    """A figure with its caption; `key` is as in `svg_markup`."""
+    # Matplotlib has escaped the texts inside; the description is escaped where it is put in.
+    return Plate(Markup(svg_markup(figure, key, caption)), caption, wide)  # noqa: S704
 
 
 @dataclass(frozen=True)
@@ -39,7 +70,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Block:
-    """A part of a section, shown in this order: heading, text, figures, table, note; whatever is empty is left out."""
+    """A part of a section, shown in this order: heading, text, figures, table, note; empty parts are left out."""
 
     heading: str = ""
     text: str = ""

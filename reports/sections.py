@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.algorithms import algorithms_of
 from marsyard.reports.columns import axis_columns, driver_columns, label, numbers
-from marsyard.reports.overall import Overall
+from marsyard.reports.evaluation import Overall
 from marsyard.reports.populations import members
 from marsyard.reports.sampled import sampled
+from marsyard.reports.section import Grid
 from marsyard.reports.stored import StoredRun, table
-from marsyard.reports.tables import error_summaries, outcome_counts, statistics_rows
+from marsyard.reports.tables import outcome_counts
+from marsyard.reports.traceability import algorithms_of
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import NOTHING, asked_text, count, number, percent
 
@@ -48,15 +49,6 @@ class VerdictRow:
     risk: str
     further: str
     strip: Strip | None
-
-
-@dataclass(frozen=True)
-class Grid:
-    """A table of texts: headings, rows, and how many rows were left out."""
-
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    left_out: int = 0
 
 
 @dataclass(frozen=True)
@@ -107,12 +99,6 @@ def cautions(whole: Overall) -> list[str]:
     if not whole.crashed:
         return []
     return [f"{count(whole.crashed, 'case')} crashed: the campaign is not in order, whatever its verdict."]
-
-
-def statistics_grid(frame: pd.DataFrame, metric: str) -> Grid:
-    """Statistics of a metric and of its parts, a column each."""
-    summaries = error_summaries(frame, metric)
-    return Grid(["", *(name for name, _ in summaries)], statistics_rows([summary for _, summary in summaries]))
 
 
 def outcome_grid(frame: pd.DataFrame) -> Grid:

@@ -15,6 +15,7 @@ from rich.text import Text
 
 from marsyard.reports.columns import axis_columns, label, numbers
 from marsyard.reports.populations import ENGINE_FAILURES, is_flag, members, terrain_groups
+from marsyard.reports.section import Grid
 from marsyard.reports.statistics.samples import ErrorSummary, summarize
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import NOTHING, asked_text, interval, number, percent, stated
@@ -84,6 +85,12 @@ def error_summaries(frame: pd.DataFrame, metric: str) -> list[tuple[str, ErrorSu
     parts = [metric, *axis_columns(metric, [str(column) for column in frame.columns])]
     groups = terrain_groups(frame)
     return [(label(part), summarize(numbers(frame, part), groups=groups)) for part in parts]
+
+
+def statistics_grid(frame: pd.DataFrame, metric: str) -> Grid:
+    """Statistics of a metric and of its parts, a column each."""
+    summaries = error_summaries(frame, metric)
+    return Grid(["", *(name for name, _ in summaries)], statistics_rows([summary for _, summary in summaries]))
 
 
 def error_table(frame: pd.DataFrame, metric: str) -> Table:

@@ -92,6 +92,13 @@ def _digits(value: float) -> str:
     return f"{value:.{next(digits for below, digits in places if magnitude <= below)}f}"
 
 
+def p_text(value: float) -> str:
+    """A probability of a test; a dash for NaN."""
+    if math.isnan(value):
+        return NOTHING
+    return "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
 def interval(lower: float, upper: float) -> str:
     """Two bounds; one alone, or a dash, where the sample is too small to give both."""
     if math.isfinite(lower) and math.isfinite(upper):

@@ -1,15 +1,13 @@
-"""The columns that the scenarios that ship fill, as `columns.toml` states them."""
+"""The columns of the scenarios' rows, as the systems' files state them (`columns.toml`)."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
-from pathlib import Path
 
-_FILE = Path(__file__).with_suffix(".toml")
+from marsyard.scenarios.systems import system_of
 
 
 @dataclass(frozen=True)
@@ -40,10 +38,21 @@ class StatedColumns:
 
 
 @cache
-def stated_columns() -> Mapping[str, StatedColumns]:
-    """The columns of each scenario that ships, by its name."""
-    tables = tomllib.loads(_FILE.read_text(encoding="utf-8"))
-    return {
-        name: StatedColumns(tuple(one["flags"]), tuple(one["numbers"]), one.get("named_flags", ""))
-        for name, one in tables.items()
-    }
+def stated_columns(scenario: str) -> StatedColumns | None:
+    """The columns of a scenario by its name; None where its system does not state them.
+
+    Raises
+    ------
+    ValueError
+        Where the system's file cannot be used.
+    """
+    system = system_of(scenario)
+    if system is None or system.columns is None:
+        return None
+    try:
+        stated = tomllib.loads(system.columns.read_text(encoding="utf-8")).get(scenario)
+        if stated is None:
+            return None
+        return StatedColumns(tuple(stated["flags"]), tuple(stated["numbers"]), stated.get("named_flags", ""))
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise ValueError(f"{system.columns}: states no columns: {type(error).__name__}: {error}") from error

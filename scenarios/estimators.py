@@ -16,6 +16,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -41,6 +42,7 @@ from marsyard.algorithms.streams import STREAM_METHODS, StreamedEstimator
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
 from marsyard.scenarios.dotted import found_at, sources_at
 from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, OfflineForm, check_offline, is_offline, made_offline
+from marsyard.scenarios.systems import systems
 
 #: Entry points of other packages' algorithms.
 GROUP = "marsyard.algorithms"
@@ -51,7 +53,7 @@ Options = TypeVar("Options")
 
 @dataclass(frozen=True)
 class Task(Generic[Algorithm, Options]):
-    """One of the three systems' tasks, and the algorithms that there are for it.
+    """What a system's algorithms do, and the algorithms that there are for it.
 
     Attributes
     ----------
@@ -63,10 +65,10 @@ class Task(Generic[Algorithm, Options]):
         What an algorithm for it must have.
     shipped
         How each algorithm that ships is made from the options of the paper's own.
-    executable
-        How a program becomes one.
     options
-        The options of the paper's algorithm.
+        The options of the published algorithm.
+    executable
+        How a program becomes one; None where programs are not accepted.
     offline
         How its answers stand in a table; None where each answer decides what is seen next.
     streamed
@@ -77,8 +79,8 @@ class Task(Generic[Algorithm, Options]):
     what: str
     methods: tuple[str, ...]
     shipped: Mapping[str, Callable[[Options], Algorithm]]
-    executable: Callable[[Command, ExecutableLimits], Algorithm]
     options: type[Options]
+    executable: Callable[[Command, ExecutableLimits], Algorithm] | None = None
     offline: OfflineForm[Any] | None = None
     streamed: Callable[[Any], Algorithm] | None = None
 
@@ -88,6 +90,8 @@ class Task(Generic[Algorithm, Options]):
             return
         command = command_of(spec)
         if command is not None:
+            if self.executable is None:
+                raise ValueError(f"'{spec}': a {self.what} cannot be a program; allowed: a name, module:Class")
             if command.stream and self.streamed is None:
                 raise ValueError(f"'{spec}': a {self.what} takes no stream of pictures; allowed: exec:, serve:")
             return
@@ -112,7 +116,7 @@ class Task(Generic[Algorithm, Options]):
         if is_offline(spec):
             return cast(Algorithm, made_offline(spec, self._form(spec), case))
         command = command_of(spec)
-        if command is not None:
+        if command is not None and self.executable is not None:
             return self.executable(command, limits)
         made = self._class(spec)()
         if self.streamed is not None and self._is_stream(made):
@@ -212,7 +216,18 @@ LANDING: Task[SiteEstimator, HdaOptions] = Task(
     offline=SITE_FORM,
 )
 
+#: The tasks that have a conformance suite, by their names.
 TASKS: Mapping[str, Task[Any, Any]] = {task.name: task for task in (VELOCITY, TRACKING, LANDING)}
+
+
+@cache
+def shipped_names() -> frozenset[str]:
+    """Names of the algorithms that the systems bring with them."""
+    names: set[str] = set()
+    for path in dict.fromkeys(path for system in systems() for path in system.tasks):
+        with suppress(ImportError):  # the system's own campaigns report it
+            names.update(found_at(path).shipped)
+    return frozenset(names)
 
 
 @cache
@@ -224,9 +239,8 @@ def installed() -> Mapping[str, EntryPoint]:
 def sources_of(spec: str) -> list[tuple[str, Path]]:
     """The sources of an algorithm of one's own in Python, by their names; none of one that ships, or of a program."""
     path = installed()[spec].value if spec in installed() else spec
-    ours = any(spec in task.shipped for task in TASKS.values())
-    named = ":" in path and not ours and not is_offline(spec) and not spec.startswith(tuple(PREFIXES))
-    return list(sources_at(path)) if named else []
+    elsewhere = is_offline(spec) or spec.startswith(tuple(PREFIXES))
+    return list(sources_at(path)) if ":" in path and not elsewhere and spec not in shipped_names() else []
 
 
 def check_chosen(task: Task[Any, Any], specs: Sequence[str]) -> None:

@@ -206,7 +206,7 @@ def answers_of(file: Path, form: OfflineForm[Answer]) -> Mapping[int, Answer]:
         status = check_regular(file)
     except OSError as error:
         raise ValueError(f"{file}: {error.strerror or error}") from error
-    return _read(file, form.required, status.st_mtime_ns, status.st_size)
+    return _read(file, form, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=4)

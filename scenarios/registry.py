@@ -1,25 +1,13 @@
-"""The scenarios that campaign files can name: those that ship with Marsyard, and a user's own by dotted path."""
+"""The scenarios that campaign files can name: those of the systems, and a user's own by ``module:Class``."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
 from typing import cast
 
 from marsyard.scenarios.dotted import found_at
 from marsyard.scenarios.interface import Scenario
-
-#: Where each scenario's class is found; imported only when asked for.
-SCENARIOS: Mapping[str, str] = {
-    "descent": "marsyard.scenarios.descent:DescentScenario",
-    "fieldtest": "marsyard.scenarios.fieldtest:FieldTestScenario",
-    "rover": "marsyard.scenarios.rover:RoverScenario",
-    "rover-drive": "marsyard.scenarios.rover:SharedDriveScenario",
-    "landing": "marsyard.scenarios.landing:LandingScenario",
-    "measured-velocity": "marsyard.scenarios.measured.descent:MeasuredVelocityScenario",
-    "measured-landing": "marsyard.scenarios.measured.landing:MeasuredLandingScenario",
-    "measured-matching": "marsyard.scenarios.measured.matching:MatchingScenario",
-}
+from marsyard.scenarios.systems import problems, scenario_paths
 
 
 class UnknownScenarioError(LookupError):
@@ -27,8 +15,8 @@ class UnknownScenarioError(LookupError):
 
 
 def scenario_names() -> list[str]:
-    """Names of the scenarios that ship with Marsyard."""
-    return sorted(SCENARIOS)
+    """Names of the scenarios of all systems."""
+    return sorted(scenario_paths())
 
 
 def scenario(name: str) -> Scenario:
@@ -39,15 +27,20 @@ def scenario(name: str) -> Scenario:
     UnknownScenarioError
         Where there is none; the message says what is allowed.
     """
-    path = name if ":" in name else SCENARIOS.get(name)
+    path = name if ":" in name else scenario_paths().get(name)
     if path is None:
-        near = difflib.get_close_matches(name, SCENARIOS, n=1)
+        near = difflib.get_close_matches(name, scenario_names(), n=1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         allowed = ", ".join(scenario_names())
-        raise UnknownScenarioError(
-            f"unknown scenario '{name}'{hint}; allowed: {allowed}, or your own as 'module:Class'"
-        )
+        message = f"unknown scenario '{name}'{hint}; allowed: {allowed}, or your own as 'module:Class'"
+        raise UnknownScenarioError("; ".join((message, *problems())))
     return _from_path(path)
+
+
+def scenario_source(name: str) -> str:
+    """``module:Class`` of a scenario whose code is not Marsyard's; the name itself of any other."""
+    path = scenario_paths().get(name, name)
+    return name if path.startswith("marsyard.") else path
 
 
 def _from_path(path: str) -> Scenario:

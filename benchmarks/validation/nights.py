@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from marsyard.reports.history import FINISHED, History, NightCampaign, NightFigure
-from marsyard.reports.regressions import Comparison, changes, comparisons_of
+from marsyard.reports.nights import Comparison, changes, comparisons_of
 from marsyard.reports.statistics.changes import Sample
 
 #: How a campaign's cases lie on terrains.

@@ -13,7 +13,7 @@ from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.rover import RoverScenarioParameters
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run import Run, run_case
 from marsyard.scenarios.rover.score import fixed_conditions, run_conditions, score
 from marsyard.sim.sensor.odometry import EXACT

@@ -1,12 +1,12 @@
-"""The campaigns that ship with Marsyard. Listing them reads their files and nothing else."""
+"""The campaigns of the systems. Listing them reads folders and nothing else."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-CATALOGUE = Path(__file__).resolve().parents[2] / "scenarios" / "catalogue"
+from marsyard.scenarios.systems import systems
 
 
 def catalogue() -> dict[str, Path]:
-    """The campaigns that ship with Marsyard, by name."""
-    return {path.stem: path for path in sorted(CATALOGUE.glob("*.toml"))}
+    """The campaign files of all systems, by their campaigns' names in order."""
+    return dict(sorted((name, path) for system in systems() for name, path in system.campaigns.items()))

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import math
+import tomllib
 import types
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from marsyard.campaigns.errors import near_match
+from marsyard.campaigns.errors import ConfigurationError, Problem, near_match
 from marsyard.campaigns.sampling.correlation import Correlation
 from marsyard.campaigns.sampling.design import Design
 from marsyard.campaigns.sampling.dispersions import FRIENDLY, AnyDispersion
 from marsyard.campaigns.sampling.levels import Grid
 from marsyard.campaigns.sampling.ranges import Normal
+from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters
+
+Model = TypeVar("Model", bound=BaseModel)
 
 #: A key in nested tables and lists, part by part.
 Key = tuple[str | int, ...]
@@ -205,6 +210,26 @@ class CampaignConfiguration(Parameters):
         if group.covariance is not None and dispersion.sd is not None:
             return f"'{path}' has an sd, which the covariance states already; leave one of them out"
         return ""
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file. Raises ConfigurationError where it cannot be read, or is none."""
+    try:
+        check_regular(path)
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
+    except (ValueError, RecursionError) as error:  # a ValueError of its own too for numbers of thousands of digits
+        raise ConfigurationError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
+
+
+def read_table(path: Path, model: type[Model]) -> Model:
+    """What a TOML file states as a whole. Raises ConfigurationError, every problem with its key."""
+    try:
+        return model.model_validate(read_tables(path))
+    except ValidationError as error:
+        found = [Problem(str(path), key_text(key), message) for key, message in problems_of(error, model)]
+        raise ConfigurationError(found) from error
 
 
 def problems_of(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:

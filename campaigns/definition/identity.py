@@ -26,7 +26,7 @@ from marsyard.scenarios.estimators import sources_of
 from marsyard.scenarios.interface import TakesAlgorithms, TakesParts
 from marsyard.scenarios.offline import answers_file
 from marsyard.scenarios.own_files import input_files
-from marsyard.scenarios.registry import UnknownScenarioError, scenario
+from marsyard.scenarios.registry import UnknownScenarioError, scenario, scenario_source
 
 #: Folders of ours whose code rows depend on; what reports and commands do changes no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")
@@ -94,8 +94,10 @@ def identity_of(configuration: CampaignConfiguration) -> Identity:
     CampaignError
         Where a file that the parameters name cannot be used any more.
     """
-    code = code_hash((configuration.scenario, *chosen_algorithms(configuration), *chosen_parts(configuration)))
-    return Identity(configuration_hash(configuration), code, package_versions(), input_hashes(configuration))
+    named = (scenario_source(configuration.scenario), *chosen_algorithms(configuration), *chosen_parts(configuration))
+    return Identity(
+        configuration_hash(configuration), code_hash(named), package_versions(), input_hashes(configuration)
+    )
 
 
 def input_hashes(configuration: CampaignConfiguration) -> dict[str, str]:

@@ -25,7 +25,10 @@ def metric_problems(campaign: Campaign) -> list[tuple[Key, str]]:
     Columns of a user's own scores are accepted by their prefix. Of a user's own scenario nothing is known: its first
     finished case is held against the requirements instead (`marsyard.campaigns.running.engine.check_metrics`).
     """
-    columns = _columns(campaign)
+    try:
+        columns = _columns(campaign)
+    except ValueError as error:
+        return [(("scenario",), str(error))]
     if columns is None:
         return []
     problems: list[tuple[Key, str]] = []
@@ -51,7 +54,7 @@ def _own_name(name: str, others: Iterable[str]) -> str:
 def _columns(campaign: Campaign) -> StatedColumns | None:
     """The scenario's columns with those that the campaign's parameters add; None where they are not known."""
     configuration = campaign.configuration
-    stated = stated_columns().get(configuration.scenario)
+    stated = stated_columns(configuration.scenario)
     if stated is None:
         return None
     own: list[str] = []

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from marsyard.campaigns.definition.configuration import Key, Requirement, key_text, problems_of
+from marsyard.campaigns.definition.configuration import Key, Requirement, read_table
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
+from marsyard.scenarios.systems import systems
 from marsyard.sim.parameters import Parameters
-
-#: The requirements that ship with Marsyard.
-REQUIREMENTS_FILE = Path(__file__).resolve().parents[2] / "scenarios" / "requirements.toml"
 
 #: What a campaign that names a stated requirement may say of it anew.
 RESTATED = ("statement", "population", "probability", "confidence", "decide_by", "accept_rate")
@@ -48,15 +45,7 @@ def read_requirements(path: Path) -> tuple[StatedRequirement, ...]:
     ConfigurationError
         Where it cannot be read, or states something that is none; every problem with its key.
     """
-    try:
-        stated = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
-    except ValidationError as error:
-        found = [Problem(str(path), key_text(key), message) for key, message in problems_of(error, _File)]
-        raise ConfigurationError(found) from error
-    except ValueError as error:
-        raise ConfigurationError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
+    stated = read_table(path, _File)
     ids = [one.id for one in stated.requirements]
     repeated = sorted({name for name in ids if ids.count(name) > 1})
     if repeated:
@@ -66,8 +55,21 @@ def read_requirements(path: Path) -> tuple[StatedRequirement, ...]:
 
 @cache
 def shipped_requirements() -> Mapping[str, StatedRequirement]:
-    """The requirements that ship with Marsyard, by id."""
-    return {one.id: one for one in read_requirements(REQUIREMENTS_FILE)}
+    """The requirements of all systems, by id; where two systems share an id, the one that is read first."""
+    return _stated()[0]
+
+
+@cache
+def _stated() -> tuple[Mapping[str, StatedRequirement], tuple[str, ...]]:
+    """The requirements of the systems' files, and what is wrong with files that cannot be used."""
+    found: dict[str, StatedRequirement] = {}
+    problems: list[str] = []
+    for path in dict.fromkeys(system.requirements for system in systems() if system.requirements):
+        try:
+            found = {one.id: one for one in read_requirements(path)} | found
+        except ConfigurationError as error:
+            problems.append(str(error))
+    return found, tuple(problems)
 
 
 def applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:
@@ -92,9 +94,9 @@ def completed(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key
         named = shipped_requirements().get(str(entry["id"]))
         wrong = [key for key in entry if key not in ("id", *RESTATED)]
         if named is None:
-            message = not_allowed("requirement", str(entry["id"]), shipped_requirements())
+            message = "; ".join((not_allowed("requirement", str(entry["id"]), shipped_requirements()), *_stated()[1]))
             problems.append((("requirements", place, "id"), f"{message}; or state a metric"))
-        problems += [(("requirements", place, key), f"is stated in {REQUIREMENTS_FILE.name} already") for key in wrong]
+        problems += [(("requirements", place, key), "is stated in requirements.toml already") for key in wrong]
         if named is not None and not wrong:
             filled.append({**named.plain(), **entry})
     return {**tables, "requirements": filled}, problems

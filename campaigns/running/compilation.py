@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from marsyard.scenarios.registry import SCENARIOS
+from marsyard.scenarios.systems import scenario_paths
 from marsyard.sim.kernel_cache import compiled_functions, kernels_are_ready
 
 #: Seconds between two reports.
@@ -29,7 +29,7 @@ def compilation_reported(scenario: str, watch: Notes) -> Iterator[Callable[[], N
 
     Gives a function to be called when the first case has ended: from then on nothing is compiled.
     """
-    if scenario not in SCENARIOS or kernels_are_ready(scenario):
+    if scenario not in scenario_paths() or kernels_are_ready(scenario):
         yield lambda: None
         return
     watch.note("compiling numeric kernels once on this machine, about two minutes (ahead of time: marsyard compile)")

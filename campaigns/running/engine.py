@@ -378,7 +378,7 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
         Where a requirement asks for a column that is not there, or is of another kind: numbers for a metric with a
         bound, true and false for a metric without one and for a population.
     """
-    stated = stated_columns().get(configuration.scenario, StatedColumns((), ()))
+    stated = stated_columns(configuration.scenario) or StatedColumns((), ())
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
     problems = []

@@ -3,18 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
 
 import typer
 
 from marsyard.cli.campaign import says_what_is_wrong
-
-#: A case of each system, with settings that make it small: together they call all kernels that campaigns call.
-SMALL: Mapping[str, Sequence[str]] = {
-    "dimes-smoke": ("terrain.samples=512",),
-    "vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5"),
-    "hda-benign": ("terrain.samples=512",),
-}
 
 
 @says_what_is_wrong
@@ -25,10 +17,11 @@ def compile_kernels() -> None:
     """
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.execution.worker_process import limit_threads
+    from marsyard.scenarios.systems import systems
     from marsyard.sim.kernel_cache import kernels_are_ready, note_ready
 
     limit_threads()
-    for name, settings in SMALL.items():
+    for name, settings in (one for system in systems() for one in system.compiled_by.items()):
         campaign = load_campaign(name, settings)
         scenario = campaign.configuration.scenario
         if kernels_are_ready(scenario):

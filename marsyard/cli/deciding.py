@@ -10,7 +10,7 @@ from marsyard.campaigns.execution.crew import Crew
 from marsyard.campaigns.running.engine import Watch, append_cases, run_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli.outcome import read_frame
-from marsyard.reports.deciding import next_look
+from marsyard.reports.evaluation import next_look
 from marsyard.reports.sampled import sampled
 from marsyard.reports.statistics.sequential import looks_of
 from marsyard.reports.verdicts import ESTIMATE, judge_campaign

@@ -2,39 +2,28 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Sequence
-from enum import StrEnum
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from marsyard.cli.campaign import says_what_is_wrong
 
-
-class System(StrEnum):
-    """What a campaign puts to the test."""
-
-    VELOCITY = "velocity"
-    LANDING = "landing"
-    TRACKING = "tracking"
-
-
-#: What is asked for each system: site and the most that its error may be, in the unit of its metric.
-_USUAL = {
-    System.VELOCITY: ("gusev", 5.0, "horizontal velocity within this many m/s (5 of the DIMES requirement)"),
-    System.LANDING: ("heli-hazardous", 0.99, "share of chosen sites that must be safe"),
-    System.TRACKING: ("mars-yard", 0.03, "position of the target within this many metres at the goal"),
-}
+if TYPE_CHECKING:
+    from marsyard.campaigns.definition.campaign import Campaign
+    from marsyard.scenarios.template import CampaignTemplate, Choices
 
 
 @says_what_is_wrong
 def new(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")],
     system: Annotated[
-        System | None,
-        typer.Option("--system", help="velocity (DIMES in a descent), landing (hazards), or tracking (a rover)."),
+        str | None,
+        typer.Option("--system", help="What is tested, such as velocity; an unknown name lists all that there are."),
     ] = None,
     site: Annotated[str | None, typer.Option("--site", help="One of `marsyard terrain list`.")] = None,
     camera: Annotated[
@@ -48,57 +37,37 @@ def new(
     ] = None,
     axes: Annotated[str, typer.Option("--axes", help="The trajectory's world axes: enu or ned.")] = "enu",
     bound: Annotated[
-        float | None, typer.Option("--bound", metavar="X", help="The requirement: most error, or least share.")
+        float | None, typer.Option("--bound", metavar="X", help="The requirement: maximum error, or minimum fraction.")
     ] = None,
     cases: Annotated[int, typer.Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Instead of NAME.toml.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it is there.")] = False,
 ) -> None:
     """Write a commented campaign of your own; at a terminal asks for what is not given."""
-    from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.errors import CampaignError, not_allowed
     from marsyard.cli.evidence import evidence_limits
-    from marsyard.cli.new_campaign import Choices, campaign_text
     from marsyard.reports.wording import count
+    from marsyard.scenarios.dotted import found_at
+    from marsyard.scenarios.systems import template_paths
+    from marsyard.scenarios.template import Choices
 
     path = Path(f"{name}.toml") if out is None else out
     if path.exists() and not overwrite:
         raise CampaignError(f"{path}: there already; --overwrite replaces it, --out writes another")
     if not name or any(letter in name for letter in '/\\"\n'):
         raise CampaignError(f"'{name}' is no name for a campaign: without slashes and quotes")
-    asked = system is None and _is_terminal()
-    chosen = System(_asked("System", "velocity", asked, _one_of(list(System)))) if system is None else system
-    usual_site, usual_bound, about = _USUAL[chosen]
-    site = site or _asked("Site", usual_site, asked, _one_of(_sites(chosen)))
-    camera = camera or _asked(
-        "Camera's file (empty: the paper's camera)", "", asked and chosen != System.TRACKING, _camera_file
+    asked, known = system is None and _is_terminal(), template_paths()
+    chosen = system or _answer("System", next(iter(known)), asked, _one_of(list(known)))
+    if chosen not in known:
+        raise CampaignError(f"--system: {not_allowed('system', chosen, known)}")
+    template: CampaignTemplate = found_at(known[chosen])
+    given = Choices(
+        name, site or "", camera or "", detector or "", flight or "", axes, math.nan if bound is None else bound, cases
     )
-    flight = flight or _asked(
-        "Trajectory's file (empty: simulated)", "", asked and chosen == System.VELOCITY, _readable_file
-    )
-    highest = 1.0 if chosen == System.LANDING else float("inf")
-    stated = (
-        float(_asked(f"Requirement: {about}", f"{usual_bound:g}", asked, _above_zero(highest)))
-        if bound is None
-        else bound
-    )
-    choices = Choices(name, chosen.value, site, camera, detector or "", flight, axes, stated, cases)
-    text = campaign_text(choices)
-    before = path.read_text(encoding="utf-8") if path.exists() else None
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise CampaignError(f"{path}: cannot be written: {error.strerror or error}") from error
-    try:
-        loaded = load_campaign(str(path))
-    except CampaignError:
-        # what was asked for cannot be run: nothing of it stays
-        path.unlink() if before is None else path.write_text(before, encoding="utf-8")
-        raise
-    typer.echo(
-        f"{path}: {chosen.value} over {site}, {count(cases, 'case')}. See it with `marsyard show {path}`, run it with"
-    )
-    typer.echo(f"  marsyard run {path}")
+    choices = _completed(template, given, asked)
+    loaded = _written(path, template, choices)
+    where = f"{path}: {chosen} over {choices.site}, {count(cases, 'case')}"
+    typer.echo(f"{where}. See it with `marsyard show {path}`, run it with\n  marsyard run {path}")
     for limit in evidence_limits(loaded):
         typer.echo(f"note: {limit}")
 
@@ -107,7 +76,39 @@ def _is_terminal() -> bool:
     return sys.stdin.isatty()
 
 
-def _asked(question: str, usual: str, asked: bool, check: Callable[[str], str]) -> str:
+def _completed(template: CampaignTemplate, given: Choices, asked: bool) -> Choices:
+    """The choices with answers at the terminal, or the template's defaults, for what is not given."""
+    asks_camera, asks_flight = (asked and option not in template.refused for option in ("camera", "flight"))
+    site = given.site or _answer("Site", template.site, asked, _one_of(_sites(template.scale)))
+    camera = given.camera or _answer("Camera's file (empty: the paper's camera)", "", asks_camera, _camera_file)
+    flight = given.flight or _answer("Trajectory's file (empty: simulated)", "", asks_flight, _readable_file)
+    question, usual = f"Requirement: {template.bound_text}", f"{template.bound:g}"
+    bound = given.bound
+    if math.isnan(bound):
+        bound = float(_answer(question, usual, asked, _above_zero(template.max_bound)))
+    return replace(given, site=site, camera=camera, flight=flight, bound=bound)
+
+
+def _written(path: Path, template: CampaignTemplate, choices: Choices) -> Campaign:
+    """Write the campaign and load it; where it cannot be loaded, restore what the path held before."""
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.errors import CampaignError
+
+    before = path.read_text(encoding="utf-8") if path.exists() else None
+    try:
+        path.write_text(template.text(choices), encoding="utf-8")
+    except ValueError as error:
+        raise CampaignError(str(error)) from error
+    except OSError as error:
+        raise CampaignError(f"{path}: cannot be written: {error.strerror or error}") from error
+    try:
+        return load_campaign(str(path))
+    except CampaignError:
+        path.unlink() if before is None else path.write_text(before, encoding="utf-8")
+        raise
+
+
+def _answer(question: str, usual: str, asked: bool, check: Callable[[str], str]) -> str:
     """The answer at the terminal, asked for again until `check` accepts it; or the usual."""
     if not asked:
         return usual
@@ -126,11 +127,10 @@ def _one_of(allowed: Sequence[str]) -> Callable[[str], str]:
     return check
 
 
-def _sites(system: System) -> list[str]:
-    """Sites that a system's scenario accepts: those with a terrain at its scale."""
+def _sites(scale: str) -> list[str]:
+    """Sites with a terrain at a scale."""
     from marsyard.sim.terrain import sites
 
-    scale = "descent" if system == System.VELOCITY else "ground"
     return [name for name, one in sites().items() if getattr(one, scale) is not None]
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from marsyard.campaigns.running.engine import Watch
     from marsyard.cli.nightly_plan import Plan, PlannedCampaign
     from marsyard.reports.history import History, NightCampaign
-    from marsyard.reports.regressions import Change
+    from marsyard.reports.nights import Change
 
 #: What a nightly's folder holds.
 HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "site"
@@ -38,7 +38,7 @@ def nightly(
 
     Exit status: as of the campaigns, the worst; 1 also for a regression, or a campaign that could not be run.
     """
-    from marsyard.campaigns.errors import StoreError
+    from marsyard.campaigns.errors import writing
     from marsyard.campaigns.store.lock import folder_lock
     from marsyard.campaigns.store.record import git_commit
     from marsyard.cli.nightly_plan import PLAN_FILE, read_plan
@@ -47,10 +47,8 @@ def nightly(
 
     path = plan or PLAN_FILE
     stated, crew = read_plan(path), make_crew(jobs, None)
-    try:
+    with writing(out):
         (out / RUNS).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"{out} cannot be written: {error.strerror or error}") from error
     with folder_lock(out), History(out / HISTORY_FILE) as history:
         night = history.begin(git_commit())
         # what a night that is killed leaves behind
@@ -83,7 +81,7 @@ def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) 
     from marsyard.campaigns.running.engine import run_campaign
     from marsyard.cli.nightly_plan import definition_of
     from marsyard.cli.outcome import settle
-    from marsyard.reports.between import figures_of, sample_of
+    from marsyard.reports.comparison import figures_of, sample_of
     from marsyard.reports.history import NightCampaign, NightFigure
 
     try:
@@ -105,7 +103,7 @@ def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) 
 
 
 def _changes(history: History, night: int) -> list[Change]:
-    from marsyard.reports.regressions import changes, comparisons_of
+    from marsyard.reports.nights import changes, comparisons_of
 
     return changes(comparisons_of(history, night))
 
@@ -122,8 +120,7 @@ def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> N
 def _write_page(history: History, night: int, out: Path, found: Sequence[Change]) -> str:
     """Writes what is known of the night so far, and returns it."""
     from marsyard.reports.campaign import write_whole
-    from marsyard.reports.night_page import night_text
-    from marsyard.reports.regressions import comparisons_of
+    from marsyard.reports.nights import comparisons_of, night_text
 
     nights = history.nights()
     now = next(one for one in nights if one.night == night)

@@ -23,7 +23,7 @@ def keep_notable_cases(directory: Path, say: Callable[[str], None]) -> None:
     from marsyard.campaigns.store.record import stored_configuration
     from marsyard.campaigns.store.retention import case_directory
     from marsyard.campaigns.store.table import stored_row
-    from marsyard.reports.notable import notable_cases
+    from marsyard.reports.cases import notable_cases
     from marsyard.reports.stored import read_run
 
     run = read_run(directory)

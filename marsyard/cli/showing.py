@@ -22,7 +22,7 @@ from marsyard.reports.columns import split_unit
 from marsyard.reports.wording import asked_text, count
 
 if TYPE_CHECKING:
-    from marsyard.reports.sections import Grid
+    from marsyard.reports.section import Grid
 
 #: Width of a column of drawn values with what sets it apart.
 _VALUE_WIDTH = 12

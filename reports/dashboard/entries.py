@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.errors import CampaignError
-from marsyard.reports.algorithms import Algorithm, algorithms_of, judged_text
 from marsyard.reports.campaign import TWIN_FILE, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
+from marsyard.reports.traceability import Algorithm, algorithms_of, judged_text
 from marsyard.reports.twin import SCHEMA
+from marsyard.scenarios.systems import system_of
 
 #: How deep below a folder campaigns are looked for.
 _DEPTH = 3
-#: Systems by the beginnings of their campaigns' names.
-_SYSTEMS = ("dimes", "vtt", "hda")
 
 
 @dataclass(frozen=True)
@@ -138,12 +137,13 @@ def _twin(path: Path) -> Mapping[str, Any]:
 def _entry(path: Path, twin: Mapping[str, Any]) -> Entry:
     record = table(json.loads((path / RECORD_FILE).read_text(encoding="utf-8")))
     parameters = table(table(record.get("configuration")).get("parameters"))
+    system = system_of(str(table(record.get("configuration")).get("scenario")))
     name = str(twin.get("campaign") or path.name)
     return Entry(
         slug=slug_of(path, name),
         directory=path,
         name=name,
-        system=next((one for one in _SYSTEMS if name.startswith(one)), "other"),
+        system="other" if system is None else system.name,
         sites=_named(twin, "sites", parameters, "site"),
         algorithms=_named(twin, "algorithms", parameters, "algorithm"),
         tested=tuple(algorithms_of(record)),

@@ -17,6 +17,7 @@ from typing import Any
 
 from marsyard.campaigns.definition.requirements import StatedRequirement, shipped_requirements
 from marsyard.reports.campaign import PAGE_FILE, VERIFICATION_FILE, page_environment, write_whole
+from marsyard.reports.cases import shown_case
 from marsyard.reports.dashboard.entries import Entry, find_campaigns, read_entries
 from marsyard.reports.dashboard.rows import (
     MOST_BESIDE,
@@ -27,10 +28,9 @@ from marsyard.reports.dashboard.rows import (
     margin_text,
     requirement_rows,
 )
-from marsyard.reports.explorer import embedded, script_hash
+from marsyard.reports.page_figures import embedded, script_hash
 from marsyard.reports.sections import replay_command
 from marsyard.reports.stored import read_run
-from marsyard.reports.systems import shown_case
 from marsyard.reports.wording import percent
 
 INDEX = "index.html"

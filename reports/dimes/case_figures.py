@@ -20,9 +20,8 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Polygon, Rectangle
 from scipy import ndimage
 
-from marsyard.reports.pictures import draw_pictures
-from marsyard.reports.products import numbers, plane
-from marsyard.reports.svg import INK, in_page_style
+from marsyard.reports.presentation import numbers, plane
+from marsyard.reports.svg import INK, draw_pictures, in_page_style
 
 TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
 #: Side of a template's square on a delivered picture where the products do not tell it, pixels.

@@ -11,9 +11,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from marsyard.reports.plates import plate
-from marsyard.reports.products import numbers, plane
-from marsyard.reports.shown import CaseView, System, TableRow
+from marsyard.reports.presentation import CaseKind, CaseView, TableRow, numbers, plane, save_figures
+from marsyard.reports.section import plate
 from marsyard.reports.svg import INK, MARKERS, MUTED, SERIES, in_page_style
 from marsyard.reports.wording import number
 
@@ -111,9 +110,7 @@ def _table(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"]:
 
 
 def _write(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    path = directory / "stream.png"
-    draw_stream_case(products).savefig(path, dpi=110, facecolor="#ffffff", metadata={"Software": None})
-    return [path]
+    return save_figures(directory, {"stream": draw_stream_case(products)})
 
 
-STREAM = System(is_stream_case, view, _write, _LEGEND)
+STREAM_CASE = CaseKind(is_stream_case, view, _write, _LEGEND)

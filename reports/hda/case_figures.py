@@ -31,8 +31,7 @@ from marsyard.reports.hda.products import (
     tracked_features,
     true_ground,
 )
-from marsyard.reports.pictures import show_picture
-from marsyard.reports.svg import MUTED, in_page_style
+from marsyard.reports.svg import MUTED, in_page_style, show_picture
 
 T = TypeVar("T")
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.reports.products import numbers, plane
+from marsyard.reports.presentation import numbers, plane
 
 
 @dataclass(frozen=True)

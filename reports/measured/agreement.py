@@ -10,9 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from marsyard.reports.columns import label, numbers
-from marsyard.reports.plates import plate
-from marsyard.reports.section import Block, Section, Subject
-from marsyard.reports.sections import Grid
+from marsyard.reports.section import Block, Grid, Section, Subject, plate
 from marsyard.reports.svg import MARKERS, SERIES, in_page_style, new_axes
 from marsyard.reports.wording import NOTHING, number
 

@@ -12,9 +12,8 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from marsyard.reports.pictures import show_picture
-from marsyard.reports.products import numbers, plane
-from marsyard.reports.svg import MUTED, in_page_style
+from marsyard.reports.presentation import numbers, plane
+from marsyard.reports.svg import MUTED, in_page_style, show_picture
 from marsyard.reports.wording import number
 
 #: Residuals are coloured from none to so many pixels.

@@ -7,6 +7,11 @@ hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of 
 
 Small probabilities of ranks are those of permutations: where many values are tied, as shares of a few cases on a
 terrain are, the sum of ranks is skewed, and its normal approximation is too small by a factor of two to three at 0.001.
+
+Pairs of cases (two algorithms, or two campaigns of the same draws): McNemar's test with the exact binomial distribution
+(Psychometrika 12, 1947) on the cases in which just one succeeds; Wilcoxon's signed ranks on the differences of errors.
+Where cases share terrains, the terrain is the pair: the sums of its differences are symmetric about zero if the two are
+alike, however much its cases go together.
 """
 
 from __future__ import annotations
@@ -16,8 +21,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import stats
+
+from marsyard.reports.statistics.clusters import terrain_index
+from marsyard.reports.statistics.samples import Groups, is_shared, mean_interval
 
 #: Share of the cases of either set that must lie on terrains of both for a comparison terrain by terrain.
 _COMMON = 0.5
@@ -165,3 +173,39 @@ def holm(p_values: Sequence[float]) -> list[float]:
         largest = max(largest, min(1.0, p * (len(known) - rank)))
         corrected[place] = largest
     return corrected
+
+
+def compared_successes(
+    first: Bool[np.ndarray, " n"], other: Bool[np.ndarray, " n"], groups: Groups = None
+) -> tuple[int, int, float]:
+    """Cases in which just the first and just the other succeeds, and the two-sided probability of so uneven a split."""
+    only_first, only_other = int((first & ~other).sum()), int((other & ~first).sum())
+    if groups is not None and is_shared(groups):
+        return only_first, only_other, _signed_ranks_p(_sums(other.astype(np.float64) - first, groups))
+    total = only_first + only_other
+    p = 1.0 if total == 0 else float(stats.binomtest(only_first, total, 0.5).pvalue)
+    return only_first, only_other, p
+
+
+def compared_errors(
+    differences: Float[np.ndarray, " n"], groups: Groups, confidence: float
+) -> tuple[float, float, float, float]:
+    """Mean of paired differences, its interval, and the two-sided probability that they are symmetric about zero.
+
+    NaN for no pairs; the interval is NaN for one.
+    """
+    if differences.size == 0:
+        return math.nan, math.nan, math.nan, math.nan
+    mean, interval = float(differences.mean()), mean_interval(differences, confidence, groups)
+    sums = _sums(differences, groups) if groups is not None and is_shared(groups) else differences
+    return mean, *interval, _signed_ranks_p(sums)
+
+
+def _sums(differences: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, " terrains"]:
+    return np.bincount(terrain_index(groups), weights=differences)
+
+
+def _signed_ranks_p(differences: Float[np.ndarray, " n"]) -> float:
+    """Wilcoxon's two-sided p; 1 where nothing differs."""
+    moved = differences[differences != 0.0]
+    return 1.0 if moved.size == 0 else float(stats.wilcoxon(moved).pvalue)

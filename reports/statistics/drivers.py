@@ -102,8 +102,10 @@ def _share(
     means = np.bincount(index, weights=y) / np.bincount(index)
     total = float(((y - y.mean()) ** 2).sum())
     between = float((np.bincount(index) * (means - y.mean()) ** 2).sum())
+    if between >= (1.0 - 1e-9) * total:
+        return 1.0, 1.0, 1.0, 0.0
     free = max(effective - bins, 1.0)
-    within = max(total - between, 1e-12 * total)
+    within = total - between
     ratio = between / (bins - 1.0) / (within / free)
     share = max(0.0, (between - (bins - 1.0) * within / free) / total)
     tail = 0.5 * (1.0 - confidence)

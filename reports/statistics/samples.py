@@ -2,16 +2,28 @@
 
 Quantiles are bounded by order statistics, free of any assumption about the distribution (Wilks, "Determination of
 sample sizes for setting tolerance limits", Ann. Math. Statist. 12, 1941; as Hanson & Beard use them for a stated
-consumer risk, NASA/TP-2010-216447). Means and spreads are bounded by the BCa bootstrap (`.bootstrap`); a spread's
-interval reaches at least as far as Bonett's ("Approximate confidence interval for standard deviation of nonnormal
-distributions", Comput. Statist. Data Anal. 50, 2006), since BCa alone covers too little in small samples.
-Where values share terrains (`groups`) all of these are by terrains: `marsyard.reports.statistics.shared`. `python -m
-benchmarks.validation --only intervals --only shared` measures their coverage.
+consumer risk, NASA/TP-2010-216447). Means and spreads are bounded by the BCa bootstrap (Efron, "Better bootstrap
+confidence intervals", J. Amer. Statist. Assoc. 82, 1987) as SciPy has it, at the level of Student's t instead of the
+normal distribution (Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69, 2015): in small
+samples BCa alone covers too little. A spread's interval reaches at least as far as Bonett's ("Approximate confidence
+interval for standard deviation of nonnormal distributions", Comput. Statist. Data Anal. 50, 2006).
+
+Where values share terrains (`groups`) they are alike, so that the terrain is what was drawn. Mean and standard
+deviation: BCa bootstrap of whole terrains (Davison & Hinkley, "Bootstrap methods and their application", 1997, section
+3.8), widened for few of them as that of single values is, and reaching at least as far as Student's interval with the
+variance over terrains (Taylor linearisation; Cochran, "Sampling techniques", 1977, section 6). Quantiles: order
+statistics, counted as success rates of shared terrains are (`marsyard.reports.statistics.clusters`): by the effective
+number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952, with Korn & Graubard's number), or by whole terrains
+where too few of them lie on either side.
+
+`python -m benchmarks.validation --only intervals --only shared` measures the coverage of all of these.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,9 +31,163 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.bootstrap import LARGEST_SAMPLE, bca
-from marsyard.reports.statistics.proportions import Interval, check_confidence
-from marsyard.reports.statistics.shared import is_shared, shared_mean, shared_quantile, shared_spread
+from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
+from marsyard.reports.statistics.proportions import Interval, check_confidence, proportion_lower
+
+#: Above this many values (or terrains) the bootstrap's interval equals the large-sample one in what is printed.
+LARGEST_SAMPLE = 2000
+_RESAMPLES = 2000
+#: A report draws from a fixed seed: the same rows give the same page.
+_SEED = 19340401
+
+
+def bca(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], confidence: float) -> Interval:
+    """Two-sided interval of a statistic of one or more columns, drawn together; NaN where it cannot be told."""
+    with warnings.catch_warnings():
+        # A degenerate bootstrap distribution (two values, say) is answered by NaN bounds, which the caller prints.
+        warnings.simplefilter("ignore")
+        result = stats.bootstrap(
+            tuple(data),
+            statistic,
+            paired=True,
+            confidence_level=_widened(confidence, data[0].size),
+            n_resamples=_RESAMPLES,
+            batch=200,
+            vectorized=True,
+            method="BCa",
+            rng=np.random.default_rng(_SEED),
+        )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def _widened(confidence: float, n: int) -> float:
+    """The level at which the normal quantile is Student's, times sqrt(n / (n - 1)): Hesterberg 2015, section 5."""
+    quantile = float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1)) * math.sqrt(n / (n - 1.0))
+    # below 1, which the bootstrap does not take
+    return min(2.0 * float(stats.norm.cdf(quantile)) - 1.0, 1.0 - 1e-6)
+
+
+#: Fewest terrains that say anything of the spread between them.
+FEWEST_TERRAINS = 5
+
+
+def is_shared(groups: Int[np.ndarray, " n"] | None) -> bool:
+    """Whether any two values are from one terrain."""
+    return groups is not None and groups.size > 0 and int(terrain_index(groups).max()) + 1 < groups.size
+
+
+def shared_mean(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
+    """Two-sided interval of the mean of values on shared terrains; NaN for fewer than five terrains.
+
+    Parameters
+    ----------
+    values, groups
+        Finite values, and the number of the terrain of each.
+    confidence
+        Of the interval.
+    """
+    index = terrain_index(groups)
+    sizes, sums = np.bincount(index).astype(np.float64), np.bincount(index, weights=values)
+    terrains = sizes.size
+    if terrains < FEWEST_TERRAINS:
+        return math.nan, math.nan
+    mean = float(values.mean())
+    half = _student(confidence, terrains) * _deviation_of_mean(sums - mean * sizes, values.size)
+    plain = mean - half, mean + half
+    if terrains > LARGEST_SAMPLE:
+        return plain
+    return _union(plain, bca((sums, sizes), _ratio, confidence))
+
+
+def shared_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
+    """Two-sided interval of the standard deviation of values on shared terrains; NaN for fewer than five terrains."""
+    index = terrain_index(groups)
+    sizes = np.bincount(index).astype(np.float64)
+    terrains = sizes.size
+    if terrains < FEWEST_TERRAINS:
+        return math.nan, math.nan
+    centred = values - values.mean()
+    sums, squares = (np.bincount(index, weights=centred**power) for power in (1, 2))
+    variance = float((centred**2).mean())
+    # of the logarithm, whose distribution is less skewed, corrected for few terrains as Bonett's interval (see
+    # `samples.spread_interval`) is for few values
+    quantile = _student(confidence, terrains)
+    correction = terrains / max(terrains - quantile, 1.0)
+    half = quantile * correction * _deviation_of_mean(squares - variance * sizes, values.size) / variance
+    middle = math.log(correction * variance)
+    plain = math.exp(0.5 * (middle - half)), math.exp(0.5 * (middle + half))
+    if terrains > LARGEST_SAMPLE:
+        return plain
+    return _union(plain, bca((squares, sums, sizes), _spread, confidence))
+
+
+def shared_quantile(
+    values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], quantile: float, confidence: float
+) -> Interval:
+    """One-sided bounds of a quantile of values on shared terrains, each at the confidence; infinite where the sample
+    is too small to give one.
+    """
+    lower = -_upper_bound(-values, groups, 1.0 - quantile, confidence)
+    return lower, _upper_bound(values, groups, quantile, confidence)
+
+
+def _upper_bound(
+    values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], quantile: float, confidence: float
+) -> float:
+    """The least value of the sample up to which at least a share `quantile` of all lies, at the confidence."""
+    ordered = np.sort(values)
+    n = ordered.size
+    below = values <= ordered[min(n - 1, max(0, math.ceil(quantile * n) - 1))]
+    shown = clustered_evidence(below, groups, confidence)
+    if shown.method is ClusterMethod.TERRAIN_COUNT:
+        # what holds for all values of so many terrains holds for at least as many values
+        index = terrain_index(groups)
+        ordered = np.full(int(index.max()) + 1, -math.inf)
+        np.maximum.at(ordered, index, values)
+        ordered, worth = np.sort(ordered), 1.0
+    else:
+        worth = shown.effective_n / n
+    return _least_rank(ordered, worth, quantile, confidence)
+
+
+def _least_rank(ordered: Float[np.ndarray, " n"], worth: float, quantile: float, confidence: float) -> float:
+    """The first of the ordered values whose rank shows the quantile, each value being worth so many; inf for none."""
+    n = ordered.size
+    if proportion_lower(n * worth, n * worth, confidence) < quantile:
+        return math.inf
+    low, high = 0, n
+    while high - low > 1:
+        middle = (low + high) // 2
+        shown = proportion_lower(middle * worth, n * worth, confidence) >= quantile
+        low, high = (low, middle) if shown else (middle, high)
+    return float(ordered[high - 1])
+
+
+def _student(confidence: float, terrains: int) -> float:
+    return float(stats.t.ppf(0.5 * (1.0 + confidence), terrains - 1))
+
+
+def _deviation_of_mean(residuals: Float[np.ndarray, " terrains"], n: int) -> float:
+    """Standard deviation of a mean over n values, from the terrains' sums of residuals."""
+    terrains = residuals.size
+    return math.sqrt(terrains / (terrains - 1.0) * float((residuals**2).sum())) / n
+
+
+def _ratio(sums: Float[np.ndarray, "*n"], sizes: Float[np.ndarray, "*n"], axis: int = -1) -> np.ndarray:
+    return np.asarray(sums.sum(axis=axis) / sizes.sum(axis=axis))
+
+
+def _spread(
+    squares: Float[np.ndarray, "*n"], sums: Float[np.ndarray, "*n"], sizes: Float[np.ndarray, "*n"], axis: int = -1
+) -> np.ndarray:
+    n = sizes.sum(axis=axis)
+    excess = squares.sum(axis=axis) - sums.sum(axis=axis) ** 2 / n
+    return np.asarray(np.sqrt(np.maximum(excess, 0.0) / (n - 1.0)))
+
+
+def _union(first: Interval, second: Interval) -> Interval:
+    return float(np.fmin(first[0], second[0])), float(np.fmax(first[1], second[1]))
+
 
 #: Which values are from one terrain: its number for each; None where all are independent.
 Groups = Int[np.ndarray, " n"] | None

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.reports.products import numbers, plane
+from marsyard.reports.presentation import numbers, plane
 
 #: Numbers that stops may have.
 _STOPS = range(1, 1000)

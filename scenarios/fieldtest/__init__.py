@@ -3,8 +3,3 @@
 Read it in the order of the paper: `parameters`; a `run` with its flight, `targets`, `attitude`, `drift`, `elevation`
 and `ephemeris`; its `triples`; the `pictures` of one of them; and the `scenario`, whose case i is one triple.
 """
-
-from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
-from marsyard.scenarios.fieldtest.scenario import FieldTestScenario
-
-__all__ = ["FieldTestParameters", "FieldTestScenario"]

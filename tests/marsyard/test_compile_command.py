@@ -7,16 +7,17 @@ from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
-from marsyard.cli.compile import SMALL
-from marsyard.scenarios.registry import SCENARIOS
+from marsyard.scenarios.registry import scenario_names
+from marsyard.scenarios.systems import systems
 from marsyard.sim.kernel_cache import note_ready
 
 
 def test_every_system_has_a_small_case_that_the_catalogue_takes() -> None:
-    scenarios = {load_campaign(name, settings).configuration.scenario for name, settings in SMALL.items()}
+    small = (one for system in systems() for one in system.compiled_by.items())
+    scenarios = {load_campaign(name, settings).configuration.scenario for name, settings in small}
     # the field test, recorded drives and real pictures call the kernels of these
     others = {"fieldtest", "rover-drive", "measured-velocity", "measured-landing", "measured-matching"}
-    assert scenarios == set(SCENARIOS) - others
+    assert scenarios == set(scenario_names()) - others
 
 
 def test_what_is_compiled_is_not_compiled_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

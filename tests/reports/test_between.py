@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.reports.between import Contrast, Figure, contrast_grid, contrasts, figures_of, sample_of
+from marsyard.reports.comparison import Contrast, Figure, contrast_grid, contrasts, figures_of, sample_of
 from marsyard.reports.statistics.changes import difference_p
 from marsyard.reports.stored import StoredRun, read_run
 

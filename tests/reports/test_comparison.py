@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from marsyard.reports.common_sections import consistencies, consistency
 from marsyard.reports.comparison import comparison, own_frame
-from marsyard.reports.consistency import consistencies, consistency
 
 
 def rows(mine: list[float], its: list[float]) -> pd.DataFrame:

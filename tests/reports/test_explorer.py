@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.explorer import MOST_POINTS, embedded, explorer_data, points_of
-from marsyard.reports.notable import notable_cases
+from marsyard.reports.cases import gallery_cases, notable_cases
+from marsyard.reports.page_figures import MOST_POINTS, embedded, explorer_data, points_of
 from marsyard.reports.stored import read_run
-from marsyard.reports.systems import gallery_cases
 
 Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"

@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.reports.gallery import driver_plates
-from marsyard.reports.hda.hazards import _distance_grid
-from marsyard.reports.hda.map_errors import _rank_text, analyse
-from marsyard.reports.overall import overall
+from marsyard.reports.evaluation import overall
+from marsyard.reports.hda.sections import MAP_EFFECTS, distance_grid
+from marsyard.reports.page_figures import driver_plates
+from marsyard.reports.scatter import correlation_text
 from marsyard.reports.traceability import junit_xml
 from marsyard.reports.wording import NOTHING, number
 
@@ -35,14 +35,14 @@ def test_rank_correlations_of_maps_have_intervals(maps: int, known: bool) -> Non
     rng = np.random.default_rng(1)
     texture = rng.uniform(0.1, 1.0, maps)
     frame = pd.DataFrame({"texture": texture, "rms_share": rng.uniform(0.0, 0.1, maps) / texture})
-    effect = next(one for one in analyse(frame) if one.error.startswith("elevation error"))
-    assert (" to " in _rank_text(effect)) == known
-    assert known or _rank_text(effect) == NOTHING
+    effect = next(one for one in MAP_EFFECTS.effects(frame) if one.error.startswith("elevation error"))
+    assert (" to " in correlation_text(effect)) == known
+    assert known or correlation_text(effect) == NOTHING
 
 
 def test_a_bound_that_cases_are_too_few_for_is_a_dash() -> None:
     # the lower bound of the 5 % quantile at 90 % confidence takes 45 values
-    (row,) = _distance_grid({"sites": np.array([1.0, 2.0, 3.0])}).rows
+    (row,) = distance_grid({"sites": np.array([1.0, 2.0, 3.0])}).rows
     assert row[-1] == NOTHING
 
 

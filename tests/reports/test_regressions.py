@@ -8,8 +8,7 @@ import pytest
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.reports.history import FINISHED, INTERRUPTED, RUNNING, History, NightCampaign, NightFigure
-from marsyard.reports.night_page import night_text
-from marsyard.reports.regressions import Change, Comparison, changes, comparisons_of
+from marsyard.reports.nights import Change, Comparison, changes, comparisons_of, night_text
 from marsyard.reports.statistics.changes import Sample
 
 CASES, TERRAINS = 100, 12

@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.overall import exit_code, overall
+from marsyard.reports.evaluation import exit_code, overall
 from marsyard.reports.sampled import INDEPENDENT, Sampled, sampled
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Status, judge_campaign

@@ -11,13 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.reports.answers import answer_shares
 from marsyard.reports.campaign import write_report
+from marsyard.reports.common_sections import FAULT_OUTCOMES, answer_shares, faults_section
 from marsyard.reports.conditions import conditions_section, cuts, terrain_spread
-from marsyard.reports.dimes.carried import carried_section
-from marsyard.reports.dimes.landing import landing_section
-from marsyard.reports.dimes.sensitivity import analyse, sensitivity_section
-from marsyard.reports.faults import fault_rows, faults_section
+from marsyard.reports.dimes.sections import FIRING, LANDING, analyse, sensitivity_section
 from marsyard.reports.section import Section, Subject
 from marsyard.reports.stored import StoredRun
 
@@ -119,8 +116,8 @@ def test_spread_between_terrains_is_found() -> None:
 
 def test_firing_section_wants_its_error(make_rows: Rows) -> None:
     frame = make_rows(30)
-    assert carried_section(subject(frame)) is None
-    carried = carried_section(subject(frame.assign(firing_velocity_error_m_s=0.5, firing_after_s=18.0)))
+    assert FIRING(subject(frame)) is None
+    carried = FIRING(subject(frame.assign(firing_velocity_error_m_s=0.5, firing_after_s=18.0)))
     assert cells(carried, "mean")[1] == "0.500"
     assert cells(carried, "firing after (s)")[1:] == ["18.00"] * 3
 
@@ -135,14 +132,14 @@ def test_faults_by_size() -> None:
             METRIC: [1.0] * 10 + [np.nan] * 6 + [9.0] * 3 + [1.0] * 11,
         }
     )
-    rows = fault_rows(frame, METRIC, 5.0)
-    assert [(row.fault, row.n, row.valid, row.invalid, row.wrong) for row in rows] == [
+    rows = FAULT_OUTCOMES.records(frame, subject(frame))
+    assert [(row["fault"], row["n"], row["valid"], row["invalid"], row["wrong"]) for row in rows] == [
         ("none", 10, 10, 0, 0),
         ("dust", 10, 10, 0, 0),
         ("dust", 10, 1, 6, 3),
     ]
-    assert [row.size for row in rows[1:]] == [0.1, 0.5]
-    assert (rows[0].commonest_refusal, rows[2].commonest_refusal) == ("", "NO_VALID_TRACK")
+    assert [row["size"] for row in rows[1:]] == [0.1, 0.5]
+    assert (rows[0]["commonest_refusal"], rows[2]["commonest_refusal"]) == ("", "NO_VALID_TRACK")
     assert faults_section(subject(frame)) is not None
     assert faults_section(subject(frame, None)) is None
     assert faults_section(subject(frame.drop(columns="fault"))) is None
@@ -205,12 +202,12 @@ def test_landing_tells_good_and_harm() -> None:
     with_it[10:30] = without[10:30]
     frame = pd.DataFrame({"touchdown_speed_with_m_s": with_it, "touchdown_speed_without_m_s": without})
     frame.loc[100] = [np.nan, np.nan]  # crashed
-    section = landing_section(subject(frame))
+    section = LANDING(subject(frame))
     assert section is not None
     assert (section.data["landings"], section.data["helped"], section.data["harmed"]) == (100, 0.7, 0.1)
     assert (section.data["largest_gain_m_s"], section.data["largest_loss_m_s"]) == pytest.approx((4.0, 2.0))
     assert cells(section, "faster than 20 m/s")[1:] == ["5.00 %", "25.00 %"]
-    assert landing_section(subject(frame[["touchdown_speed_with_m_s"]])) is None
+    assert LANDING(subject(frame[["touchdown_speed_with_m_s"]])) is None
 
 
 def test_page_and_twin_hold_every_section(make_rows: Rows, make_run: MakeRun) -> None:

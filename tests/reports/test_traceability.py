@@ -10,7 +10,7 @@ from xml.etree import ElementTree as Xml
 import pandas as pd
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.overall import overall
+from marsyard.reports.evaluation import overall
 from marsyard.reports.traceability import COLUMNS, evidence_of, junit_xml, verification_csv
 from marsyard.reports.verdicts import judge_campaign
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marsyard.reports.overall import exit_code, overall
+from marsyard.reports.evaluation import exit_code, overall
 from marsyard.reports.sampled import Sampled, sampled
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 from marsyard.reports.verdicts import Status, Verdict, judge_campaign

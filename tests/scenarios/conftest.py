@@ -10,7 +10,7 @@ import pytest
 from marsyard.scenarios.columns import StatedColumns, stated_columns
 from marsyard.scenarios.dotted import found_at
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.registry import SCENARIOS
+from marsyard.scenarios.systems import scenario_paths
 
 
 def _unstated(row: Any, stated: StatedColumns, own: tuple[str, ...]) -> list[str]:
@@ -42,7 +42,9 @@ def _checked(run: Callable[..., CaseResult], stated: StatedColumns) -> Callable[
 @pytest.fixture(autouse=True, scope="session")
 def _rows_have_the_columns_that_are_stated() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        for name, path in SCENARIOS.items():
+        for name, path in scenario_paths().items():
             kind = found_at(path)
-            patch.setattr(kind, "run", _checked(kind.run, stated_columns()[name]))
+            stated = stated_columns(name)
+            assert stated is not None
+            patch.setattr(kind, "run", _checked(kind.run, stated))
         yield

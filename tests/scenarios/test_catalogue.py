@@ -11,7 +11,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.store.columns import Row
 from marsyard.cli.compile import SMALL
-from marsyard.scenarios.rover import SharedDriveParameters, SharedDriveScenario
+from marsyard.scenarios.rover.shared import SharedDriveParameters, SharedDriveScenario
 from marsyard.sim.streams import Streams
 
 

@@ -13,12 +13,12 @@ import pytest
 
 from marsyard import scenarios
 from marsyard.algorithms.interface import VelocityOutcome
-from marsyard.scenarios.fieldtest import FieldTestParameters, FieldTestScenario, pictures
+from marsyard.scenarios.fieldtest import pictures
 from marsyard.scenarios.fieldtest.elevation import ElevationModel
 from marsyard.scenarios.fieldtest.ephemeris import sun_direction
-from marsyard.scenarios.fieldtest.parameters import ElevationParameters
+from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters
 from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera, work_out
-from marsyard.scenarios.fieldtest.scenario import case_order
+from marsyard.scenarios.fieldtest.scenario import FieldTestScenario, case_order
 from marsyard.scenarios.fieldtest.triples import Category
 from marsyard.scenarios.optics import camera_optics
 from marsyard.scenarios.parts import ScoredFlight

@@ -23,7 +23,7 @@ from rasterio.warp import transform
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios import terrain_files
-from marsyard.scenarios.descent import DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.terrain_files import check_source, grid_north_deg
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError
 

@@ -16,15 +16,17 @@ import pytest
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.descent import DescentScenario, DescentScenarioParameters
 from marsyard.scenarios.descent.optics import camera_optics
-from marsyard.scenarios.fieldtest import FieldTestScenario
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.fieldtest.run import field_camera
+from marsyard.scenarios.fieldtest.scenario import FieldTestScenario
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.scenario import LandingScenario
 from marsyard.scenarios.parts.scores import ScoredDescent, ScoredFlight
-from marsyard.scenarios.rover import RoverScenarioParameters, run_case
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.run import run_case
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, MastCalibration, RoverMeasurements

@@ -11,7 +11,7 @@ from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
-from marsyard.scenarios.descent import DescentScenario
+from marsyard.scenarios.descent.scenario import DescentScenario
 
 SCORE = """
 def braking(case):

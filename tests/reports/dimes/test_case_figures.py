@@ -11,6 +11,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from marsyard.reports.cases import write_case_figures
 from marsyard.reports.dimes.case_figures import (
     MATCH,
     TEMPLATE,
@@ -21,8 +22,7 @@ from marsyard.reports.dimes.case_figures import (
     tracks,
     write_dimes_figures,
 )
-from marsyard.reports.dimes.shown import view
-from marsyard.reports.systems import write_case_figures
+from marsyard.reports.dimes.presentation import view
 
 
 def _squares(figure: Figure, colour: str) -> list[Rectangle]:

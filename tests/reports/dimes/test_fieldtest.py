@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.dimes.fieldtest import PAPER, cells, field_test_section
+from marsyard.reports.dimes.sections import FIG_11, field_cells, field_test_section
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import read_run
 
@@ -33,14 +33,14 @@ def field_frame(make_rows: MakeRows) -> pd.DataFrame:
 
 def test_cells_stand_beside_the_papers(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
     run = read_run(make_run(field_frame, requirements=[VELOCITY]))
-    short, same, other = cells(Subject(run, "velocity_error_m_s", 5.0))
-    assert (short.valid.hits, short.paper_percent) == (20, 100)
-    assert short.difference_points == pytest.approx(0.0)
-    assert (same.valid.hits, same.paper_percent) == (10, 40)
-    assert same.difference_points == pytest.approx(10.0)
-    assert other.paper_percent is None
-    assert np.isnan(other.difference_points)
-    assert np.isnan(other.largest)
+    short, same, other = field_cells(Subject(run, "velocity_error_m_s", 5.0))
+    assert (short["valid"].hits, short["paper_percent"]) == (20, 100)
+    assert short["difference_points"] == pytest.approx(0.0)
+    assert (same["valid"].hits, same["paper_percent"]) == (10, 40)
+    assert same["difference_points"] == pytest.approx(10.0)
+    assert other["paper_percent"] is None
+    assert np.isnan(other["difference_points"])
+    assert np.isnan(other["largest"])
 
 
 def test_page_tells_misprints_and_draws_each_category(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
@@ -56,12 +56,14 @@ def test_page_tells_misprints_and_draws_each_category(make_run: MakeRun, field_f
 
 def test_papers_table_is_as_printed() -> None:
     """Two rows do not add up; each per cent is that of valid over both counts, but for one (97 printed as 99)."""
-    odd = [key for key, cell in PAPER.items() if not cell.adds_up]
+    odd = [key for key, cell in FIG_11.items() if cell["valid"] + cell["invalid"] != cell["total"]]
     assert odd == [("short time", "Pisgah Run 3"), ("same direction", "Pisgah Run 3")]
-    assert sum(cell.total for cell in PAPER.values()) == 1913
-    assert sum(cell.valid + cell.invalid for cell in PAPER.values()) == 1925
+    assert sum(cell["total"] for cell in FIG_11.values()) == 1913
+    assert sum(cell["valid"] + cell["invalid"] for cell in FIG_11.values()) == 1925
     assert [
-        key for key, cell in PAPER.items() if abs(100.0 * cell.valid / (cell.valid + cell.invalid) - cell.percent) > 0.6
+        key
+        for key, cell in FIG_11.items()
+        if abs(100.0 * cell["valid"] / (cell["valid"] + cell["invalid"]) - cell["percent"]) > 0.6
     ] == [("same direction", "Pisgah Run 3")]
 
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from marsyard.reports.cases import write_case_figures
 from marsyard.reports.dimes.stream import draw_stream_case, is_stream_case, view
-from marsyard.reports.systems import write_case_figures
 
 PICTURES = 4
 

@@ -11,14 +11,20 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.hda.faults import landing_faults, landing_faults_section
-from marsyard.reports.hda.hazards import hazard_classes, outcome_counts, site_shares
-from marsyard.reports.hda.limits import AtSize, curves, knee
-from marsyard.reports.hda.map_errors import analyse, with_shares
-from marsyard.reports.hda.rows import Rate, rate
-from marsyard.reports.hda.run_times import TABLE_1, paper_factor, stage_times
-from marsyard.reports.hda.threshold import thresholds
-from marsyard.reports.hda.touchdown import TABLE_2, touchdown_section
+from marsyard.reports.hda.classes import AtSize, curves, hazard_classes, knee
+from marsyard.reports.hda.sections import (
+    FAULT_OUTCOMES,
+    FAULTS,
+    MAP_EFFECTS,
+    PAPER,
+    THRESHOLD,
+    TOUCHDOWN,
+    map_rows,
+    outcome_counts,
+    run_times_section,
+    site_shares,
+)
+from marsyard.reports.rates import PooledRate, pooled_rate
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 from tests.reports.hda.made_up import landing_frame
@@ -30,7 +36,7 @@ def _subject(frame: pd.DataFrame) -> Subject:
 
 def test_rates_pool_footprints_over_flights() -> None:
     frame = pd.DataFrame({"hits": [1, 0, 3, 0], "of": [10, 10, 20, 0]})
-    found = rate(frame, "hits", "of")
+    found = pooled_rate(frame, "hits", "of")
     assert (found.hits, found.of, found.flights, found.flights_hit) == (4, 40, 3, 2)
     assert found.share == pytest.approx(0.1)
     assert found.lower < 0.1 < found.upper
@@ -42,36 +48,38 @@ def test_interval_of_a_rate_covers_the_truth() -> None:
     covered = 0
     for _ in range(60):
         chances = rng.beta(1.0, 9.0, 40)
-        found = rate(pd.DataFrame({"hits": rng.binomial(500, chances), "of": np.full(40, 500)}), "hits", "of")
+        found = pooled_rate(pd.DataFrame({"hits": rng.binomial(500, chances), "of": np.full(40, 500)}), "hits", "of")
         covered += found.lower <= 0.1 <= found.upper
     assert covered >= 45
 
 
 def test_no_hit_has_no_bootstrap_interval() -> None:
-    found = rate(pd.DataFrame({"hits": [0, 0], "of": [10, 10]}), "hits", "of")
+    found = pooled_rate(pd.DataFrame({"hits": [0, 0], "of": [10, 10]}), "hits", "of")
     assert found.share == 0.0
     assert np.isnan(found.upper)
 
 
 def test_table_1_is_scaled_to_its_sum() -> None:
-    times, cases = stage_times(_subject(landing_frame(20)))
-    assert cases == 20
-    assert sum(one.scaled_s for one in times) == pytest.approx(0.77)
-    assert paper_factor(times) == pytest.approx(0.77 / 0.017)
-    assert [one.parameters for one in times] == ["70 features", "60 tracks", "600 points", "19x27 terrain map"]
-    assert sum(stage.paper_s for stage in TABLE_1) < 1.0  # "less than one second"
+    section = run_times_section(_subject(landing_frame(20)))
+    assert section is not None
+    assert section.data["cases"] == 20
+    times = section.data["stages"]
+    assert sum(one["scaled_s"] for one in times) == pytest.approx(0.77)
+    assert section.data["factor"] == pytest.approx(0.77 / 0.017)
+    assert [one["parameters"] for one in times] == ["70 features", "60 tracks", "600 points", "19x27 terrain map"]
+    assert sum(stage["seconds"] for stage in PAPER["stages"]) < 1.0  # "less than one second"
 
 
 def test_table_2_beside_landings() -> None:
     frame = landing_frame(200)
-    section = touchdown_section(_subject(frame))
+    section = TOUCHDOWN(_subject(frame))
     assert section is not None
     landed = frame[frame["landed"]]
     assert section.data["landings"] == len(landed)
     assert section.data["mean_m"]["touchdown_error_gps_m"] == pytest.approx(landed["touchdown_error_gps_m"].mean())
     assert section.data["paper_m"] == {"1": 1.21, "3": 1.20, "4": 0.89}
-    assert np.mean([row[1] for row in TABLE_2]) == pytest.approx(1.1)
-    assert touchdown_section(_subject(frame.assign(landed=False))) is None
+    assert np.mean([run["error_m"] for run in PAPER["landings"]]) == pytest.approx(1.1)
+    assert TOUCHDOWN(_subject(frame.assign(landed=False))) is None
 
 
 def test_sites_against_the_truth() -> None:
@@ -109,27 +117,30 @@ def test_classes_of_hazards() -> None:
 
 def test_thresholds() -> None:
     frame = landing_frame(40).assign(max_roughness_m=np.tile([0.1, 0.2], 20), false_alarms=np.tile([120, 30], 20))
-    low, high = thresholds(_subject(frame))
-    assert (low.threshold_m, high.threshold_m) == (0.1, 0.2)
-    assert (low.false_alarms.share, high.false_alarms.share) == (pytest.approx(0.2), pytest.approx(0.05))
-    assert low.missed.share == pytest.approx(8 / 400)
-    assert thresholds(_subject(landing_frame(40))) == []
+    section = THRESHOLD(_subject(frame))
+    assert section is not None
+    low, high = section.data["thresholds"]
+    assert (low["max_roughness_m"], high["max_roughness_m"]) == (0.1, 0.2)
+    assert (low["false_alarms"]["share"], high["false_alarms"]["share"]) == (pytest.approx(0.2), pytest.approx(0.05))
+    assert low["missed"]["share"] == pytest.approx(8 / 400)
+    assert THRESHOLD(_subject(landing_frame(40))) is None
 
 
 def test_faults_by_size() -> None:
     frame = landing_frame(60)
     frame["fault"] = np.repeat(["none", "laser_stuck", "laser_silent"], 20)
     frame["fault_size"] = np.concatenate([np.zeros(20), np.tile([0.05, 1.0], 10), np.ones(20)])
-    rows = landing_faults(frame)
-    assert [(row.fault, row.size, row.n) for row in rows] == [
+    rows = FAULT_OUTCOMES.records(frame, _subject(frame))
+    assert [(row["fault"], row["size"], row["n"]) for row in rows] == [
         ("none", 0.0, 20),
         ("laser_silent", 1.0, 20),
         ("laser_stuck", 0.05, 10),
         ("laser_stuck", 1.0, 10),
     ]
-    assert all(row.safe + row.refused + row.unconverged + row.wrong + row.unfinished == row.n for row in rows)
-    assert sum(row.wrong for row in rows) == (frame["site_reported"] & ~frame["site_safe"]).sum()
-    assert landing_faults_section(_subject(landing_frame(20))) is None
+    ends = ("safe", "refused", "unconverged", "wrong", "unfinished")
+    assert all(sum(row[end] for end in ends) == row["n"] for row in rows)
+    assert sum(row["wrong"] for row in rows) == (frame["site_reported"] & ~frame["site_safe"]).sum()
+    assert FAULTS(_subject(landing_frame(20))) is None
 
 
 def _changed(column: str, sizes: list[float], shares: list[float]) -> pd.DataFrame:
@@ -149,7 +160,7 @@ def test_knee_stands_where_the_curve_falls_below_nine_tenths() -> None:
 
 
 def test_knee_of_a_curve_that_starts_below() -> None:
-    points = [AtSize(size, Rate(0, 1, share, 0.0, 1.0, 1, 0), 1, 0) for size, share in ((0.0, 0.5), (5.0, 1.0))]
+    points = [AtSize(size, PooledRate(0, 1, share, 0.0, 1.0, 1, 0), 1, 0) for size, share in ((0.0, 0.5), (5.0, 1.0))]
     assert knee(points, 1.0) == 0.0
 
 
@@ -171,8 +182,9 @@ def test_map_errors_follow_their_drivers() -> None:
     )
     frame["elevation_noise_m"] = 0.01 / frame["baseline_share"]
     frame["elevation_rms_m"] = np.abs(frame["range_error_m"])
-    mapped = with_shares(frame)
-    effects = {(one.driver, one.error): one for one in analyse(mapped)}
+    mapped = map_rows(_subject(frame))
+    assert mapped is not None
+    effects = {(one.driver, one.error): one for one in MAP_EFFECTS.effects(mapped)}
     noise = effects["baseline over height", "the same without its plane (% of height)"]
     assert noise.rank_correlation == pytest.approx(-1.0)
     assert np.all(np.diff(noise.medians) < 0.0)

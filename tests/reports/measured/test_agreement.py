@@ -9,10 +9,10 @@ import pandas as pd
 
 from marsyard.reports.measured.agreement import agreement_section
 from marsyard.reports.measured.case_figures import matched_pairs
-from marsyard.reports.measured.shown import MEASURED
+from marsyard.reports.measured.presentation import MEASURED
+from marsyard.reports.presentation import case_kind
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.systems import SYSTEMS
 
 
 def subject(**columns: object) -> Subject:
@@ -57,10 +57,10 @@ def test_no_section_without_real_cases() -> None:
 
 
 def test_a_case_without_matches_is_shown_all_the_same(tmp_path: Path) -> None:
-    view = MEASURED.view(products(0), "k")
+    view = MEASURED.cases[0].view(products(0), "k")
     assert view.rows[0].succeeded is False
     assert "0 matches" in view.plates[0].caption
-    (path,) = MEASURED.write(tmp_path, products(40))
+    (path,) = MEASURED.cases[0].write(tmp_path, products(40))
     assert path.stat().st_size > 5000
 
 
@@ -72,4 +72,4 @@ def test_pairs_are_read_with_care() -> None:
     assert matched_pairs({**whole, "matches_1": np.zeros((4, 3))}) == []
     assert matched_pairs({**whole, "image_2": None}) == []
     # a real case is known before the systems whose pictures it may hold too
-    assert next(one for one in SYSTEMS if one.is_case(whole)) is MEASURED
+    assert case_kind(whole) is MEASURED.cases[0]

@@ -70,3 +70,12 @@ def test_two_kinds() -> None:
 def test_what_does_not_vary_drives_nothing() -> None:
     assert driver(np.ones(50), np.arange(50.0), None, 0.9) is None
     assert driver(np.arange(19.0), np.arange(19.0), None, 0.9) is None
+
+
+def test_a_condition_that_leaves_nothing_to_explain() -> None:
+    """Two kinds of condition, one response each: the share is 1, where the F ratio is infinite."""
+    condition = np.repeat([400.0, 800.0], 20)
+    found = driver(condition, condition / 400.0, None, 0.9)
+    assert found is not None
+    assert (found.share, found.share_lower, found.share_upper, found.p_value) == (1.0, 1.0, 1.0, 0.0)
+    assert found.correlation == pytest.approx(1.0)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from marsyard.reports.statistics.paired import compared_errors, compared_successes
+from marsyard.reports.statistics.changes import compared_errors, compared_successes
 
 TERRAINS = np.repeat(np.arange(25), 8)
 

@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from marsyard.reports.statistics.samples import mean_interval, quantile_bounds, spread_interval, summarize
-from marsyard.reports.statistics.shared import FEWEST_TERRAINS
+from marsyard.reports.statistics.samples import (
+    FEWEST_TERRAINS,
+    mean_interval,
+    quantile_bounds,
+    spread_interval,
+    summarize,
+)
 
 
 def _values(rng: np.random.Generator, terrains: int, correlation: float) -> tuple[np.ndarray, np.ndarray]:

@@ -11,10 +11,10 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from marsyard.reports.systems import write_case_figures
+from marsyard.reports.cases import write_case_figures
 from marsyard.reports.vtt.case_figures import TARGET, WINDOW, draw_stops, draw_way
+from marsyard.reports.vtt.presentation import view
 from marsyard.reports.vtt.products import is_vtt_case, stops_of, way_of
-from marsyard.reports.vtt.shown import view
 from tests.reports.vtt.tracking_rows import products
 
 

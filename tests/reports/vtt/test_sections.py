@@ -6,13 +6,24 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.reports.campaign import FURTHER_SECTIONS
-from marsyard.reports.vtt.beside import CHECKOUT_3, PAPER, TABLE_IV, beside_section
-from marsyard.reports.vtt.goal import camera_runs, goal_section, losses_grid
-from marsyard.reports.vtt.kinds import REGRESSION, TABLE_II, TERRAINS, regression_section, terrains_section
-from marsyard.reports.vtt.steps import cells, steps_section
-from marsyard.reports.vtt.table_1 import measured, table_1_section
-from marsyard.reports.vtt.updates import CHECKOUT_1, TABLE_III, updates_section
+from marsyard.reports.presentation import presentations
+from marsyard.reports.vtt.goal import GOAL, camera_runs, losses_grid
+from marsyard.reports.vtt.presentation import VTT
+from marsyard.reports.vtt.sections import (
+    CHECKOUT_1,
+    CHECKOUT_3,
+    PAPER,
+    REGRESSION,
+    SINGLE_RUNS,
+    TERRAINS,
+    measured_accuracy,
+    regression_section,
+    step_rates,
+    steps_section,
+    table_1_section,
+    terrains_section,
+    updates_section,
+)
 from tests.reports.vtt.tracking_rows import rows, subject, table
 
 
@@ -29,19 +40,19 @@ def test_measured_accuracy_is_three_times_the_rms_by_camera() -> None:
     frame = rows(8, camera=["research-navcam"] * 4 + ["research-pancam"] * 4)
     frame.loc[:3, "designation_error_m"] = [0.0, 0.0, 0.0, 0.2]
     frame.loc[4:, "drift_px"] = [3.0, 4.0, 5.0, 0.0]
-    navcam, pancam = measured(frame)
-    assert navcam.designation_cm == pytest.approx(300.0 * 0.1)
-    assert navcam.disparity_px == pytest.approx(0.1 / 0.388)
+    navcam, pancam = measured_accuracy(frame)
+    assert navcam["designation_cm"] == pytest.approx(300.0 * 0.1)
+    assert navcam["disparity_px"] == pytest.approx(0.1 / 0.388)
     # Eq. 3: sqrt(0.1^2 + 0.05^2), root mean square.
-    assert navcam.untracked_cm == pytest.approx(300.0 * np.hypot(0.1, 0.05))
-    assert pancam.drift_px == pytest.approx(np.sqrt(12.5))
+    assert navcam["untracked_cm"] == pytest.approx(300.0 * np.hypot(0.1, 0.05))
+    assert pancam["drift_px"] == pytest.approx(np.sqrt(12.5))
     told = table(table_1_section(subject(frame)), 1)
     # Navcam, 2 px of drift: sqrt(1.6^2 + 0.32^2).
     assert told[0]["Table I, the same"] == "1.6"
     # Runs from elsewhere, at unfit targets or not completed do not count.
-    assert measured(frame.assign(range_start_m=7.0)) == []
-    assert measured(frame.assign(selectable=False)) == []
-    assert measured(frame.assign(position_error_m=np.nan)) == []
+    assert measured_accuracy(frame.assign(range_start_m=7.0)) == []
+    assert measured_accuracy(frame.assign(selectable=False)) == []
+    assert measured_accuracy(frame.assign(position_error_m=np.nan)) == []
 
 
 def _shared(skips: int = 5) -> pd.DataFrame:
@@ -57,13 +68,13 @@ def _shared(skips: int = 5) -> pd.DataFrame:
 def test_steps_stand_beside_fig_8() -> None:
     frame = _shared()
     frame.loc[0, ["selectable", "tracked", "true_track"]] = False  # a target on the edge counts for nothing
-    found = cells(subject(frame, legs=[{"motion": "approach", "step_share": 0.05}]))
-    at = {(one.line, round(one.step)): one for one in found}
-    assert (at["vtt", 5].good.hits, at["vtt", 5].good.n, at["vtt", 5].paper_percent) == (9, 9, 100.0)
-    assert (at["vtt", 5].all_targets.hits, at["vtt", 5].all_targets.n) == (9, 10)
-    assert at["vtt", 5].false_tracks.hits == 0
-    assert (at["pure-ncc", 23].good.hits, at["pure-ncc", 23].paper_percent) == (4, 15.0)
-    assert at["pure-ncc", 10].paper_percent is None
+    found = step_rates(subject(frame, legs=[{"motion": "approach", "step_share": 0.05}]))
+    at = {(one["line"], round(one["step"])): one for one in found}
+    assert (at["vtt", 5]["good"].hits, at["vtt", 5]["good"].n, at["vtt", 5]["paper_percent"]) == (9, 9, 100.0)
+    assert (at["vtt", 5]["all_targets"].hits, at["vtt", 5]["all_targets"].n) == (9, 10)
+    assert at["vtt", 5]["false_tracks"].hits == 0
+    assert (at["pure-ncc", 23]["good"].hits, at["pure-ncc", 23]["paper_percent"]) == (4, 15.0)
+    assert at["pure-ncc", 10]["paper_percent"] is None
     section = steps_section(subject(frame, legs=[{"motion": "approach"}]))
     assert section is not None
     assert "Fig. 8" in section.title
@@ -72,11 +83,11 @@ def test_steps_stand_beside_fig_8() -> None:
 def test_steps_around_and_in_place_are_degrees() -> None:
     frame = pd.concat([rows(11, skip=k, step=5.0 * (k + 1), search_px=px) for k in range(3) for px in (200, 600)])
     frame = frame.reset_index(drop=True)
-    around = cells(subject(frame, legs=[{"motion": "circle"}]))
-    assert [(one.line, one.step) for one in around[:3]] == [("200 px", 5.0), ("200 px", 10.0), ("200 px", 15.0)]
-    assert around[2].paper_percent == pytest.approx(100.0 * 9 / 11)
-    turned = cells(subject(frame, legs=[{"motion": "turn"}]))
-    assert {one.paper_percent for one in turned} == {None}
+    around = step_rates(subject(frame, legs=[{"motion": "circle"}]))
+    assert [(one["line"], one["step"]) for one in around[:3]] == [("200 px", 5.0), ("200 px", 10.0), ("200 px", 15.0)]
+    assert around[2]["paper_percent"] == pytest.approx(100.0 * 9 / 11)
+    turned = step_rates(subject(frame, legs=[{"motion": "turn"}]))
+    assert {one["paper_percent"] for one in turned} == {None}
     assert steps_section(subject(rows(3))) is None
 
 
@@ -86,8 +97,8 @@ def test_oblique_targets_are_told_apart_and_those_off_the_face_are_no_part_of_th
     oblique = rows(4, skip=0, step=5.0, obliquity_max_deg=72.0, in_view=True, on_face=False, tracked=False)
     hidden = rows(3, skip=0, step=5.0, obliquity_max_deg=80.0, in_view=False, on_face=False, tracked=False)
     run = subject(pd.concat([face_on, oblique, hidden], ignore_index=True), legs=[{"motion": "circle"}])
-    (cell,) = cells(run)
-    assert (cell.good.hits, cell.good.n, cell.all_targets.n) == (6, 6, 13)
+    (cell,) = step_rates(run)
+    assert (cell["good"].hits, cell["good"].n, cell["all_targets"].n) == (6, 6, 13)
     section = steps_section(run)
     assert section is not None
     grid = section.blocks[-1].grid
@@ -122,25 +133,24 @@ def test_table_iii_stands_beside_ours() -> None:
 
 def test_table_iii_is_as_printed() -> None:
     """What the paper's text says of its table holds of ours."""
-    scores = TABLE_III["match_score"].values()
-    assert (min(scores), max(scores)) == (0.79, 0.94)
-    assert (min(TABLE_III["magnification"].values()), max(TABLE_III["magnification"].values())) == (0.97, 1.04)
-    assert (min(TABLE_III["roll_change_deg"].values()), max(TABLE_III["roll_change_deg"].values())) == (0.06, 6.25)
+    printed = {name: list(values.values()) for name, values in PAPER["table_3"].items()}
+    ends = {"match_score": (0.79, 0.94), "magnification": (0.97, 1.04), "roll_change_deg": (0.06, 6.25)}
+    assert {name: (min(printed[name]), max(printed[name])) for name in ends} == ends
     # From -3.4 to 50.1 deg; the table's own changes come to as much.
-    assert sum(TABLE_III["azimuth_change_deg"].values()) == pytest.approx(53.5, abs=0.1)
+    assert sum(printed["azimuth_change_deg"]) == pytest.approx(53.5, abs=0.1)
 
 
 def test_facts_of_single_runs() -> None:
     frame = rows(4, target_moved_m=[0.1, 0.2, 0.3, 0.4], tracked=[True, True, True, False])
-    told = {row[""]: row for row in table(beside_section(subject(frame, "vtt-checkout-2")))}
+    told = {row[""]: row for row in table(SINGLE_RUNS(subject(frame, "vtt-checkout-2")))}
     moved = told["target moved, first to last estimate (cm)"]
     assert (moved["Paper"], moved["Ours"]) == ("36", "25.0 (10.0 to 40.0)")
     assert told["tracked to the goal"]["Ours"] == "3 of 4: 75.00 %"
     assert told["largest correction (px)"]["Ours"] == "–"
     roll = rows(4, roll_compensated=[True, True, False, False], tracked=[True, True, True, False])
-    told = {row[""]: row for row in table(beside_section(subject(roll, "vtt-roll")))}
+    told = {row[""]: row for row in table(SINGLE_RUNS(subject(roll, "vtt-roll")))}
     assert told["tracked with compensation"]["Ours"] == "2 of 2: 100 %"
-    assert beside_section(subject(frame, "another")) is None
+    assert SINGLE_RUNS(subject(frame, "another")) is None
 
 
 def test_table_iv_by_mode() -> None:
@@ -151,15 +161,15 @@ def test_table_iv_by_mode() -> None:
     for n, leg in enumerate(legs, start=1):
         frame[f"update_{n}_leg"], frame[f"update_{n}_time_s"] = float(leg), 60.0 * n
     frame.loc[1, ["update_27_leg", "update_27_time_s"]] = np.nan  # ended a step early
-    told = table(beside_section(subject(frame, CHECKOUT_3, legs=driven)), 1)
+    told = table(SINGLE_RUNS(subject(frame, CHECKOUT_3, legs=driven)), 1)
     assert [row["Updates, paper"] for row in told] == ["2", "7", "10", "4", "4"]
     assert [row["Updates, ours"] for row in told] == ["2", "7", "10", "4", "4 (3 to 4)"]
     assert [row["Minutes, ours"] for row in told[:4]] == ["2.0", "7.0", "10.0", "4.0"]
 
 
 def test_table_iv_is_as_printed() -> None:
-    assert sum(mode.updates for mode in TABLE_IV) == 27
-    assert sum(mode.duration_min for mode in TABLE_IV) == 66
+    assert sum(mode["updates"] for mode in PAPER["table_4"]) == 27
+    assert sum(mode["minutes"] for mode in PAPER["table_4"]) == 66
 
 
 def test_terrains_tell_failures_and_causes() -> None:
@@ -182,8 +192,8 @@ def test_terrains_tell_failures_and_causes() -> None:
 
 
 def test_table_ii_is_as_printed() -> None:
-    assert sum(row.trials for row in TABLE_II.values()) == 26
-    assert sum(row.failures for row in TABLE_II.values()) == 2
+    assert sum(row["trials"] for row in PAPER["table_2"].values()) == 26
+    assert sum(row["failures"] for row in PAPER["table_2"].values()) == 2
 
 
 def test_regression_runs_one_by_one() -> None:
@@ -209,24 +219,25 @@ def test_goal_by_camera() -> None:
     frame.loc[n, ["losses", "lost_range_m"]] = ["MATCH_SCORE", 3.5]
     frame.loc[n + 1, "true_track"] = False
     navcam, pancam = camera_runs(frame)
-    assert navcam.within.hits == 225  # 0.0399 k / 299 stays within 3 cm up to k = 224
-    assert navcam.median_m == pytest.approx(0.01995)
-    assert navcam.quantile_bound_m > navcam.quantile_m
-    assert (pancam.completed.hits, pancam.completed.n) == (n - 1, n)
-    assert (pancam.within.hits, pancam.within.n) == (n - 1, n - 1)
-    assert pancam.false_tracks.hits == 1
-    assert np.isfinite(pancam.quantile_bound_m)
+    assert navcam["within"].hits == 225  # 0.0399 k / 299 stays within 3 cm up to k = 224
+    assert navcam["median_m"] == pytest.approx(0.01995)
+    assert navcam["quantile_bound_m"] > navcam["quantile_m"]
+    assert (pancam["completed"].hits, pancam["completed"].n) == (n - 1, n)
+    assert (pancam["within"].hits, pancam["within"].n) == (n - 1, n - 1)
+    assert pancam["false_tracks"].hits == 1
+    assert np.isfinite(pancam["quantile_bound_m"])
     assert losses_grid(frame).rows == [["LOST", "match score", "1", "3.5 to 3.5", "3.0", "0"]]
-    told = table(goal_section(subject(frame)), 1)
+    told = table(GOAL(subject(frame)), 1)
     assert told[1]["Median (mm)"] == "4.000"
-    few = table(goal_section(subject(frame.iloc[:20])), 1)
+    few = table(GOAL(subject(frame.iloc[:20])), 1)
     assert few[0]["Its bound (mm)"] == "n too small"
 
 
 def test_other_rows_have_no_section_of_tracking() -> None:
     """Rows of another system hold none of its columns; rows of crashed cases alone have no numbers."""
-    ours = [make for make in FURTHER_SECTIONS if make.__module__.startswith("marsyard.reports.vtt.")]
+    assert VTT in presentations()
+    ours = [*VTT.first, *VTT.sections]
     assert len(ours) == 7
     descent = pd.DataFrame({"case": [0, 1], "outcome": "VALID", "answered": True, "velocity_error_m_s": 1.0})
-    for name in ("a-campaign", TERRAINS, REGRESSION, *PAPER):
+    for name in ("a-campaign", TERRAINS, REGRESSION, *(one["campaign"] for one in PAPER["facts"])):
         assert [make(subject(descent, name)) for make in ours] == [None] * 7

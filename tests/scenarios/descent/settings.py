@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from marsyard.scenarios.descent import DescentScenario, DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from marsyard.scenarios.descent import DescentScenarioParameters
 from marsyard.scenarios.descent.optics import calibrated_camera, camera_optics
-from marsyard.scenarios.descent.parameters import CameraParameters, binned_size_for
+from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters, binned_size_for
 from marsyard.scenarios.descent.world import World
 from marsyard.sim.sensor import OwnCamera
 from marsyard.sim.terrain import site

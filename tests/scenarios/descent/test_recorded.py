@@ -11,8 +11,8 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent import DescentScenarioParameters
 from marsyard.scenarios.descent.flight import flown_descent
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import World
 from marsyard.sim.dynamics.recorded_files import COLUMNS
 from marsyard.sim.streams import Streams

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, problems_of
 from marsyard.campaigns.definition.identity import chosen_parts, foreign_sources
-from marsyard.scenarios.descent import DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.parts import named
 from marsyard.scenarios.parts.motions import OwnMotion
 from marsyard.scenarios.parts.named import DYNAMICS, SCORE, checked_columns

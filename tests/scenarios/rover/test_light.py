@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.scenarios.rover import RoverScenarioParameters, Run, run_case
-from marsyard.scenarios.rover.parameters import SunParameters
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters
+from marsyard.scenarios.rover.run import Run, run_case
 from marsyard.scenarios.rover.world import SunPath
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT

@@ -4,9 +4,10 @@ import re
 
 import pytest
 
-from marsyard.scenarios.rover import RoverScenarioParameters, run_case
 from marsyard.scenarios.rover import run as loop
 from marsyard.scenarios.rover.mapping import Mapper
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.run import run_case
 from marsyard.scenarios.rover.vehicle import Vehicle
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT

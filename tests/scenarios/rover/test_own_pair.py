@@ -10,8 +10,8 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.rover import RoverScenario, RoverScenarioParameters
-from marsyard.scenarios.rover.parameters import CameraParameters
+from marsyard.scenarios.rover.parameters import CameraParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.scenario import RoverScenario
 from marsyard.sim.camera import write_cahvor
 from marsyard.sim.frames import rigid
 from marsyard.sim.sensor import preset, stereo_mast

@@ -3,14 +3,10 @@
 import numpy as np
 import pytest
 
-from marsyard.scenarios.rover import (
-    RoverScenario,
-    RoverScenarioParameters,
-    SharedDriveParameters,
-    SharedDriveScenario,
-    run_case,
-)
-from marsyard.scenarios.rover.shared import DriveKey, render_drive, track_views
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.run import run_case
+from marsyard.scenarios.rover.scenario import RoverScenario, SharedDriveScenario
+from marsyard.scenarios.rover.shared import DriveKey, SharedDriveParameters, render_drive, track_views
 from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT

@@ -1,0 +1,168 @@
+"""Figures that sections of any system draw: cumulative curves, rates against a condition, bars, scatter panels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from marsyard.reports.figures import axis_edge, note_beyond
+from marsyard.reports.rates import PooledRate, Share
+from marsyard.reports.svg import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
+
+Values = Float[np.ndarray, " n"]
+_LINES = ("-", "--", ":", "-.")
+_BELOW: Mapping[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2}
+
+
+@in_page_style
+def cumulative_figure(
+    curves: Mapping[str, Values],
+    labels: tuple[str, str],
+    *,
+    falling: bool = False,
+    bound: float | None = None,
+    limits: Mapping[str, Sequence[float]] | None = None,
+) -> Figure:
+    """Shares of cases up to each value, or from each value on.
+
+    Parameters
+    ----------
+    curves
+        Values by the curve's name; a curve without values is left out.
+    labels
+        Of the x and the y axis.
+    falling
+        Whether a curve shows the share of larger values.
+    bound
+        A requirement: the x axis then ends near it, and values beyond are counted.
+    limits
+        Further vertical lines by their name.
+    """
+    figure, axes = new_axes(6.4, 3.4)
+    every = np.concatenate([*curves.values()])
+    edge = None if bound is None else max(1.25 * bound, axis_edge(every, bound))
+    for (name, values), colour, line in zip(curves.items(), SERIES, _LINES * 2, strict=False):
+        if values.size:
+            x, share = np.concatenate([[0.0], np.sort(values)]), np.arange(values.size + 1) / values.size
+            if edge is not None:
+                x, share = np.append(x, max(edge, x[-1])), np.append(share, 1.0)
+            y = 1.0 - share if falling else share
+            axes.plot(x, y, drawstyle="steps-post", color=colour, linestyle=line, label=name)
+    for name, places in (limits or {}).items():
+        for number, place in enumerate(places):
+            label = name if number == 0 else None
+            axes.axvline(place, color=REQUIREMENT, linewidth=0.9, linestyle="-.", label=label)
+    axes.set(xlabel=labels[0], ylabel=labels[1], ylim=(0.0, 1.03))
+    axes.set_xlim(left=0.0)
+    if bound is None or edge is None:
+        axes.legend(loc="upper right" if falling else "lower right")
+        return figure
+    axes.axvline(bound, color=REQUIREMENT, linewidth=1.5, linestyle="--")
+    axes.set_xlim(0.0, 1.02 * edge)
+    note_beyond(axes, int((every > edge).sum()))
+    axes.legend(**_BELOW)
+    return figure
+
+
+@dataclass(frozen=True)
+class RateLine:
+    """Rates against a condition: a name, the condition's values, the rates, and a paper's rates by value."""
+
+    name: str
+    x: Sequence[float]
+    rates: Sequence[Share | PooledRate]
+    paper: Mapping[float, float] = field(default_factory=dict)
+
+
+def draw_rates(axes: Axes, lines: Sequence[RateLine], linestyle: str = "-") -> None:
+    """Draw rates with their intervals, a line each; rates of a paper are open marks."""
+    for place, line in enumerate(lines):
+        style: dict[str, Any] = {"color": SERIES[place % len(SERIES)], "marker": MARKERS[place % len(MARKERS)]}
+        shares = np.array([one.share for one in line.rates])
+        bounds = np.array([[one.lower, one.upper] for one in line.rates]).reshape(-1, 2)
+        spread = np.abs(np.nan_to_num(bounds - shares[:, None])).T
+        bars: dict[str, Any] = {"capsize": 2.5, "elinewidth": 0.9, "markersize": 5.0, "linestyle": linestyle}
+        axes.errorbar(line.x, shares, spread, label=line.name or None, **bars, **style)
+        if line.paper:
+            name = f"{line.name}, paper" if len(lines) > 1 else "paper"
+            open_marks: dict[str, Any] = {
+                "linestyle": "",
+                "markersize": 10,
+                "markerfacecolor": "none",
+                "markeredgewidth": 1.5,
+            }
+            axes.plot([*line.paper], [*line.paper.values()], label=name, **open_marks, **style)
+    axes.set_ylim(-0.03, 1.05)
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+
+
+@in_page_style
+def rate_figure(lines: Sequence[RateLine], labels: tuple[str, str], limit: tuple[str, float] | None = None) -> Figure:
+    """Rates against a condition; `limit` is the name and the place of a vertical line."""
+    figure, axes = new_axes(6.4, 3.7)
+    draw_rates(axes, lines)
+    if limit is not None:
+        axes.axvline(limit[1], color=REQUIREMENT, linestyle="--", linewidth=1.2, label=limit[0])
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+    axes.legend(**_BELOW)
+    return figure
+
+
+#: How a kind of outcome is drawn; none is told by its colour alone.
+BARS: Mapping[str, Mapping[str, Any]] = {
+    "full": {"color": SERIES[0]},
+    "hatched": {"color": "none", "edgecolor": SERIES[1], "hatch": "////"},
+    "dotted": {"color": "none", "edgecolor": SERIES[5], "hatch": "...."},
+    "crossed": {"color": "none", "edgecolor": REQUIREMENT, "hatch": "xxxx"},
+}
+
+
+@in_page_style
+def stacked_bars(names: Sequence[str], shares: Mapping[str, tuple[str, Sequence[float]]], xlabel: str) -> Figure:
+    """A bar for each name, of shares in per cent; `shares` has the style of `BARS` and the shares by their name."""
+    figure, axes = new_axes(7.4, 1.0 + 0.27 * len(names))
+    places, left = np.arange(len(names)), np.zeros(len(names))
+    for name, (style, values) in shares.items():
+        axes.barh(places, values, left=left, height=0.7, label=name, **BARS[style])
+        left = left + np.asarray(values)
+    axes.set_yticks(places, list(names))
+    axes.set(xlabel=xlabel, xlim=(0.0, 100.0))
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(shares))
+    return figure
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Cases as points, and medians of bins of them: the x and y of both."""
+
+    points: tuple[Values, Values]
+    medians: tuple[Sequence[float], Sequence[float]]
+
+
+@in_page_style
+def scatter_panels(panels: Mapping[tuple[str, str], Panel], *, logarithmic: bool = False) -> Figure:
+    """Panels by the labels of their x and y axes: a row for each y, a column for each x."""
+    columns, rows = (list(dict.fromkeys(pair[k] for pair in panels)) for k in (0, 1))
+    size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(rows))
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex="col", sharey="row")
+    for (x, y), panel in panels.items():
+        axes = grid[rows.index(y), columns.index(x)]
+        axes.plot(*panel.points, ".", color=SERIES[5], markersize=3, rasterized=True)
+        axes.plot(*panel.medians, "o-", color=SERIES[0], markersize=4.5)
+        if logarithmic:
+            axes.set_yscale("log")
+        if y == rows[-1]:
+            axes.set_xlabel(x, fontsize=8)
+        if x == columns[0]:
+            axes.set_ylabel(y, fontsize=8)
+    return figure

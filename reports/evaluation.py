@@ -1,0 +1,154 @@
+"""A stored campaign with its verdicts, its exit status, and whether a campaign may stop itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from marsyard.reports.populations import crashed_cases
+from marsyard.reports.sampled import INDEPENDENT, Sampled, sampled
+from marsyard.reports.statistics.clusters import ClusterMethod
+from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.sequential import confidence_at, looks_of
+from marsyard.reports.stored import StoredRun, read_run
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, judge_campaign
+from marsyard.reports.wording import count
+
+
+@dataclass(frozen=True)
+class Overall:
+    """A campaign's verdict in one word and one sentence.
+
+    `status` is None where no requirement was asked.
+    """
+
+    status: Status | None
+    crashed: int
+    sentence: str
+
+    @property
+    def word(self) -> str:
+        """The headline."""
+        return "NO REQUIREMENT" if self.status is None else str(self.status)
+
+
+def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = INDEPENDENT) -> Overall:
+    """The campaign's verdict: that of the worst requirement, by the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
+    crashed = crashed_cases(frame)
+    statuses = [verdict.status for verdict in verdicts]
+    tail = f" {count(crashed, 'case')} crashed." if crashed else ""
+    if not statuses:
+        return Overall(None, crashed, "The campaign asks for no requirement." + tail)
+    order = (Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE)
+    worst = next((status for status in order if status in statuses), Status.PASS)
+    if not how.independent:
+        return Overall(worst, crashed, _by_rates(verdicts) + how.no_probability + tail)
+    sentence = {
+        Status.PASS: f"{count(len(statuses), 'requirement')} met.",
+        Status.MET_BY_RATE: (
+            f"{statuses.count(Status.MET_BY_RATE)} of {count(len(statuses), 'requirement')} met by the rate alone, not "
+            "at the confidence."
+        ),
+        Status.FAIL: f"{statuses.count(Status.FAIL)} of {count(len(statuses), 'requirement')} not met.",
+        Status.INSUFFICIENT: (
+            f"{statuses.count(Status.INSUFFICIENT)} of {count(len(statuses), 'requirement')} "
+            f"cannot be decided by {count(len(frame), 'case')}.{_further(verdicts)}"
+        ),
+    }[worst]
+    return Overall(worst, crashed, sentence + tail)
+
+
+def _by_rates(verdicts: Sequence[Verdict]) -> str:
+    """How many requirements the rates of a designed campaign's own cases meet; empty where none is decided by them."""
+    statuses = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
+    if not statuses:
+        return ""
+    met = statuses.count(Status.MET_BY_RATE)
+    return f"{met} of {count(len(statuses), 'requirement')} met by the rate of these cases. "
+
+
+def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
+    """The exit code of a campaign: 1 a requirement failed or a case crashed, 3 some are not shown, 0 otherwise.
+
+    A requirement that is MET BY RATE gives 3, unless it says `accept_rate`.
+    """
+    if crashed or any(one.status is Status.FAIL for one in verdicts):
+        return 1
+    by_rate = any(one.status is Status.MET_BY_RATE and not one.accept_rate for one in verdicts)
+    return 3 if by_rate or any(one.status is Status.INSUFFICIENT for one in verdicts) else 0
+
+
+def _further(verdicts: Sequence[Verdict]) -> str:
+    """How many cases would decide what is open, or what keeps more cases from it, where that can be said."""
+    limited = next((verdict for verdict in verdicts if verdict.advice), None)
+    if limited is not None:
+        return f" {limited.advice}"
+    needed = [verdict for verdict in verdicts if verdict.further_cases is not None]
+    if not needed:
+        return ""
+    most = max(needed, key=lambda verdict: verdict.further_cases or 0)
+    counted = most.clustered is not None and most.clustered.method is ClusterMethod.TERRAIN_COUNT
+    where = ", each on a terrain of its own," if counted else ""
+    return f" {count(most.further_cases or 0, 'further case')}{where} would do if no more fail."
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A stored campaign, how its cases were drawn, and its verdicts: each requirement's, and the whole one."""
+
+    run: StoredRun
+    how: Sampled
+    verdicts: Sequence[Verdict]
+    whole: Overall
+
+    @property
+    def exit_code(self) -> int:
+        """The exit status that goes with the verdicts."""
+        return exit_code(self.verdicts, bool(self.whole.crashed))
+
+
+def judged(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Judged:
+    """Judges a campaign's stored rows, by its own requirements or by those given.
+
+    Raises
+    ------
+    marsyard.campaigns.errors.StoreError
+        Where the folder holds no rows.
+    """
+    run = read_run(directory, requirements)
+    how = sampled(run.configuration)
+    verdicts = judge_campaign(run.whole, run.requirements, how)
+    return Judged(run, how, verdicts, overall(verdicts, run.whole, how))
+
+
+def next_look(verdicts: Sequence[Verdict], how: Sampled, cases: int) -> int | None:
+    """The number of cases at which to look again; None where the campaign may stop.
+
+    It may where every requirement is met or not met, or can be neither by the last look, whatever the cases left do.
+    Requirements that are decided by the estimate are not waited for.
+    """
+    if how.most_cases is None or cases >= how.most_cases:
+        return None
+    left = how.most_cases - cases
+    share = looks_of(how.most_cases)[-1].share
+    if not any(_open(verdict, left, share) for verdict in verdicts):
+        return None
+    return next(look.cases for look in looks_of(how.most_cases) if look.cases > cases)
+
+
+def _open(verdict: Verdict, left: int, share: float) -> bool:
+    """Whether a requirement is undecided, and the cases left can still decide it."""
+    if verdict.status is not Status.INSUFFICIENT or verdict.decide_by == ESTIMATE:
+        return False
+    if not 0.0 < verdict.probability < 1.0 or not 0.0 < verdict.confidence < 1.0:
+        return False
+    confidence = confidence_at(verdict.confidence, share)
+    succeeded, n = verdict.n - verdict.failures, verdict.n + left
+    # as for independent cases, all of the population: bounds for shared terrains are never tighter
+    may_pass = proportion_lower(succeeded + left, n, confidence) >= verdict.probability
+    may_fail = proportion_upper(succeeded, n, confidence) < verdict.probability
+    return may_pass or may_fail

@@ -1,0 +1,295 @@
+"""Hazards missed by their size, and features tracked by the change between the pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float
+from matplotlib.figure import Figure
+
+from marsyard.reports.charts import RateLine, draw_rates
+from marsyard.reports.columns import numbers
+from marsyard.reports.hda.sections import PAPER, landing_rows
+from marsyard.reports.kinds import Drawn, Rows
+from marsyard.reports.rates import CONFIDENCE, PooledRate, flag, pooled_rate, rate_text
+from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
+from marsyard.reports.svg import MUTED, REQUIREMENT, in_page_style
+from marsyard.reports.wording import NOTHING, percent, stated
+from marsyard.scenarios.landing.confusion import CLASS_NAMES, CLASSES
+
+
+@dataclass(frozen=True)
+class HazardClass:
+    """Hazards of one size.
+
+    Attributes
+    ----------
+    kind
+        `roughness` (their height) or `slope`.
+    low, high
+        Bounds in units of the lander's limit; infinite for the last class.
+    called_safe, unflagged
+        Footprints that the map calls safe, and those under which it has no hazard before growth, of all in the class.
+    """
+
+    kind: str
+    low: float
+    high: float
+    called_safe: PooledRate
+    unflagged: PooledRate
+
+    @property
+    def name(self) -> str:
+        """The bounds in words."""
+        if self.low == 0.0:
+            return f"< {self.high:g}"
+        return f"> {self.low:g}" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}"
+
+
+#: Rates of footprints over all flights, by their names: hits and of what.
+RATES: Mapping[str, tuple[str, str]] = {
+    "truly safe, with a hazard of the map under them (false alarms)": ("false_alarms", "footprints_truly_safe"),
+    "called safe by the map, not truly safe": ("footprints_called_safe_unsafe", "footprints_called_safe"),
+    "called safe, with a hazard of twice the roughness limit, three cells across": (
+        "gross_called_safe",
+        "footprints_called_safe",
+    ),
+    "such hazards, called safe": ("gross_called_safe", "gross"),
+    "such hazards, with no hazard of the map under them": ("gross_unflagged", "gross"),
+}
+_CLASSES_NOTE = (
+    "A footprint is what lies under the lander at a place of a lattice, a tenth of a diameter apart: those of a flight "
+    f"overlap. Its roughness is the height of its highest hazard. Intervals: {stated(CONFIDENCE)}, by bootstrap over "
+    "flights, or terrains where flights share them; none where no flight has a hit. Flagged: a cell under the lander "
+    "is a hazard before growth. Called safe: after growth, border and holes."
+)
+
+
+def hazard_classes(frame: Rows) -> list[HazardClass]:
+    """Missed hazards by size, in order; none where rows do not count them."""
+    edges = (0.0, *CLASSES, math.inf)
+    found = []
+    for kind in ("roughness", "slope"):
+        for name, low, high in zip(CLASS_NAMES, edges[:-1], edges[1:], strict=True):
+            column = f"footprints_{kind}_{name}"
+            if column in frame:
+                called, unflagged = (pooled_rate(frame, f"{column}_{part}", column) for part in ("safe", "unflagged"))
+                found.append(HazardClass(kind, low, high, called, unflagged))
+    return found
+
+
+def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
+    """Hazards missed by size, and rates of footprints; nothing where rows do not count them."""
+    del subject
+    classes = hazard_classes(frame)
+    if not classes:
+        return [], {}
+    rates = {name: pooled_rate(frame, *columns) for name, columns in RATES.items()}
+    figure = plate(class_figure(classes), key, "Hazards by size: called safe, and not flagged.")
+    by_class = grid_of(
+        [one for one in classes if one.called_safe.of],
+        {
+            "By": lambda one: one.kind,
+            "Over the limit": lambda one: one.name,
+            "Footprints in flights": lambda one: f"{one.called_safe.of:,} in {one.called_safe.flights:,}",
+            "Called safe": lambda one: rate_text(one.called_safe),
+            "Not flagged": lambda one: rate_text(one.unflagged),
+            "Flights with one not flagged": lambda one: f"{one.unflagged.flights_hit:,} of {one.unflagged.flights:,}",
+        },
+    )
+    rows = [[name, f"{one.hits:,} of {one.of:,}", rate_text(one)] for name, one in rates.items()]
+    counted = Grid(["Footprints", "Counted", f"Share ({stated(CONFIDENCE)} interval)"], rows)
+    blocks = [
+        Block(heading="Hazards missed, by height and slope", plates=[figure], grid=by_class),
+        Block(grid=counted, note=_CLASSES_NOTE),
+    ]
+    told = {name: asdict(one) for name, one in rates.items()}
+    return blocks, {"rates": told, "classes": [asdict(one) for one in classes]}
+
+
+@in_page_style
+def class_figure(classes: Sequence[HazardClass]) -> Figure:
+    """Shares called safe and not flagged against the hazards' size, roughness and slope apart."""
+    figure = Figure(figsize=(7.2, 3.3), layout="constrained")
+    for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("roughness", "slope"), strict=True):
+        ours = [one for one in classes if one.kind == kind]
+        places = np.arange(len(ours))
+        called = RateLine("called safe", (places - 0.08).tolist(), [one.called_safe for one in ours])
+        unflagged = RateLine("not flagged", (places + 0.08).tolist(), [one.unflagged for one in ours])
+        draw_rates(axes, (called, unflagged), linestyle="")
+        axes.set_xticks(places, [one.name for one in ours])
+        axes.set(title=f"by {kind}", xlabel="over the lander's limit")
+    figure.axes[0].set_ylabel("share of footprints")
+    figure.axes[1].legend(loc="upper right")
+    return figure
+
+
+#: Share of features below which tracking is no longer good.
+GOOD = 0.9
+#: A change below this share of the paper's limit is none: what is read back of a change that was not asked for.
+_NONE = 0.02
+_FEWEST_SIZES = 3
+
+
+@dataclass(frozen=True)
+class AtSize:
+    """Flights with one change of one signed size: features that both pictures show and that were tracked rightly, the
+    number of flights, and of those in which `GOOD` of the features were.
+    """
+
+    size: float
+    tracked: PooledRate
+    flights: int
+    good: int
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Tracking against one of the paper's changes.
+
+    Attributes
+    ----------
+    change
+        What changes, as `paper.toml` has it.
+    points
+        By size, among them none at all.
+    knee_up, knee_down
+        Largest change upwards and downwards up to which the interpolated share stays at `GOOD`; infinite where it never
+        falls below, NaN where the side was not flown.
+    """
+
+    change: Mapping[str, Any]
+    points: Sequence[AtSize]
+    knee_up: float
+    knee_down: float
+
+    def knee_text(self, value: float, sign: float) -> str:
+        """A knee with its unit."""
+        if math.isnan(value):
+            return NOTHING
+        if math.isinf(value):
+            return f"> {max(sign * at.size for at in self.points):g} {self.change['unit']}"
+        return f"{value:.1f} {self.change['unit']}"
+
+    @property
+    def least_within(self) -> float:
+        """The least share of all sizes up to the paper's limit, rounded sizes at the limit among them."""
+        shares = [at.tracked.share for at in self.points if abs(at.size) <= 1.001 * self.change["paper"]]
+        return float(np.nanmin(shares)) if shares and not np.all(np.isnan(shares)) else math.nan
+
+
+def limits_section(subject: Subject) -> Section | None:
+    """Features tracked by the change between the pictures; None where flights do not change one thing at a time."""
+    frame = landing_rows(subject)
+    found = [] if frame is None else curves(frame)
+    if not found:
+        return None
+    text = (
+        "The paper (section II.A): features can be tracked when the change of attitude is less than 10 deg in roll "
+        "about the optical axis and less than 20 deg in pitch and yaw, and that of altitude less than 20 %."
+    )
+    knees = grid_of(
+        found,
+        {
+            "Change": lambda one: one.change["name"],
+            "Paper's limit": lambda one: f"{one.change['paper']:g} {one.change['unit']}",
+            "Knee": lambda one: one.knee_text(one.knee_up, 1.0),
+            "Knee, downwards": lambda one: one.knee_text(one.knee_down, -1.0),
+            "Least share within the paper's limit": lambda one: percent(one.least_within),
+        },
+    )
+    by_size = grid_of(
+        [(one.change, at) for one in found for at in one.points],
+        {
+            "Change": lambda pair: pair[0]["name"],
+            "Size": lambda pair: f"{pair[1].size:g} {pair[0]['unit']}",
+            "Flights": lambda pair: f"{pair[1].flights:,}",
+            "Tracked rightly": lambda pair: rate_text(pair[1].tracked),
+            "Flights with 90 %": lambda pair: f"{pair[1].good:,}",
+        },
+    )
+    note = (
+        "Knee: the largest change up to which the share, interpolated between sizes flown, stays at 90 %; '>' where it "
+        "never falls below. Tracked rightly: accepted, and within 1 px of the true place."
+    )
+    caption = "Features tracked rightly, of those that both pictures show; red: the paper's limits; grey: 90 %."
+    blocks = [
+        Block(text=text, plates=[plate(limits_figure(found), "limits", caption, wide=True)]),
+        Block(heading="Knees", grid=knees, note=note),
+        Block(heading="By size", grid=by_size),
+    ]
+    data = {"curves": [asdict(one) for one in found]}
+    return Section("limits", "Limits", "Tracking by change between the pictures", blocks, data)
+
+
+def curves(frame: pd.DataFrame) -> list[Curve]:
+    """A curve for every change that was flown in several sizes, alone; none where they come together."""
+    changes = PAPER["changes"]
+    if "tracks_right" not in frame:
+        return []
+    sizes = [one["scale"] * numbers(frame, one["column"]) for one in changes]
+    present = np.stack([np.abs(size) > _NONE * one["paper"] for size, one in zip(sizes, changes, strict=True)])
+    flown = np.isfinite(np.stack(sizes)).all(axis=0)
+    if not flown.any() or np.any(present[:, flown].sum(axis=0) > 1):
+        return []
+    still = flown & ~present.any(axis=0)
+    found = []
+    for one, size, changed in zip(changes, sizes, present, strict=True):
+        chosen = flown & (changed | still)
+        rounded = np.where(changed, np.round(size, 1), 0.0)
+        if np.unique(rounded[chosen]).size >= _FEWEST_SIZES:
+            found.append(_curve(one, frame, rounded, chosen))
+    return found
+
+
+def _curve(
+    change: Mapping[str, Any], frame: Rows, sizes: Float[np.ndarray, " n"], chosen: Bool[np.ndarray, " n"]
+) -> Curve:
+    points = []
+    for size in np.unique(sizes[chosen]):
+        flights = frame[chosen & (sizes == size)]
+        # a flight without tracks has tracked none of what was to be seen
+        tracked = pooled_rate(flights, "tracks_right", "features_in_view")
+        points.append(AtSize(float(size), tracked, len(flights), int(flag(flights, "tracked_well").sum())))
+    return Curve(change, points, knee(points, 1.0), knee(points, -1.0))
+
+
+def knee(points: Sequence[AtSize], sign: float) -> float:
+    """Where the share falls below `GOOD` for the first time, going from no change upwards (1) or downwards (-1)."""
+    side = sorted((sign * at.size, at.tracked.share) for at in points if sign * at.size >= 0.0)
+    side = [(size, share) for size, share in side if not math.isnan(share)]
+    if len(side) < 2:
+        return math.nan
+    if side[0][1] < GOOD:
+        return side[0][0]
+    for (size, share), (next_size, next_share) in pairwise(side):
+        if next_share < GOOD:
+            return size + (next_size - size) * (share - GOOD) / (share - next_share)
+    return math.inf
+
+
+@in_page_style
+def limits_figure(found: Sequence[Curve]) -> Figure:
+    """The curves next to each other, with the paper's limits."""
+    figure = Figure(figsize=(9.0, 2.7 if len(found) < 3 else 5.2), layout="constrained")
+    columns = min(2, len(found))
+    panels = figure.subplots(-(-len(found) // columns), columns, squeeze=False, sharey=True)
+    for axes, curve in zip(panels.ravel(), found, strict=False):
+        x = [at.size for at in curve.points]
+        draw_rates(axes, [RateLine("", x, [at.tracked for at in curve.points])])
+        for limit in (-curve.change["paper"], curve.change["paper"]):
+            if min(x) <= limit <= max(x):
+                axes.axvline(limit, color=REQUIREMENT, linestyle="--", linewidth=1.2)
+        axes.axhline(GOOD, color=MUTED, linewidth=0.9, linestyle=":")
+        axes.set(title=curve.change["name"], xlabel=f"change ({curve.change['unit']})")
+    for axes in panels.ravel()[len(found) :]:
+        axes.set_axis_off()
+    for axes in panels[:, 0]:
+        axes.set_ylabel("features tracked")
+    return figure

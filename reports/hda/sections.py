@@ -1,0 +1,411 @@
+"""Sections about landings: thresholds, faults, errors of the map, touchdowns, sites, and run times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float
+
+from marsyard.reports.columns import numbers
+from marsyard.reports.kinds import (
+    Distribution,
+    Drawn,
+    MadeBy,
+    OutcomesBySize,
+    Quantiles,
+    Quantity,
+    Rate,
+    RateByCondition,
+    RateTable,
+    SectionDeclaration,
+    flagged,
+    pooled,
+)
+from marsyard.reports.papers import read_paper
+from marsyard.reports.populations import terrain_groups
+from marsyard.reports.rates import (
+    CONFIDENCE,
+    Share,
+    flag,
+    flag_share,
+    known,
+    quantile,
+    share_of,
+    stated_parameter,
+    varies,
+)
+from marsyard.reports.scatter import Scatter
+from marsyard.reports.section import Block, Grid, Section, Subject
+from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
+from marsyard.reports.wording import NOTHING, count, number, stated
+from marsyard.scenarios.landing.parameters import LanderParameters
+
+PAPER = read_paper(Path(__file__).with_name("paper.toml"))
+#: Columns that every row of a landing case has.
+_OWN = ("site_safe", "site_reported", "no_site_reported", "truly_safe_share")
+#: Fewest cases with a map for the section on its errors.
+FEWEST_MAPS = 8
+
+
+def landing_rows(subject: Subject) -> pd.DataFrame | None:
+    """The rows if they are those of landing cases."""
+    frame = subject.frame
+    return frame if all(name in frame for name in _OWN) and len(frame) > 0 else None
+
+
+def _threshold_rows(subject: Subject) -> pd.DataFrame | None:
+    frame = landing_rows(subject)
+    if frame is None:
+        return None
+    unsafe = numbers(frame, "footprints") - numbers(frame, "footprints_truly_safe")
+    return frame.assign(footprints_not_safe=unsafe)
+
+
+def _lander_limit_m(subject: Subject) -> float:
+    """The lander's own limit of roughness, as the campaign states it."""
+    limit = stated_parameter(subject, "lander", "max_roughness_m")
+    return float(limit) if isinstance(limit, int | float) else LanderParameters().max_roughness_m
+
+
+#: What the landing paper says of its false positives: false alarms and misses against the threshold of roughness.
+THRESHOLD = SectionDeclaration(
+    "threshold",
+    "Threshold",
+    "False alarms and misses by threshold of roughness",
+    rows=_threshold_rows,
+    requires=("false_alarms",),
+    parts=(
+        RateByCondition(
+            by=Quantity("max_roughness_m", "Threshold of roughness (m)"),
+            rates=(
+                Rate("false_alarms", "False alarms", pooled("false_alarms", "footprints_truly_safe")),
+                Rate("missed", "Missed", pooled("missed", "footprints_not_safe")),
+                Rate(
+                    "called_safe_unsafe",
+                    "Called safe, not safe",
+                    pooled("footprints_called_safe_unsafe", "footprints_called_safe"),
+                ),
+                Rate("found", "Site found, of those with one", flagged("site_reported", "roomy_exists"), drawn=False),
+                Rate("safe", "Sites truly safe", flagged("site_safe", "site_reported"), drawn=False),
+            ),
+            cases="Flights",
+            ylabel="share of footprints",
+            text="The paper: both results of its Fig. 7 have false positive hazards, caused by a low threshold of "
+            "roughness and by noise of the map; a higher one would remove them. It gives no numbers.",
+            note="False alarms: of truly safe footprints. Missed: of footprints that are not truly safe, for slope or "
+            "roughness.",
+            caption="Shares of footprints against the threshold; dashed: what the lander can stand on.",
+            limit=("the lander's limit", _lander_limit_m),
+            data="thresholds",
+        ),
+    ),
+)
+
+#: Faults in words with the unit of their size; a unit of None is one kind without sizes.
+FAULT_NAMES: Mapping[str, tuple[str, str | None]] = {
+    "none": ("none", None),
+    "black_picture": ("picture delivered black", "number"),
+    "repeated_picture": ("first picture delivered again", None),
+    "lost_rows": ("rows of the second picture lost", "share"),
+    "lost_pictures": ("pictures of the flight lost", "share"),
+    "laser_silent": ("altimeter silent", None),
+    "laser_stuck": ("altimeter stuck at a height greater by", "share"),
+    "gps_outage_s": ("no GPS from before the pictures on", "s"),
+    "bad_pixels": ("dead pixels, and as many hot ones", "share"),
+    "listed_bad_pixels": ("the same, listed and filled", "share"),
+    "dust_discs": ("specks of dust on the lens", "number"),
+    "own_shadow_m": ("own shadow in view", "m"),
+    "several": ("several", None),
+}
+
+
+def _fault_words(fault: str, size: float) -> tuple[str, str]:
+    name, unit = FAULT_NAMES.get(fault, (fault.replace("_", " "), "number"))
+    if unit is None or math.isnan(size):
+        return name, ""
+    if unit == "share":
+        return name, f"{100.0 * size:g} %"
+    return name, f"{size:g}" if unit == "number" else f"{size:g} {unit}"
+
+
+def answers(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
+    """What became of the search: each row is in one of these."""
+    reported, safe, refused = (flag(frame, name) for name in ("site_reported", "site_safe", "no_site_reported"))
+    finished = frame["site_reported"].notna().to_numpy(dtype=np.bool_)
+    return {
+        "safe": reported & safe,
+        "wrong": reported & ~safe,
+        "refused": refused,
+        "unconverged": finished & ~reported & ~refused,
+        "unfinished": ~finished,
+    }
+
+
+def _two_digits(value: float) -> str:
+    return NOTHING if math.isnan(value) else f"{value:.2f}"
+
+
+FAULT_OUTCOMES = OutcomesBySize(
+    outcomes=lambda frame, _: answers(frame),
+    styles={
+        "safe": ("safe site", "full"),
+        "refused": ("no safe site", "hatched"),
+        "unconverged": ("not converged", "dotted"),
+        "wrong": ("wrong", "crossed"),
+    },
+    cases="Flights",
+    wording=_fault_words,
+    further=(
+        ("Touchdown off (m)", "off_m", lambda rows: quantile(known(rows, "touchdown_error_m"), 0.5), _two_digits),
+        ("Sinking (m/s)", "sink_m_s", lambda rows: quantile(known(rows, "touchdown_sink_m_s"), 0.5), _two_digits),
+    ),
+    caption="Full: a truly safe site. Hatched: no safe site. Dotted: not converged. Crossed: a site that is not safe.",
+    note="Not converged: said so, and the a-priori site is what is left. Wrong: a site was reported as safe and is "
+    f"not, with the interval of its share at {stated(CONFIDENCE)}. 'No safe site' may be right: rows tell no "
+    "difference. Touchdown off: median distance of the true touchdown from where the site was; sinking: median speed "
+    "then.",
+)
+FAULTS = SectionDeclaration("landing-faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), rows=landing_rows)
+
+
+def map_rows(subject: Subject) -> pd.DataFrame | None:
+    """The cases with a map, with errors as shares of height and range; None where no condition varies, or for few."""
+    frame = landing_rows(subject)
+    if frame is None or not (varies(frame, "texture") and varies(frame, "baseline_share")):
+        return None
+    shares = {
+        "rms_share": numbers(frame, "elevation_rms_m") / numbers(frame, "height_m"),
+        "noise_share": numbers(frame, "elevation_noise_m") / numbers(frame, "height_m"),
+        "altimeter_share": np.abs(numbers(frame, "range_error_m")) / numbers(frame, "range_m"),
+    }
+    mapped = pd.DataFrame(frame.assign(**shares)[np.isfinite(shares["rms_share"])])
+    return mapped if len(mapped) >= FEWEST_MAPS else None
+
+
+#: Errors of the map, as columns made by `map_rows`.
+_MAP_ERRORS = (
+    Quantity("rms_share", "elevation error rms (% of height)", 100.0),
+    Quantity("noise_share", "the same without its plane (% of height)", 100.0),
+    Quantity("slope_error_rms_deg", "slope error rms (deg)"),
+)
+#: What the errors depend on; errors as they were applied.
+MAP_EFFECTS = Scatter(
+    x=(
+        Quantity("baseline_share", "baseline over height"),
+        Quantity("texture", "texture over the site's"),
+        Quantity("grid_px", "grid spacing (px)"),
+        Quantity("level_error_deg", "error of the vertical (deg)"),
+        Quantity("altimeter_share", "altimeter's error (% of the range)", 100.0),
+    ),
+    y=_MAP_ERRORS,
+    heading="What they depend on",
+    caption="Every case, and medians of bins with equally many cases; scales of the errors are logarithmic.",
+    logarithmic=True,
+)
+MAP_ERRORS = SectionDeclaration(
+    "map-errors",
+    "Map",
+    "Errors of the elevation map",
+    rows=map_rows,
+    parts=(
+        Quantiles(
+            _MAP_ERRORS,
+            {"5 %": 0.05, "Median": 0.5, "95 %": 0.95},
+            heading="Errors of the maps",
+            note="Against exact heights averaged over each cell. Rms holds what the altimeter, the vertical and the "
+            "motion do to the whole map; without its plane the map's own noise is left, which roughness sees. Errors "
+            "as they were applied in the case: that of the vertical from the inclinometers, that of the altimeter from "
+            "its reading.",
+            data="maps",
+        ),
+        MAP_EFFECTS,
+    ),
+)
+
+#: Errors of the touchdown: columns, and how they are called.
+TOUCHDOWN_ERRORS = (
+    Quantity("touchdown_error_gps_m", "by averaged GPS, as the paper"),
+    Quantity("touchdown_error_m", "by truth"),
+    Quantity("touchdown_error_believed_m", "as the filter believes"),
+)
+_DEVIATIONS = ("gps_deviation_north_m", "gps_deviation_east_m")
+
+
+def _landed(subject: Subject) -> pd.DataFrame | None:
+    frame = landing_rows(subject)
+    return None if frame is None else frame[flag(frame, "landed")]
+
+
+def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> Drawn:
+    """The paper's runs, their mean, and ours by each measure."""
+    del subject, key
+    runs: Sequence[Mapping[str, float]] = PAPER["landings"]
+    columns = ("error_m", "north_m", "east_m", "run_time_s")
+    paper = {f"run {run['run']}": (1, [run[name] for name in columns]) for run in runs}
+    paper["mean"] = len(runs), [float(np.mean([run[name] for run in runs])) for name in columns]
+    rows = [
+        [f"paper, {name}", str(n), f"{error:.2f}", NOTHING, f"{north:.2f}", f"{east:.2f}", f"{taken:.1f} s"]
+        for name, (n, (error, north, east, taken)) in paper.items()
+    ]
+    deviations = {name: known(landed, name) for name in _DEVIATIONS}
+    taken_s = known(landed, "estimation_time_s")
+    groups, means, intervals = terrain_groups(landed), {}, {}
+    for one in TOUCHDOWN_ERRORS:
+        values = one.values(landed)
+        finite = np.isfinite(values)
+        if finite.any():
+            low, high = mean_interval(values[finite], CONFIDENCE, None if groups is None else groups[finite])
+            means[one.column], intervals[one.column] = float(values[finite].mean()), (low, high)
+            told = f"mean {number(means[one.column])} ({number(low)} to {number(high)})"
+            spread = " to ".join(number(float(end)) for end in np.quantile(values[finite], (0.05, 0.95)))
+            run_time = f"{1e3 * float(np.median(taken_s)):.0f} ms here" if taken_s.size else NOTHING
+            off = [f"{each.mean():.2f}" if each.size else NOTHING for each in deviations.values()]
+            rows.append([f"ours, {one.title}", f"{int(finite.sum()):,}", told, spread, *off, run_time])
+    head = ["", "Landings", "Position error (m)", "90 % of errors (m)", "Northing dev. (m)", "Easting dev. (m)"]
+    note = (
+        "By averaged GPS: distance of the receiver's averaged solutions after landing from the site's coordinates, as "
+        "the paper measured it. By truth: of the true touchdown from where these coordinates led, the navigation's "
+        "error at the first picture taken off. Deviations: the receiver's own. Intervals of means: "
+        f"{stated(CONFIDENCE)}."
+    )
+    data = {
+        "landings": len(landed),
+        "mean_m": means,
+        "mean_interval_m": intervals,
+        "deviations_m": {name: float(values.mean()) for name, values in deviations.items() if values.size},
+        "touchdown_safe": flag_share(landed, "touchdown_safe").share if "touchdown_safe" in landed else math.nan,
+        "paper_m": {str(run["run"]): run["error_m"] for run in runs},
+    }
+    return [Block(heading="Table II", grid=Grid([*head, "Run time"], rows), note=note)], data
+
+
+TOUCHDOWN = SectionDeclaration(
+    "touchdown",
+    "Touchdown",
+    "Touchdown, beside Table II",
+    rows=_landed,
+    requires=("touchdown_error_gps_m", "touchdown_error_m"),
+    parts=(
+        Distribution(
+            TOUCHDOWN_ERRORS,
+            ("distance of the touchdown from the site (m)", "share of landings"),
+            "Share of landings nearer to the site than so much; vertical: the paper's three runs, by averaged GPS.",
+            limits={"paper, runs 1, 3, 4": [run["error_m"] for run in PAPER["landings"]]},
+        ),
+        MadeBy(_table_2),
+        RateTable(
+            (
+                Rate("touchdown", "came down on ground that is safe", flagged("touchdown_safe")),
+                Rate("site", "the site itself was safe", flagged("site_safe")),
+            ),
+            cases="Landings",
+            heading="Ground under the helicopter",
+            data="ground",
+            shared=False,
+        ),
+    ),
+)
+
+#: What is true of the ground that both pictures show, best first, and what became of the search.
+GROUNDS = ("safe place with room about it", "safe place without room", "no safe place")
+ANSWERS = ("safe site, truly safe", "site, not safe", "no safe site", "not converged", "not finished")
+
+
+def site_shares(frame: pd.DataFrame) -> dict[str, Share]:
+    """How often the answer was right, by what was asked for; those alone that had cases."""
+    reported, none, roomy, landed = (
+        flag(frame, name) for name in ("site_reported", "none_exists", "roomy_exists", "landed")
+    )
+    refused, safe = flag(frame, "no_site_reported"), flag(frame, "site_safe")
+    narrow, right = flag(frame, "safe_exists") & ~roomy, refused | (reported & safe)
+    shares = {
+        "chosen sites that are truly safe": share_of(safe[reported], frame[reported]),
+        "'no safe site', where none exists": share_of(refused[none], frame[none]),
+        "a site reported, where none exists": share_of(reported[none], frame[none]),
+        "a site found, where one has room about it": share_of(reported[roomy], frame[roomy]),
+        "a truly safe site or 'no safe site', where safe sites have no room": share_of(right[narrow], frame[narrow]),
+        "ground mapped, of all flights": share_of(flag(frame, "converged"), frame),
+        "landings on safe ground": share_of(flag(frame, "touchdown_safe")[landed], frame[landed]),
+    }
+    return {name: one for name, one in shares.items() if one.n}
+
+
+def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
+    """Flights by what is true (`GROUNDS`) and what became of them (`ANSWERS`)."""
+    roomy, exists, none = (flag(frame, name) for name in ("roomy_exists", "safe_exists", "none_exists"))
+    given = dict(zip(ANSWERS, answers(frame).values(), strict=True))
+    truths = dict(zip(GROUNDS, (roomy, exists & ~roomy, none), strict=True))
+    return {
+        ground: {answer: int((of_ground & mask).sum()) for answer, mask in given.items()}
+        for ground, of_ground in truths.items()
+    }
+
+
+def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> Drawn:
+    """What became of the search by what is true of the ground."""
+    del subject, key
+    counts = outcome_counts(frame)
+    rows = [[ground, *(f"{of_answer[name]:,}" for name in ANSWERS)] for ground, of_answer in counts.items()]
+    note = (
+        "Flights by what is true of the ground that both pictures show. Room: every place within a lander's radius is "
+        "safe too. Where the algorithm does not converge the a-priori site is what is left; it is reported as such."
+    )
+    block = Block(heading="By what is there", grid=Grid(["The pictures show", *ANSWERS], rows), note=note)
+    return [block], {"outcomes": counts}
+
+
+def distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
+    """Distances of reported sites and of touchdowns to the nearest true hazard, metres."""
+    return {
+        "site, where one was reported": known(frame[flag(frame, "site_reported")], "site_hazard_distance_m"),
+        "touchdown": known(frame, "touchdown_hazard_distance_m"),
+    }
+
+
+def distance_grid(curves: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
+    """Least distance, low quantiles, and the bound of the 5 % quantile."""
+    rows = []
+    for name, values in curves.items():
+        if values.size:
+            bound = quantile_bounds(values, 0.05, CONFIDENCE)[0]
+            numbers_told = [number(float(one)) for one in (values.min(), *np.quantile(values, (0.05, 0.5)))]
+            rows.append([name, f"{values.size:,}", *numbers_told, NOTHING if math.isinf(bound) else number(bound)])
+    return Grid(["Distance (m)", "Cases", "Least", "5 % quantile", "Median", "5 % quantile is at least"], rows)
+
+
+def run_times_section(subject: Subject) -> Section | None:
+    """Processor time of the four stages next to Table I; None where no case went through all of them."""
+    frame, stages = landing_rows(subject), PAPER["stages"]
+    if frame is None:
+        return None
+    taken = np.column_stack([numbers(frame, stage["column"]) for stage in stages])
+    complete = np.isfinite(taken).all(axis=1)
+    taken, chosen, cases = taken[complete], frame[complete], int(complete.sum())
+    if not cases or not taken.sum() > 0.0:
+        return None
+    median, late = np.median(taken, axis=0), np.quantile(taken, 0.95, axis=0)
+    paper, ours = sum(stage["seconds"] for stage in stages), float(median.sum())
+    factor, rows, data = paper / ours, [], []
+    for stage, middle, slow in zip(stages, median.tolist(), late.tolist(), strict=True):
+        sizes = [quantile(known(chosen, name), 0.5) for name in stage["ours"]]
+        told = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
+        data.append(
+            {"name": stage["name"], "paper_s": stage["seconds"], "median_s": middle, "late_s": slow}
+            | {"scaled_s": factor * middle, "parameters": told}
+        )
+        times = [f"{stage['seconds']:.2f}", f"{1e3 * middle:.1f}", f"{1e3 * slow:.1f}", f"{factor * middle:.2f}"]
+        rows.append([stage["name"], *times, stage["parameters"], told])
+    rows.append(["Together", f"{paper:.2f}", f"{1e3 * ours:.1f}", NOTHING, f"{ours * factor:.2f}", NOTHING, NOTHING])
+    head = ["Stage", "Paper (s)", "Here, median (ms)", "95 %", "Scaled (s)", "Paper's parameters", "Parameters here"]
+    note = (
+        f"Processor time of {count(cases, 'case')} that reached a map. The paper's is of a 400 MHz R12000. Scaled: "
+        f"times {number(factor)}, which makes the sum the paper's, as no benchmark is known of both processors: it "
+        "compares how the time is shared out, not how fast either is. Here the elevation map counts with the hazards, "
+        "the scale with the motion. Stages with exactly the paper's parameters, on an idle machine: make bench."
+    )
+    block, told_too = Block(grid=Grid(head, rows), note=note), {"factor": factor, "cases": cases, "stages": data}
+    return Section("run-times", "Run time", "Run time by stage, beside Table I", [block], told_too)

@@ -1,0 +1,72 @@
+"""Numbers of papers, each paper's in one TOML file, next to ours."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from marsyard.reports.kinds import Part, Rows
+from marsyard.reports.rates import all_flags, flag_share, known, share_text, spread_text
+from marsyard.reports.section import Block, Grid, Section, Subject
+from marsyard.reports.wording import NOTHING
+
+
+@cache
+def read_paper(path: Path) -> Mapping[str, Any]:
+    """A paper's numbers from its TOML file; see `PaperFacts` for the facts of campaigns."""
+    with path.open("rb") as file:
+        return tomllib.load(file)
+
+
+@dataclass(frozen=True)
+class PaperFacts:
+    """What a paper tells of single runs, next to ours: `[[facts]]` of its TOML file.
+
+    Each has `campaign` (the name of the campaign that repeats the run), `title`, `source`, `note`, and `rows`. A row
+    has `name` (with its unit), `paper` (the paper's value as text; none for a dash), `column`, and optionally
+    `statistic` (``spread``, the median with least and greatest, or ``rate``), `among` (flags that choose rows),
+    `scale`, `digits` and `magnitude` (whether signs are dropped).
+
+    Attributes
+    ----------
+    path
+        The file.
+    further
+        What a campaign's section has in addition.
+    """
+
+    path: Path
+    further: Mapping[str, Part] = field(default_factory=dict)
+
+    def __call__(self, subject: Subject) -> Section | None:
+        """The section; None where no run of the paper has the campaign's name."""
+        facts = {one["campaign"]: one for one in read_paper(self.path)["facts"]}.get(subject.run.name)
+        if facts is None or not any(row["column"] in subject.frame for row in facts["rows"]):
+            return None
+        told = {row["name"]: (row.get("paper", NOTHING), ours_text(subject.frame, row)) for row in facts["rows"]}
+        grid = Grid(["", "Paper", "Ours"], [[name, paper, ours] for name, (paper, ours) in told.items()])
+        data: dict[str, Any] = {name: {"paper": paper, "ours": ours} for name, (paper, ours) in told.items()}
+        blocks = [Block(grid=grid, note=f"{_MEDIANS} {facts.get('note', '')}".strip())]
+        if subject.run.name in self.further:
+            shown, numbers_too = self.further[subject.run.name].draw(subject.frame, subject, "paper")
+            blocks += shown
+            data |= numbers_too
+        return Section("paper", "Beside the paper", facts["title"], blocks, data)
+
+
+_MEDIANS = "Ours: the median over all cases, and least to greatest in brackets. A dash: the paper does not say."
+
+
+def ours_text(frame: Rows, row: Mapping[str, Any]) -> str:
+    """Our value of a paper's quantity."""
+    chosen, column = frame[all_flags(frame, *row.get("among", ()))], row["column"]
+    if row.get("statistic") == "rate":
+        return share_text(flag_share(chosen, column)) if column in chosen else NOTHING
+    values = known(chosen, column, row.get("scale", 1.0))
+    return spread_text(np.abs(values) if row.get("magnitude") else values, row.get("digits"))

@@ -1,0 +1,444 @@
+"""Sections about visual target tracking: the paper's tables and runs next to ours, positions at the goal, and steps."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, AccuracyRow, table_1, tracked_approach_error_m
+from marsyard.reports.charts import RateLine, rate_figure
+from marsyard.reports.columns import numbers
+from marsyard.reports.kinds import Drawn, MadeBy, Rows
+from marsyard.reports.papers import PaperFacts, read_paper
+from marsyard.reports.rates import (
+    CONFIDENCE,
+    all_flags,
+    flag,
+    flag_share,
+    interval_text,
+    known,
+    rms,
+    share_text,
+    spread_text,
+    stated_parameter,
+)
+from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
+from marsyard.reports.stored import table
+from marsyard.reports.vtt.goal import losses_grid
+from marsyard.reports.vtt.rows import is_closed_loop, is_tracking, selectable
+from marsyard.reports.wording import NOTHING, number, percent, stated
+
+_PAPER_FILE = Path(__file__).with_name("paper.toml")
+PAPER = read_paper(_PAPER_FILE)
+#: Table I as printed.
+PRINTED = {name: AccuracyRow(name, **row) for name, row in PAPER["table_1"].items()}
+#: Campaigns of Tables II and III, and of the regression runs.
+TERRAINS, CHECKOUT_1, CHECKOUT_3, REGRESSION = "vtt-terrains", "vtt-checkout-1", "vtt-checkout-3", "vtt-regression"
+#: Runs count whose distances from the camera differ from Table I's by no more than this share.
+_NEAR = 0.1
+
+
+def table_1_section(subject: Subject) -> Section | None:
+    """Table I: computed from its equations, as printed, and measured; None where no completed run goes from the paper's
+    10 m to its 2 m.
+    """
+    found = measured_accuracy(subject.frame)
+    if not found:
+        return None
+    computed = {row.name: row for row in table_1()}
+    both = [(kind, row[name]) for name in PRINTED for kind, row in (("printed", PRINTED), ("computed", computed))]
+    grid = grid_of(
+        both,
+        {
+            "Camera": lambda pair: pair[1].name,
+            "": lambda pair: pair[0],
+            "Designation (cm)": lambda pair: f"{pair[1].designation_cm:g}",
+            "Approach without tracker (cm)": lambda pair: f"{pair[1].untracked_cm:.1f}",
+            "Approach with N px of drift (cm)": lambda pair: pair[1].tracked_formula,
+        },
+    )
+    note = (
+        "All 3 sigma. Computed by Eqs. 1 to 5 with the 4.65 µm pixel of the manufacturer, each column rounded "
+        "before the next is computed from it."
+    )
+    measured_note = (
+        f"Selectable targets of completed runs from {START_M:g} m to {GOAL_M:g} m: three times the root mean square. "
+        "Without tracker: by Eq. 3 from the measured errors of designation and pose, whatever odometry the runs "
+        "had; the paper's is visual. Table I, the same: its last column for the drift measured. The paper takes 1 "
+        "px as the disparity error of 3 sigma; the error, calibration included, that Eq. 1 makes of the designation "
+        "stands beside."
+    )
+    blocks = [
+        Block(heading="Computed", grid=grid, note=note),
+        Block(heading="Measured", grid=_measured_grid(found), note=measured_note),
+    ]
+    data = {
+        "computed": {name: asdict(row) for name, row in computed.items()},
+        "printed": {name: asdict(row) for name, row in PRINTED.items()},
+        "measured": found,
+    }
+    return Section("table-1", "Table I", "Table I: accuracy of a target's position", blocks, data)
+
+
+def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
+    """Errors of each camera's completed runs: three times their root mean square, centimetres, as the paper tells
+    3 sigma. `disparity_px` is the disparity error, 1 sigma, that Eq. 1 makes of the designation's error for the camera
+    as it was; `untracked_cm` is Eq. 3 of the errors of designation and pose.
+    """
+    if not is_closed_loop(frame) or "designation_error_m" not in frame or "camera" not in frame:
+        return []
+    ends = {"range_start_m": START_M, "range_end_m": GOAL_M}
+    near = [np.abs(numbers(frame, name) / distance - 1.0) < _NEAR for name, distance in ends.items()]
+    completed = selectable(frame[near[0] & near[1] & np.isfinite(numbers(frame, "position_error_m"))])
+    found = []
+    for camera in sorted(completed["camera"].unique()):
+        runs = completed[completed["camera"].eq(camera)]
+        designation, pose = numbers(runs, "designation_error_m"), numbers(runs, "pose_error_m")
+        found.append(
+            {
+                "camera": str(camera),
+                "runs": len(runs),
+                "designation_cm": 300.0 * rms(designation),
+                "disparity_px": rms(designation / numbers(runs, "designation_3_sigma_m")),
+                "untracked_cm": 300.0 * rms(np.hypot(designation, pose)),
+                "tracked_cm": 300.0 * rms(numbers(runs, "position_error_m")),
+                "drift_px": rms(numbers(runs, "drift_px")),
+            }
+        )
+    return found
+
+
+def _measured_grid(found: Sequence[Mapping[str, Any]]) -> Grid:
+    head = ["Camera", "Runs", "Designation (cm)", "Table I", "Disparity error, 1 sigma (px)"]
+    head += ["Approach without tracker (cm)", "Table I", "Approach with tracker (cm)", "Table I, the same"]
+    rows = []
+    for one in found:
+        printed = next((row for name, row in PRINTED.items() if one["camera"].endswith(name.lower())), None)
+        paper = [NOTHING] * 3
+        if printed is not None:
+            tracked = tracked_approach_error_m(printed.stereo_cm, printed.drift_cm_px * one["drift_px"])
+            paper = [f"{printed.designation_cm:g}", f"{printed.untracked_cm:.1f}", f"{tracked:.1f}"]
+        first = [one["camera"], f"{one['runs']:,}", f"{one['designation_cm']:.1f}", paper[0]]
+        second = [number(one["disparity_px"]), f"{one['untracked_cm']:.1f}", paper[1]]
+        rows.append([*first, *second, f"{one['tracked_cm']:.1f}", paper[2], f"{one['drift_px']:.1f}"])
+    return Grid([*head, "Drift rms (px)"], rows)
+
+
+def legs(subject: Subject) -> list[Mapping[str, Any]]:
+    """The legs that the campaign's file gives its drive or its runs."""
+    drive = stated_parameter(subject, "drive")
+    said = table(drive).get("legs") if drive is not None else stated_parameter(subject, "legs")
+    return [table(leg) for leg in said] if isinstance(said, list | tuple) else []
+
+
+def table_4(frame: Rows, driven: Sequence[Mapping[str, Any]]) -> Grid:
+    """Table IV: tracking updates and minutes of each operational mode, the paper's and ours; `driven` are the legs."""
+    of_update = [int(str(name).split("_")[1]) for name in frame.columns if re.match(r"^update_\d+_leg$", str(name))]
+    legs_of = np.column_stack([numbers(frame, f"update_{n}_leg") for n in of_update])
+    times = np.column_stack([numbers(frame, f"update_{n}_time_s") for n in of_update]) / 60.0
+    steered = [(str(leg.get("motion", "approach")), bool(leg.get("autonav"))) for leg in driven]
+    steered = [(motion, motion == "approach" and autonav) for motion, autonav in steered]
+    rows, before = [], np.zeros(len(frame))
+    for mode in PAPER["table_4"]:
+        numbers_of = [k for k, kind in enumerate(steered) if kind == (mode["motion"], mode.get("autonav", False))]
+        # the first update, at the start, has the leg -1
+        chosen = np.isin(legs_of, [-1, *numbers_of] if mode.get("start") else numbers_of)
+        reached = chosen.any(axis=1)
+        end = np.where(chosen, times, -np.inf).max(axis=1)
+        counts, minutes = chosen.sum(axis=1).astype(np.float64), (end - before)[reached]
+        ours = (spread_text(counts[reached], 0), spread_text(minutes, 1))
+        rows.append([mode["name"], f"{mode['updates']}", ours[0], f"{mode['minutes']:g}", ours[1]])
+        before = np.where(reached, end, before)
+    return Grid(["Mode", "Updates, paper", "Updates, ours", "Minutes, paper", "Minutes, ours"], rows)
+
+
+def _modes(frame: Rows, subject: Subject, key: str) -> Drawn:
+    del key
+    if "update_1_leg" not in frame:
+        return [], {}
+    note = (
+        "The paper's 5 minutes for the first map stand with the navigator's 23, as the map is begun on the way back in "
+        "ours. Ours: as above. A mode lasts from the last update before it to its own last."
+    )
+    return [Block(heading="By operational mode", grid=table_4(frame, legs(subject)), note=note)], {}
+
+
+#: What the paper tells of single runs, next to the campaign that repeats the run.
+SINGLE_RUNS = PaperFacts(_PAPER_FILE, further={CHECKOUT_3: MadeBy(_modes)})
+
+#: What the table tells of an update: its heading, the column's ending, digits.
+QUANTITIES: tuple[tuple[str, str, int], ...] = (
+    ("Distance (m)", "range_m", 2),
+    ("Magnification", "magnification", 2),
+    ("Roll change (deg)", "roll_change_deg", 2),
+    ("Azimuth change (deg)", "azimuth_change_deg", 2),
+    ("NCC score", "match_score", 2),
+    ("Stereo score", "stereo_score", 2),
+    ("Correction (px)", "correction_px", 1),
+    ("Off by (px)", "error_px", 1),
+)
+
+
+def updates_section(subject: Subject) -> Section | None:
+    """Numbers of every stored update, next to Table III where the campaign is the first checkout; None where rows store
+    none.
+    """
+    frame = subject.frame
+    matched = (re.match(r"^update_(\d+)_range_m$", str(name)) for name in frame.columns)
+    updates = sorted(int(one[1]) for one in matched if one)
+    if not is_tracking(frame) or not updates:
+        return None
+    values = {n: {ending: known(frame, f"update_{n}_{ending}") for _, ending, _ in QUANTITIES} for n in updates}
+    grid = grid_of(
+        [n for n in updates if values[n]["range_m"].size],
+        {
+            "Update": str,
+            "Cases": lambda n: f"{values[n]['range_m'].size:,}",
+            **{one[0]: lambda n, one=one: spread_text(values[n][one[1]], one[2]) for one in QUANTITIES},
+        },
+    )
+    note = (
+        "Of all cases that came so far: median, and least to greatest in brackets. Changes are since the update "
+        "before; roll and azimuth with their sign. Correction: the larger of row and column, found less predicted. "
+        "Off by: found less true."
+    )
+    blocks, title = [Block(grid=grid, note=note)], "Updates one by one"
+    if subject.run.name == CHECKOUT_1:
+        title = "Table III: the first checkout's updates"
+        paper_note = (
+            "The paper's number, then ours: the median, and least to greatest in brackets, without their signs, as the "
+            "paper prints them. Distances are those that Fig. 15 states. Path and steps are the paper's; rock, ground "
+            "and light are not known from it."
+        )
+        blocks = [
+            Block(heading="Beside the paper's", grid=_table_3(values), note=paper_note),
+            Block(heading="All of ours", grid=grid, note=note),
+        ]
+    told = {str(n): {ending: one.tolist() for ending, one in of_n.items()} for n, of_n in values.items()}
+    return Section("updates", "Updates", title, blocks, {"updates": told})
+
+
+def _table_3(values: Mapping[int, Mapping[str, np.ndarray]]) -> Grid:
+    """Table III, a row for each quantity and whose it is, a column for each rover position."""
+    rows = []
+    for heading, ending, digits in QUANTITIES:
+        printed = PAPER["table_3"].get(ending)
+        if printed is not None:
+            paper = [f"{printed[str(n)]:.{digits}f}" if str(n) in printed else NOTHING for n in values]
+            ours = [spread_text(np.abs(of_n[ending]), digits) for of_n in values.values()]
+            rows += [[heading, "paper", *paper], ["", "ours", *ours]]
+    return Grid(["Parameter", "Rover position", *(str(n) for n in values)], rows)
+
+
+#: What tells the lines of a figure of steps apart, where it varies.
+_SERIES = ("algorithm", "search_px")
+_STEPS_NOTE = (
+    "Selectable: lit, off the rock's edge, in both pictures to the end and, where the campaign says so, on the face "
+    "that all stops see. Tracked: found in the last picture within the stated pixels of the designated point's true "
+    "projection. Falsely tracked: reported beyond them at some stop. "
+    f"Intervals: two-sided, Clopper and Pearson, at {stated(CONFIDENCE)} confidence, as for independent targets; "
+    "those of a rock share its pictures and are not."
+)
+#: Edges of classes of the most oblique sight, deg.
+_CLASSES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
+
+
+def steps_section(subject: Subject) -> Section | None:
+    """Targets tracked by size of step: Fig. 8, sideways motions (5.2), turns (5.3); None where rows do not share
+    pictures of a drive.
+    """
+    motion, found = _motion(subject), step_rates(subject)
+    if motion is None or not found:
+        return None
+    lines = [
+        RateLine(
+            name,
+            [one["step"] for one in ours],
+            [one["good"] for one in ours],
+            {one["step"]: one["paper_percent"] / 100.0 for one in ours if one["paper_percent"] is not None},
+        )
+        for name in dict.fromkeys(one["line"] for one in found)
+        if (ours := [one for one in found if one["line"] == name and one["good"].n])
+    ]
+    unit = "% of the distance" if motion["per_cent"] else "deg"
+    xlabel = "step (% of the target's distance)" if motion["per_cent"] else "step (deg)"
+    caption = "Selectable targets tracked to the end, with intervals; open: the paper's text."
+    grid = grid_of(
+        found,
+        {
+            "Tracker": lambda one: one["line"] or "vtt",
+            f"Step ({unit})": lambda one: number(one["step"]).rstrip("0").rstrip("."),
+            "Tracked, of selectable": lambda one: share_text(one["good"]),
+            f"{stated(CONFIDENCE)} interval": lambda one: interval_text(one["good"]),
+            "Paper": lambda one: NOTHING if one["paper_percent"] is None else f"{one['paper_percent']:.0f} %",
+            "Tracked, of all targets": lambda one: share_text(one["all_targets"]),
+            "Falsely tracked, of selectable": lambda one: share_text(one["false_tracks"]),
+        },
+    )
+    figure = rate_figure(lines, (xlabel, "targets tracked"))
+    blocks = [
+        Block(text=motion["text"], plates=[plate(figure, "steps", caption)]),
+        Block(grid=grid, note=_STEPS_NOTE),
+    ]
+    oblique = None if motion["per_cent"] else _obliquity_grid(subject.frame)
+    if oblique is not None:
+        note = (
+            "Lit targets in view to the end, tracked of all, by how obliquely their surface was seen at most. The "
+            "template is scaled and rolled, but not narrowed as an oblique patch is that turns."
+        )
+        blocks.append(Block(grid=oblique, note=note))
+    rates = ("good", "all_targets", "false_tracks")
+    data = [one | {name: asdict(one[name]) for name in rates} for one in found]
+    return Section("steps", "Steps", motion["title"], blocks, {"cells": data})
+
+
+def _motion(subject: Subject) -> Mapping[str, Any] | None:
+    """What the paper tells of the campaign's motion; None where it does not drive one leg."""
+    of_drive = legs(subject)
+    motions: Mapping[str, Mapping[str, Any]] = PAPER["steps"]
+    return motions.get(str(of_drive[0].get("motion", "approach"))) if len(of_drive) == 1 else None
+
+
+def step_rates(subject: Subject) -> list[dict[str, Any]]:
+    """Every line (the tracker, or its search window) and step: shares tracked of selectable targets (`good`) and of
+    all, share of selectable targets that some update reported at a wrong place, and the paper's per cent.
+    """
+    frame, motion = subject.frame, _motion(subject)
+    if motion is None or not is_tracking(frame) or "step" not in frame or "skip" not in frame:
+        return []
+    found = []
+    for line, rows in _lines(frame[frame["step"].notna()]):
+        paper = motion["paper"].get(line) or motion["paper"].get("", {})
+        for _, chosen in rows.groupby("skip"):
+            step = float(chosen["step"].iloc[0]) * (100.0 if motion["per_cent"] else 1.0)
+            good = selectable(chosen)
+            found.append(
+                {
+                    "line": line,
+                    "step": step,
+                    "good": flag_share(good, "tracked"),
+                    "all_targets": flag_share(chosen, "tracked"),
+                    "false_tracks": flag_share(good, "true_track", wanted=False),
+                    "paper_percent": next((p for size, p in paper.items() if abs(step - float(size)) < 0.5), None),
+                }
+            )
+    return found
+
+
+def _lines(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Rows by what tells them apart; one line without a name where nothing does."""
+    column = next((name for name in _SERIES if name in frame and frame[name].nunique() > 1), None)
+    if column is None:
+        yield "", frame
+        return
+    for kind in sorted(frame[column].dropna().unique(), reverse=column == "algorithm"):
+        # an algorithm's label in the rows has underscores, its name hyphens
+        name = f"{kind:g} px" if column.endswith("_px") else str(kind).replace("_", "-")
+        yield name, frame[frame[column].eq(kind)]
+
+
+def _obliquity_grid(frame: Rows) -> Grid | None:
+    """Targets tracked by class of the most oblique sight and step; None where sights are not told."""
+    if "obliquity_max_deg" not in frame:
+        return None
+    seen = frame[all_flags(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
+    steps = sorted(seen["step"].unique())
+    rows = []
+    for low, high in pairwise(_CLASSES_DEG):
+        chosen = seen[seen["obliquity_max_deg"].between(low, high, inclusive="left")]
+        if len(chosen):
+            shares = [flag_share(chosen[chosen["step"].eq(step)], "tracked") for step in steps]
+            rows.append([f"{low:g} to {high:g}", *(f"{one.hits:,} of {one.n:,}" for one in shares)])
+    return Grid(["Most oblique sight (deg)", *(f"{step:g} deg" for step in steps)], rows) if rows else None
+
+
+#: A change of azimuth that the paper calls excessive, degrees (section 5.5).
+EXCESSIVE_DEG = 10.0
+#: Rocks up to this height are small ones (section 6), metres.
+SMALL_M = 0.1
+
+
+def terrains_section(subject: Subject) -> Section | None:
+    """Table II; None where the campaign is not that of the paper's terrains."""
+    frame, printed = subject.frame, PAPER["table_2"]
+    if subject.run.name != TERRAINS or not is_closed_loop(frame) or "incline" not in frame:
+        return None
+    names = [str(name) for name in frame["incline"].dropna().unique()]
+    ordered = [name for name in printed if name in names] + sorted(set(names) - set(printed))
+    rows, data = [], []
+    for name in ordered:
+        runs = frame[frame["incline"].eq(name)]
+        good, slips = selectable(runs), known(runs, "slip_max")
+        counted = dict(Counter(cause_of(row) for _, row in good[~flag(good, "tracked")].iterrows()).most_common())
+        failed, failed_all = (flag_share(one, "tracked", wanted=False) for one in (good, runs))
+        slip = float(slips.max()) if slips.size else float("nan")
+        row = printed.get(name)
+        paper = [NOTHING] * 2 if row is None else [f"{row['failures']} of {row['trials']}", row["reason"]]
+        ours = [share_text(failed), interval_text(failed), "; ".join(f"{c}: {n}" for c, n in counted.items()) or "none"]
+        rows.append([name, *paper, *ours, share_text(failed_all), percent(slip)])
+        shares = {"failed": asdict(failed), "failed_all": asdict(failed_all)}
+        data.append({"name": name, **shares, "causes": counted, "slip_max": slip})
+    head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{stated(CONFIDENCE)} interval"]
+    head += ["Cause, ours", "Failures, with unfit targets", "Largest slip"]
+    note = (
+        "Failures: runs that did not end at the goal with the target within the stated pixels; ours of selectable "
+        "targets, and of all, those in shade or on the rock's edge included. Causes, the first that holds: the "
+        f"navigator or mast gave up; the azimuth changed by more than {EXCESSIVE_DEG:g} deg between two updates; "
+        "clouds passed; drifted though never lost; else the criterion that lost the target."
+    )
+    title = "Table II: tracking with visual odometry on four kinds of ground"
+    return Section("table-2", "Table II", title, [Block(grid=Grid(head, rows), note=note)], {"terrains": data})
+
+
+def cause_of(row: pd.Series) -> str:
+    """Why a run failed, as far as its row tells."""
+    outcome = str(row["outcome"])
+    if outcome not in ("COMPLETED", "LOST"):
+        return outcome.replace("_", " ").lower()
+    if float(row.get("azimuth_change_max_deg", 0.0)) > EXCESSIVE_DEG:
+        return "excessive azimuth change"
+    if row.get("clear_sky") is not None and not bool(row["clear_sky"]):
+        return "lighting change"
+    return "drift" if outcome == "COMPLETED" else str(row["losses"]).replace("_", " ").lower()
+
+
+def regression_section(subject: Subject) -> Section | None:
+    """The regression runs (section 6) one by one; None where the campaign is not that one."""
+    frame = subject.frame
+    if subject.run.name != REGRESSION or not is_closed_loop(frame) or "visual_odometry" not in frame:
+        return None
+    mapped = frame["map_by"] if "map_by" in frame else pd.Series("none", index=frame.index)
+    driving = np.where(frame["visual_odometry"].astype(bool), "visual odometry", "blind")
+    by_map = ("Autonav by " + mapped.astype(str) + " cameras").to_numpy()
+    described = frame.assign(
+        driving=np.where(frame["autonav"].astype(bool), by_map, driving),
+        rock=np.where(numbers(frame, "rock_height_m") <= SMALL_M, "small", "large"),
+    )
+    grid = grid_of(
+        list(described.groupby(["driving", "rock", "incline"], sort=True)),
+        {
+            "Driving": lambda one: str(one[0][0]),
+            "Rock": lambda one: str(one[0][1]),
+            "Ground": lambda one: str(one[0][2]),
+            "Runs": lambda one: f"{len(one[1]):,}",
+            "Tracked to the goal": lambda one: share_text(flag_share(one[1], "tracked")),
+            "Outcomes": lambda one: ", ".join(sorted(str(outcome) for outcome in one[1]["outcome"].unique())),
+            "Position error (cm)": lambda one: spread_text(known(one[1], "position_error_m", 100.0), 2),
+            "Drift (px)": lambda one: spread_text(known(one[1], "drift_px"), 1),
+            "Navigation updates": lambda one: spread_text(known(one[1], "autonav_updates"), 0),
+        },
+    )
+    note = "The paper: 14 runs, all successful, which it does not list. Small rocks are those less than 10 cm high."
+    blocks, lost = [Block(grid=grid, note=note)], losses_grid(frame)
+    if lost.rows:
+        blocks.append(Block(heading="Runs that did not track to the end", grid=lost))
+    data = {"tracked": asdict(flag_share(frame, "tracked"))}
+    return Section("regression", "Regression", "Regression runs on the engineering model", blocks, data)

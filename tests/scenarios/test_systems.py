@@ -1,0 +1,166 @@
+"""The registry of systems: what an installed package brings is found; a system that cannot be used is left out."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from marsyard.campaigns.definition import requirements
+from marsyard.campaigns.definition.catalogue import catalogue
+from marsyard.campaigns.definition.identity import foreign_sources
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import ConfigurationError
+from marsyard.cli.app import app
+from marsyard.doctor import Verdict, check_systems
+from marsyard.scenarios.columns import stated_columns
+from marsyard.scenarios.estimators import shipped_names
+from marsyard.scenarios.registry import UnknownScenarioError, scenario, scenario_names, scenario_source
+from marsyard.scenarios.systems import BUILT_IN, problems, registry, system_of, systems, template_paths
+
+CACHED = (registry, stated_columns, shipped_names, requirements.shipped_requirements, requirements._stated)
+HEAD = "from pathlib import Path\nfrom marsyard.scenarios.system import System\nHERE = Path(__file__).parent\n"
+Install = Callable[..., None]
+
+
+def _clear() -> None:
+    for one in CACHED:
+        one.cache_clear()
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Installs a package with one module and entry points for systems: files below a folder of `sys.path`."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    modules: list[str] = []
+
+    def installed(package: str, source: str, *points: str, **files: str) -> None:
+        info = tmp_path / f"{package}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+        stated = "".join(f"{point} = {package}:SYSTEM\n" for point in points or (package,))
+        (info / "entry_points.txt").write_text(f"[marsyard.systems]\n{stated}")
+        (tmp_path / f"{package}.py").write_text(HEAD + source)
+        for name, text in files.items():
+            (tmp_path / f"{name}.toml").write_text(text)
+        modules.append(package)
+        _clear()
+
+    yield installed
+    for module in modules:
+        sys.modules.pop(module, None)
+    monkeypatch.undo()
+    _clear()
+
+
+def _system(name: str, more: str = "") -> str:
+    return f"SYSTEM = System(name={name!r}, title='T', summary='S', scenarios={{'{name}-case': 'x:Y'}}{more})\n"
+
+
+def test_the_systems_of_marsyard_are_whole() -> None:
+    assert not problems()
+    assert [one.name for one in systems()][: len(BUILT_IN)] == ["measured", "dimes", "fieldtest", "vtt", "hda"]
+    for system in systems():
+        assert system.title, system.name
+        assert system.summary.endswith("."), system.name
+        for name in system.scenarios:
+            assert scenario(name).name == name
+            assert system_of(name) is system
+            assert stated_columns(name) is not None
+        for name, path in system.campaigns.items():
+            assert catalogue()[name] == path
+        assert set(system.compiled_by) <= set(system.campaigns)
+    # every file of the folder belongs to a system
+    folder = next(iter(catalogue().values())).parent
+    assert set(catalogue()) == {path.stem for path in folder.glob("*.toml")}
+    assert list(template_paths()) == ["velocity", "tracking", "landing"]
+    assert {"dimes", "vtt", "hda", "homography"} <= shipped_names()
+
+
+def test_a_system_of_another_package_is_found_everywhere(install: Install) -> None:
+    files = ", catalogue=HERE / 'mine-*.toml', requirements=HERE / 'asked.toml', columns=HERE / 'columns.toml'"
+    stated = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
+    install(
+        "mine",
+        _system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.matching:MatchingScenario'"),
+        **{"mine-one": 'scenario = "mine-case"\n', "asked": f'[[requirements]]\nid = "MINE"\n{stated}'},
+        columns='[mine-case]\nflags = []\nnumbers = ["metres"]\n',
+    )
+    assert not problems()
+    assert systems()[-1].name == "mine"
+    assert "mine-case" in scenario_names()
+    assert catalogue()["mine-one"].name == "mine-one.toml"
+    assert requirements.shipped_requirements()["MINE"].bound == 1.0
+    columns = stated_columns("mine-case")
+    assert columns is not None
+    assert columns.has_number("metres")
+    listed = json.loads(CliRunner().invoke(app, ["list", "--json"]).stdout)
+    assert "mine-one" in [one["name"] for one in listed]
+
+
+def test_the_code_of_a_foreign_scenario_is_part_of_the_identity(install: Install, tmp_path: Path) -> None:
+    install("mine", _system("mine").replace("x:Y", "mine:Case"))
+    assert scenario_source("mine-case") == "mine:Case"
+    assert list(foreign_sources(scenario_source("mine-case"))) == [("mine.py", tmp_path / "mine.py")]
+    # that of ours is hashed as a whole, whatever the scenario
+    assert scenario_source("descent") == "descent"
+    assert list(foreign_sources("descent")) == []
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("import absent_module\n", "it cannot be imported: No module named 'absent_module'"),
+        ("raise RuntimeError('broken')\n", "it cannot be imported: RuntimeError: broken"),
+        ("", "has no attribute 'SYSTEM'"),
+        ("SYSTEM = {'name': 'mine'}\n", "it is a dict; allowed: a marsyard.scenarios.system.System"),
+        (_system("dimes"), "the system 'dimes' already has the name 'dimes'"),
+        (_system("descent").replace("-case", ""), "the system 'dimes' already has the scenario 'descent'"),
+        (_system("mine", ", templates={'tracking': 'x:Y'}"), "the system 'vtt' already has the template 'tracking'"),
+        (_system("mine", ", catalogue=HERE / 'hda-*.toml'"), "the system 'hda' already has the campaign 'hda-map'"),
+        (_system("mine", ", columns=HERE / 'none.toml'"), "it names what is not there: "),
+        (_system("mine", ", catalogue=HERE / 'none-*.toml'"), "it names what is not there: "),
+    ],
+)
+def test_a_system_that_cannot_be_used_leaves_the_others_alone(install: Install, source: str, reason: str) -> None:
+    install("mine", source, **{"hda-map": ""})
+    install("sound", _system("sound"))
+    (message,) = problems()
+    assert message.startswith("system 'mine' (mine:SYSTEM) is left out: ")
+    assert reason in message
+    assert [one.name for one in systems()[len(BUILT_IN) :]] == ["sound"]
+    ended = CliRunner().invoke(app, ["list"])
+    assert (ended.exit_code, ended.stderr) == (0, f"warning: {message}\n")
+    assert "dimes-smoke" in ended.stdout
+    checks = list(check_systems())
+    assert checks[0].found.endswith("of other packages: sound")
+    assert [one.found for one in checks if one.verdict is Verdict.WARN] == [message]
+    with pytest.raises(UnknownScenarioError, match="is left out"):
+        scenario("unheard-of")
+
+
+def test_of_two_entry_points_of_one_system_the_first_counts(install: Install) -> None:
+    install("mine", _system("mine"), "a", "b")
+    assert [one.name for one in systems()].count("mine") == 1
+    assert problems() == ("system 'b' (mine:SYSTEM) is left out: the system 'mine' already has the name 'mine'",)
+
+
+def test_a_file_of_requirements_that_is_wrong_is_named_where_one_is_missed(install: Install, tmp_path: Path) -> None:
+    install("mine", _system("mine", ", requirements=HERE / 'asked.toml'"), asked='[[requirements]]\nid = "MINE"\n')
+    assert "DIMES-VEL" in requirements.shipped_requirements()
+    campaign = tmp_path / "campaign.toml"
+    campaign.write_text('name = "c"\nscenario = "descent"\ncases = 1\n[[requirements]]\nid = "MINE"\n')
+    with pytest.raises(ConfigurationError, match=r"unknown requirement 'MINE'.*asked\.toml: .*metric.*required"):
+        load_campaign(str(campaign))
+
+
+def test_columns_that_cannot_be_read_stop_the_systems_own_campaigns_alone(install: Install, tmp_path: Path) -> None:
+    scenario_path = "marsyard.scenarios.measured.matching:MatchingScenario"
+    install("mine", _system("mine", ", columns=HERE / 'columns.toml'").replace("x:Y", scenario_path), columns="x = [")
+    with pytest.raises(ValueError, match=r"columns\.toml: states no columns: TOMLDecodeError"):
+        stated_columns("mine-case")
+    assert stated_columns("descent") is not None
