@@ -13,7 +13,7 @@ import pytest
 
 TUTORIALS = sorted((Path(__file__).parents[2] / "docs" / "tutorials").glob("*.md"))
 FENCED = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-SAVED_AS = re.compile(r"Save it as `([\w./]+)`:\s*\Z")
+SAVED_AS = re.compile(r"Save it as `([\w./-]+)`:\s*\Z")
 #: What a tutorial says is there in the end.
 PROMISED = {
     "first-campaign": (

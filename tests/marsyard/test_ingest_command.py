@@ -77,6 +77,8 @@ def test_what_is_wrong_ends_with_2_and_leaves_nothing(tmp_path: Path) -> None:
     assert (status, "is not empty" in output) == (2, True)
     status, output = told("ingest", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
     assert (status, "ingest.toml: cannot be read" in output) == (2, True)
+    status, output = told("ingest", str(folder), "--out", str(tmp_path / "out"), "--system", "vtt")
+    assert (status, "unknown system 'vtt'; allowed: measured" in output) == (2, True)
 
 
 def test_summed_rows_are_taken_from_the_camera(tmp_path: Path) -> None:

@@ -107,6 +107,10 @@ def test_own_files_are_named_in_it(here: Path) -> None:
     ("words", "said"),
     [
         (("--system", "velocity", "--site", "venus"), "venus"),
+        (
+            ("--system", "velocty"),
+            "unknown system 'velocty' (did you mean 'velocity'?); allowed: landing, tracking, velocity",
+        ),
         (("--system", "velocity", "--camera", "absent.yaml"), "absent.yaml: file: cannot be read"),
         (("--system", "tracking", "--camera", "cam.yaml"), "see camera.preset"),
         (("--system", "landing", "--flight", "flight.csv"), "only descents fly"),
