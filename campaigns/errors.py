@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 
@@ -13,6 +14,15 @@ class CampaignError(Exception):
 
 class StoreError(CampaignError):
     """A campaign's folder that cannot be written, or does not hold what is asked of it."""
+
+
+@contextmanager
+def writing(what: object) -> Iterator[None]:
+    """Raise StoreError, which names what cannot be written, where the system refuses it inside the context."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(f"{what} cannot be written: {error.strerror or error}") from error
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ alone (`marsyard.scenarios.systems`).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -18,6 +19,7 @@ from matplotlib.figure import Figure
 
 from marsyard.reports.section import Plate, SectionMaker
 from marsyard.scenarios.dotted import found_at
+from marsyard.scenarios.system import System
 from marsyard.scenarios.systems import systems
 
 Products = Mapping[str, Any]
@@ -88,25 +90,28 @@ class Presentation:
 def presentations() -> tuple[Presentation, ...]:
     """The presentations of all systems that have one, in the order of the registry.
 
-    Raises
-    ------
-    ValueError
-        Where a system's `report` names no `Presentation`.
+    One that cannot be used is left out with a warning: no system keeps the others from their reports.
     """
     found = []
     for system in systems():
-        if system.report:
-            try:
-                presentation = found_at(system.report)
-            except (ImportError, AttributeError) as error:
-                raise ValueError(f"the report '{system.report}' of system '{system.name}': {error}") from error
-            if not isinstance(presentation, Presentation):
-                raise ValueError(
-                    f"the report '{system.report}' of system '{system.name}' is a {type(presentation).__name__}; "
-                    "allowed: a marsyard.reports.presentation.Presentation"
-                )
-            found.append(presentation)
+        try:
+            found += [_presentation(system)] if system.report else []
+        except ValueError as error:
+            warnings.warn(f"{error}; its sections and pictures are left out", stacklevel=2)
     return tuple(found)
+
+
+def _presentation(system: System) -> Presentation:
+    """The presentation of a system that names one. Raises ValueError where it cannot be used."""
+    stated = f"the report '{system.report}' of system '{system.name}'"
+    try:
+        presentation = found_at(system.report)
+    except ImportError as error:
+        raise ValueError(f"{stated} cannot be imported: {error}") from error
+    if not isinstance(presentation, Presentation):
+        kind = type(presentation).__name__
+        raise ValueError(f"{stated} is a {kind}; allowed: a marsyard.reports.presentation.Presentation")
+    return presentation
 
 
 def case_kind(products: Products) -> CaseKind | None:

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import math
+import tomllib
 import types
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from marsyard.campaigns.errors import near_match
+from marsyard.campaigns.errors import ConfigurationError, Problem, near_match
 from marsyard.campaigns.sampling.correlation import Correlation
 from marsyard.campaigns.sampling.design import Design
 from marsyard.campaigns.sampling.dispersions import FRIENDLY, AnyDispersion
 from marsyard.campaigns.sampling.levels import Grid
 from marsyard.campaigns.sampling.ranges import Normal
+from marsyard.campaigns.sampling.stated import StatedTable
+from marsyard.sim.files import check_regular
+
+Model = TypeVar("Model", bound=BaseModel)
 
 #: A key in nested tables and lists, part by part.
 Key = tuple[str | int, ...]
@@ -27,7 +33,7 @@ MOST_CASES = 1_000_000_000
 POPULATIONS = ("all", "completed", "valid")
 
 
-class Requirement(BaseModel):
+class Requirement(StatedTable):
     """What must hold in a stated fraction of a population of cases, with a stated confidence.
 
     With a `bound`, that the metric's absolute value is at most the bound; a case without a number fails. Without one
@@ -40,8 +46,6 @@ class Requirement(BaseModel):
     confidence. They are at best MET BY RATE, with the exit status 3, which `accept_rate` makes 0. `source` and `kind`
     say whose requirement it is.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     id: Annotated[str, Field(min_length=1)]
     statement: str = ""
@@ -77,14 +81,12 @@ class Requirement(BaseModel):
         return tuple(part for part in self.population.split(" and ") if part not in POPULATIONS)
 
 
-class Retain(BaseModel):
+class Retain(StatedTable):
     """Which cases keep their products (histories, pictures, intermediate results) beside their rows.
 
     Rows are always kept. `showcase` is the case that the report shows: the answered case with the worst metric of the
     first requirement, the first case, or none.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     showcase: Literal["worst", "first", "none"] = "worst"
     products: Literal["none", "failed", "worst", "every", "all"] = Field(
@@ -103,10 +105,8 @@ class Retain(BaseModel):
 _Amount = Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)]
 
 
-class Limits(BaseModel):
+class Limits(StatedTable):
     """What one case may use before it is ended; rows of cases that were ended say so in their outcome."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     case_time_s: _Amount = Field(default=600.0, description="wall-clock time of a case")
     prepare_time_s: _Amount = Field(default=3600.0, description="wall-clock time of building a shared input")
@@ -117,10 +117,8 @@ class Limits(BaseModel):
     output_mb: _Amount = Field(default=10.0, description="what a case may write to standard output and error")
 
 
-class CampaignConfiguration(BaseModel):
+class CampaignConfiguration(StatedTable):
     """Everything that a campaign's rows depend on, apart from the program and the machine."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
     scenario: Annotated[str, Field(min_length=1)]
@@ -128,8 +126,8 @@ class CampaignConfiguration(BaseModel):
     cases: Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)]
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = 0
     design: Design = Design()
-    parameters: dict[str, Any] = {}
-    dispersions: dict[str, AnyDispersion] = {}
+    parameters: dict[str, Any] = Field(default={})
+    dispersions: dict[str, AnyDispersion] = Field(default={})
     correlations: tuple[Correlation, ...] = ()
     requirements: tuple[Requirement, ...] = ()
     retain: Retain = Retain()
@@ -212,6 +210,26 @@ class CampaignConfiguration(BaseModel):
         if group.covariance is not None and dispersion.sd is not None:
             return f"'{path}' has an sd, which the covariance states already; leave one of them out"
         return ""
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file. Raises ConfigurationError where it cannot be read, or is none."""
+    try:
+        check_regular(path)
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
+    except (ValueError, RecursionError) as error:  # a ValueError of its own too for numbers of thousands of digits
+        raise ConfigurationError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
+
+
+def read_table(path: Path, model: type[Model]) -> Model:
+    """What a TOML file states as a whole. Raises ConfigurationError, every problem with its key."""
+    try:
+        return model.model_validate(read_tables(path))
+    except ValidationError as error:
+        found = [Problem(str(path), key_text(key), message) for key, message in problems_of(error, model)]
+        raise ConfigurationError(found) from error
 
 
 def problems_of(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.checking import sampling_problems
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, Key, key_text, problems_of
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, Key, key_text, problems_of, read_tables
 from marsyard.campaigns.definition.metrics import metric_problems
 from marsyard.campaigns.definition.requirements import completed
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
@@ -94,7 +94,7 @@ def load_campaign(
         Names every problem by file (or option), key and what is allowed.
     """
     path = find_campaign(name_or_path)
-    tables = _read(path)
+    tables = read_tables(path)
     overridden: dict[tuple[str, ...], str] = {}
     for override in overrides:
         tables = _override(tables, override, overridden)
@@ -120,16 +120,6 @@ def _command(
     for option, values in (("--algorithm", algorithms), ("--set", overrides)):
         words += [word for value in values for word in (option, value)]
     return tuple(words)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # a ValueError of its own too for numbers of thousands of digits
-        raise ConfigurationError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
-    except OSError as error:
-        raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
 
 
 def _override(tables: Mapping[str, Any], override: str, overridden: dict[tuple[str, ...], str]) -> dict[str, Any]:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
-from marsyard.campaigns.definition.configuration import Key, Requirement, key_text, problems_of
+from marsyard.campaigns.definition.configuration import Key, Requirement, read_table
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
+from marsyard.campaigns.sampling.stated import StatedTable
 from marsyard.scenarios.systems import systems
 
 #: What a campaign that names a stated requirement may say of it anew.
@@ -33,9 +33,7 @@ class StatedRequirement(Requirement):
         return self.model_dump(mode="json", exclude={"campaigns"})
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+class _File(StatedTable):
     requirements: Annotated[tuple[StatedRequirement, ...], Field(strict=False)]
 
 
@@ -47,15 +45,7 @@ def read_requirements(path: Path) -> tuple[StatedRequirement, ...]:
     ConfigurationError
         Where it cannot be read, or states something that is none; every problem with its key.
     """
-    try:
-        stated = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
-    except ValidationError as error:
-        found = [Problem(str(path), key_text(key), message) for key, message in problems_of(error, _File)]
-        raise ConfigurationError(found) from error
-    except ValueError as error:
-        raise ConfigurationError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
+    stated = read_table(path, _File)
     ids = [one.id for one in stated.requirements]
     repeated = sorted({name for name in ids if ids.count(name) > 1})
     if repeated:

@@ -16,7 +16,7 @@ from typing import Any
 from marsyard.campaigns.definition.campaign import Campaign, replaced
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
 from marsyard.campaigns.definition.identity import configuration_hash
-from marsyard.campaigns.errors import CampaignError, StoreError
+from marsyard.campaigns.errors import CampaignError, StoreError, writing
 from marsyard.campaigns.execution.crew import Crew
 from marsyard.campaigns.running.engine import Watch, resume_campaign, run_campaign
 from marsyard.campaigns.store import record
@@ -114,11 +114,9 @@ def _write_manifest(campaign: Campaign, directory: Path) -> None:
             "",
         ]
     )
-    try:
+    with writing(directory):
         (directory / MANIFEST_FILE).write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
         (directory / README_FILE).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
 
 
 def scored_campaign(exported: Exported, answers: Path) -> Campaign:

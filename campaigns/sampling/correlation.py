@@ -18,7 +18,9 @@ from typing import Annotated, Self
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from marsyard.campaigns.sampling.stated import StatedTable
 
 Entry = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 #: Up to this share of their size two entries that mirror each other may differ: digits that a file was rounded to.
@@ -29,10 +31,8 @@ _LEAST_EIGENVALUE = 1e-10
 KINDS = ("covariance", "correlation", "rank")
 
 
-class Correlation(BaseModel):
+class Correlation(StatedTable):
     """Dispersed parameters that are drawn together, with one matrix over them in their order."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     parameters: Annotated[tuple[str, ...], Field(min_length=1, max_length=200)]
     covariance: tuple[tuple[Entry, ...], ...] | None = None

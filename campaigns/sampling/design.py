@@ -20,9 +20,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.special import ndtr, ndtri
 
+from marsyard.campaigns.sampling.stated import StatedTable
 from marsyard.sim.streams import Streams
 
 #: Half the step of `Generator.random`: keeps a draw off 0, where distributions with endless tails have no value.
@@ -39,13 +40,11 @@ _KEPT = 4
 Kind = Literal["random", "latin-hypercube", "sobol"]
 
 
-class Design(BaseModel):
+class Design(StatedTable):
     """How cases are laid out.
 
     With `nominal` the first case is the campaign's parameters as they stand, without any draw.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     kind: Kind = "random"
     nominal: Annotated[bool, Field(strict=True)] = False

@@ -14,22 +14,19 @@ from collections.abc import Iterator, Mapping
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict
-
 from marsyard.campaigns.sampling.formulas import Formula, formula
+from marsyard.campaigns.sampling.stated import StatedTable
 
 #: Probability left out on either side when the reach of a distribution is checked against what a parameter allows.
 TAIL = 1e-12
 
 
-class Dispersion(BaseModel, ABC):
+class Dispersion(StatedTable, ABC):
     """What every dispersion states: its distribution, and where it was taken from.
 
     `unit` and `description` are those of the parameter (the ending of its name, the scenario's own words) where they
     are not stated.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     #: Whether the values fill a range without gaps, so that their ranks can be correlated.
     continuous: ClassVar[bool] = False

@@ -6,10 +6,16 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import Field, PlainValidator
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator
 from pydantic_core import PydanticKnownError
 
 from marsyard.campaigns.sampling.formulas import formula
+
+
+class StatedTable(BaseModel):
+    """A table of a file: unknown keys are refused, and nothing changes after it is read."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def _number_or_formula(stated: Any) -> float | str:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.errors import StoreError, writing
 
 #: Held for as long as a runner works in the folder; the file stays, the lock goes with the process however it ends.
 LOCK_FILE = "campaign.lock"
@@ -25,10 +25,8 @@ def folder_lock(directory: Path) -> Iterator[None]:
         Where another runner holds it, or the folder cannot be written.
     """
     path = directory / LOCK_FILE
-    try:
+    with writing(directory):
         file = path.open("a+", encoding="utf-8")
-    except OSError as error:
-        raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -15,7 +15,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.errors import StoreError, writing
 
 #: Stands for an array in `products.json`, with the name that it has in `products.npz`.
 _ARRAY = "__array__"
@@ -86,7 +86,7 @@ def replaced_files(directory: Path) -> Iterator[Path]:
     StoreError
         Where the folder cannot be written.
     """
-    try:
+    with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=directory, prefix=".partial-") as name:
             folder = Path(name)
@@ -98,8 +98,6 @@ def replaced_files(directory: Path) -> Iterator[Path]:
                     target.mkdir(exist_ok=True)
                 else:
                     path.replace(target)
-    except OSError as error:
-        raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
 
 
 def unpack_products(packed: PackedProducts) -> dict[str, Any]:

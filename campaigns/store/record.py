@@ -16,7 +16,7 @@ from typing import Any
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.definition.identity import Identity
-from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.errors import StoreError, writing
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 
 #: Version of the layout of a campaign's folder.
@@ -149,18 +149,12 @@ def write(directory: Path, record: Mapping[str, Any]) -> None:
     """
     path = directory / RECORD_FILE
     partial = path.with_suffix(".partial")
-    try:
+    with writing(path):
         with partial.open("w", encoding="utf-8") as file:
-            file.write(_text(record))
+            file.write(json.dumps(record, indent=2, ensure_ascii=False) + "\n")
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
-    except OSError as error:
-        raise StoreError(f"{path} cannot be written: {error.strerror or error}") from error
-
-
-def _text(record: Mapping[str, Any]) -> str:
-    return json.dumps(record, indent=2, ensure_ascii=False) + "\n"
 
 
 def read(directory: Path) -> dict[str, Any]:

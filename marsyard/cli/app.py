@@ -14,6 +14,7 @@ import typer
 from marsyard.cli.campaign import (
     CampaignArgument,
     Exit,
+    JsonOption,
     SetOption,
     append,
     console,
@@ -62,7 +63,7 @@ for offline in (export, score):
 @app.command(name="list")
 @says_what_is_wrong
 def list_campaigns(
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """List the campaigns of the catalogue."""
     from marsyard.campaigns.definition.catalogue import catalogue
@@ -113,7 +114,7 @@ def show(
 
 @app.command()
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Examine the machine and the installation, and say how to mend what is amiss."""
     from marsyard.doctor import run as examine

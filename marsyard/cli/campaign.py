@@ -36,6 +36,18 @@ class Exit(IntEnum):
 CampaignArgument = Annotated[
     str, typer.Argument(metavar="CAMPAIGN", help="A name from `marsyard list`, or the path of a TOML file.")
 ]
+SiteArgument = Annotated[
+    str, typer.Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
+]
+MaxHolesOption = Annotated[
+    float | None,
+    typer.Option(
+        "--max-holes", metavar="F", min=0.0, max=0.99, help="Of a DTM: fraction of posts without height allowed."
+    ),
+]
+CasesOption = Annotated[int | None, typer.Option("-n", "--cases", metavar="N", help="Number of cases.")]
+SeedOption = Annotated[int | None, typer.Option("--seed", metavar="S", help="Root seed.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 DirectoryArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a campaign that was run.")]
 SetOption = Annotated[
     list[str] | None,
@@ -98,8 +110,8 @@ def says_what_is_wrong(command: Callable[Parameters, None]) -> Callable[Paramete
 @says_what_is_wrong
 def run(
     campaign: CampaignArgument,
-    cases: Annotated[int | None, typer.Option("-n", "--cases", metavar="N", help="Number of cases.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", metavar="S", help="Root seed.")] = None,
+    cases: CasesOption = None,
+    seed: SeedOption = None,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
     case_time: CaseTimeOption = None,

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from marsyard.cli.campaign import console, says_what_is_wrong, size_text
+from marsyard.cli.campaign import JsonOption, console, says_what_is_wrong, size_text
 
 #: What is kept, and what it costs to be without it.
 KINDS = {
@@ -28,7 +28,7 @@ class Kept:
     kind: str
     folder: Path
     files: int
-    size_bytes: int
+    bytes: int
     limit_bytes: int | None = None
 
 
@@ -38,7 +38,7 @@ def clean(
         list[str] | None, typer.Argument(metavar="[KIND]...", help="terrain, kernels; by default all of them.")
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Remove it; without this it is only shown.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Show what Marsyard keeps on disk beside campaigns, with sizes; with --yes remove it.
 
@@ -52,17 +52,7 @@ def clean(
     found = [kept(kind) for kind in kinds or KINDS]
     freed = sum(_removed(one.folder) for one in found) if yes else 0
     if as_json:
-        told = [
-            {
-                "kind": k.kind,
-                "folder": str(k.folder),
-                "files": k.files,
-                "bytes": k.size_bytes,
-                "limit_bytes": k.limit_bytes,
-            }
-            for k in found
-        ]
-        typer.echo(json.dumps({"kept": told, "removed_bytes": freed}, indent=2))
+        typer.echo(json.dumps({"kept": [asdict(one) for one in found], "removed_bytes": freed}, indent=2, default=str))
         return
     _print(found)
     if yes:
@@ -120,5 +110,5 @@ def _print(found: list[Kept]) -> None:
         table.add_column(heading, justify="right" if right else "left", overflow="fold")
     for one in found:
         limit = "none" if one.limit_bytes is None else size_text(one.limit_bytes)
-        table.add_row(one.kind, str(one.files), size_text(one.size_bytes), limit, str(one.folder), KINDS[one.kind])
+        table.add_row(one.kind, str(one.files), size_text(one.bytes), limit, str(one.folder), KINDS[one.kind])
     console().print(table)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marsyard.cli.campaign import Exit, console, says_what_is_wrong
+from marsyard.cli.campaign import Exit, JsonOption, console, says_what_is_wrong
 
 if TYPE_CHECKING:
     from marsyard.scenarios.conformance import Finding, Subject
@@ -31,7 +32,7 @@ def conformance(
     time_limit: Annotated[
         float, typer.Option("--time-limit", metavar="S", help="Seconds that one answer may take.", min=0.1)
     ] = 60.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Put an algorithm, or your own motion, instrument or score, to its suite: right types, no change of inputs, ..."""
     from marsyard.campaigns.running.conformance import examine, subject_of
@@ -67,16 +68,6 @@ def _print(finding: Finding) -> None:
 
 
 def _plain(subject: Subject, findings: Sequence[Finding]) -> dict[str, object]:
-    checks = [
-        {
-            "check": one.check,
-            "asked": one.asked,
-            "passed": one.passed,
-            "problem": one.problem,
-            "next_step": one.next_step,
-            "note": one.note,
-        }
-        for one in findings
-    ]
+    checks = [{**asdict(one), "passed": one.passed} for one in findings]
     passed = all(one.passed for one in findings)
     return {"algorithm": subject.spec, "task": subject.task, "passed": passed, "checks": checks}

@@ -28,17 +28,15 @@ def dashboard(
 ) -> None:
     """Write a dashboard over stored campaigns: requirements, latest verdicts, trends, pages of campaigns and cases."""
     from marsyard.campaigns.definition.requirements import read_requirements
-    from marsyard.campaigns.errors import CampaignError, StoreError
+    from marsyard.campaigns.errors import CampaignError, writing
     from marsyard.reports.dashboard.site import write_site
 
     missing = [str(one) for one in directories if not one.is_dir()]
     if missing:
         raise CampaignError(f"no such folder: {', '.join(missing)}")
     stated = None if requirements is None else {one.id: one for one in read_requirements(requirements)}
-    try:
+    with writing(out):
         site = write_site(out, directories, stated)
-    except OSError as error:
-        raise StoreError(f"{out} cannot be written: {error}") from error
     for problem in site.problems:
         typer.echo(f"not shown: {problem}", err=True)
     typer.echo(f"campaigns: {site.campaigns}")

@@ -7,15 +7,15 @@ from typing import Annotated
 
 import typer
 
-from marsyard.cli.campaign import CampaignArgument, SetOption, says_what_is_wrong, size_text
+from marsyard.cli.campaign import CampaignArgument, CasesOption, SeedOption, SetOption, says_what_is_wrong, size_text
 
 
 @says_what_is_wrong
 def dataset(
     campaign: CampaignArgument,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the shards.")],
-    cases: Annotated[int | None, typer.Option("-n", "--cases", metavar="N", help="Number of cases.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", metavar="S", help="Root seed.")] = None,
+    cases: CasesOption = None,
+    seed: SeedOption = None,
     shard: Annotated[int, typer.Option("--shard", metavar="N", min=1, help="Cases in a shard.")] = 50,
     jobs: Annotated[int, typer.Option("--jobs", metavar="J", min=1, help="Worker processes.")] = 1,
     override: SetOption = None,

@@ -38,7 +38,7 @@ def nightly(
 
     Exit status: as of the campaigns, the worst; 1 also for a regression, or a campaign that could not be run.
     """
-    from marsyard.campaigns.errors import StoreError
+    from marsyard.campaigns.errors import writing
     from marsyard.campaigns.store.lock import folder_lock
     from marsyard.campaigns.store.record import git_commit
     from marsyard.cli.nightly_plan import PLAN_FILE, read_plan
@@ -47,10 +47,8 @@ def nightly(
 
     path = plan or PLAN_FILE
     stated, crew = read_plan(path), make_crew(jobs, None)
-    try:
+    with writing(out):
         (out / RUNS).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"{out} cannot be written: {error.strerror or error}") from error
     with folder_lock(out), History(out / HISTORY_FILE) as history:
         night = history.begin(git_commit())
         # what a night that is killed leaves behind

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import MOST_CASES, key_text, problems_of
+from marsyard.campaigns.definition.configuration import MOST_CASES, read_table
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.errors import ConfigurationError, Problem
-from marsyard.sim.files import check_regular
+from marsyard.campaigns.sampling.stated import StatedTable
 
 #: The plan that ships with Marsyard.
 PLAN_FILE = Path(__file__).resolve().parents[1] / "scenarios" / "nightly.toml"
@@ -22,10 +20,8 @@ PLAN_FILE = Path(__file__).resolve().parents[1] / "scenarios" / "nightly.toml"
 Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
-class PlannedCampaign(BaseModel):
+class PlannedCampaign(StatedTable):
     """A campaign of the plan, with what is said of it instead of its file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     campaign: Annotated[str, Field(min_length=1)]
     cases: Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)] | None = None
@@ -39,10 +35,8 @@ class PlannedCampaign(BaseModel):
         return load_campaign(name, self.override, self.cases, night_seed(seed, night), self.algorithms)
 
 
-class Plan(BaseModel):
+class Plan(StatedTable):
     """What runs every night."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = Field(
         default=0, description="of which each night's root seed is made, so that nights draw cases of their own"
@@ -65,16 +59,7 @@ def read_plan(path: Path) -> Plan:
     ConfigurationError
         Where it cannot be read, or states something else.
     """
-    try:
-        check_regular(path)
-        return Plan.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
-    except ValidationError as error:
-        found = [Problem(str(path), key_text(key), message) for key, message in problems_of(error, Plan)]
-        raise ConfigurationError(found) from error
-    except ValueError as error:
-        raise ConfigurationError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
+    return read_table(path, Plan)
 
 
 def night_seed(seed: int, night: int) -> int:

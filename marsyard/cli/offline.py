@@ -10,9 +10,11 @@ import typer
 
 from marsyard.cli.campaign import (
     CampaignArgument,
+    CasesOption,
     ClusterOption,
     Exit,
     JobsOption,
+    SeedOption,
     SetOption,
     carry_out,
     default_directory,
@@ -30,8 +32,8 @@ TruthOption = Annotated[
 def export(
     campaign: CampaignArgument,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the cases, without their truth.")],
-    cases: Annotated[int | None, typer.Option("-n", "--cases", metavar="N", help="Number of cases.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", metavar="S", help="Root seed.")] = None,
+    cases: CasesOption = None,
+    seed: SeedOption = None,
     truth: TruthOption = None,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,

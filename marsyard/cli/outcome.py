@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.errors import StoreError, writing
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import is_locked
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table
@@ -70,10 +70,8 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
     found = judged(directory, requirements)
     if requirements is None and found.run.said("state") == "finished":
         record.update(directory, {"exit_code": found.exit_code})
-    try:
+    with writing("the report"):
         return found, write_judged(found)
-    except OSError as error:
-        raise StoreError(f"the report cannot be written: {error}") from error
 
 
 def _comparison_tables(

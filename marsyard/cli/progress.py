@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import timedelta
-from types import TracebackType
-from typing import Protocol, Self
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
+
+if TYPE_CHECKING:
+    from marsyard.campaigns.running.engine import Watch
 
 #: Seconds between two plain lines.
 LINE_INTERVAL_S = 10.0
@@ -49,25 +53,11 @@ class _LeftColumn(ProgressColumn):
         return Text(f"{timedelta(seconds=round(left_s(done, total, elapsed)))} left" if done else "")
 
 
-class CampaignProgress(Protocol):
-    """A context in which a campaign is told of; also the engine's `Watch`."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-
-    def begin(self, stage: str, total: int) -> None: ...  # noqa: D102
-    def step(self) -> None: ...  # noqa: D102
-    def note(self, text: str) -> None: ...  # noqa: D102
-
-
 class BarProgress:
     """A bar for each stage."""
 
     def __init__(self, console: Console) -> None:
-        self._bars = Progress(
+        self.bars = Progress(
             TextColumn("{task.description:<10}"),
             BarColumn(),
             MofNCompleteColumn(),
@@ -75,29 +65,20 @@ class BarProgress:
             _LeftColumn(),
             console=console,
         )
-        self._task = self._bars.add_task("starting", visible=False)
-
-    def __enter__(self) -> Self:
-        self._bars.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bars.stop()
+        self._task = self.bars.add_task("starting", visible=False)
 
     def begin(self, stage: str, total: int) -> None:
         """See `marsyard.campaigns.running.engine.Watch`."""
-        self._bars.stop_task(self._task)
-        self._task = self._bars.add_task(stage, total=total)
+        self.bars.stop_task(self._task)
+        self._task = self.bars.add_task(stage, total=total)
 
     def step(self) -> None:
         """See `marsyard.campaigns.running.engine.Watch`."""
-        self._bars.advance(self._task)
+        self.bars.advance(self._task)
 
     def note(self, text: str) -> None:
         """See `marsyard.campaigns.running.engine.Watch`."""
-        self._bars.console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
+        self.bars.console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
 
 
 class LineProgress:
@@ -107,14 +88,6 @@ class LineProgress:
         self._console = console
         self._stage, self._total, self._done = "", 0, 0
         self._began = self._told = 0.0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
 
     def begin(self, stage: str, total: int) -> None:
         """See `marsyard.campaigns.running.engine.Watch`."""
@@ -141,6 +114,12 @@ class LineProgress:
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def campaign_progress(console: Console) -> CampaignProgress:
-    """What suits the console: a bar on a terminal, lines elsewhere."""
-    return BarProgress(console) if console.is_terminal else LineProgress(console)
+@contextmanager
+def campaign_progress(console: Console) -> Iterator[Watch]:
+    """Report a running campaign as suits the console: by bars on a terminal, by lines elsewhere."""
+    if not console.is_terminal:
+        yield LineProgress(console)
+        return
+    shown = BarProgress(console)
+    with shown.bars:
+        yield shown

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from marsyard.cli.campaign import Exit, MaxHolesOption, SiteArgument
+
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Bool, Float32, UInt16
@@ -23,8 +25,6 @@ if TYPE_CHECKING:
     from marsyard.sim.sensor import AutoExposure
     from marsyard.sim.terrain import Site
 
-#: Exit status where the command or a file is wrong, as elsewhere.
-WRONG = 2
 #: What a picture is written as: 16-bit picture, truth layers, camera model, and what it was made from.
 ENDINGS = (".png", ".npz", ".cahvor", ".json")
 #: Radiance factor of the largest number in a picture without detector.
@@ -159,9 +159,7 @@ class Picture:
 
 
 def render(
-    site: Annotated[
-        str, typer.Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
-    ],
+    site: SiteArgument,
     camera: Annotated[
         str, typer.Option("--camera", metavar="NAME", help="Such as mer-navcam; a wrong name lists those there are.")
     ],
@@ -173,12 +171,10 @@ def render(
         float | None, typer.Option("--altitude", metavar="M", help="Height above the ground; by default the usual.")
     ] = None,
     east: Annotated[
-        float | None,
-        typer.Option("--east", metavar="M", help="By default 0, of a DTM its middle; repeats."),
+        float | None, typer.Option("--east", metavar="M", help="By default 0, of a DTM its middle; repeats.")
     ] = None,
     north: Annotated[
-        float | None,
-        typer.Option("--north", metavar="M", help="By default 0, of a DTM its middle; repeats."),
+        float | None, typer.Option("--north", metavar="M", help="By default 0, of a DTM its middle; repeats.")
     ] = None,
     azimuth: Annotated[
         float, typer.Option("--azimuth", metavar="DEG", help="Where the camera looks, clockwise from north.")
@@ -193,12 +189,7 @@ def render(
     ] = True,
     seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Of the terrain and the noise.")] = 1,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
-    max_holes: Annotated[
-        float | None,
-        typer.Option(
-            "--max-holes", metavar="F", min=0.0, max=0.99, help="Of a DTM: fraction of posts without height allowed."
-        ),
-    ] = None,
+    max_holes: MaxHolesOption = None,
 ) -> None:
     """Render a site or DTM: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; -left, -right of a pair."""
     with says_why_not(out):
@@ -233,10 +224,10 @@ def says_why_not(out: Path) -> Iterator[None]:
         yield
     except (ValueError, RenderingError) as error:
         typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(WRONG) from None
+        raise typer.Exit(Exit.WRONG) from None
     except OSError as error:
         typer.echo(f"error: cannot write to {out}: {error}", err=True)
-        raise typer.Exit(WRONG) from None
+        raise typer.Exit(Exit.WRONG) from None
 
 
 def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Picture]:

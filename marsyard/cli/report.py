@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marsyard.cli.campaign import DirectoryArgument, console, says_what_is_wrong
+from marsyard.cli.campaign import DirectoryArgument, JsonOption, console, says_what_is_wrong
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,7 +63,7 @@ def report(
 def compare(
     first: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a campaign that was run.")],
     second: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of another.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Set two stored campaigns side by side: success, answers and errors, and whether they differ.
 
@@ -107,19 +107,17 @@ def _write_csv(directory: Path) -> Path:
     import pyarrow.csv as pa_csv
     import pyarrow.parquet as pq
 
-    from marsyard.campaigns.errors import StoreError
+    from marsyard.campaigns.errors import writing
     from marsyard.campaigns.store.table import TABLE_FILE
 
     path = directory / "cases.csv"
     partial = path.with_name(f"{path.name}.partial")
-    try:
+    with writing(path):
         table = pq.ParquetFile(directory / TABLE_FILE)
         with pa_csv.CSVWriter(partial, table.schema_arrow) as writer:
             for batch in table.iter_batches():
                 writer.write_batch(batch)
         partial.replace(path)
-    except OSError as error:
-        raise StoreError(f"{path} cannot be written: {error}") from error
     return path
 
 

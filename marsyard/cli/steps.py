@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.errors import writing
 
 
 def write_steps(directory: Path, products: Mapping[str, Any]) -> int:
@@ -28,10 +28,8 @@ def write_steps(directory: Path, products: Mapping[str, Any]) -> int:
     StoreError
         Where they cannot be written.
     """
-    try:
+    with writing(directory):
         return _write(directory, products)
-    except OSError as error:
-        raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
 
 
 def _write(directory: Path, products: Mapping[str, Any]) -> int:

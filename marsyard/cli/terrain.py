@@ -8,21 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from marsyard.cli.campaign import Exit, JsonOption, MaxHolesOption, SiteArgument
+
 if TYPE_CHECKING:
     from marsyard.sim.terrain.embedding import RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
     from marsyard.sim.terrain.sites import PaperFigures
     from marsyard.sim.terrain.statistics import TerrainStatistics
 
-#: Exit status where the command or a file is wrong, as elsewhere.
-WRONG = 2
-
 app = typer.Typer(no_args_is_help=True, help="Sites and the figures of their terrain.")
 
 
 @app.command(name="list")
 def list_sites(
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """List the sites."""
     import json
@@ -56,20 +55,13 @@ def list_sites(
 
 @app.command()
 def stats(
-    site: Annotated[
-        str, typer.Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
-    ],
+    site: SiteArgument,
     scale: Annotated[
         str | None, typer.Option("--scale", metavar="SCALE", help="descent or ground; by default the site's coarser.")
     ] = None,
     seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Seed of the terrain.")] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-    max_holes: Annotated[
-        float | None,
-        typer.Option(
-            "--max-holes", metavar="F", min=0.0, max=0.99, help="Of a DTM: fraction of posts without height allowed."
-        ),
-    ] = None,
+    as_json: JsonOption = False,
+    max_holes: MaxHolesOption = None,
     picture: Annotated[
         Path | None, typer.Option("--picture", metavar="PNG", help="Write a picture from above; filled holes are red.")
     ] = None,
@@ -98,7 +90,7 @@ def stats(
             write_terrain_picture(picture, surface, real)
     except ValueError as error:
         typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(WRONG) from None
+        raise typer.Exit(Exit.WRONG) from None
     measured = terrain_statistics(surface, None if real is None else real.real_samples(parameters.samples))
     extent = None if real is None else real.extent
     if as_json:

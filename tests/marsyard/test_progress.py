@@ -31,7 +31,7 @@ class Clock:
 def _shown(bars: BarProgress, clock: Clock) -> list[str]:
     """The lines of the bars as they would be drawn now."""
     console = Console(width=120, file=io.StringIO(), get_time=clock, force_terminal=False)
-    console.print(bars._bars.get_renderable())
+    console.print(bars.bars.get_renderable())
     file = console.file
     assert isinstance(file, io.StringIO)
     return file.getvalue().splitlines()
@@ -40,7 +40,7 @@ def _shown(bars: BarProgress, clock: Clock) -> list[str]:
 def test_finished_stages_stop_counting_and_time_left_follows_the_rate() -> None:
     clock = Clock()
     bars = BarProgress(Console(file=io.StringIO(), force_terminal=True, get_time=clock))
-    bars._bars.live.auto_refresh = False
+    bars.bars.live.auto_refresh = False
     bars.begin("preparing", 2)
     for _ in range(2):
         clock.now_s += 5.0

@@ -25,8 +25,8 @@ from marsyard.campaigns.store import record
 from marsyard.cli import app as cli
 from marsyard.cli.deciding import run_until_decided
 from marsyard.cli.site_server import server
-from marsyard.reports.evaluation import next_look
 from marsyard.reports.cases import notable_cases
+from marsyard.reports.evaluation import next_look
 from marsyard.reports.sampled import Sampled
 from marsyard.reports.stored import read_run
 from marsyard.reports.verdicts import judge_campaign
