@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, PercentFormatter
+from matplotlib.ticker import LogFormatter, PercentFormatter
 
 from marsyard.reports.figures import axis_edge, note_beyond
 from marsyard.reports.rates import PooledRate, Share
@@ -162,8 +162,8 @@ def scatter_panels(panels: Mapping[tuple[str, str], Panel], *, logarithmic: bool
         if logarithmic:
             axes.set_yscale("log")
             # the page's style does not typeset powers of ten
-            axes.yaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_formatter(NullFormatter())
+            axes.yaxis.set_major_formatter(LogFormatter())
+            axes.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
         if y == rows[-1]:
             axes.set_xlabel(x, fontsize=8)
         if x == columns[0]:
