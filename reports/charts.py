@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import LogFormatter, PercentFormatter
 
 from marsyard.reports.figures import axis_edge, note_beyond
 from marsyard.reports.rates import PooledRate, Share
@@ -136,7 +136,7 @@ def stacked_bars(names: Sequence[str], shares: Mapping[str, tuple[str, Sequence[
     axes.set(xlabel=xlabel, xlim=(0.0, 100.0))
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(shares))
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(shares))
     return figure
 
 
@@ -161,6 +161,9 @@ def scatter_panels(panels: Mapping[tuple[str, str], Panel], *, logarithmic: bool
         axes.plot(*panel.medians, "o-", color=SERIES[0], markersize=4.5)
         if logarithmic:
             axes.set_yscale("log")
+            # the page's style does not typeset powers of ten
+            axes.yaxis.set_major_formatter(LogFormatter())
+            axes.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
         if y == rows[-1]:
             axes.set_xlabel(x, fontsize=8)
         if x == columns[0]:

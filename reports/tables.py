@@ -69,17 +69,6 @@ def answered_outcomes(frame: pd.DataFrame) -> set[str]:
     return {str(name) for name in frame.loc[members(frame, "valid"), "outcome"].dropna().unique()}
 
 
-def outcome_table(frame: pd.DataFrame) -> Table:
-    """How the cases ended."""
-    table = Table(title="Outcomes", box=box.SIMPLE_HEAD, title_justify="left")
-    table.add_column("Outcome")
-    table.add_column("Cases", justify="right")
-    table.add_column("Share", justify="right")
-    for name, count in outcome_counts(frame):
-        table.add_row(Text(name), str(count), percent(count / len(frame)))
-    return table
-
-
 def error_summaries(frame: pd.DataFrame, metric: str) -> list[tuple[str, ErrorSummary]]:
     """Summaries of a metric and of its signed parts, over all cases that have one."""
     parts = [metric, *axis_columns(metric, [str(column) for column in frame.columns])]
@@ -91,18 +80,6 @@ def statistics_grid(frame: pd.DataFrame, metric: str) -> Grid:
     """Statistics of a metric and of its parts, a column each."""
     summaries = error_summaries(frame, metric)
     return Grid(["", *(name for name, _ in summaries)], statistics_rows([summary for _, summary in summaries]))
-
-
-def error_table(frame: pd.DataFrame, metric: str) -> Table:
-    """Statistics of a metric and of its signed parts, a column each."""
-    summaries = error_summaries(frame, metric)
-    table = Table(title="Errors", box=box.SIMPLE_HEAD, title_justify="left")
-    table.add_column("Statistic")
-    for name, _ in summaries:
-        table.add_column(Text(name), justify="right")
-    for row in statistics_rows([summary for _, summary in summaries]):
-        table.add_row(*row)
-    return table
 
 
 def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Polygon, Rectangle
 from scipy import ndimage
 
-from marsyard.reports.presentation import numbers, plane
+from marsyard.reports.presentation import numbers, plane, save_figures
 from marsyard.reports.svg import INK, draw_pictures, in_page_style
 
 TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
@@ -116,7 +116,7 @@ def delivered_pictures(products: Mapping[str, Any]) -> list[Float[np.ndarray, "_
     return [_picture(products, f"image_{number}") for number in (1, 2, 3)]
 
 
-def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> Path:
+def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     """Writes a case's figure into a folder; returns its path.
 
     It is `dimes.png`, as `draw_dimes_case` draws it; of an algorithm without DIMES' details `pictures.png`, the
@@ -129,11 +129,9 @@ def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> Path:
     OSError
         Where it cannot be written.
     """
-    drawn = has_dimes_details(products)
-    path = directory / ("dimes.png" if drawn else "pictures.png")
-    figure = draw_dimes_case(products) if drawn else draw_pictures(delivered_pictures(products))
-    figure.savefig(path, dpi=110, facecolor="#ffffff", metadata={"Software": None})
-    return path
+    if has_dimes_details(products):
+        return save_figures(directory, {"dimes": draw_dimes_case(products)})
+    return save_figures(directory, {"pictures": draw_pictures(delivered_pictures(products))})
 
 
 def _row_heights(products: Mapping[str, Any], pair: int) -> dict[str, float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,11 +59,7 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     )
 
 
-def _write(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    return [write_dimes_figures(directory, products)]
-
-
-DIMES_CASE = CaseKind(is_dimes_case, view, _write, _LEGEND)
+DIMES_CASE = CaseKind(is_dimes_case, view, write_dimes_figures, _LEGEND)
 DIMES = Presentation(cases=(STREAM_CASE, DIMES_CASE), sections=(FIRING, LANDING, sensitivity_section))
 FIELD_TEST = Presentation(first=(field_test_section,))
 

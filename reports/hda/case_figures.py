@@ -31,6 +31,7 @@ from marsyard.reports.hda.products import (
     tracked_features,
     true_ground,
 )
+from marsyard.reports.presentation import save_figures
 from marsyard.reports.svg import MUTED, in_page_style, show_picture
 
 T = TypeVar("T")
@@ -230,12 +231,7 @@ def write_hda_figures(directory: Path, products: Mapping[str, Any]) -> list[Path
     OSError
         Where they cannot be written.
     """
-    written = []
-    for name in figures_reached(products):
-        path = directory / f"{name}.png"
-        FIGURES[name](products).savefig(path, dpi=130, facecolor="#ffffff", metadata={"Software": None})
-        written.append(path)
-    return written
+    return save_figures(directory, {name: FIGURES[name](products) for name in figures_reached(products)}, dpi=130)
 
 
 def _known(part: T | None, name: str) -> T:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.reports.presentation import numbers, plane
+from marsyard.reports.presentation import numbers, plane, shaped
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def pictures(products: Mapping[str, Any]) -> tuple[Float[np.ndarray, "_ _"], Flo
 
 def tracked_features(products: Mapping[str, Any]) -> TrackedFeatures | None:
     """Features and tracks; None where there are none."""
-    first, second = (_rows(products, name, 2) for name in ("features", "tracked"))
+    first, second = (shaped(products.get(name), None, 2) for name in ("features", "tracked"))
     accepted = _flags(products, "tracks_accepted")
     if first is None or second is None or accepted is None or not len(first) == len(second) == len(accepted):
         return None
@@ -143,10 +143,10 @@ def tracked_features(products: Mapping[str, Any]) -> TrackedFeatures | None:
 
 def solved_motion(products: Mapping[str, Any]) -> SolvedMotion | None:
     """Motion and structure; None where none was found."""
-    rotations = [_shaped(products, name, (3, 3)) for name in ("rotation", "true_rotation")]
-    translations = [_shaped(products, name, (3,)) for name in ("translation", "true_translation")]
-    rays = [_shaped(products, f"frustum_{number}", (4, 3)) for number in (0, 1)]
-    points = _rows(products, "sparse_points", 3)
+    rotations = [_finite(products, name, 3, 3) for name in ("rotation", "true_rotation")]
+    translations = [_finite(products, name, 3) for name in ("translation", "true_translation")]
+    rays = [_finite(products, f"frustum_{number}", 4, 3) for number in (0, 1)]
+    points = shaped(products.get("sparse_points"), None, 3)
     known = [one for one in (*rotations, *translations, *rays) if one is not None]
     if points is None or not len(points) or len(known) < 6:
         return None
@@ -155,7 +155,7 @@ def solved_motion(products: Mapping[str, Any]) -> SolvedMotion | None:
 
 def epipolar_matches(products: Mapping[str, Any]) -> EpipolarMatches | None:
     """Structure pixels and matches; None where there are none."""
-    arrays = [_rows(products, name, 2) for name in ("grid", "segment_starts", "segment_ends", "matched")]
+    arrays = [shaped(products.get(name), None, 2) for name in ("grid", "segment_starts", "segment_ends", "matched")]
     known = [one for one in arrays if one is not None]
     accepted = _flags(products, "matches_accepted")
     if len(known) < 4 or accepted is None or {len(one) for one in known} != {len(accepted)}:
@@ -176,7 +176,7 @@ def landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
         "world_from_surface": (3, 3),
         "limits": (3,),
     }
-    others = [_shaped(products, name, shape) for name, shape in shapes.items()]
+    others = [_finite(products, name, *shape) for name, shape in shapes.items()]
     further = [one for one in others if one is not None]
     pixels = numbers(products.get("map_pixels"))
     if pixels is None or pixels.shape != (*known[0].shape, 2):
@@ -187,7 +187,7 @@ def landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
     corner, apriori, surface, world, limits = further
     if not np.all(limits > 0.0):
         return None
-    site = _shaped(products, "site", (2,))
+    site = _finite(products, "site", 2)
     return LandingMaps(
         elevation_m=known[0],
         roughness_m=known[1],
@@ -216,15 +216,15 @@ def _filled(pixels: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "r
 
 def true_ground(products: Mapping[str, Any]) -> TrueGround | None:
     """The truth; None where it is missing."""
-    places, camera = numbers(products.get("true_places")), _shaped(products, "camera_true", (4, 4))
-    heights, corner = numbers(products.get("true_heights")), _shaped(products, "true_corner", (2,))
+    places, camera = numbers(products.get("true_places")), _finite(products, "camera_true", 4, 4)
+    heights, corner = numbers(products.get("true_heights")), _finite(products, "true_corner", 2)
     spacing = numbers(products.get("true_spacing"))
     if places is None or places.ndim != 3 or places.shape[2] != 2 or min(places.shape[:2]) < 2:
         return None
     if camera is None or heights is None or heights.ndim != 2 or not heights.size or corner is None:
         return None
     shape = places.shape[:2]
-    planes = [_shaped(products, f"true_{name}", shape) for name in ("slope", "roughness", "safe", "covered")]
+    planes = [_finite(products, f"true_{name}", *shape) for name in ("slope", "roughness", "safe", "covered")]
     known = [one for one in planes if one is not None]
     if len(known) < 4 or spacing is None or spacing.size != 1 or not spacing.item() > 0.0:
         return None
@@ -240,16 +240,11 @@ def true_ground(products: Mapping[str, Any]) -> TrueGround | None:
     )
 
 
-def _rows(products: Mapping[str, Any], name: str, width: int) -> Float[np.ndarray, "n width"] | None:
-    values = numbers(products.get(name))
-    return values if values is not None and values.ndim == 2 and values.shape[1] == width else None
-
-
 def _flags(products: Mapping[str, Any], name: str) -> Bool[np.ndarray, " n"] | None:
-    values = numbers(products.get(name))
-    return values > 0.5 if values is not None and values.ndim == 1 else None
+    values = shaped(products.get(name), None)
+    return None if values is None else values > 0.5
 
 
-def _shaped(products: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Float[np.ndarray, "..."] | None:
-    values = numbers(products.get(name))
-    return values if values is not None and values.shape == shape and np.isfinite(values).all() else None
+def _finite(products: Mapping[str, Any], name: str, *shape: int) -> Float[np.ndarray, "..."] | None:
+    values = shaped(products.get(name), *shape)
+    return values if values is not None and np.isfinite(values).all() else None

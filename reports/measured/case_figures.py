@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from marsyard.reports.presentation import numbers, plane
+from marsyard.reports.presentation import numbers, plane, save_figures
 from marsyard.reports.svg import MUTED, in_page_style, show_picture
 from marsyard.reports.wording import number
 
@@ -120,9 +120,4 @@ def _draw_offsets(axes: Axes, pair: MatchedPair, lengths: Float[np.ndarray, " k"
 
 def write_measured_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     """Writes a figure of each pair into a folder; returns their paths. Raises OSError where that fails."""
-    written = []
-    for pair in matched_pairs(products):
-        path = directory / f"matches-{pair.number}.png"
-        draw_pair(pair).savefig(path, dpi=110, facecolor="#ffffff", metadata={"Software": None})
-        written.append(path)
-    return written
+    return save_figures(directory, {f"matches-{pair.number}": draw_pair(pair) for pair in matched_pairs(products)})

@@ -22,6 +22,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Rectangle
 from scipy import ndimage
 
+from marsyard.reports.presentation import save_figures
 from marsyard.reports.svg import GRID, INK, MUTED, SERIES, in_page_style
 from marsyard.reports.vtt.products import StopPictures, Way, stops_of, template_px, way_of
 
@@ -82,12 +83,10 @@ def draw_way(products: Mapping[str, Any]) -> Figure:
 
 def write_vtt_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     """Writes `stops.png` and, where the products hold it, `way.png` into a folder; returns their paths."""
-    figures = {"stops.png": draw_stops(products)}
+    figures = {"stops": draw_stops(products)}
     if way_of(products) is not None:
-        figures["way.png"] = draw_way(products)
-    for name, figure in figures.items():
-        figure.savefig(directory / name, dpi=110, facecolor="#ffffff", metadata={"Software": None})
-    return [directory / name for name in figures]
+        figures["way"] = draw_way(products)
+    return save_figures(directory, figures)
 
 
 def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopPictures, side: float) -> None:

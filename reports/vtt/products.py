@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.reports.presentation import numbers, plane
+from marsyard.reports.presentation import numbers, plane, shaped
 
 #: Numbers that stops may have.
 _STOPS = range(1, 1000)
@@ -116,10 +116,10 @@ def stops_of(products: Mapping[str, Any]) -> list[StopPictures]:
                 state=str(state).replace("_", " ").lower(),
                 left=left,
                 right=plane(products.get(f"stop_{number}_right")),
-                corners=_shaped(products.get(f"stop_{number}_corners"), (2, 2)),
-                window=_shaped(products.get(f"stop_{number}_window"), (4,)),
-                found=_shaped(products.get(f"stop_{number}_found"), (2, 2)),
-                point=_shaped(products.get(f"stop_{number}_point"), (2,)),
+                corners=_shaped(products.get(f"stop_{number}_corners"), 2, 2),
+                window=_shaped(products.get(f"stop_{number}_window"), 4),
+                found=_shaped(products.get(f"stop_{number}_found"), 2, 2),
+                point=_shaped(products.get(f"stop_{number}_point"), 2),
                 figures=_figures(products.get("figures"), number - 1),
             )
         )
@@ -135,10 +135,9 @@ def way_of(products: Mapping[str, Any]) -> Way | None:
         return None
     if not stops.shape == estimates.shape == believed.shape:
         return None
-    path, rocks = _places(products.get("path_true_m")), numbers(products.get("rocks_m"))
-    if rocks is None or rocks.ndim != 2 or rocks.shape[1] != 3:
-        rocks = np.empty((0, 3))
-    heading = np.radians(_shaped(products.get("heading_deg"), (len(stops),)))
+    path, rocks = _places(products.get("path_true_m")), shaped(products.get("rocks_m"), None, 3)
+    rocks = np.empty((0, 3)) if rocks is None else rocks
+    heading = np.radians(_shaped(products.get("heading_deg"), len(stops)))
     return Way(path if path.size else stops, stops, believed, heading, target[:2], estimates, rocks)
 
 
@@ -149,15 +148,13 @@ def _figures(table: object, place: int) -> dict[str, float]:
     return {name: float(a[place]) for name, a in arrays.items() if a is not None and a.ndim == 1 and place < a.size}
 
 
-def _shaped(value: object, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+def _shaped(value: object, *shape: int) -> Float[np.ndarray, "..."]:
     """A product of this shape; NaN where it is not of it."""
-    values = numbers(value)
-    return values if values is not None and values.shape == shape else np.full(shape, np.nan)
+    values = shaped(value, *shape)
+    return np.full(shape, np.nan) if values is None else values
 
 
 def _places(value: object) -> Float[np.ndarray, "n 2"]:
     """East and north of world positions; none where the product is something else."""
-    values = numbers(value)
-    if values is None or values.ndim != 2 or values.shape[1] not in (2, 3):
-        return np.empty((0, 2))
+    values = next((one for width in (2, 3) if (one := shaped(value, None, width)) is not None), np.empty((0, 2)))
     return np.asarray(values[:, :2])

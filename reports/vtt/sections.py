@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -202,7 +202,7 @@ def updates_section(subject: Subject) -> Section | None:
         {
             "Update": str,
             "Cases": lambda n: f"{values[n]['range_m'].size:,}",
-            **{one[0]: lambda n, one=one: spread_text(values[n][one[1]], one[2]) for one in QUANTITIES},
+            **{one[0]: _update_text(values, *one[1:]) for one in QUANTITIES},
         },
     )
     note = (
@@ -224,6 +224,10 @@ def updates_section(subject: Subject) -> Section | None:
         ]
     told = {str(n): {ending: one.tolist() for ending, one in of_n.items()} for n, of_n in values.items()}
     return Section("updates", "Updates", title, blocks, {"updates": told})
+
+
+def _update_text(values: Mapping[int, Mapping[str, np.ndarray]], ending: str, digits: int) -> Callable[[int], str]:
+    return lambda n: spread_text(values[n][ending], digits)
 
 
 def _table_3(values: Mapping[int, Mapping[str, np.ndarray]]) -> Grid:

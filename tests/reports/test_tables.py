@@ -18,7 +18,7 @@ from marsyard.reports.columns import (
     magnitude_label,
     primary_metric,
 )
-from marsyard.reports.tables import error_table, outcome_counts, outcome_table, verdict_table
+from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
 from marsyard.reports.verdicts import judge_campaign
 from marsyard.reports.wording import interval, number, percent, stated
 
@@ -51,8 +51,6 @@ def test_texts_are_not_read_as_markup(make_rows: Rows, velocity: dict[str, Any])
     verdicts = judge_campaign(make_rows(5), [{**velocity, "id": "[red]R[/red]", "metric": "[/]"}])
     text = _printed(verdict_table(verdicts), 140)
     assert "[red]R[/red]" in text
-    frame = make_rows(2).assign(outcome="[bold]x[/]")
-    assert "[bold]x[/]" in _printed(outcome_table(frame), 80)
 
 
 def test_outcomes_in_order(make_rows: Rows) -> None:
@@ -64,10 +62,14 @@ def test_outcomes_in_order(make_rows: Rows) -> None:
     assert outcome_counts(frame.drop(columns="outcome")) == []
 
 
-def test_error_table(make_rows: Rows) -> None:
-    text = _printed(error_table(make_rows(24), "velocity_error_m_s"), 140)
-    for said in ("velocity error (m/s)", "velocity error x (m/s)", "median", "95 % quantile"):
-        assert said in text
+def test_table_of_statistics(make_rows: Rows) -> None:
+    grid = statistics_grid(make_rows(24), "velocity_error_m_s")
+    assert list(grid.head) == ["", "velocity error (m/s)", "velocity error x (m/s)", "velocity error y (m/s)"]
+    assert [row[0] for row in grid.rows if "interval" not in row[0] and "bounds" not in row[0]][:3] == [
+        "cases",
+        "mean",
+        "standard deviation",
+    ]
 
 
 def test_columns_in_words() -> None:

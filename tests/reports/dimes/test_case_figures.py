@@ -138,5 +138,5 @@ def test_figures_leave_out_rows_that_have_nothing_to_show(dimes_products: dict[s
 
 def test_replay_writes_the_pictures_of_a_case_without_details(dimes_products: dict[str, Any], tmp_path: Path) -> None:
     plain = {name: value for name, value in dimes_products.items() if name.startswith("image_")}
-    assert write_dimes_figures(tmp_path, plain) == tmp_path / "pictures.png"
+    assert write_dimes_figures(tmp_path, plain) == [tmp_path / "pictures.png"]
     assert (tmp_path / "pictures.png").stat().st_size > 1000
