@@ -25,7 +25,7 @@ from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.streams import StreamedEstimator, spanned
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.conformance.checks import answer_print as fingerprint
+from marsyard.scenarios.handover import fingerprint
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
