@@ -74,13 +74,19 @@ def _folder() -> str:
         return ""
 
 
+#: Variable that the first picture sets, for the whole life of its process.
+_OPENGL = b"PYOPENGL_PLATFORM"
+
+
 def _environment() -> dict[bytes, bytes]:
     # the mapping below `os.environ`: reading through it decodes each variable, which takes ten times as long
-    return dict(os.environ._data)  # type: ignore[attr-defined]
+    variables: dict[bytes, bytes] = dict(os.environ._data)  # type: ignore[attr-defined]
+    variables.pop(_OPENGL, None)
+    return variables
 
 
 def _set_environment(saved: dict[bytes, bytes]) -> None:
-    for name in set(os.environb) - set(saved):
+    for name in set(os.environb) - {*saved, _OPENGL}:
         del os.environb[name]
     os.environb.update(saved)
 

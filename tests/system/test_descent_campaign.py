@@ -121,6 +121,7 @@ def test_the_run_says_what_it_was(runs: Path) -> None:
     rows = pd.read_parquet(runs / "A" / "cases.parquet")
     assert {"gl_backend", "gl_version", "processor_features"} <= set(rows.columns)
     assert rows["gl_version"].str.contains("Mesa|NVIDIA").all()
+    assert "changed its worker process" not in (runs / "A" / "run.log").read_text()
 
 
 def test_an_existing_campaign_is_not_overwritten(runs: Path) -> None:
