@@ -277,15 +277,13 @@ def _sample_views(views: Views, directions: Array32, first: int, width: int, str
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _start_on_ground(ground: Ground, views: Views, pixel_angles: Array32, first: int, width: int, strip: _Strip) -> int:
-    """The level and the distance at which each ray of a strip meets the ground, to begin with.
-
-    Flat rays are brought to the first place where they dip below it. Returns how many of the rays are to be refined.
-    """
-    levels, ceilings, top_level, spacing, extent = ground
+def _select_levels(
+    spacing: float, top_level: int, views: Views, pixel_angles: Array32, first: int, width: int, strip: _Strip
+) -> bool:
+    """Distance at which each ray of a strip meets the mesh, and the level of the ground there; whether any is flat."""
     depth, ids, view_of_pixel = views.depth, views.numbers, views.view_of_pixel
-    work, row, column, shown, level_of, refined = strip
-    count = 0
+    work, row, column, shown, level_of = strip.work, strip.row, strip.column, strip.shown, strip.level
+    flat = False
     for k in range(width):
         if shown[k] != 0 or work[GUESS + k] == 0.0:
             face = view_of_pixel[first + k]
@@ -299,17 +297,32 @@ def _start_on_ground(ground: Ground, views: Views, pixel_angles: Array32, first:
             continue
         # Far away and at a flat angle a pixel covers many samples along its line of sight: it sees them smoothed.
         if work[STRETCHED + k] > FINE_UNTIL * spacing:
-            coarser = int(math.log2(work[STRETCHED + k] / (FINE_UNTIL * spacing))) + 1
-            level_of[k] = min(coarser, top_level)
+            level_of[k] = min(int(math.log2(work[STRETCHED + k] / (FINE_UNTIL * spacing))) + 1, top_level)
         work[MET + k] = work[GUESS + k]
-        if work[DZ + k] > -GRAZING:
+        flat |= work[DZ + k] > -GRAZING
+    return flat
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _trace_flat_rays(ground: Ground, width: int, strip: _Strip) -> None:
+    """Bring the flat rays of a strip to the first place where they dip below the ground."""
+    levels, ceilings, _top_level, spacing, extent = ground
+    work, level_of = strip.work, strip.level
+    for k in range(width):
+        if work[DZ + k] > -GRAZING and work[MET + k] < math.inf:
             n = level_of[k]
             level = GroundLevel(levels[n], ceilings[n], 1.0 / spacing / (1 << n))
             work[MET + k] = first_ground(level, extent, _ray(work, k), work[GUESS + k])
-        # where a flat ray dips below the ground, it is there already
-        if work[MET + k] == work[GUESS + k]:
-            refined[count] = k
-            count += 1
+
+
+@njit(cache=True)
+def _select_refined(width: int, strip: _Strip) -> int:
+    """Select the rays to be refined: where a flat ray dips below the ground, it is there already."""
+    work, refined = strip.work, strip.refined
+    count = 0
+    for k in range(width):
+        refined[count] = k
+        count += work[MET + k] == work[GUESS + k]
     return count
 
 
@@ -353,6 +366,7 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
     rotation = numbers(pose.rotation)
     centre = (pose.position[0], pose.position[1], pose.position[2])
     origins, directions = rays.origins.reshape(-1), rays.directions.reshape(-1)
+    levels, spacing = ground.levels, ground.spacing
     near = no_cells()
     strip = _Strip(
         np.empty(ROWS * ROW),
@@ -370,6 +384,8 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
         _aim(rotation, centre, origins[here], directions[here], width, strip.work)
         _sample_views(views, directions[here], first, width, strip)
         _guess(angles, width, strip.work)
-        refined = _start_on_ground(ground, views, angles, first, width, strip)
-        _meet_ground(ground.levels, 1.0 / ground.spacing, strip.level, strip.refined, refined, width, strip.work, near)
+        if _select_levels(spacing, ground.top_level, views, angles, first, width, strip):
+            _trace_flat_rays(ground, width, strip)
+        refined = _select_refined(width, strip)
+        _meet_ground(levels, 1.0 / spacing, strip.level, strip.refined, refined, width, strip.work, near)
         _keep_hits(views, tree, first, width, strip, hits)

@@ -17,6 +17,7 @@ from marsyard.sim.render.kernels.structs import (
     Flags,
     Footprint,
     Ground,
+    GroundLevel,
     GroundShadow,
     Hits,
     Ints,
@@ -37,7 +38,7 @@ from marsyard.sim.render.kernels.sun import (
     visible_sun_fraction,
 )
 from marsyard.sim.render.kernels.texture import add_texture
-from marsyard.sim.terrain.kernels import Array, sample
+from marsyard.sim.terrain.kernels import Array, Level, sample
 
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
@@ -207,19 +208,13 @@ def _keep_normals(width: int, work: Array, normal: Array32) -> None:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _select_levels(ground: Ground, hits: Hits, strip: _Strip) -> tuple[int, int, int]:
+def _select_levels(spacing: float, top_level: int, hits: Hits, strip: _Strip) -> tuple[int, int, int]:
     """Select the level of the ground for each pixel: as far apart as its footprint, blended between the two nearest.
 
     Returns how many pixels see the ground, how many of them blend levels, and how many do not see the ground.
     """
     work, level_of, of_ground, blended, other, _hidden = strip
-    distance, triangle, level, spacing, top_level = (
-        hits.distance,
-        hits.triangle,
-        hits.level,
-        ground.spacing,
-        ground.top_level,
-    )
+    distance, triangle, level = hits.distance, hits.triangle, hits.level
     n_ground = 0
     n_blended = 0
     n_other = 0
@@ -246,17 +241,19 @@ def _select_levels(ground: Ground, hits: Hits, strip: _Strip) -> tuple[int, int,
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _sample_ground(ground: Ground, n_ground: int, n_blended: int, width: int, strip: _Strip, near: Near) -> None:
+def _sample_ground(
+    levels: tuple[Level, ...], per_metre: float, n_ground: int, n_blended: int, width: int, strip: _Strip, near: Near
+) -> None:
     """Slopes, albedo and normals of the ground that the pixels of a strip see."""
-    work, per_metre = strip.work, 1.0 / ground.spacing
+    work = strip.work
     if n_ground > 0:
         x, y = work[X : X + ROW], work[Y : Y + ROW]
-        fetch_levels(ground.levels, per_metre, strip.level, strip.ground, n_ground, x, y, near)
+        fetch_levels(levels, per_metre, strip.level, strip.ground, n_ground, x, y, near)
         _ground(near, width, work[HEIGHT : HEIGHT + 4 * ROW])
         if n_blended > 0:
             for m in range(n_blended):
                 strip.level[strip.blended[m]] += 1
-            fetch_levels(ground.levels, per_metre, strip.level, strip.blended, n_blended, x, y, near)
+            fetch_levels(levels, per_metre, strip.level, strip.blended, n_blended, x, y, near)
             _ground(near, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
         _blend(width, work)
     _face(width, work)
@@ -318,14 +315,23 @@ def _apply_texture(materials: Materials, width: int, seen: int, strip: _Strip) -
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _cast_shadows(
-    ground: Ground, hits: Hits, pixel_angles: Array32, light: Light, occluders: Occluders, body: Ints, strip: _Strip
+    finest: GroundLevel,
+    terrain: Level,
+    hits: Hits,
+    pixel_angles: Array32,
+    light: Light,
+    occluders: Occluders,
+    body: Ints,
+    strip: _Strip,
 ) -> None:
-    """Fraction of the sun that each pixel's place sees past the ground and past objects."""
-    sun, radius, spacing = light.sun, light.law[7], ground.spacing
+    """Fraction of the sun that each pixel's place sees past the ground and past objects.
+
+    `terrain` is the level on which the ground's shadow was swept.
+    """
+    sun, radius = light.sun, light.law[7]
     distance, triangle, level = hits.distance, hits.triangle, hits.level
     work, other, hidden = strip.work, strip.other, strip.hidden
     shadow, casters, footprint = occluders
-    finest, lift_field = ground.levels[0], ground.levels[shadow.level]
     shadowed = shadow.height.shape[0] > 1
     objects = casters[0].shape[0] > 0
     unsure = UNSURE * shadow.spacing
@@ -340,7 +346,7 @@ def _cast_shadows(
         if shadowed:
             if not on_object and not met:
                 # the terrain itself, where the pixel saw it smoothed: its own bumps must not shade a smooth ground
-                height, _slope_x, _slope_y, _albedo = sample(lift_field, 1.0 / shadow.spacing, x, y)
+                height, _slope_x, _slope_y, _albedo = sample(terrain, 1.0 / shadow.spacing, x, y)
                 z = max(z, height)
                 work[Z + k] = z
             clear, rows = shadow_clearance(shadow, x, y, z)
@@ -351,7 +357,7 @@ def _cast_shadows(
                 lit = 0.0
             elif clear < unsure + soft:
                 # at the shadow's edge the swept grid is too coarse: search towards the sun from here
-                lit = visible_sun_fraction(finest, 1.0 / spacing, shadow, (x, y, z), sun, radius)
+                lit = visible_sun_fraction(finest.field, finest.per_metre, shadow, (x, y, z), sun, radius)
         work[LIT + k] = lit
         if lit > 0.0 and objects and (on_object or _in_footprint(footprint, x, y)):
             # lifted off its own facet, so that this and its neighbours do not shade it by rounding
@@ -428,6 +434,9 @@ def shade(
     law = light.law
     reflectance = (law[0], law[1], law[2], law[3], law[4], law[5])
     origins, directions, normals = rays.origins.reshape(-1), rays.directions.reshape(-1), picture.normal.reshape(-1)
+    levels, spacing = ground.levels, ground.spacing
+    finest = GroundLevel(levels[0], ground.ceilings[0], 1.0 / spacing)
+    terrain = levels[occluders.shadow.level]
     near = no_cells()
     work = np.empty(ROWS * ROW)
     strip = _Strip(
@@ -449,12 +458,12 @@ def shade(
         body[:] = GROUND
         here, there = 3 * first, 3 * last
         _place(rotation, centre, origins[here:there], directions[here:there], angles, met.distance, width, work)
-        n_ground, n_blended, n_other = _select_levels(ground, met, strip)
-        _sample_ground(ground, n_ground, n_blended, width, strip, near)
+        n_ground, n_blended, n_other = _select_levels(spacing, ground.top_level, met, strip)
+        _sample_ground(levels, 1.0 / spacing, n_ground, n_blended, width, strip, near)
         seen = _sample_objects(materials, met, angles, n_other, strip, body)
         _photometric_angles(towards, width, work)
         _apply_texture(materials, width, seen, strip)
-        _cast_shadows(ground, met, angles, light, occluders, body, strip)
+        _cast_shadows(finest, terrain, met, angles, light, occluders, body, strip)
         if law[6] > 0.0 or light.drift[4] > 0.0:
             _dim_sun(light, met.distance, work)
         _reflect(reflectance, width, work, radiance)
