@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -13,13 +14,13 @@ from marsyard.sim.render.kernels.structs import (
     Array32,
     Flags,
     Ground,
+    GroundLevel,
     Hits,
     Ints,
     Longs,
     Pose,
     Ray,
     Rays,
-    ground_level,
     world_ray,
 )
 from marsyard.sim.render.kernels.triangles import TriangleHit, nearer_hit
@@ -222,34 +223,8 @@ def _middle_ray(pose: Pose, rays: Rays, first: int, last: int, origin: Array32, 
     for axis in range(3):
         origin[0, axis] = 0.5 * (rays.origins[first, axis] + rays.origins[last, axis])
         direction[0, axis] = 0.5 * (rays.directions[first, axis] + rays.directions[last, axis])
-    return world_ray(pose, Rays(origin, direction, rays.pixel_angles), 0)
-
-
-@njit(cache=True, inline="always")
-def _first_stretch(
-    ground: Ground, ray: Ray, ranges: Array, levels: Longs, sky: bool, farthest: float
-) -> tuple[float, int]:
-    """Distance at which a ray meets the ground where pixels around have met it, infinite for none, and the level.
-
-    Places met on one level are one stretch; it begins where the stretch before has ended. Ground beyond `farthest` is
-    hidden by an object.
-    """
-    t = math.inf
-    level = 0
-    end = math.inf
-    c = 0
-    while c < ranges.size and t == math.inf:
-        level = levels[c]
-        start = max(min(AHEAD * ranges[c], end), way_in(ground.extent, ray))
-        if start >= farthest:
-            break
-        while c + 1 < ranges.size and levels[c + 1] == level:
-            c += 1
-        end = (TO_HORIZON if sky and c + 1 == ranges.size else BEYOND) * ranges[c]
-        end = min(end, way_out(ground.extent, ray))
-        t = cross_ground(ground_level(ground, max(level, 0)), ray, start, min(end, farthest))
-        c += 1
-    return t, level
+    middle: Ray = world_ray(pose, Rays(origin, direction, rays.pixel_angles), 0)
+    return middle
 
 
 @njit(cache=True, fastmath={"contract"})
@@ -274,6 +249,7 @@ def trace_subpixel_rays(
     hits
         Output: what the rays meet.
     """
+    fields, ceilings, _top_level, spacing, extent = ground
     share = rays.directions.shape[0] // max(pixels.size, 1)
     ranges = np.empty(9)
     levels = np.empty(9, dtype=np.int64)
@@ -293,7 +269,25 @@ def trace_subpixel_rays(
             hit = TriangleHit(math.inf, -1, 0.0, 0.0)
             for m in range(in_list):
                 hit = nearer_hit(hit, tree[0], listed[m], ray, 0.0)
-            t, level = _first_stretch(ground, ray, ranges[:count], levels[:count], sky, hit.distance)
+            t = math.inf
+            level = 0
+            end = math.inf
+            c = 0
+            while c < count and t == math.inf:
+                # places met on one level are one stretch; it begins where the stretch before has ended
+                level = levels[c]
+                start = max(min(AHEAD * ranges[c], end), way_in(extent, ray))
+                # ground behind an object is hidden
+                if start >= hit.distance:
+                    break
+                while c + 1 < count and levels[c + 1] == level:
+                    c += 1
+                end = (TO_HORIZON if sky and c + 1 == count else BEYOND) * ranges[c]
+                end = min(end, way_out(extent, ray))
+                m = max(level, 0)
+                ground_level = GroundLevel(fields[m], ceilings[m], 1.0 / spacing / (1 << m))
+                t = cross_ground(ground_level, ray, start, min(end, hit.distance))
+                c += 1
             if in_list < 0 and objects:
                 hit = nearest_hit(tree, ray, t)
             if not hit.distance < t:
@@ -305,7 +299,8 @@ def trace_subpixel_rays(
                 else:
                     # a sliver of ground that no pixel around sees
                     level = int(seen.level[pixel])
-                    triangle, second, third = np.int64(seen.triangle[pixel]), 0.0, 0.0
+                    triangle: Any = np.int64(seen.triangle[pixel])
+                    second, third = 0.0, 0.0
                     if triangle >= 0:
                         second, third = float(seen.weights[pixel, 0]), float(seen.weights[pixel, 1])
                     hit = TriangleHit(seen.distance[pixel], triangle, second, third)

@@ -33,9 +33,9 @@ class Clearance(NamedTuple):
 
 
 @njit(cache=True, inline="always")
-def clearance_at(level: GroundLevel, ray: Ray, t: float) -> Clearance:
+def clearance_at(field: Level, per_metre: float, ray: Ray, t: float) -> Clearance:
     """Clearance of a ray over a level of the ground at a distance."""
-    height, slope_x, slope_y, _albedo = sample(level.field, level.per_metre, ray.x + t * ray.dx, ray.y + t * ray.dy)
+    height, slope_x, slope_y, _albedo = sample(field, per_metre, ray.x + t * ray.dx, ray.y + t * ray.dy)
     return Clearance(t, ray.z + t * ray.dz - height, ray.dz - slope_x * ray.dx - slope_y * ray.dy)
 
 
@@ -47,7 +47,8 @@ def skip_empty_blocks(level: GroundLevel, ray: Ray, start: float, farthest: floa
     by one (Amanatides & Woo 1987).
     """
     per_metre = level.per_metre / CEILING_BLOCK
-    mask = level.ceiling.shape[0] - 1
+    ceiling = level.ceiling
+    mask = ceiling.shape[0] - 1
     gx, gy = (ray.x + start * ray.dx) * per_metre, (ray.y + start * ray.dy) * per_metre
     j, i = math.floor(gx), math.floor(gy)
     across, along = ray.dx * per_metre, ray.dy * per_metre
@@ -60,7 +61,7 @@ def skip_empty_blocks(level: GroundLevel, ray: Ray, start: float, farthest: floa
     while t < farthest:
         out = min(next_x, next_y)
         lowest = ray.z + (out if ray.dz < 0.0 else t) * ray.dz
-        if lowest <= level.ceiling[i & mask, j & mask]:
+        if lowest <= ceiling[i & mask, j & mask]:
             break
         t = out
         # selections in place of branches: which side a ray leaves a block by cannot be predicted
@@ -80,11 +81,12 @@ def find_occluding_crest(level: GroundLevel, ray: Ray, near: Clearance, far: Cle
     tangents of the clearance meet; while that is below the ground, the place is sampled and replaces that side.
     Returns a place below the crest; its height is 0 where there is none.
     """
+    field, per_metre = level.field, level.per_metre
     for _ in range(CREST_LOOKS):
         step = (far.rate * (far.t - near.t) - far.height + near.height) / (far.rate - near.rate)
         if near.height + near.rate * step >= 0.0:
             break
-        here = clearance_at(level, ray, near.t + step)
+        here: Clearance = clearance_at(field, per_metre, ray, near.t + step)
         if here.height < 0.0:
             return here
         if here.rate < 0.0:
@@ -117,7 +119,8 @@ def _close_in(level: GroundLevel, ray: Ray, above: Clearance, below: Clearance) 
     The root of the cubic of clearance and rate at both ends, then false position (Illinois), to a thousandth of a
     sample; a final step of Newton's method needs no further sample.
     """
-    spacing = 1.0 / level.per_metre
+    field, per_metre = level.field, level.per_metre
+    spacing = 1.0 / per_metre
     before, above_height, above_rate = above.t, above.height, above.rate
     t, below_height, below_rate = below.t, below.height, below.rate
     middle = below
@@ -129,7 +132,7 @@ def _close_in(level: GroundLevel, ray: Ray, above: Clearance, below: Clearance) 
                 above_height, above_rate * (t - before), below_height, below_rate * (t - before), share
             )
             kept = 1.0
-        middle = clearance_at(level, ray, before + (t - before) * share)
+        middle = clearance_at(field, per_metre, ray, before + (t - before) * share)
         if abs(middle.height) < 1e-3 * spacing * max(-ray.dz, 1e-3) or t - before <= 0.01 * spacing:
             break
         if middle.height < 0.0:
@@ -152,7 +155,8 @@ def cross_ground(level: GroundLevel, ray: Ray, start: float, farthest: float) ->
     """
     if start >= farthest:
         return math.inf
-    spacing = 1.0 / level.per_metre
+    field, per_metre = level.field, level.per_metre
+    spacing = 1.0 / per_metre
     bounded = level.ceiling.shape[0] > 1
     t = start
     if bounded:
@@ -162,7 +166,7 @@ def cross_ground(level: GroundLevel, ray: Ray, start: float, farthest: float) ->
     before = Clearance(t, 0.0, 0.0)
     skipped = True
     while True:
-        here = clearance_at(level, ray, t)
+        here = clearance_at(field, per_metre, ray, t)
         if here.height < 0.0:
             break
         if not skipped and before.rate < 0.0 and here.rate > 0.0:

@@ -24,6 +24,7 @@ from marsyard.sim.render.kernels.strips import (
 from marsyard.sim.render.kernels.structs import (
     Array32,
     Ground,
+    GroundLevel,
     Hits,
     Ints,
     Longs,
@@ -31,7 +32,6 @@ from marsyard.sim.render.kernels.structs import (
     Ray,
     Rays,
     Views,
-    ground_level,
 )
 from marsyard.sim.render.kernels.triangles import TriangleHit, nearer_hit
 from marsyard.sim.terrain.kernels import Array, Level
@@ -69,23 +69,25 @@ class _Strip(NamedTuple):
 
 
 @njit(cache=True, inline="always")
-def _nearest_depth(views: Views, face: int, strip: _Strip, k: int) -> float:
-    """Depth of the nearest sample of ground among the four around a ray's place in its view; 0 where there is none."""
-    i, j, fu, fv = strip.row[k], strip.column[k], strip.work[U + k], strip.work[V + k]
+def _nearest_depth(depth: Array32, ids: Ints, shown: int, face: int, i: int, j: int, fu: float, fv: float) -> float:
+    """Depth of the nearest sample of ground among the four around a place between samples; 0 where there is none.
+
+    `shown` is 0 where none of them shows a triangle.
+    """
     nearest = 0.0
     least = math.inf
     for di in range(2):
         for dj in range(2):
-            value = views.depth[face, i + di, j + dj]
+            value = depth[face, i + di, j + dj]
             far = abs(fv - di) + abs(fu - dj)
-            if value > 0.0 and far < least and (strip.shown[k] == 0 or views.numbers[face, i + di, j + dj] == 0):
+            if value > 0.0 and far < least and (shown == 0 or ids[face, i + di, j + dj] == 0):
                 least = far
                 nearest = value
     return nearest
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _meet_object(views: Views, face: int, i: int, j: int, tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
+def _meet_object(ids: Ints, face: int, i: int, j: int, tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
     """The nearest triangle that a ray meets among those that the four samples around it show.
 
     Where the samples show triangles and the ray meets none of them, it passes by an outline, or triangles are smaller
@@ -94,7 +96,7 @@ def _meet_object(views: Views, face: int, i: int, j: int, tree: Hierarchy, ray: 
     best = TriangleHit(math.inf, -1, 0.0, 0.0)
     last = 0
     for k in range(4):
-        one = views.numbers[face, i + k // 2, j + k % 2]
+        one = ids[face, i + k // 2, j + k % 2]
         if one <= 0 or one == last:
             continue
         last = one
@@ -236,14 +238,16 @@ def _meet_ground(
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _sample_views(views: Views, directions: Array32, first: int, width: int, strip: _Strip) -> None:
     """Where the rays of a strip meet their views, and what the four samples around there hold."""
-    depth, ids, work = views.depth, views.numbers, strip.work
+    depth, ids, view_of_pixel = views.depth, views.numbers, views.view_of_pixel
+    work, row, column, shown = strip.work, strip.row, strip.column, strip.shown
     side = depth.shape[1]
+    objects = ids.shape[1] > 0
     start = 0
     while start < width:
         # pixels of one view stand in a row
-        face = views.view_of_pixel[first + start]
+        face = view_of_pixel[first + start]
         end = start + 1
-        while end < width and views.view_of_pixel[first + end] == face:
+        while end < width and view_of_pixel[first + end] == face:
             end += 1
         _project(
             numbers(views.view_from_body[face]),
@@ -256,73 +260,92 @@ def _sample_views(views: Views, directions: Array32, first: int, width: int, str
         )
         start = end
     for k in range(width):
-        face = views.view_of_pixel[first + k]
+        face = view_of_pixel[first + k]
         u, v = work[U + k], work[V + k]
         i = min(max(math.floor(v), 0), side - 2)
         j = min(max(math.floor(u), 0), side - 2)
-        strip.row[k] = i
-        strip.column[k] = j
+        row[k] = i
+        column[k] = j
         work[U + k] = u - j
         work[V + k] = v - i
         work[UPPER_LEFT + k] = depth[face, i, j]
         work[UPPER_RIGHT + k] = depth[face, i, j + 1]
         work[LOWER_LEFT + k] = depth[face, i + 1, j]
         work[LOWER_RIGHT + k] = depth[face, i + 1, j + 1]
-        if ids.shape[1] > 0:
-            strip.shown[k] = ids[face, i, j] | ids[face, i, j + 1] | ids[face, i + 1, j] | ids[face, i + 1, j + 1]
+        if objects:
+            shown[k] = ids[face, i, j] | ids[face, i, j + 1] | ids[face, i + 1, j] | ids[face, i + 1, j + 1]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _start_on_ground(ground: Ground, views: Views, pixel_angles: Array32, first: int, width: int, strip: _Strip) -> int:
-    """The level and the distance at which each ray of a strip meets the ground, to begin with.
-
-    Flat rays are brought to the first place where they dip below it. Returns how many of the rays are to be refined.
-    """
-    work = strip.work
-    count = 0
+def _select_levels(
+    spacing: float, top_level: int, views: Views, pixel_angles: Array32, first: int, width: int, strip: _Strip
+) -> bool:
+    """Distance at which each ray of a strip meets the mesh, and the level of the ground there; whether any is flat."""
+    depth, ids, view_of_pixel = views.depth, views.numbers, views.view_of_pixel
+    work, row, column, shown, level_of = strip.work, strip.row, strip.column, strip.shown, strip.level
+    flat = False
     for k in range(width):
-        if strip.shown[k] != 0 or work[GUESS + k] == 0.0:
-            seen = _nearest_depth(views, views.view_of_pixel[first + k], strip, k)
+        if shown[k] != 0 or work[GUESS + k] == 0.0:
+            face = view_of_pixel[first + k]
+            seen = _nearest_depth(depth, ids, shown[k], face, row[k], column[k], work[U + k], work[V + k])
             work[GUESS + k] = seen / work[FORWARD + k]
             work[STRETCHED + k] = work[GUESS + k] * pixel_angles[k] / max(-work[DZ + k], FLATTEST)
-        strip.level[k] = 0
+        level_of[k] = 0
         if work[GUESS + k] == 0.0:
             work[GUESS + k] = -1.0
             work[MET + k] = math.inf
             continue
         # Far away and at a flat angle a pixel covers many samples along its line of sight: it sees them smoothed.
-        if work[STRETCHED + k] > FINE_UNTIL * ground.spacing:
-            coarser = int(math.log2(work[STRETCHED + k] / (FINE_UNTIL * ground.spacing))) + 1
-            strip.level[k] = min(coarser, ground.top_level)
+        if work[STRETCHED + k] > FINE_UNTIL * spacing:
+            level_of[k] = min(int(math.log2(work[STRETCHED + k] / (FINE_UNTIL * spacing))) + 1, top_level)
         work[MET + k] = work[GUESS + k]
-        if work[DZ + k] > -GRAZING:
-            level = ground_level(ground, strip.level[k])
-            work[MET + k] = first_ground(level, ground.extent, _ray(work, k), work[GUESS + k])
-        # where a flat ray dips below the ground, it is there already
-        if work[MET + k] == work[GUESS + k]:
-            strip.refined[count] = k
-            count += 1
+        flat |= work[DZ + k] > -GRAZING
+    return flat
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _trace_flat_rays(ground: Ground, width: int, strip: _Strip) -> None:
+    """Bring the flat rays of a strip to the first place where they dip below the ground."""
+    levels, ceilings, _top_level, spacing, extent = ground
+    work, level_of = strip.work, strip.level
+    for k in range(width):
+        if work[DZ + k] > -GRAZING and work[MET + k] < math.inf:
+            n = level_of[k]
+            level = GroundLevel(levels[n], ceilings[n], 1.0 / spacing / (1 << n))
+            work[MET + k] = first_ground(level, extent, _ray(work, k), work[GUESS + k])
+
+
+@njit(cache=True)
+def _select_refined(width: int, strip: _Strip) -> int:
+    """Select the rays to be refined: where a flat ray dips below the ground, it is there already."""
+    work, refined = strip.work, strip.refined
+    count = 0
+    for k in range(width):
+        refined[count] = k
+        count += work[MET + k] == work[GUESS + k]
     return count
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _keep_hits(views: Views, tree: Hierarchy, first: int, width: int, strip: _Strip, hits: Hits) -> None:
     """Write what the rays of a strip meet: the ground, or a triangle before it."""
-    work = strip.work
+    ids, view_of_pixel = views.numbers, views.view_of_pixel
+    work, row, column, shown, level_of, _refined = strip
+    distance, triangle, weights, level = hits
     for k in range(width):
         n = first + k
         t = work[MET + k]
-        on_terrain = strip.level[k] == 0 and t != work[GUESS + k]
-        hits.level[n] = 0 if on_terrain else (strip.level[k] if strip.level[k] > 0 else -1)
-        hits.distance[n] = t
-        hits.triangle[n] = -1
-        if strip.shown[k] != 0:
-            hit = _meet_object(views, views.view_of_pixel[n], strip.row[k], strip.column[k], tree, _ray(work, k), t)
+        on_terrain = level_of[k] == 0 and t != work[GUESS + k]
+        level[n] = 0 if on_terrain else (level_of[k] if level_of[k] > 0 else -1)
+        distance[n] = t
+        triangle[n] = -1
+        if shown[k] != 0:
+            hit = _meet_object(ids, view_of_pixel[n], row[k], column[k], tree, _ray(work, k), t)
             if hit.triangle >= 0 and hit.distance < t:
-                hits.distance[n] = hit.distance
-                hits.triangle[n] = hit.triangle
-                hits.weights[n, 0] = hit.second
-                hits.weights[n, 1] = hit.third
+                distance[n] = hit.distance
+                triangle[n] = hit.triangle
+                weights[n, 0] = hit.second
+                weights[n, 1] = hit.third
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -343,6 +366,7 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
     rotation = numbers(pose.rotation)
     centre = (pose.position[0], pose.position[1], pose.position[2])
     origins, directions = rays.origins.reshape(-1), rays.directions.reshape(-1)
+    levels, spacing = ground.levels, ground.spacing
     near = no_cells()
     strip = _Strip(
         np.empty(ROWS * ROW),
@@ -360,6 +384,8 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
         _aim(rotation, centre, origins[here], directions[here], width, strip.work)
         _sample_views(views, directions[here], first, width, strip)
         _guess(angles, width, strip.work)
-        refined = _start_on_ground(ground, views, angles, first, width, strip)
-        _meet_ground(ground.levels, 1.0 / ground.spacing, strip.level, strip.refined, refined, width, strip.work, near)
+        if _select_levels(spacing, ground.top_level, views, angles, first, width, strip):
+            _trace_flat_rays(ground, width, strip)
+        refined = _select_refined(width, strip)
+        _meet_ground(levels, 1.0 / spacing, strip.level, strip.refined, refined, width, strip.work, near)
         _keep_hits(views, tree, first, width, strip, hits)

@@ -17,6 +17,7 @@ from marsyard.sim.render.kernels.structs import (
     Flags,
     Footprint,
     Ground,
+    GroundLevel,
     GroundShadow,
     Hits,
     Ints,
@@ -37,7 +38,7 @@ from marsyard.sim.render.kernels.sun import (
     visible_sun_fraction,
 )
 from marsyard.sim.render.kernels.texture import add_texture
-from marsyard.sim.terrain.kernels import Array, sample
+from marsyard.sim.terrain.kernels import Array, Level, sample
 
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
@@ -207,49 +208,52 @@ def _keep_normals(width: int, work: Array, normal: Array32) -> None:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _select_levels(ground: Ground, hits: Hits, strip: _Strip) -> tuple[int, int, int]:
+def _select_levels(spacing: float, top_level: int, hits: Hits, strip: _Strip) -> tuple[int, int, int]:
     """Select the level of the ground for each pixel: as far apart as its footprint, blended between the two nearest.
 
     Returns how many pixels see the ground, how many of them blend levels, and how many do not see the ground.
     """
-    work = strip.work
+    work, level_of, of_ground, blended, other, _hidden = strip
+    distance, triangle, level = hits.distance, hits.triangle, hits.level
     n_ground = 0
     n_blended = 0
     n_other = 0
-    for k in range(hits.distance.size):
+    for k in range(distance.size):
         work[BLEND + k] = 0.0
-        if hits.distance[k] == math.inf or hits.triangle[k] >= 0:
-            strip.other[n_other] = k
+        if distance[k] == math.inf or triangle[k] >= 0:
+            other[n_other] = k
             n_other += 1
             continue
         lower = 0
-        if hits.level[k] > 0 or work[FOOTPRINT + k] > SHARP_UNTIL * ground.spacing:
-            suited = math.log2(max(work[FOOTPRINT + k] / (SHARP_UNTIL * ground.spacing), 1.0))
-            fractional = max(suited, float(hits.level[k]))
-            lower = min(int(fractional), ground.top_level)
-            if lower < ground.top_level and fractional > lower:
+        if level[k] > 0 or work[FOOTPRINT + k] > SHARP_UNTIL * spacing:
+            suited = math.log2(max(work[FOOTPRINT + k] / (SHARP_UNTIL * spacing), 1.0))
+            fractional = max(suited, float(level[k]))
+            lower = min(int(fractional), top_level)
+            if lower < top_level and fractional > lower:
                 work[BLEND + k] = min(fractional - lower, 1.0)
-                strip.blended[n_blended] = k
+                blended[n_blended] = k
                 n_blended += 1
-        strip.level[k] = lower
-        work[SCALE + k] = 1.0 / ground.spacing / (1 << lower)
-        strip.ground[n_ground] = k
+        level_of[k] = lower
+        work[SCALE + k] = 1.0 / spacing / (1 << lower)
+        of_ground[n_ground] = k
         n_ground += 1
     return n_ground, n_blended, n_other
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _sample_ground(ground: Ground, n_ground: int, n_blended: int, width: int, strip: _Strip, near: Near) -> None:
+def _sample_ground(
+    levels: tuple[Level, ...], per_metre: float, n_ground: int, n_blended: int, width: int, strip: _Strip, near: Near
+) -> None:
     """Slopes, albedo and normals of the ground that the pixels of a strip see."""
-    work, per_metre = strip.work, 1.0 / ground.spacing
+    work = strip.work
     if n_ground > 0:
         x, y = work[X : X + ROW], work[Y : Y + ROW]
-        fetch_levels(ground.levels, per_metre, strip.level, strip.ground, n_ground, x, y, near)
+        fetch_levels(levels, per_metre, strip.level, strip.ground, n_ground, x, y, near)
         _ground(near, width, work[HEIGHT : HEIGHT + 4 * ROW])
         if n_blended > 0:
             for m in range(n_blended):
                 strip.level[strip.blended[m]] += 1
-            fetch_levels(ground.levels, per_metre, strip.level, strip.blended, n_blended, x, y, near)
+            fetch_levels(levels, per_metre, strip.level, strip.blended, n_blended, x, y, near)
             _ground(near, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
         _blend(width, work)
     _face(width, work)
@@ -263,27 +267,29 @@ def _sample_objects(
 
     Returns how many see objects; their numbers become the first of `strip.other`.
     """
-    work = strip.work
+    work, other = strip.work, strip.other
+    distance, triangles, weights = hits.distance, hits.triangle, hits.weights
+    normals, body_of_triangle, albedo = materials.normals, materials.body_of_triangle, materials.albedo
     seen = 0
     for m in range(n_other):
-        k = strip.other[m]
+        k = other[m]
         work[FOOTPRINT + k] = math.inf
-        triangle = hits.triangle[k]
-        if hits.distance[k] == math.inf:
+        triangle = triangles[k]
+        if distance[k] == math.inf:
             body[k] = SKY
             work[NX + k] = 0.0
             work[NY + k] = 0.0
             work[NZ + k] = 0.0
             continue
-        _interpolate_normal(materials.normals, triangle, hits.weights[k, 0], hits.weights[k, 1], k, work)
-        body[k] = materials.body_of_triangle[triangle]
-        work[ALBEDO + k] = materials.albedo[body[k]]
+        _interpolate_normal(normals, triangle, weights[k, 0], weights[k, 1], k, work)
+        body[k] = body_of_triangle[triangle]
+        work[ALBEDO + k] = albedo[body[k]]
         work[OBJECT_X + seen] = work[X + k]
         work[OBJECT_Y + seen] = work[Y + k]
         work[OBJECT_Z + seen] = work[Z + k]
-        work[OBJECT_FOOTPRINT + seen] = _object_footprint(hits.distance[k] * pixel_angles[k], k, work)
+        work[OBJECT_FOOTPRINT + seen] = _object_footprint(distance[k] * pixel_angles[k], k, work)
         work[OBJECT_CHANGE + seen] = 0.0
-        strip.other[seen] = k
+        other[seen] = k
         seen += 1
     return seen
 
@@ -307,68 +313,75 @@ def _apply_texture(materials: Materials, width: int, seen: int, strip: _Strip) -
             work[ALBEDO + k] *= math.exp(work[CHANGE + k])
 
 
-@njit(cache=True, error_model="numpy", inline="always")
-def _light_over_ground(ground: Ground, shadow: GroundShadow, light: Light, hits: Hits, k: int, work: Array) -> float:
-    """Fraction of the sun that a pixel's place sees over the ground.
-
-    A place on smoothed ground is lifted onto the terrain itself, whose bumps must not shade it.
-    """
-    sun, radius = light.sun, light.law[7]
-    on_object = hits.triangle[k] >= 0
-    met = hits.level[k] == 0
-    x, y, z = work[X + k], work[Y + k], work[Z + k]
-    if not on_object and not met:
-        height, _slope_x, _slope_y, _albedo = sample(ground.levels[shadow.level], 1.0 / shadow.spacing, x, y)
-        z = max(z, height)
-        work[Z + k] = z
-    clear, rows = shadow_clearance(shadow, x, y, z)
-    soft = penumbra(shadow, radius, 0.0, rows)
-    if on_object or not met:
-        fraction: float = disc_above(clear / soft)
-        return fraction
-    if clear <= -UNSURE * shadow.spacing - soft:
-        return 0.0
-    if clear < UNSURE * shadow.spacing + soft:
-        # at the shadow's edge the swept grid is too coarse: search towards the sun from here
-        seen: float = visible_sun_fraction(ground.levels[0], 1.0 / ground.spacing, shadow, (x, y, z), sun, radius)
-        return seen
-    return 1.0
-
-
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _cast_shadows(
-    ground: Ground, hits: Hits, pixel_angles: Array32, light: Light, occluders: Occluders, body: Ints, strip: _Strip
+    finest: GroundLevel,
+    terrain: Level,
+    hits: Hits,
+    pixel_angles: Array32,
+    light: Light,
+    occluders: Occluders,
+    body: Ints,
+    strip: _Strip,
 ) -> None:
-    """Fraction of the sun that each pixel's place sees past the ground and past objects."""
-    work = strip.work
-    shadowed = occluders.shadow.height.shape[0] > 1
-    objects = occluders.casters[0].shape[0] > 0
+    """Fraction of the sun that each pixel's place sees past the ground and past objects.
+
+    `terrain` is the level on which the ground's shadow was swept.
+    """
+    sun, radius = light.sun, light.law[7]
+    distance, triangle, level = hits.distance, hits.triangle, hits.level
+    work, other, hidden = strip.work, strip.other, strip.hidden
+    shadow, casters, footprint = occluders
+    shadowed = shadow.height.shape[0] > 1
+    objects = casters[0].shape[0] > 0
+    unsure = UNSURE * shadow.spacing
     asked = 0
-    for k in range(hits.distance.size):
+    for k in range(distance.size):
         if work[COS_I + k] <= 0.0 or body[k] == SKY:
             continue
-        lit = _light_over_ground(ground, occluders.shadow, light, hits, k, work) if shadowed else 1.0
+        x, y, z = work[X + k], work[Y + k], work[Z + k]
+        on_object = triangle[k] >= 0
+        met = level[k] == 0
+        lit = 1.0
+        if shadowed:
+            if not on_object and not met:
+                # the terrain itself, where the pixel saw it smoothed: its own bumps must not shade a smooth ground
+                height, _slope_x, _slope_y, _albedo = sample(terrain, 1.0 / shadow.spacing, x, y)
+                z = max(z, height)
+                work[Z + k] = z
+            clear, rows = shadow_clearance(shadow, x, y, z)
+            soft = penumbra(shadow, radius, 0.0, rows)
+            if on_object or not met:
+                lit = disc_above(clear / soft)
+            elif clear <= -unsure - soft:
+                lit = 0.0
+            elif clear < unsure + soft:
+                # at the shadow's edge the swept grid is too coarse: search towards the sun from here
+                lit = visible_sun_fraction(finest.field, finest.per_metre, shadow, (x, y, z), sun, radius)
         work[LIT + k] = lit
-        on_object = hits.triangle[k] >= 0
-        if lit > 0.0 and objects and (on_object or _in_footprint(occluders.footprint, work[X + k], work[Y + k])):
+        if lit > 0.0 and objects and (on_object or _in_footprint(footprint, x, y)):
             # lifted off its own facet, so that this and its neighbours do not shade it by rounding
-            lift = 1e-4 + (0.05 * hits.distance[k] * pixel_angles[k] if on_object else 0.0)
-            work[OBJECT_X + asked] = work[X + k] + lift * work[NX + k]
-            work[OBJECT_Y + asked] = work[Y + k] + lift * work[NY + k]
-            work[OBJECT_Z + asked] = work[Z + k] + lift * work[NZ + k]
-            strip.other[asked] = k
+            lift = 1e-4 + (0.05 * distance[k] * pixel_angles[k] if on_object else 0.0)
+            work[OBJECT_X + asked] = x + lift * work[NX + k]
+            work[OBJECT_Y + asked] = y + lift * work[NY + k]
+            work[OBJECT_Z + asked] = z + lift * work[NZ + k]
+            other[asked] = k
             asked += 1
     if asked > 0:
-        x, y, z = OBJECT_X, OBJECT_Y, OBJECT_Z
-        sun_hidden(occluders.casters, work[x : x + asked], work[y : y + asked], work[z : z + asked], strip.hidden)
+        xs, ys, zs = (
+            work[OBJECT_X : OBJECT_X + asked],
+            work[OBJECT_Y : OBJECT_Y + asked],
+            work[OBJECT_Z : OBJECT_Z + asked],
+        )
+        sun_hidden(casters, xs, ys, zs, hidden)
         for m in range(asked):
-            work[LIT + strip.other[m]] *= 0.0 if strip.hidden[m] else 1.0
+            work[LIT + other[m]] *= 0.0 if hidden[m] else 1.0
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _dim_sun(light: Light, distance: Array, work: Array) -> None:
     """What a round body at the camera's place and clouds leave of the sun."""
-    sun, law, drift = light.sun, light.law, light.drift
+    sun, law, drift, cover = light.sun, light.law, light.drift, light.cover
     for k in range(distance.size):
         if work[COS_I + k] <= 0.0:
             continue
@@ -378,17 +391,17 @@ def _dim_sun(light: Light, distance: Array, work: Array) -> None:
         if drift[4] > 0.0:
             up = max(drift[1] - work[Z + k], 0.0) / sun[2]
             x, y = work[X + k] + up * sun[0] - drift[2], work[Y + k] + up * sun[1] - drift[3]
-            work[LIT + k] *= 1.0 - drift[4] * cloud_cover(light.cover, drift[0], x, y)
+            work[LIT + k] *= 1.0 - drift[4] * cloud_cover(cover, drift[0], x, y)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _draw_sky(light: Light, pixel_angles: Array32, body: Ints, work: Array, radiance: Array32) -> None:
     """Radiance factor of the pixels that see the sky."""
-    sun = light.sun
+    sun, sky, radius = light.sun, light.sky, light.law[7]
     for k in range(body.size):
         if body[k] == SKY:
             cos_g = work[DX + k] * sun[0] + work[DY + k] * sun[1] + work[DZ + k] * sun[2]
-            radiance[k] = sky_brightness(light.sky, sun[2], light.law[7], work[DZ + k], cos_g, pixel_angles[k])
+            radiance[k] = sky_brightness(sky, sun[2], radius, work[DZ + k], cos_g, pixel_angles[k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -421,6 +434,9 @@ def shade(
     law = light.law
     reflectance = (law[0], law[1], law[2], law[3], law[4], law[5])
     origins, directions, normals = rays.origins.reshape(-1), rays.directions.reshape(-1), picture.normal.reshape(-1)
+    levels, spacing = ground.levels, ground.spacing
+    finest = GroundLevel(levels[0], ground.ceilings[0], 1.0 / spacing)
+    terrain = levels[occluders.shadow.level]
     near = no_cells()
     work = np.empty(ROWS * ROW)
     strip = _Strip(
@@ -442,12 +458,12 @@ def shade(
         body[:] = GROUND
         here, there = 3 * first, 3 * last
         _place(rotation, centre, origins[here:there], directions[here:there], angles, met.distance, width, work)
-        n_ground, n_blended, n_other = _select_levels(ground, met, strip)
-        _sample_ground(ground, n_ground, n_blended, width, strip, near)
+        n_ground, n_blended, n_other = _select_levels(spacing, ground.top_level, met, strip)
+        _sample_ground(levels, 1.0 / spacing, n_ground, n_blended, width, strip, near)
         seen = _sample_objects(materials, met, angles, n_other, strip, body)
         _photometric_angles(towards, width, work)
         _apply_texture(materials, width, seen, strip)
-        _cast_shadows(ground, met, angles, light, occluders, body, strip)
+        _cast_shadows(finest, terrain, met, angles, light, occluders, body, strip)
         if law[6] > 0.0 or light.drift[4] > 0.0:
             _dim_sun(light, met.distance, work)
         _reflect(reflectance, width, work, radiance)

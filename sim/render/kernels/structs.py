@@ -1,4 +1,8 @@
-"""What compiled kernels take and return: small structs of arrays, by what they hold."""
+"""What compiled kernels take and return: small structs of arrays, by what they hold.
+
+A loop over pixels takes the arrays out of their structs before it begins, and gives inlined functions arrays alone:
+each copy of a struct counts a reference to every array in it, which takes longer than a pixel does.
+"""
 
 from __future__ import annotations
 
@@ -165,12 +169,6 @@ class Picture(NamedTuple):
     radiance: Array32
     body: Ints
     normal: Array32
-
-
-@njit(cache=True, inline="always")
-def ground_level(ground: Ground, n: int) -> GroundLevel:
-    """The n-th level of the ground."""
-    return GroundLevel(ground.levels[n], ground.ceilings[n], 1.0 / ground.spacing / (1 << n))
 
 
 @njit(cache=True, inline="always")

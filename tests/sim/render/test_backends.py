@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render.kernels.structs import Pose
 from marsyard.sim.terrain import TerrainParameters, synthesise
 
 surface = synthesise(TerrainParameters(samples=256, rms_slope_deg=6.0, outer_scale_m=200.0), np.random.default_rng(1))
@@ -32,7 +33,8 @@ pose = rigid(Rotation.from_euler("zxy", [30.0, 20.0, 15.0], degrees=True), np.ar
 scene = Scene(surface, (10.0, 20.0), Sun(direction(1.0, 0.7)), Photometry())
 renderer = Renderer(sys.argv[1])
 frame = renderer.render(scene, PixelRays.of(camera), pose)
-depth, _ = renderer._draw(scene, PixelRays.of(camera), pose.rotation.as_matrix(), pose.translation, 1000.0)
+camera_pose = Pose(pose.rotation.as_matrix(), pose.translation)
+depth = renderer._draw(scene, PixelRays.of(camera), camera_pose, 1000.0).depth
 np.savez(sys.argv[2], radiance=frame.radiance, distance=frame.range_m, depth=depth)
 """
 
