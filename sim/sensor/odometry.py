@@ -79,6 +79,14 @@ class OdometryParameters(Parameters):
     visual: VisualOdometryParameters = VisualOdometryParameters()
 
 
+#: Odometry without errors of its own: slip alone makes it wrong, and visual odometry sees that.
+EXACT = OdometryParameters(
+    scale_error=0.0, walk_m=0.0, heading_scale_error=0.0, heading_drift_deg_m=0.0, heading_walk_deg=0.0,
+    misalignment_deg=0.0, tilt_noise_deg=0.0,
+    visual=VisualOdometryParameters(scale_error=0.0, walk_m=0.0, floor_m=0.0),
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class PoseEstimate:
     """What the rover believes at a stop.

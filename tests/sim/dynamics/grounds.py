@@ -8,18 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from marsyard.sim.dynamics import SlipParameters
-from marsyard.sim.sensor.odometry import OdometryParameters, VisualOdometryParameters
 
 #: Wheels that do exactly as they are told.
 NO_SLIP = SlipParameters(
     flat=0.0, full_slope_deg=89.0, exponent=100.0, downhill=0.0, across=0.0, turn=0.0, turn_slope=0.0,
     soil_spread=0.0, step_spread=0.0, wander_deg_m=0.0,
-)  # fmt: skip
-#: Odometry without errors of its own.
-EXACT = OdometryParameters(
-    scale_error=0.0, walk_m=0.0, heading_scale_error=0.0, heading_drift_deg_m=0.0, heading_walk_deg=0.0,
-    misalignment_deg=0.0, tilt_noise_deg=0.0,
-    visual=VisualOdometryParameters(scale_error=0.0, walk_m=0.0, floor_m=0.0),
 )  # fmt: skip
 
 

@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.dynamics import MER, Drive, Ground, SlipParameters, Soil, drive, settle
 from marsyard.sim.measurements import DriveCommand
-from marsyard.sim.sensor.odometry import Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
-from tests.sim.dynamics.grounds import EXACT, NO_SLIP, Plane, uphill_east
+from marsyard.sim.sensor.odometry import EXACT, Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
+from tests.sim.dynamics.grounds import NO_SLIP, Plane, uphill_east
 
 EAST = 0.5 * np.pi
 STRAIGHT = DriveCommand(forward_m=0.8)
