@@ -210,9 +210,8 @@ def answers_of(file: Path, form: OfflineForm[Answer]) -> Mapping[int, Answer]:
 
 
 @lru_cache(maxsize=4)
-def _read(file: Path, required: tuple[str, ...], _time: int, _size: int) -> Mapping[int, Any]:
-    """The answers of a file as it is now; the form goes by its columns."""
-    form = next(one for one in (VELOCITY_FORM, SITE_FORM) if one.required == required)
+def _read(file: Path, form: OfflineForm[Any], _time: int, _size: int) -> Mapping[int, Any]:
+    """Read the answers of a file as it is now."""
     header, lines = read_lines(file, MAX_ROWS)
     problems = list(_header_problems(header, form))
     if problems:

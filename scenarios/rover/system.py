@@ -10,7 +10,7 @@ VTT = System(
     summary="Position of a target that a rover drives at, tracked in the pictures of its mast.",
     scenarios={
         "rover": "marsyard.scenarios.rover.scenario:RoverScenario",
-        "rover-drive": "marsyard.scenarios.rover.shared:SharedDriveScenario",
+        "rover-drive": "marsyard.scenarios.rover.scenario:SharedDriveScenario",
     },
     tasks=("marsyard.scenarios.estimators:TRACKING",),
     catalogue=SCENARIOS_FOLDER / "catalogue" / "vtt-*.toml",
