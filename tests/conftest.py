@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import sys
@@ -37,8 +38,15 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", 
 os.environ["MPLBACKEND"] = "Agg"
 # Programs that tests start, and their workers, import the tests' modules by name.
 os.environ["PYTHONPATH"] = os.pathsep.join([*filter(None, [os.environ.get("PYTHONPATH")]), str(ROOT)])
-# Terrains that tests build outlive the run, but stay out of the user's own cache.
-os.environ.setdefault("MARSYARD_CACHE", str(ROOT / "build" / "test-cache"))
+# Terrains that tests build outlive the run, but stay out of the user's own cache; compiled kernels are shared with it.
+if "MARSYARD_CACHE" not in os.environ:
+    _CACHE = ROOT / "build" / "test-cache"
+    _KERNELS = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "marsyard" / "kernels"
+    os.environ["MARSYARD_CACHE"] = str(_CACHE)
+    if _KERNELS.is_dir() and not (_CACHE / "kernels").exists():
+        _CACHE.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            (_CACHE / "kernels").symlink_to(_KERNELS)
 
 hypothesis.settings.register_profile("marsyard", deadline=None, derandomize="CI" in os.environ)
 hypothesis.settings.load_profile("marsyard")

@@ -10,8 +10,9 @@ from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.store.columns import Row
-from marsyard.cli.compile import SMALL
-from marsyard.scenarios.rover.shared import SharedDriveParameters, SharedDriveScenario
+from marsyard.scenarios.rover.scenario import SharedDriveScenario
+from marsyard.scenarios.rover.shared import SharedDriveParameters
+from marsyard.scenarios.systems import systems
 from marsyard.sim.streams import Streams
 
 
@@ -21,7 +22,9 @@ def _row_of(scenario: str) -> Row:
         result = SharedDriveScenario().run(_short_drive(), Streams(1, "catalogue", 0))
     else:
         small = {
-            load_campaign(name, settings).configuration.scenario: (name, settings) for name, settings in SMALL.items()
+            load_campaign(name, settings).configuration.scenario: (name, settings)
+            for system in systems()
+            for name, settings in system.compiled_by.items()
         }
         campaign = load_campaign(*small.get(scenario, ("dimes-fieldtest", ())))
         result = campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
