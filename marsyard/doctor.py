@@ -316,7 +316,7 @@ def _check_backend(backend: str, probe: Probe) -> Check:
 def check_numba_cache() -> Check:
     """Whether compiled kernels can be kept; where not, every process compiles them anew."""
     with contextlib.suppress(ImportError):
-        importlib.import_module("marsyard.sim")  # which tells numba where, unless the user has
+        importlib.import_module("marsyard.sim")  # which sets numba's folder, unless the user has
     place = Path(os.environ.get("NUMBA_CACHE_DIR", Path.home() / ".cache" / "numba"))
     if _writable(place):
         return Check("numba cache", f"{place} is writable")

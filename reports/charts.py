@@ -115,7 +115,7 @@ def rate_figure(lines: Sequence[RateLine], labels: tuple[str, str], limit: tuple
     return figure
 
 
-#: How a kind of outcome is drawn; none is told by its colour alone.
+#: How a kind of outcome is drawn; none is distinguished by its colour alone.
 BARS: Mapping[str, Mapping[str, Any]] = {
     "full": {"color": SERIES[0]},
     "hatched": {"color": "none", "edgecolor": SERIES[1], "hatch": "////"},

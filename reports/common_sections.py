@@ -36,7 +36,7 @@ ROOM = "room"
 
 def answers_section(subject: Subject) -> Section | None:
     """Shares of cases with an answer, with room, and of answers beyond the bound: availability and "do no harm"; None
-    where rows tell no answers.
+    where rows hold no answers.
     """
     shares = answer_shares(subject)
     if not shares:
@@ -63,7 +63,7 @@ def answers_section(subject: Subject) -> Section | None:
 
 
 def answer_shares(subject: Subject) -> Mapping[str, Share]:
-    """The shares by name; those alone that the rows tell."""
+    """The shares by name; only those that the rows hold."""
     frame = subject.whole
     if not is_flag(frame, "answered") or frame.empty:
         return {}
@@ -116,8 +116,8 @@ def scatter_section(subject: Subject) -> Section | None:
     return Section("scatter", "Scatter", "Scatter of the errors", [Block(text=text, grid=grid, note=note)], data)
 
 
-#: Conditions that are ranked, and cases that are looked at: the first ones, which tell as much as they need to.
-MOST_CONDITIONS, MOST_CASES = 12, 20_000
+#: Conditions that are ranked, and cases that are looked at: the first ones, which are enough to rank by.
+MAX_CONDITIONS, MAX_CASES = 12, 20_000
 
 
 def drivers_section(subject: Subject) -> Section | None:
@@ -125,7 +125,7 @@ def drivers_section(subject: Subject) -> Section | None:
     metric = subject.metric
     if metric is None:
         return None
-    frame = subject.frame.head(MOST_CASES)
+    frame = subject.frame.head(MAX_CASES)
     responses = {"the size of errors": np.abs(numbers(frame, metric))}
     if subject.bound is not None:
         responses["failures"] = (~succeeded(frame, metric, subject.bound)).astype(np.float64)
@@ -134,9 +134,9 @@ def drivers_section(subject: Subject) -> Section | None:
     if not known:
         return None
     note = (
-        f"Share: part of the variance of the ranks that the condition alone explains, whatever the curve (first-order "
-        f"index). Intervals at {stated(CONFIDENCE)} confidence, fewer cases taken where terrains share condition and "
-        "response. p: that it explains nothing, corrected for the number of conditions (Holm). A failure is a case "
+        "Share: part of the variance of the ranks that the condition alone explains, for a curve of any shape "
+        f"(first-order index). Intervals at {stated(CONFIDENCE)} confidence, fewer cases taken where terrains share "
+        "condition and response. p: that it explains nothing, corrected for the number of conditions (Holm). A failure is a case "
         "without an answer within the bound. Nothing is claimed about causes."
     )
     blocks = [Block(heading=f"What explains {name}", grid=_ranked_grid(found)) for name, found in known.items()]
@@ -155,7 +155,7 @@ def ranked_drivers(frame: pd.DataFrame, metric: str, response: Float[np.ndarray,
     groups = terrain_groups(frame)
     found: Mapping[str, Driver] = {
         column: one
-        for column in driver_columns(frame, metric, MOST_CONDITIONS)
+        for column in driver_columns(frame, metric, MAX_CONDITIONS)
         if (one := driver(numbers(frame, column), response, groups, CONFIDENCE)) is not None
     }
     p_values = dict(zip(found, holm([one.p_value for one in found.values()]), strict=True))
@@ -351,8 +351,8 @@ def consistencies(frame: pd.DataFrame) -> list[Consistency]:
     """Those of all algorithms in the rows that state covariances."""
     judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "judged"
     frames = {judged: frame, **{name: own_frame(frame, name) for name in compared_names(frame)}}
-    told = {name: numbers(own, NEES) for name, own in frames.items() if NEES in own}
-    known = {name: nees[np.isfinite(nees)] for name, nees in told.items()}
+    by_name = {name: numbers(own, NEES) for name, own in frames.items() if NEES in own}
+    known = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
     return [consistency(name, nees) for name, nees in known.items() if nees.size]
 
 

@@ -1,6 +1,6 @@
 """Algorithms compared on the same cases, and two stored campaigns compared with each other.
 
-Algorithms are paired: both had the same pictures, or the same draws. Whether one succeeds more often is told by the
+Algorithms are paired: both had the same pictures, or the same draws. Whether one succeeds more often is tested by the
 cases in which just one of them does (`marsyard.reports.statistics.changes`); whose errors are smaller, by the
 differences of the cases that both answered. Where cases share terrains, whole terrains are compared. Further algorithms
 stand in the rows as `marsyard.scenarios.trial` puts them.
@@ -353,7 +353,7 @@ def _unpaired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: 
 
 
 def _apart_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure) -> float:
-    """As `_unpaired_p`, of campaigns that have no terrain in common, whatever their numbers."""
+    """As `_unpaired_p`, of campaigns that have no terrain in common, also where they share numbers."""
     here, there = sample_of(first, mine), sample_of(second, other)
     if not here.terrains.size or not there.terrains.size:
         return math.nan

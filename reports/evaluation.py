@@ -128,8 +128,8 @@ def judged(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
 def next_look(verdicts: Sequence[Verdict], how: Sampled, cases: int) -> int | None:
     """The number of cases at which to look again; None where the campaign may stop.
 
-    It may where every requirement is met or not met, or can be neither by the last look, whatever the cases left do.
-    Requirements that are decided by the estimate are not waited for.
+    It may stop where every requirement is met or not met, or can be neither by the last look with any results of the
+    remaining cases. Requirements that are decided by the estimate do not count.
     """
     if how.most_cases is None or cases >= how.most_cases:
         return None

@@ -19,7 +19,7 @@ SCHEMA = 1
 #: Nights that a night is held against, at most: the latest ones.
 WINDOW = 30
 #: Cases of a figure that are kept of a night, at most.
-MOST_CASES = 10_000
+MAX_CASES = 10_000
 
 RUNNING, FINISHED, INTERRUPTED = "running", "finished", "interrupted"
 
@@ -211,7 +211,7 @@ def utc_now() -> str:
 
 
 def _packed(sample: Sample) -> tuple[bytes, bytes]:
-    values, terrains = sample.values[:MOST_CASES], sample.terrains[:MOST_CASES]
+    values, terrains = sample.values[:MAX_CASES], sample.terrains[:MAX_CASES]
     return values.astype("<f4").tobytes(), terrains.astype("<i8").tobytes()
 
 

@@ -87,9 +87,9 @@ class SectionDeclaration:
         blocks: list[Block] = []
         data: dict[str, Any] = {}
         for place, part in enumerate(self.parts):
-            shown, told = part.draw(frame, subject, f"{self.key.replace('-', '')}{place}")
+            shown, values = part.draw(frame, subject, f"{self.key.replace('-', '')}{place}")
             blocks += shown
-            data |= told
+            data |= values
         if not blocks:
             return None
         return Section(

@@ -178,6 +178,6 @@ def _compared(compared: int, found: Sequence[Change]) -> str:
 
 
 def _cell(text: str) -> str:
-    """A text that stays a text in a table, whatever it holds."""
+    """A text that stays a text in a table, with any characters."""
     marks = {letter: f"&#{ord(letter)};" for letter in "&<>|"} | {letter: f"\\{letter}" for letter in "\\`*_[]#"}
     return "".join(marks.get(letter, letter) for letter in " ".join(text.split()))

@@ -26,7 +26,7 @@ def read_paper(path: Path) -> Mapping[str, Any]:
 
 @dataclass(frozen=True)
 class PaperFacts:
-    """What a paper tells of single runs, next to ours: `[[facts]]` of its TOML file.
+    """What a paper reports of single runs, next to ours: `[[facts]]` of its TOML file.
 
     Each has `campaign` (the name of the campaign that repeats the run), `title`, `source`, `note`, and `rows`. A row
     has `name` (with its unit), `paper` (the paper's value as text; none for a dash), `column`, and optionally
@@ -49,9 +49,9 @@ class PaperFacts:
         facts = {one["campaign"]: one for one in read_paper(self.path)["facts"]}.get(subject.run.name)
         if facts is None or not any(row["column"] in subject.frame for row in facts["rows"]):
             return None
-        told = {row["name"]: (row.get("paper", NOTHING), ours_text(subject.frame, row)) for row in facts["rows"]}
-        grid = Grid(["", "Paper", "Ours"], [[name, paper, ours] for name, (paper, ours) in told.items()])
-        data: dict[str, Any] = {name: {"paper": paper, "ours": ours} for name, (paper, ours) in told.items()}
+        texts = {row["name"]: (row.get("paper", NOTHING), ours_text(subject.frame, row)) for row in facts["rows"]}
+        grid = Grid(["", "Paper", "Ours"], [[name, paper, ours] for name, (paper, ours) in texts.items()])
+        data: dict[str, Any] = {name: {"paper": paper, "ours": ours} for name, (paper, ours) in texts.items()}
         blocks = [Block(grid=grid, note=f"{_MEDIANS} {facts.get('note', '')}".strip())]
         if subject.run.name in self.further:
             shown, numbers_too = self.further[subject.run.name].draw(subject.frame, subject, "paper")

@@ -27,7 +27,7 @@ Products = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class TableRow:
-    """A row of a case's table: its values as texts, and whether what it tells of succeeded."""
+    """A row of a case's table: its values as texts, and whether the case that it describes succeeded."""
 
     values: Sequence[str]
     succeeded: bool

@@ -51,10 +51,10 @@ def handed_copy(original: Given, *, writable: bool = False) -> Given:
     return made
 
 
-def fingerprint(thing: Any, leave: tuple[str, ...] = ()) -> str:
+def fingerprint(value: Any, leave: tuple[str, ...] = ()) -> str:
     """SHA-256 of all values, bit for bit, in arrays, poses and data classes; fields named in `leave` are left out."""
     digest = hashlib.sha256()
-    for part in _parts(thing, leave):
+    for part in _parts(value, leave):
         if isinstance(part, np.ndarray):
             digest.update(f"{part.dtype}{part.shape}".encode())
             digest.update(np.ascontiguousarray(part).data)
@@ -67,16 +67,16 @@ def fingerprint(thing: Any, leave: tuple[str, ...] = ()) -> str:
     return digest.hexdigest()
 
 
-def _parts(thing: Any, leave: tuple[str, ...] = ()) -> Iterator[Any]:
-    """The arrays, poses and other values in data classes, lists and tuples, and what tells these apart."""
-    if is_dataclass(thing) and not isinstance(thing, type):
-        yield type(thing).__name__
-        for field in fields(thing):
+def _parts(value: Any, leave: tuple[str, ...] = ()) -> Iterator[Any]:
+    """The arrays, poses and other values in data classes, lists and tuples, and the names of their types."""
+    if is_dataclass(value) and not isinstance(value, type):
+        yield type(value).__name__
+        for field in fields(value):
             if field.name not in leave:
-                yield from _parts(getattr(thing, field.name), leave)
-    elif isinstance(thing, list | tuple):
-        yield len(thing)
-        for inner in thing:
+                yield from _parts(getattr(value, field.name), leave)
+    elif isinstance(value, list | tuple):
+        yield len(value)
+        for inner in value:
             yield from _parts(inner, leave)
     else:
-        yield thing
+        yield value

@@ -181,7 +181,7 @@ def rocks_in_sight(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> 
     """The rocks that the eye can tell apart, and those near it whose shadows it may see; bodies carry rocks' numbers.
 
     Where rocks of `SMALLEST_ROCK_PX` would come to more than about `ROCK_TRIANGLES`, only larger ones are taken. Rocks
-    are drawn so finely that they cannot be told from their finest shape
+    are drawn so finely that they look the same as their finest shape
     (`marsyard.sim.terrain.rocks.shapes.DEVIATION_PX`), except where that takes more than `DETAIL_TRIANGLES`, as fine
     pixels over fields of clinker do.
     """

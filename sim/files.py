@@ -18,7 +18,7 @@ _KINDS = (
     (stat.S_ISCHR, "a character device"),
     (stat.S_ISBLK, "a block device"),
 )
-#: What numpy raises for archives and headers that are none.
+#: What numpy and zipfile raise for damaged archives and headers; NotImplementedError is an unknown compression.
 ARCHIVE_ERRORS = (OSError, ValueError, EOFError, TypeError, KeyError, NotImplementedError, zipfile.BadZipFile)
 
 #: Shape and type of an array, by its header.

@@ -62,7 +62,7 @@ class DimesOptions:
         maximum so near stays within the requirement of 5 m/s.
     imu_threshold_m_s
         Largest horizontal difference between the change of velocity from a first-pair to a second-pair track and that
-        of the IMU. By Monte Carlo (`benchmarks.threshold_derivation`, kept in `imu_threshold.json` beside it; see
+        of the IMU. By Monte Carlo (`benchmarks.threshold_derivation`, kept in `imu_threshold.json` next to it; see
         `docs/adr/0008-threshold-of-the-imu-check.md`): 99.5 % of descents with one right track in each pair, with
         altitude, attitude, relief and match errors as specified, agree better.
     """

@@ -23,7 +23,7 @@ from marsyard.algorithms.exchange.replies import (
     numbers,
 )
 from marsyard.algorithms.exchange.serving import Session, ask_case
-from marsyard.algorithms.exchange.stops import told_pose, told_target, write_mast, write_stop
+from marsyard.algorithms.exchange.stops import encode_pose, encode_target, write_mast, write_stop
 from marsyard.algorithms.interface import (
     MastAim,
     PixelBox,
@@ -126,11 +126,13 @@ class ExecutableTargetTracker:
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
         """Tells the target and the rover's pose."""
-        self._ask_state("designate", {"target": told_target(target), "world_from_rover": told_pose(world_from_rover)})
+        self._ask_state(
+            "designate", {"target": encode_target(target), "world_from_rover": encode_pose(world_from_rover)}
+        )
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
         """Where the program wants the mast to look."""
-        values = {"world_from_rover": told_pose(world_from_rover), "mast": self._write_mast(mast)}
+        values = {"world_from_rover": encode_pose(world_from_rover), "mast": self._write_mast(mast)}
         answer, details = self._session.ask("aim", values)
         return in_its_words(details.stderr, lambda: checked_aim(_aim(answer), mast))
 

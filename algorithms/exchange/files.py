@@ -42,7 +42,7 @@ ANSWER_VERSIONS = (1, 2)
 
 CASE_FILE, FRAME_FILE = "case.json", "frame.json"
 
-#: What is known of a detector beside its flat field.
+#: What is known of a detector next to its flat field.
 _CALIBRATION = tuple(one.name for one in fields(DetectorCalibration) if one.name != "flat_field")
 
 #: Form in which pictures are written.
@@ -53,37 +53,37 @@ def write_case(
     folder: Path, measurements: DescentMeasurements | LandingMeasurements, pictures: Pictures = "pgm"
 ) -> None:
     """Writes what instruments delivered into a folder that is there. Raises OSError where that fails."""
-    told = _descent(measurements) if isinstance(measurements, DescentMeasurements) else _landing(measurements)
+    content = _descent(measurements) if isinstance(measurements, DescentMeasurements) else _landing(measurements)
     images = _write_images(folder, measurements.images, pictures)
-    write_json(folder / CASE_FILE, {"exchange": EXCHANGE, **told, "images": images})
+    write_json(folder / CASE_FILE, {"exchange": EXCHANGE, **content, "images": images})
 
 
 def write_frame(folder: Path, frame: DescentFrame) -> None:
     """Writes what came with one picture of a descent into a folder that is there. Raises OSError where that fails."""
     (image,) = _write_images(folder, [frame.image], "pgm")
-    told = {
+    content = {
         "exchange": EXCHANGE,
         "image": image,
-        "attitude": _told_attitude(frame.attitude),
-        "altitude": _told_altitude(frame.altitude),
+        "attitude": _encode_attitude(frame.attitude),
+        "altitude": _encode_altitude(frame.altitude),
         "sun_direction": frame.sun_direction.tolist(),
-        "inertial_velocity_m_s": _told_vector(frame.inertial_velocity_m_s),
-        "interval_velocity_m_s": _told_vector(frame.interval_velocity_m_s),
+        "inertial_velocity_m_s": _encode_vector(frame.inertial_velocity_m_s),
+        "interval_velocity_m_s": _encode_vector(frame.interval_velocity_m_s),
     }
-    write_json(folder / FRAME_FILE, told)
+    write_json(folder / FRAME_FILE, content)
 
 
 def read_frame(folder: Path) -> DescentFrame:
     """Reads what `write_frame` wrote. Raises ValueError where the folder holds no frame, or one of another version."""
-    with reading(folder / FRAME_FILE, "picture of a descent") as told:
-        _check_version(told)
+    with reading(folder / FRAME_FILE, "picture of a descent") as content:
+        _check_version(content)
         return DescentFrame(
-            image=_read_image(folder, told["image"]),
-            attitude=_read_attitude(told["attitude"]),
-            altitude=_read_altitude(told["altitude"]),
-            sun_direction=_vector(told["sun_direction"]),
-            inertial_velocity_m_s=_optional_vector(told["inertial_velocity_m_s"]),
-            interval_velocity_m_s=_optional_vector(told["interval_velocity_m_s"]),
+            image=_read_image(folder, content["image"]),
+            attitude=_read_attitude(content["attitude"]),
+            altitude=_read_altitude(content["altitude"]),
+            sun_direction=_vector(content["sun_direction"]),
+            inertial_velocity_m_s=_optional_vector(content["inertial_velocity_m_s"]),
+            interval_velocity_m_s=_optional_vector(content["interval_velocity_m_s"]),
         )
 
 
@@ -95,10 +95,10 @@ def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
     ValueError
         Where the folder holds no case, or one of another version.
     """
-    with reading(folder / CASE_FILE, "case") as told:
-        _check_version(told)
-        images = [_read_image(folder, one) for one in told["images"]]
-        return _read_descent(told, images) if told["task"] == "velocity" else _read_landing(told, images)
+    with reading(folder / CASE_FILE, "case") as content:
+        _check_version(content)
+        images = [_read_image(folder, one) for one in content["images"]]
+        return _read_descent(content, images) if content["task"] == "velocity" else _read_landing(content, images)
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
@@ -115,62 +115,62 @@ def reading(path: Path, kind: str) -> Iterator[Mapping[str, Any]]:
         raise ValueError(f"{path} is no {kind}: {error}") from error
 
 
-def _check_version(told: Mapping[str, Any]) -> None:
-    if told["exchange"] != EXCHANGE:
-        raise ValueError(f"it has version {told['exchange']} of the exchange; this program reads {EXCHANGE}")
+def _check_version(content: Mapping[str, Any]) -> None:
+    if content["exchange"] != EXCHANGE:
+        raise ValueError(f"it has version {content['exchange']} of the exchange; this program reads {EXCHANGE}")
 
 
 def _descent(measurements: DescentMeasurements) -> dict[str, Any]:
     at = measurements.inertial_velocities_m_s
     return {
         "task": "velocity",
-        "attitudes": [_told_attitude(one) for one in measurements.attitudes],
-        "altitudes": [_told_altitude(one) for one in measurements.altitudes],
+        "attitudes": [_encode_attitude(one) for one in measurements.attitudes],
+        "altitudes": [_encode_altitude(one) for one in measurements.altitudes],
         "interval_velocities_m_s": measurements.interval_velocities_m_s.tolist(),
-        "inertial_velocities_m_s": _told_vector(at),
+        "inertial_velocities_m_s": _encode_vector(at),
         "sun_direction": measurements.sun_direction.tolist(),
     }
 
 
-def _read_descent(told: Mapping[str, Any], images: Sequence[DetectorImage]) -> DescentMeasurements:
+def _read_descent(content: Mapping[str, Any], images: Sequence[DetectorImage]) -> DescentMeasurements:
     return DescentMeasurements(
         images=tuple(images),
-        attitudes=tuple(_read_attitude(one) for one in told["attitudes"]),
-        altitudes=tuple(_read_altitude(one) for one in told["altitudes"]),
-        interval_velocities_m_s=_vector(told["interval_velocities_m_s"]).reshape(-1, 3),
-        sun_direction=_vector(told["sun_direction"]),
-        inertial_velocities_m_s=_optional_vector(told.get("inertial_velocities_m_s")),
+        attitudes=tuple(_read_attitude(one) for one in content["attitudes"]),
+        altitudes=tuple(_read_altitude(one) for one in content["altitudes"]),
+        interval_velocities_m_s=_vector(content["interval_velocities_m_s"]).reshape(-1, 3),
+        sun_direction=_vector(content["sun_direction"]),
+        inertial_velocities_m_s=_optional_vector(content.get("inertial_velocities_m_s")),
     )
 
 
-def _told_attitude(measured: AttitudeMeasurement) -> dict[str, Any]:
+def _encode_attitude(measured: AttitudeMeasurement) -> dict[str, Any]:
     return {"world_from_body_xyzw": measured.world_from_body.as_quat().tolist(), "time_s": measured.time_s}
 
 
-def _read_attitude(told: Mapping[str, Any]) -> AttitudeMeasurement:
-    return AttitudeMeasurement(Rotation.from_quat(told["world_from_body_xyzw"]), told["time_s"])
+def _read_attitude(content: Mapping[str, Any]) -> AttitudeMeasurement:
+    return AttitudeMeasurement(Rotation.from_quat(content["world_from_body_xyzw"]), content["time_s"])
 
 
-def _told_altitude(measured: AltitudeMeasurement) -> dict[str, Any]:
+def _encode_altitude(measured: AltitudeMeasurement) -> dict[str, Any]:
     known = math.isfinite(measured.altitude_m)
     return {"altitude_m": measured.altitude_m if known else None, "time_s": measured.time_s}
 
 
-def _read_altitude(told: Mapping[str, Any]) -> AltitudeMeasurement:
-    altitude_m = told["altitude_m"]
-    return AltitudeMeasurement(math.nan if altitude_m is None else altitude_m, told["time_s"])
+def _read_altitude(content: Mapping[str, Any]) -> AltitudeMeasurement:
+    altitude_m = content["altitude_m"]
+    return AltitudeMeasurement(math.nan if altitude_m is None else altitude_m, content["time_s"])
 
 
-def _told_vector(value: Float[np.ndarray, "..."] | None) -> list[Any] | None:
+def _encode_vector(value: Float[np.ndarray, "..."] | None) -> list[Any] | None:
     return None if value is None else value.tolist()
 
 
-def _vector(told: Any) -> Float64[np.ndarray, "..."]:
-    return np.array(told, dtype=np.float64)
+def _vector(content: Any) -> Float64[np.ndarray, "..."]:
+    return np.array(content, dtype=np.float64)
 
 
-def _optional_vector(told: Any) -> Float64[np.ndarray, "..."] | None:
-    return None if told is None else _vector(told)
+def _optional_vector(content: Any) -> Float64[np.ndarray, "..."] | None:
+    return None if content is None else _vector(content)
 
 
 def _landing(measurements: LandingMeasurements) -> dict[str, Any]:
@@ -191,20 +191,20 @@ def _landing(measurements: LandingMeasurements) -> dict[str, Any]:
     }
 
 
-def _read_landing(told: Mapping[str, Any], images: Sequence[DetectorImage]) -> LandingMeasurements:
+def _read_landing(content: Mapping[str, Any], images: Sequence[DetectorImage]) -> LandingMeasurements:
     poses = [
         PoseMeasurement(
             rigid(Rotation.from_quat(one["world_from_body_xyzw"]), np.array(one["position_world_m"])), one["time_s"]
         )
-        for one in told["poses"]
+        for one in content["poses"]
     ]
-    range_m = told["slant_range_m"]
+    range_m = content["slant_range_m"]
     return LandingMeasurements(
         images=(images[0], images[1]),
         poses=(poses[0], poses[1]),
         slant_range_m=math.nan if range_m is None else range_m,
-        up_body=np.array(told["up_body"], dtype=np.float64),
-        apriori_site_world=np.array(told["apriori_site_world"], dtype=np.float64),
+        up_body=np.array(content["up_body"], dtype=np.float64),
+        apriori_site_world=np.array(content["apriori_site_world"], dtype=np.float64),
     )
 
 
@@ -228,13 +228,13 @@ def _write_images(folder: Path, images: Sequence[DetectorImage], pictures: Pictu
     return written
 
 
-def _read_image(folder: Path, told: Mapping[str, Any]) -> DetectorImage:
-    known, shape = told["calibration"], (told["rows"], told["columns"])
+def _read_image(folder: Path, content: Mapping[str, Any]) -> DetectorImage:
+    known, shape = content["calibration"], (content["rows"], content["columns"])
     flat = np.fromfile(folder / known["flat_field"], dtype="<f8").reshape(shape)
     return DetectorImage(
-        counts=read_picture(folder / told["file"]),
-        time_s=told["time_s"],
-        camera=read_cahvor(folder / told["camera"]),
+        counts=read_picture(folder / content["file"]),
+        time_s=content["time_s"],
+        camera=read_cahvor(folder / content["camera"]),
         calibration=DetectorCalibration(flat.astype(np.float64), **{one: known[one] for one in _CALIBRATION}),
     )
 

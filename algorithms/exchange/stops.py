@@ -32,52 +32,53 @@ def write_mast(folder: Path, mast: MastCalibration) -> None:
     for name, camera in (("left", mast.left), ("right", mast.right)):
         write_cahvor(camera, folder / f"{name}.cahvor", frame=HEAD_FRAME)
     geometry = mast.geometry
-    told = {
+    content = {
         **{name: getattr(geometry, name).tolist() for name in _OFFSETS},
         **{name: list(getattr(geometry, name)) for name in _LIMITS},
         "left": {"camera": "left.cahvor", "columns": mast.left.size[0], "rows": mast.left.size[1]},
         "right": {"camera": "right.cahvor", "columns": mast.right.size[0], "rows": mast.right.size[1]},
     }
-    write_json(folder / MAST_FILE, told)
+    write_json(folder / MAST_FILE, content)
 
 
 def read_mast(folder: Path) -> MastCalibration:
     """Reads what `write_mast` wrote. Raises ValueError where the folder holds no mast."""
-    with reading(folder / MAST_FILE, "mast") as told:
-        left, right = (read_cahvor(folder / told[name]["camera"]) for name in ("left", "right"))
-        base, elbow, head = (np.array(told[name], dtype=np.float64) for name in _OFFSETS)
-        azimuths, elevations = ((told[name][0], told[name][1]) for name in _LIMITS)
+    with reading(folder / MAST_FILE, "mast") as content:
+        left, right = (read_cahvor(folder / content[name]["camera"]) for name in ("left", "right"))
+        base, elbow, head = (np.array(content[name], dtype=np.float64) for name in _OFFSETS)
+        azimuths, elevations = ((content[name][0], content[name][1]) for name in _LIMITS)
         return MastCalibration(MastGeometry(base, elbow, head, azimuths, elevations), left, right)
 
 
 def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
-    """Writes a stop's pictures and angles into a folder that is there; the mast is told apart."""
-    told: dict[str, Any] = {
+    """Writes a stop's pictures and angles into a folder that is there; the mast has a file of its own."""
+    content: dict[str, Any] = {
         "azimuth_rad": measurements.azimuth_rad,
         "elevation_rad": measurements.elevation_rad,
-        "world_from_rover": told_pose(measurements.world_from_rover),
+        "world_from_rover": encode_pose(measurements.world_from_rover),
     }
     for name, image in (("left", measurements.left), ("right", measurements.right)):
         write_picture(folder / f"{name}.pgm", image.counts)
         rows, columns = image.counts.shape
-        told[name] = {"file": f"{name}.pgm", "corner": list(image.corner), "columns": columns, "rows": rows}
-    write_json(folder / STOP_FILE, told)
+        content[name] = {"file": f"{name}.pgm", "corner": list(image.corner), "columns": columns, "rows": rows}
+    write_json(folder / STOP_FILE, content)
 
 
 def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
     """Reads what `write_stop` wrote. Raises ValueError where the folder holds no stop."""
-    with reading(folder / STOP_FILE, "stop") as told:
+    with reading(folder / STOP_FILE, "stop") as content:
         left, right = (
             MastImage(
-                read_picture(folder / told[name]["file"]), (int(told[name]["corner"][0]), int(told[name]["corner"][1]))
+                read_picture(folder / content[name]["file"]),
+                (int(content[name]["corner"][0]), int(content[name]["corner"][1])),
             )
             for name in ("left", "right")
         )
-        azimuth, elevation = float(told["azimuth_rad"]), float(told["elevation_rad"])
-        return RoverMeasurements(left, right, mast, azimuth, elevation, read_pose(told["world_from_rover"]))
+        azimuth, elevation = float(content["azimuth_rad"]), float(content["elevation_rad"])
+        return RoverMeasurements(left, right, mast, azimuth, elevation, read_pose(content["world_from_rover"]))
 
 
-def told_pose(pose: RigidTransform) -> dict[str, list[float]]:
+def encode_pose(pose: RigidTransform) -> dict[str, list[float]]:
     """A rover's pose: position in the world and unit quaternion, scalar last."""
     return {
         "position_world_m": np.asarray(pose.translation).tolist(),
@@ -85,14 +86,14 @@ def told_pose(pose: RigidTransform) -> dict[str, list[float]]:
     }
 
 
-def read_pose(told: Mapping[str, Any]) -> RigidTransform:
-    """Reads what `told_pose` told."""
+def read_pose(content: Mapping[str, Any]) -> RigidTransform:
+    """Read what `encode_pose` wrote."""
     return rigid(
-        Rotation.from_quat(told["world_from_rover_xyzw"]), np.array(told["position_world_m"], dtype=np.float64)
+        Rotation.from_quat(content["world_from_rover_xyzw"]), np.array(content["position_world_m"], dtype=np.float64)
     )
 
 
-def told_target(target: TargetDesignation) -> dict[str, Any]:
+def encode_target(target: TargetDesignation) -> dict[str, Any]:
     """A designation, in one of the three ways."""
     match target:
         case PixelTarget():
@@ -104,10 +105,12 @@ def told_target(target: TargetDesignation) -> dict[str, Any]:
             return {"position_site": target.position_site.tolist()}
 
 
-def read_target(told: Mapping[str, Any]) -> TargetDesignation:
-    """Reads what `told_target` told."""
-    if "pixel" in told:
-        return PixelTarget(np.array(told["pixel"], dtype=np.float64), told["azimuth_rad"], told["elevation_rad"])
-    if "position_rover" in told:
-        return RoverTarget(np.array(told["position_rover"], dtype=np.float64))
-    return SiteTarget(np.array(told["position_site"], dtype=np.float64))
+def read_target(content: Mapping[str, Any]) -> TargetDesignation:
+    """Read what `encode_target` wrote."""
+    if "pixel" in content:
+        return PixelTarget(
+            np.array(content["pixel"], dtype=np.float64), content["azimuth_rad"], content["elevation_rad"]
+        )
+    if "position_rover" in content:
+        return RoverTarget(np.array(content["position_rover"], dtype=np.float64))
+    return SiteTarget(np.array(content["position_site"], dtype=np.float64))

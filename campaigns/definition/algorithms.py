@@ -98,7 +98,7 @@ def _distribution_version(name: str) -> str | None:
 
 
 def _plain_options(options: object) -> dict[str, Any]:
-    """Options as JSON has them; empty where there are none, or they cannot be told so."""
+    """Options as JSON has them; empty where there are none, or JSON cannot hold them."""
     try:
         if isinstance(options, BaseModel):
             options = options.model_dump(mode="json")

@@ -26,7 +26,7 @@ Model = TypeVar("Model", bound=BaseModel)
 Key = tuple[str | int, ...]
 
 #: The most cases a campaign may have: numbers of cases are stored as 64-bit integers, and a slip of the keyboard shows.
-MOST_CASES = 1_000_000_000
+MAX_CASES = 1_000_000_000
 
 
 #: Populations that every campaign has; any other name in a population is a column of true and false.
@@ -123,7 +123,7 @@ class CampaignConfiguration(Parameters):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
     scenario: Annotated[str, Field(min_length=1)]
     description: str = ""
-    cases: Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)]
+    cases: Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)]
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = 0
     design: Design = Design()
     parameters: dict[str, Any] = Field(default_factory=dict)
@@ -132,12 +132,12 @@ class CampaignConfiguration(Parameters):
     requirements: tuple[Requirement, ...] = ()
     retain: Retain = Retain()
     limits: Limits = Limits()
-    most_cases: Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)] | None = Field(
+    most_cases: Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)] | None = Field(
         default=None,
         description="cases of the last look at a campaign that stops itself when its verdicts are decided; set by "
         "--until-decided",
     )
-    appended: tuple[Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)], ...] = Field(
+    appended: tuple[Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)], ...] = Field(
         default=(), strict=False, description="sizes of the blocks of cases that were added behind the first"
     )
 

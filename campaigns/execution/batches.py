@@ -10,7 +10,7 @@ from collections.abc import Iterable
 BATCH_S = 1.0
 
 #: The most cases in a batch.
-MOST_CASES = 1000
+MAX_CASES = 1000
 
 #: Weight of the latest batch in the running mean of the time that a case takes.
 _WEIGHT = 0.3
@@ -51,5 +51,5 @@ class Batches:
         latest = seconds / items
         known = not math.isnan(self._item_s)
         self._item_s = self._item_s + _WEIGHT * (latest - self._item_s) if known else latest
-        wanted = MOST_CASES if self._item_s <= 0.0 else int(BATCH_S / self._item_s)
-        self._size = max(1, min(wanted, 2 * self._size, MOST_CASES))
+        wanted = MAX_CASES if self._item_s <= 0.0 else int(BATCH_S / self._item_s)
+        self._size = max(1, min(wanted, 2 * self._size, MAX_CASES))

@@ -3,7 +3,7 @@
 No case runs in a Dask worker's own process. What is sent there is a watcher: it keeps worker processes like those of
 one machine, one for each of the Dask worker's threads, and runs its batch in one with the same limits
 (`marsyard.campaigns.execution.workers`). A case that hangs, takes the memory or kills its process so costs that process
-alone, and is told apart as at home. Where a Dask worker itself goes, with its machine, Dask gives its batches to
+alone, and its cause is identified as on one machine. Where a Dask worker itself is lost, Dask gives its batches to
 others; a batch that lost several (Dask's `allowed-failures`, by default 3) comes back, is cut into single cases, and
 only a case that does so again counts as crashed.
 """

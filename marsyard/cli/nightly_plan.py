@@ -10,7 +10,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import MOST_CASES, read_table
+from marsyard.campaigns.definition.configuration import MAX_CASES, read_table
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.sim.parameters import Parameters
 
@@ -24,7 +24,7 @@ class PlannedCampaign(Parameters):
     """A campaign of the plan, with what is said of it instead of its file."""
 
     campaign: Annotated[str, Field(min_length=1)]
-    cases: Annotated[int, Field(strict=True, ge=1, le=MOST_CASES)] | None = None
+    cases: Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)] | None = None
     override: Texts = Field(default=(), alias="set")
     algorithms: Texts = ()
 

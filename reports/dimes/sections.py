@@ -89,7 +89,7 @@ def field_test_section(subject: Subject) -> Section | None:
             )
         blocks.append(Block(heading="Errors by category", plates=plates, note=note))
     data = {"cells": [one | {"valid": asdict(one["valid"])} for one in found]}
-    return Section("field-test", "Field test", "Runs and categories, beside the paper's Fig. 11", blocks, data)
+    return Section("field-test", "Field test", "Runs and categories, next to the paper's Fig. 11", blocks, data)
 
 
 def field_cells(subject: Subject) -> list[dict[str, Any]]:
@@ -212,7 +212,7 @@ FIRING = SectionDeclaration(
 WITH, WITHOUT = "touchdown_speed_with_m_s", "touchdown_speed_without_m_s"
 #: A landing is helped or harmed where the speeds differ by more than this, m/s.
 NOTABLE_M_S = 1.0
-#: Speeds that the table tells the share above of, m/s.
+#: Speeds above which the table gives the fraction of cases, m/s.
 SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
 
 
@@ -389,8 +389,8 @@ def analyse(subject: Subject, metric: str) -> list[Driver]:
     ranks = weighted_correlations(stats.rankdata(x, axis=0), stats.rankdata(y), weights)
     # the sample's own value, then the interval over the resamples
     values = [ranks, slopes / y.std(), slopes / x.std(axis=0) * (high - low)]
-    told = [[(float(one[0, k]), *percentile_interval(one[1:, k])) for one in values] for k in range(len(columns))]
-    return [Driver(name, float(low[k]), float(high[k]), *told[k]) for k, name in enumerate(columns)]
+    intervals = [[(float(one[0, k]), *percentile_interval(one[1:, k])) for one in values] for k in range(len(columns))]
+    return [Driver(name, float(low[k]), float(high[k]), *intervals[k]) for k, name in enumerate(columns)]
 
 
 def regressions(

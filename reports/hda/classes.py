@@ -109,8 +109,8 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
         Block(heading="Hazards missed, by height and slope", plates=[figure], grid=by_class),
         Block(grid=counted, note=_CLASSES_NOTE),
     ]
-    told = {name: asdict(one) for name, one in rates.items()}
-    return blocks, {"rates": told, "classes": [asdict(one) for one in classes]}
+    as_data = {name: asdict(one) for name, one in rates.items()}
+    return blocks, {"rates": as_data, "classes": [asdict(one) for one in classes]}
 
 
 @in_page_style
@@ -185,7 +185,7 @@ class Curve:
 
 
 def limits_section(subject: Subject) -> Section | None:
-    """Features tracked by the change between the pictures; None where flights do not change one thing at a time."""
+    """Features tracked by the change between the pictures; None where flights do not change one condition at a time."""
     frame = landing_rows(subject)
     found = [] if frame is None else curves(frame)
     if not found:

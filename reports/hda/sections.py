@@ -165,7 +165,7 @@ FAULT_OUTCOMES = OutcomesBySize(
     ),
     caption="Full: a truly safe site. Hatched: no safe site. Dotted: not converged. Crossed: a site that is not safe.",
     note="Not converged: said so, and the a-priori site is what is left. Wrong: a site was reported as safe and is "
-    f"not, with the interval of its share at {stated(CONFIDENCE)}. 'No safe site' may be right: rows tell no "
+    f"not, with the interval of its share at {stated(CONFIDENCE)}. 'No safe site' may be right: rows hold no "
     "difference. Touchdown off: median distance of the true touchdown from where the site was; sinking: median speed "
     "then.",
 )
@@ -260,11 +260,11 @@ def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> Drawn:
         if finite.any():
             low, high = mean_interval(values[finite], CONFIDENCE, None if groups is None else groups[finite])
             means[one.column], intervals[one.column] = float(values[finite].mean()), (low, high)
-            told = f"mean {number(means[one.column])} ({number(low)} to {number(high)})"
+            text = f"mean {number(means[one.column])} ({number(low)} to {number(high)})"
             spread = " to ".join(number(float(end)) for end in np.quantile(values[finite], (0.05, 0.95)))
             run_time = f"{1e3 * float(np.median(taken_s)):.0f} ms here" if taken_s.size else NOTHING
             off = [f"{each.mean():.2f}" if each.size else NOTHING for each in deviations.values()]
-            rows.append([f"ours, {one.title}", f"{int(finite.sum()):,}", told, spread, *off, run_time])
+            rows.append([f"ours, {one.title}", f"{int(finite.sum()):,}", text, spread, *off, run_time])
     head = ["", "Landings", "Position error (m)", "90 % of errors (m)", "Northing dev. (m)", "Easting dev. (m)"]
     note = (
         "By averaged GPS: distance of the receiver's averaged solutions after landing from the site's coordinates, as "
@@ -286,7 +286,7 @@ def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> Drawn:
 TOUCHDOWN = SectionDeclaration(
     "touchdown",
     "Touchdown",
-    "Touchdown, beside Table II",
+    "Touchdown, next to Table II",
     rows=_landed,
     requires=("touchdown_error_gps_m", "touchdown_error_m"),
     parts=(
@@ -372,8 +372,8 @@ def distance_grid(curves: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
     for name, values in curves.items():
         if values.size:
             bound = quantile_bounds(values, 0.05, CONFIDENCE)[0]
-            numbers_told = [number(float(one)) for one in (values.min(), *np.quantile(values, (0.05, 0.5)))]
-            rows.append([name, f"{values.size:,}", *numbers_told, NOTHING if math.isinf(bound) else number(bound)])
+            texts = [number(float(one)) for one in (values.min(), *np.quantile(values, (0.05, 0.5)))]
+            rows.append([name, f"{values.size:,}", *texts, NOTHING if math.isinf(bound) else number(bound)])
     return Grid(["Distance (m)", "Cases", "Least", "5 % quantile", "Median", "5 % quantile is at least"], rows)
 
 
@@ -392,13 +392,13 @@ def run_times_section(subject: Subject) -> Section | None:
     factor, rows, data = paper / ours, [], []
     for stage, middle, slow in zip(stages, median.tolist(), late.tolist(), strict=True):
         sizes = [quantile(known(chosen, name), 0.5) for name in stage["ours"]]
-        told = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
+        text = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
         data.append(
             {"name": stage["name"], "paper_s": stage["seconds"], "median_s": middle, "late_s": slow}
-            | {"scaled_s": factor * middle, "parameters": told}
+            | {"scaled_s": factor * middle, "parameters": text}
         )
         times = [f"{stage['seconds']:.2f}", f"{1e3 * middle:.1f}", f"{1e3 * slow:.1f}", f"{factor * middle:.2f}"]
-        rows.append([stage["name"], *times, stage["parameters"], told])
+        rows.append([stage["name"], *times, stage["parameters"], text])
     rows.append(["Together", f"{paper:.2f}", f"{1e3 * ours:.1f}", NOTHING, f"{ours * factor:.2f}", NOTHING, NOTHING])
     head = ["Stage", "Paper (s)", "Here, median (ms)", "95 %", "Scaled (s)", "Paper's parameters", "Parameters here"]
     note = (
@@ -407,5 +407,5 @@ def run_times_section(subject: Subject) -> Section | None:
         "compares how the time is shared out, not how fast either is. Here the elevation map counts with the hazards, "
         "the scale with the motion. Stages with exactly the paper's parameters, on an idle machine: make bench."
     )
-    block, told_too = Block(grid=Grid(head, rows), note=note), {"factor": factor, "cases": cases, "stages": data}
-    return Section("run-times", "Run time", "Run time by stage, beside Table I", [block], told_too)
+    block, data_of_section = Block(grid=Grid(head, rows), note=note), {"factor": factor, "cases": cases, "stages": data}
+    return Section("run-times", "Run time", "Run time by stage, next to Table I", [block], data_of_section)

@@ -42,7 +42,7 @@ _SEED = 19340401
 
 
 def bca(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], confidence: float) -> Interval:
-    """Two-sided interval of a statistic of one or more columns, drawn together; NaN where it cannot be told."""
+    """Two-sided interval of a statistic of one or more columns, drawn together; NaN where there is none."""
     with warnings.catch_warnings():
         # A degenerate bootstrap distribution (two values, say) is answered by NaN bounds, which the caller prints.
         warnings.simplefilter("ignore")

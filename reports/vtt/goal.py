@@ -126,7 +126,7 @@ def _draw_cameras(runs: Rows, subject: Subject, key: str) -> Drawn:
     if lost.rows:
         note = (
             "Losses are the criteria (section 4.6) of the first update that lost the target. Azimuth change: the "
-            "largest between two sightings; clouds: whether there were any. What caused a loss is for a replay to tell."
+            "largest between two sightings; clouds: whether there were any. What caused a loss is shown by a replay."
         )
         blocks.append(Block(heading="Runs that did not track to the end", grid=lost, note=note))
     data = [one | {rate: vars(one[rate]) for rate in _RATES.values()} for one in found]
@@ -166,7 +166,7 @@ def losses_grid(frame: Rows) -> Grid:
 GOAL = SectionDeclaration(
     "goal",
     "Goal",
-    "Where the target is, as told at the goal",
+    "Reported position of the target at the goal",
     rows=goal_rows,
     requires=("camera",),
     parts=(

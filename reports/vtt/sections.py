@@ -71,10 +71,10 @@ def table_1_section(subject: Subject) -> Section | None:
     )
     measured_note = (
         f"Selectable targets of completed runs from {START_M:g} m to {GOAL_M:g} m: three times the root mean square. "
-        "Without tracker: by Eq. 3 from the measured errors of designation and pose, whatever odometry the runs "
+        "Without tracker: by Eq. 3 from the measured errors of designation and pose, with any odometry that the runs "
         "had; the paper's is visual. Table I, the same: its last column for the drift measured. The paper takes 1 "
         "px as the disparity error of 3 sigma; the error, calibration included, that Eq. 1 makes of the designation "
-        "stands beside."
+        "stands next to."
     )
     blocks = [
         Block(heading="Computed", grid=grid, note=note),
@@ -89,7 +89,7 @@ def table_1_section(subject: Subject) -> Section | None:
 
 
 def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
-    """Errors of each camera's completed runs: three times their root mean square, centimetres, as the paper tells
+    """Errors of each camera's completed runs: three times their root mean square, centimetres, as the paper states
     3 sigma. `disparity_px` is the disparity error, 1 sigma, that Eq. 1 makes of the designation's error for the camera
     as it was; `untracked_cm` is Eq. 3 of the errors of designation and pose.
     """
@@ -171,10 +171,10 @@ def _modes(frame: Rows, subject: Subject, key: str) -> Drawn:
     return [Block(heading="By operational mode", grid=table_4(frame, legs(subject)), note=note)], {}
 
 
-#: What the paper tells of single runs, next to the campaign that repeats the run.
+#: What the paper states of single runs, next to the campaign that repeats the run.
 SINGLE_RUNS = PaperFacts(_PAPER_FILE, further={CHECKOUT_3: MadeBy(_modes)})
 
-#: What the table tells of an update: its heading, the column's ending, digits.
+#: What the table shows of an update: its heading, the column's ending, digits.
 QUANTITIES: tuple[tuple[str, str, int], ...] = (
     ("Distance (m)", "range_m", 2),
     ("Magnification", "magnification", 2),
@@ -222,8 +222,8 @@ def updates_section(subject: Subject) -> Section | None:
             Block(heading="Beside the paper's", grid=_table_3(values), note=paper_note),
             Block(heading="All of ours", grid=grid, note=note),
         ]
-    told = {str(n): {ending: one.tolist() for ending, one in of_n.items()} for n, of_n in values.items()}
-    return Section("updates", "Updates", title, blocks, {"updates": told})
+    lists = {str(n): {ending: one.tolist() for ending, one in of_n.items()} for n, of_n in values.items()}
+    return Section("updates", "Updates", title, blocks, {"updates": lists})
 
 
 def _update_text(values: Mapping[int, Mapping[str, np.ndarray]], ending: str, digits: int) -> Callable[[int], str]:
@@ -242,7 +242,7 @@ def _table_3(values: Mapping[int, Mapping[str, np.ndarray]]) -> Grid:
     return Grid(["Parameter", "Rover position", *(str(n) for n in values)], rows)
 
 
-#: What tells the lines of a figure of steps apart, where it varies.
+#: What distinguishes the lines of a figure of steps, where it varies.
 _SERIES = ("algorithm", "search_px")
 _STEPS_NOTE = (
     "Selectable: lit, off the rock's edge, in both pictures to the end and, where the campaign says so, on the face "
@@ -305,7 +305,7 @@ def steps_section(subject: Subject) -> Section | None:
 
 
 def _motion(subject: Subject) -> Mapping[str, Any] | None:
-    """What the paper tells of the campaign's motion; None where it does not drive one leg."""
+    """What the paper states of the campaign's motion; None where it does not drive one leg."""
     of_drive = legs(subject)
     motions: Mapping[str, Mapping[str, Any]] = PAPER["steps"]
     return motions.get(str(of_drive[0].get("motion", "approach"))) if len(of_drive) == 1 else None
@@ -338,7 +338,7 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
 
 
 def _lines(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Rows by what tells them apart; one line without a name where nothing does."""
+    """Rows by what distinguishes them; one line without a name where nothing does."""
     column = next((name for name in _SERIES if name in frame and frame[name].nunique() > 1), None)
     if column is None:
         yield "", frame
@@ -350,7 +350,7 @@ def _lines(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def _obliquity_grid(frame: Rows) -> Grid | None:
-    """Targets tracked by class of the most oblique sight and step; None where sights are not told."""
+    """Targets tracked by class of the most oblique sight and step; None where rows hold no sights."""
     if "obliquity_max_deg" not in frame:
         return None
     seen = frame[all_flags(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
@@ -403,7 +403,7 @@ def terrains_section(subject: Subject) -> Section | None:
 
 
 def cause_of(row: pd.Series) -> str:
-    """Why a run failed, as far as its row tells."""
+    """Why a run failed, as far as its row shows."""
     outcome = str(row["outcome"])
     if outcome not in ("COMPLETED", "LOST"):
         return outcome.replace("_", " ").lower()

@@ -66,7 +66,7 @@ class Check:
     advice
         What to do where it fails.
     run
-        Does it; returns a note, and raises BreachError, or whatever the algorithm raised.
+        Does it; returns a note, and raises BreachError, or what the algorithm raised.
     """
 
     name: str
@@ -150,7 +150,7 @@ class Suite(ABC):
         if not self.program:
             copies = "work on copies: counts.astype(...), array.copy()"
             yield Check("inputs", "leaves its inputs as they are", copies, self._change_inputs)
-        asked = "gives the same answers to the same case, whatever was asked before"
+        asked = "gives the same answers to the same case, after any other cases"
         yield Check("deterministic", asked, self.deterministic_advice, self._answer_again)
         faster = "be faster, or allow more with --time-limit"
         yield Check("time", f"{self.answers} within {self.limit_s:g} s", faster, self._answer_in_time)

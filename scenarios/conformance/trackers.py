@@ -134,13 +134,13 @@ class TrackerSuite(Suite):
         return checked_update(tracker.update(handed_copy(measurements))).state.name
 
     def _change_inputs(self) -> str:
-        tracker, told = self.make(), handed_copy(designation(), writable=True)
-        before = fingerprint(told)
-        tracker.designate(told, pose(0.0))
+        tracker, target = self.make(), handed_copy(designation(), writable=True)
+        before = fingerprint(target)
+        tracker.designate(target, pose(0.0))
         measurements = handed_copy(taken(_aimed(tracker, pose(0.0)), pose(0.0)), writable=True)
         seen = fingerprint(measurements)
         tracker.update(measurements)
-        if fingerprint(told) != before or fingerprint(measurements) != seen:
+        if fingerprint(target) != before or fingerprint(measurements) != seen:
             raise BreachError("its designation or measurements are not what they were before")
         return ""
 

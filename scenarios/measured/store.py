@@ -42,7 +42,7 @@ Quaternion = tuple[float, float, float, float]
 
 
 class Named(Parameters):
-    """A file beside `cases.json`, and the hash of its contents."""
+    """A file next to `cases.json`, and the hash of its contents."""
 
     file: str
     sha256: str
@@ -171,7 +171,7 @@ def write_cases(folder: Path, stored: StoredCases) -> Path:
 
 
 def put_file(folder: Path, kind: str, name: str, write: Callable[[Path], object]) -> Named:
-    """Write a file beside `cases.json`, in the folder of its kind (`pictures`, `cameras`, `flat_fields`)."""
+    """Write a file next to `cases.json`, in the folder of its kind (`pictures`, `cameras`, `flat_fields`)."""
     path = folder / kind / name
     path.parent.mkdir(exist_ok=True)
     write(path)
@@ -179,7 +179,7 @@ def put_file(folder: Path, kind: str, name: str, write: Callable[[Path], object]
 
 
 def put_camera(folder: Path, number: int, camera: CameraModel) -> Named:
-    """Write a camera beside `cases.json`; its file states the body frame."""
+    """Write a camera next to `cases.json`; its file states the body frame."""
     return put_file(
         folder, "cameras", f"{number:06d}.cahvor", lambda path: write_cahvor(camera, path, frame=BODY_FRAME)
     )

@@ -172,7 +172,7 @@ def _judge(
 
 
 def _case_columns(p: SharedDriveParameters) -> dict[str, Scalar]:
-    """What makes a case, whatever tracks in it."""
+    """What makes a case, for any tracker."""
     chosen = p.targets[p.target]
     bands: dict[str, Scalar] = {one.name: bool(one.least <= p.step <= one.most) for one in p.bands}
     return {

@@ -1,4 +1,4 @@
-"""The designated point: chosen on the target's rock where it is seen from the start, and told to the rover."""
+"""The designated point: chosen on the target's rock where it is seen from the start, and designated to the rover."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ChosenTarget:
     point_world
         The designated point of the rock's surface, world, metres.
     designation
-        How it is told to the rover.
+        How it is designated to the rover.
     on_edge
         Whether the template about it, as either camera sees it from the start, shows what lies well behind the rock.
     lit
@@ -87,8 +87,8 @@ def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance:
     rig.point(*angles)
     world_from_head = stance.world_from_rover * rig.rover_from_head
     point, on_edge, lit = point_on(world, rig.eyes(world_from_head), p.target.across, p.target.up, rig.pixel_rad, p.vtt)
-    told = _told(p, rig, stance.world_from_rover, world_from_head, point)
-    return ChosenTarget(point, told, on_edge, lit)
+    designation = _designate(p, rig, stance.world_from_rover, world_from_head, point)
+    return ChosenTarget(point, designation, on_edge, lit)
 
 
 def point_on(
@@ -149,10 +149,10 @@ def choose_by_pixel(
     """The point at a place (across, up) of the rock's face as seen from a position, designated by its true pixel."""
     eyes = rig.eyes(world_from_head)
     point, on_edge, lit = point_on(world, eyes, *place, rig.pixel_rad, options, picked_from)
-    return ChosenTarget(point, told_by_pixel(rig.left, world_from_head, point, angles_rad), on_edge, lit)
+    return ChosenTarget(point, designate_by_pixel(rig.left, world_from_head, point, angles_rad), on_edge, lit)
 
 
-def told_by_pixel(
+def designate_by_pixel(
     left: CameraModel,
     world_from_head: RigidTransform,
     point: Float64[np.ndarray, "3"],
@@ -182,7 +182,7 @@ def _on_edge(
     return bool(np.any(seen > (1.0 + BEHIND_SHARE) * distance))
 
 
-def _told(
+def _designate(
     p: RoverScenarioParameters,
     rig: Rig,
     world_from_rover: RigidTransform,
@@ -192,7 +192,7 @@ def _told(
     """The designation: the point's true pixel, or what the ground makes of the pair of pixels by triangulation."""
     angles, known = rig.state.readings_rad, rig.calibrated
     if p.target.designation == "pixel":
-        return told_by_pixel(rig.left, world_from_head, point, angles)
+        return designate_by_pixel(rig.left, world_from_head, point, angles)
     in_head = np.asarray(world_from_head.inv().apply(point.copy()))
     left, right = (np.asarray(camera.project(in_head)[0]) for camera in (rig.left, rig.right))
     position = triangulated(known.left, known.right, left, right)

@@ -1,4 +1,4 @@
-"""PDS3 products: the picture itself, behind its label or in a file beside it, and the pose that the label states."""
+"""PDS3 products: the picture itself, behind its label or in a file next to it, and the pose that the label states."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ROVERS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
 #: `9`, `20481 <BYTES>`, `("PICTURE.IMG", 9)`, `("PICTURE.IMG", 20481 <BYTES>)`, `"PICTURE.IMG"`.
 _POINTER = re.compile(
     r"^[ \t]*\^IMAGE[ \t]*=[ \t]*"
-    r"(?:\([ \t]*\"(?P<beside>[^\"\n]+)\"[ \t]*,[ \t]*(?P<at>\d+)[ \t]*(?P<at_bytes><BYTES>)?[ \t]*\)"
+    r"(?:\([ \t]*\"(?P<detached>[^\"\n]+)\"[ \t]*,[ \t]*(?P<at>\d+)[ \t]*(?P<at_bytes><BYTES>)?[ \t]*\)"
     r"|\"(?P<alone>[^\"\n]+)\"|(?P<place>\d+)[ \t]*(?P<bytes><BYTES>)?)[ \t]*\r?$",
     re.MULTILINE,
 )
@@ -76,11 +76,11 @@ def read_pds3_product(path: str | Path) -> Pds3Product:
 
 
 def _place(text: str, source: Source) -> tuple[Path, int]:
-    """The file that holds the picture, the label's own or one beside it, and the bytes before the picture."""
+    """The file that holds the picture, the label's own or one next to it, and the bytes before the picture."""
     pointer = _POINTER.search(text)
     if pointer is None:
         raise source.error("^IMAGE", "missing, or of another form", 'a record, bytes, or ("FILE", record)')
-    name = pointer["beside"] or pointer["alone"]
+    name = pointer["detached"] or pointer["alone"]
     path = Path(source.path) if name is None else _beside(name, source)
     place = int(pointer["at"] or pointer["place"] or 1)
     if place == 1 or pointer["at_bytes"] or pointer["bytes"]:
@@ -95,7 +95,7 @@ def _beside(name: str, source: Source) -> Path:
     """A file in the label's folder; archives differ in the case of names."""
     folder = Path(source.path).parent
     if Path(name).name != name:
-        raise source.error("^IMAGE", f"names {name!r}, a file elsewhere", "a file beside the label")
+        raise source.error("^IMAGE", f"names {name!r}, a file elsewhere", "a file next to the label")
     named = [folder / name, folder / name.lower(), folder / name.upper()]
     return next((path for path in named if path.exists()), named[0])
 

@@ -21,7 +21,7 @@ from marsyard.sim.camera.base import CameraModel
 from marsyard.sim.camera.cahvore import Cahvore
 
 #: Frames of the cameras that Marsyard writes, as their files state them.
-BODY_FRAME = "body (metres); the body's pose in the world, where it is known, is stated beside this file"
+BODY_FRAME = "body (metres); the body's pose in the world, where it is known, is stated next to this file"
 HEAD_FRAME = "head of the mast (metres: x forward, y left, z up at azimuth and elevation zero)"
 
 _TYPE_NAMES = {

@@ -20,7 +20,7 @@ from marsyard.algorithms.exchange import (
     read_target,
 )
 from marsyard.algorithms.exchange.serving import end_persistent
-from marsyard.algorithms.exchange.stops import told_target, write_mast, write_stop
+from marsyard.algorithms.exchange.stops import encode_target, write_mast, write_stop
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import TargetLoss, TargetTracker, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
@@ -237,5 +237,5 @@ def test_what_a_tracker_is_given_comes_back_as_it_was(tmp_path: Path) -> None:
     ],
 )
 def test_targets_are_told_in_each_of_the_three_ways(target: TargetDesignation) -> None:
-    assert told_target(read_target(told_target(target))) == told_target(target)
-    assert type(read_target(told_target(target))) is type(target)
+    assert encode_target(read_target(encode_target(target))) == encode_target(target)
+    assert type(read_target(encode_target(target))) is type(target)

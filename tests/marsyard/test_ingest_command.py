@@ -16,7 +16,7 @@ from marsyard.scenarios.conformance import inputs
 from tests.scenarios.measured.folders import landing_folder, read_rows, velocity_folder, write_texts
 
 
-def told(*words: str) -> tuple[int, str]:
+def run_command(*words: str) -> tuple[int, str]:
     result = CliRunner().invoke(app, list(words))
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -29,9 +29,9 @@ def test_real_pictures_are_run_and_reported(tmp_path: Path) -> None:
         tmp_path / "out",
         tmp_path / "run",
     )
-    status, output = told("ingest", str(folder), "--out", str(cases))
+    status, output = run_command("ingest", str(folder), "--out", str(cases))
     assert (status, "1 case of 2 pictures" in output) == (0, True)
-    status, output = told("run", str(cases / "campaign.toml"), "--out", str(run), "--jobs", "1")
+    status, output = run_command("run", str(cases / "campaign.toml"), "--out", str(run), "--jobs", "1")
     assert status == 0, output
     frame = pd.read_parquet(run / "cases.parquet")
     assert frame["outcome"].tolist() == ["MATCHED"]
@@ -40,7 +40,7 @@ def test_real_pictures_are_run_and_reported(tmp_path: Path) -> None:
     page = (run / "report.html").read_text()
     assert "Pictures against measured poses" in page
     assert 'aria-label="Pictures 1 and 2: ' in page
-    status, output = told("replay", str(run), "0", "--out", str(tmp_path / "again"))
+    status, output = run_command("replay", str(run), "0", "--out", str(tmp_path / "again"))
     assert (status, "the row equals the stored one" in output) == (0, True)
     assert (tmp_path / "again" / "matches-1.png").stat().st_size > 10_000
 
@@ -48,7 +48,7 @@ def test_real_pictures_are_run_and_reported(tmp_path: Path) -> None:
 def test_a_campaign_with_truth_asks_for_errors_by_the_estimate(tmp_path: Path) -> None:
     given = inputs.descent()
     folder = velocity_folder(tmp_path / "in", {"one": given, "two": given}, {"two": inputs.DESCENT_VELOCITY_M_S[:2]})
-    assert told("ingest", str(folder), "--out", str(tmp_path / "out"))[0] == 0
+    assert run_command("ingest", str(folder), "--out", str(tmp_path / "out"))[0] == 0
     path = tmp_path / "out" / "campaign.toml"
     written = tomllib.loads(path.read_text())
     (asked,) = written["requirements"]
@@ -67,17 +67,17 @@ def test_what_is_wrong_ends_with_2_and_leaves_nothing(tmp_path: Path) -> None:
     rows = read_rows(folder)
     rows[1]["file"] = "lost.png"
     write_texts(folder, rows)
-    status, output = told("ingest", str(folder), "--out", str(tmp_path / "out"))
+    status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "out"))
     assert status == 2
     assert "lost.png: No such file or directory" in output
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
-    status, output = told("ingest", str(folder), "--out", str(tmp_path / "full"))
+    status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "full"))
     assert (status, "is not empty" in output) == (2, True)
-    status, output = told("ingest", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
+    status, output = run_command("ingest", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
     assert (status, "ingest.toml: cannot be read" in output) == (2, True)
-    status, output = told("ingest", str(folder), "--out", str(tmp_path / "out"), "--system", "vtt")
+    status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "out"), "--system", "vtt")
     assert (status, "unknown system 'vtt'; allowed: measured" in output) == (2, True)
 
 
@@ -89,10 +89,10 @@ def test_summed_rows_are_taken_from_the_camera(tmp_path: Path) -> None:
     folder = velocity_folder(tmp_path / "in", {"one": given}, {})
     stated = (folder / "ingest.toml").read_text()
     assert f"rows_summed = {summed}\n" in stated
-    status, output = told("ingest", str(folder), "--out", str(tmp_path / "stated"))
+    status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "stated"))
     assert (status, "rows_summed" in output) == (0, False)
     (folder / "ingest.toml").write_text(stated.replace(f"rows_summed = {summed}\n", ""))
-    status, output = told("ingest", str(folder), "--out", str(tmp_path / "inferred"))
+    status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "inferred"))
     assert status == 0
     assert f"rows_summed = {summed}: taken from the camera" in output
     detectors = [json.loads((tmp_path / one / "cases.json").read_text())["detector"] for one in ("stated", "inferred")]

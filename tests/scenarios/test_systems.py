@@ -106,7 +106,7 @@ def test_the_code_of_a_foreign_scenario_is_part_of_the_identity(install: Install
     install("mine", _system("mine").replace("x:Y", "mine:Case"))
     assert scenario_source("mine-case") == "mine:Case"
     assert list(foreign_sources(scenario_source("mine-case"))) == [("mine.py", tmp_path / "mine.py")]
-    # that of ours is hashed as a whole, whatever the scenario
+    # that of ours is hashed as a whole for every scenario
     assert scenario_source("descent") == "descent"
     assert list(foreign_sources("descent")) == []
 

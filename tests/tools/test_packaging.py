@@ -1,4 +1,4 @@
-"""What is installed is one package, `marsyard`, whatever else lies on the path."""
+"""What is installed is one package, `marsyard`, with any other modules on the path."""
 
 from __future__ import annotations
 

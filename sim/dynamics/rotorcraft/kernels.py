@@ -1,4 +1,4 @@
-"""Compiled flight of a small helicopter; `marsyard.sim.dynamics.rotorcraft.flight` tells what is modelled.
+"""Compiled flight of a small helicopter; `marsyard.sim.dynamics.rotorcraft.flight` states what is modelled.
 
 A row is the state at a knot: position, velocity and acceleration, then angles (yaw, pitch, roll), their rates and
 accelerations. Between knots accelerations are straight lines, so that rows are exact at every time: the motion is

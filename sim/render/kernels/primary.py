@@ -171,7 +171,7 @@ def _reach_out(width: int, work: Array) -> None:
 
 @njit(cache=True, error_model="numpy")
 def _step(near: Near, width: int, work: Array) -> None:
-    """One step of Newton's method for the rays that are followed; `GOING` tells which go on, 1 or 0."""
+    """One step of Newton's method for the rays that are followed; `GOING` marks those that continue, 1 or 0."""
     for k in range(min(width, STRIP)):
         height, slope_x, slope_y, _albedo = spline(near[0], near[1], k)
         t, start, scale, dz = work[MET + k], work[START + k], work[SCALE + k], work[DZ + k]

@@ -20,7 +20,7 @@ import pytest
 
 from marsyard.algorithms.processes import used_memory
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.batches import MOST_CASES, Batches
+from marsyard.campaigns.execution.batches import MAX_CASES, Batches
 from marsyard.campaigns.execution.work import UNLIMITED, Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import Board, Done, Standing
 from marsyard.campaigns.execution.workers import LocalWorkers
@@ -241,7 +241,7 @@ def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
     while batch := empty.next():
         empty.took(sizes[-1], 0.0)
         sizes.append(len(batch))
-    assert max(sizes) == MOST_CASES
+    assert max(sizes) == MAX_CASES
     slow = Batches(range(5), 5, 1)
     slow.took(1, 30.0)
     assert [len(slow.next()) for _ in range(5)] == [1] * 5

@@ -46,9 +46,9 @@ def test_measured_accuracy_is_three_times_the_rms_by_camera() -> None:
     # Eq. 3: sqrt(0.1^2 + 0.05^2), root mean square.
     assert navcam["untracked_cm"] == pytest.approx(300.0 * np.hypot(0.1, 0.05))
     assert pancam["drift_px"] == pytest.approx(np.sqrt(12.5))
-    told = table(table_1_section(subject(frame)), 1)
+    shown = table(table_1_section(subject(frame)), 1)
     # Navcam, 2 px of drift: sqrt(1.6^2 + 0.32^2).
-    assert told[0]["Table I, the same"] == "1.6"
+    assert shown[0]["Table I, the same"] == "1.6"
     # Runs from elsewhere, at unfit targets or not completed do not count.
     assert measured_accuracy(frame.assign(range_start_m=7.0)) == []
     assert measured_accuracy(frame.assign(selectable=False)) == []
@@ -119,12 +119,12 @@ def _with_updates(numbers: int, cases: int = 3) -> pd.DataFrame:
 def test_table_iii_stands_beside_ours() -> None:
     frame = _with_updates(8)
     frame.loc[0, "update_8_match_score"] = 0.5
-    told = table(updates_section(subject(frame, CHECKOUT_1)))
-    scores = next(k for k, row in enumerate(told) if row["Parameter"] == "NCC score")
-    assert (told[scores]["8"], told[scores]["1"]) == ("0.79", "–")
-    assert told[scores + 1]["8"] == "0.90 (0.50 to 0.90)"
-    rolls = next(k for k, row in enumerate(told) if row["Parameter"] == "Roll change (deg)")
-    assert told[rolls + 1]["2"] == "2.00"  # without its sign, as the paper prints it
+    shown = table(updates_section(subject(frame, CHECKOUT_1)))
+    scores = next(k for k, row in enumerate(shown) if row["Parameter"] == "NCC score")
+    assert (shown[scores]["8"], shown[scores]["1"]) == ("0.79", "–")
+    assert shown[scores + 1]["8"] == "0.90 (0.50 to 0.90)"
+    rolls = next(k for k, row in enumerate(shown) if row["Parameter"] == "Roll change (deg)")
+    assert shown[rolls + 1]["2"] == "2.00"  # without its sign, as the paper prints it
     other = table(updates_section(subject(frame, "another")))
     assert other[7]["NCC score"] == "0.90 (0.50 to 0.90)"
     assert other[7]["Roll change (deg)"] == "−2.00"
@@ -142,14 +142,14 @@ def test_table_iii_is_as_printed() -> None:
 
 def test_facts_of_single_runs() -> None:
     frame = rows(4, target_moved_m=[0.1, 0.2, 0.3, 0.4], tracked=[True, True, True, False])
-    told = {row[""]: row for row in table(SINGLE_RUNS(subject(frame, "vtt-checkout-2")))}
-    moved = told["target moved, first to last estimate (cm)"]
+    shown = {row[""]: row for row in table(SINGLE_RUNS(subject(frame, "vtt-checkout-2")))}
+    moved = shown["target moved, first to last estimate (cm)"]
     assert (moved["Paper"], moved["Ours"]) == ("36", "25.0 (10.0 to 40.0)")
-    assert told["tracked to the goal"]["Ours"] == "3 of 4: 75.00 %"
-    assert told["largest correction (px)"]["Ours"] == "–"
+    assert shown["tracked to the goal"]["Ours"] == "3 of 4: 75.00 %"
+    assert shown["largest correction (px)"]["Ours"] == "–"
     roll = rows(4, roll_compensated=[True, True, False, False], tracked=[True, True, True, False])
-    told = {row[""]: row for row in table(SINGLE_RUNS(subject(roll, "vtt-roll")))}
-    assert told["tracked with compensation"]["Ours"] == "2 of 2: 100 %"
+    shown = {row[""]: row for row in table(SINGLE_RUNS(subject(roll, "vtt-roll")))}
+    assert shown["tracked with compensation"]["Ours"] == "2 of 2: 100 %"
     assert SINGLE_RUNS(subject(frame, "another")) is None
 
 
@@ -161,10 +161,10 @@ def test_table_iv_by_mode() -> None:
     for n, leg in enumerate(legs, start=1):
         frame[f"update_{n}_leg"], frame[f"update_{n}_time_s"] = float(leg), 60.0 * n
     frame.loc[1, ["update_27_leg", "update_27_time_s"]] = np.nan  # ended a step early
-    told = table(SINGLE_RUNS(subject(frame, CHECKOUT_3, legs=driven)), 1)
-    assert [row["Updates, paper"] for row in told] == ["2", "7", "10", "4", "4"]
-    assert [row["Updates, ours"] for row in told] == ["2", "7", "10", "4", "4 (3 to 4)"]
-    assert [row["Minutes, ours"] for row in told[:4]] == ["2.0", "7.0", "10.0", "4.0"]
+    shown = table(SINGLE_RUNS(subject(frame, CHECKOUT_3, legs=driven)), 1)
+    assert [row["Updates, paper"] for row in shown] == ["2", "7", "10", "4", "4"]
+    assert [row["Updates, ours"] for row in shown] == ["2", "7", "10", "4", "4 (3 to 4)"]
+    assert [row["Minutes, ours"] for row in shown[:4]] == ["2.0", "7.0", "10.0", "4.0"]
 
 
 def test_table_iv_is_as_printed() -> None:
@@ -180,14 +180,14 @@ def test_terrains_tell_failures_and_causes() -> None:
     frame.loc[8, "outcome"] = "STUCK"
     frame.loc[9, ["outcome", "losses"]] = ["LOST", "STEREO_SCORE"]
     frame.loc[15, ["selectable", "tracked"]] = False
-    told = {row["Terrain"]: row for row in table(terrains_section(subject(frame, TERRAINS)))}
-    assert list(told) == ["flat ground", "steep incline", "a ledge"]
-    assert told["flat ground"]["Failures, paper"] == "1 of 11"
-    assert told["flat ground"]["Failures, ours"] == "2 of 8: 25.00 %"
-    assert told["flat ground"]["Cause, ours"] == "excessive azimuth change: 1; lighting change: 1"
-    assert told["steep incline"]["Failures, ours"] == "3 of 7: 42.86 %"
-    assert told["steep incline"]["Failures, with unfit targets"] == "4 of 8: 50.00 %"
-    assert set(told["steep incline"]["Cause, ours"].split("; ")) == {"stuck: 1", "stereo score: 1", "drift: 1"}
+    shown = {row["Terrain"]: row for row in table(terrains_section(subject(frame, TERRAINS)))}
+    assert list(shown) == ["flat ground", "steep incline", "a ledge"]
+    assert shown["flat ground"]["Failures, paper"] == "1 of 11"
+    assert shown["flat ground"]["Failures, ours"] == "2 of 8: 25.00 %"
+    assert shown["flat ground"]["Cause, ours"] == "excessive azimuth change: 1; lighting change: 1"
+    assert shown["steep incline"]["Failures, ours"] == "3 of 7: 42.86 %"
+    assert shown["steep incline"]["Failures, with unfit targets"] == "4 of 8: 50.00 %"
+    assert set(shown["steep incline"]["Cause, ours"].split("; ")) == {"stuck: 1", "stereo score: 1", "drift: 1"}
     assert terrains_section(subject(frame, "another")) is None
 
 
@@ -201,8 +201,8 @@ def test_regression_runs_one_by_one() -> None:
     frame = frame.assign(map_by=["none", "none", "body", "mast"], rock_height_m=[0.09, 0.09, 0.5, 0.5])
     frame.loc[3, ["tracked", "outcome", "losses"]] = [False, "NO_PATH", "none"]
     section = regression_section(subject(frame, REGRESSION))
-    told = [(row["Driving"], row["Rock"], row["Tracked to the goal"]) for row in table(section)]
-    assert told == [
+    shown = [(row["Driving"], row["Rock"], row["Tracked to the goal"]) for row in table(section)]
+    assert shown == [
         ("Autonav by body cameras", "large", "1 of 1: 100 %"),
         ("Autonav by mast cameras", "large", "0 of 1: 0 %"),
         ("blind", "small", "1 of 1: 100 %"),
@@ -227,8 +227,8 @@ def test_goal_by_camera() -> None:
     assert pancam["false_tracks"].hits == 1
     assert np.isfinite(pancam["quantile_bound_m"])
     assert losses_grid(frame).rows == [["LOST", "match score", "1", "3.5 to 3.5", "3.0", "0"]]
-    told = table(GOAL(subject(frame)), 1)
-    assert told[1]["Median (mm)"] == "4.000"
+    shown = table(GOAL(subject(frame)), 1)
+    assert shown[1]["Median (mm)"] == "4.000"
     few = table(GOAL(subject(frame.iloc[:20])), 1)
     assert few[0]["Its bound (mm)"] == "n too small"
 

@@ -16,7 +16,7 @@ from tests.scenarios.rover.short_run import SHORT
 def test_a_step_drives_by_what_was_tracked_and_mapped_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[str] = []
 
-    def told(kind: object, name: str, word: str) -> None:
+    def record_calls(kind: object, name: str, word: str) -> None:
         before = getattr(kind, name)
 
         def after(*args: object, **more: object) -> object:
@@ -25,9 +25,9 @@ def test_a_step_drives_by_what_was_tracked_and_mapped_before_it(monkeypatch: pyt
 
         monkeypatch.setattr(kind, name, after)
 
-    told(Mapper, "sense", "map")
-    told(Vehicle, "drive", "drive and see how far")
-    told(loop, "visit_stop", "track")
+    record_calls(Mapper, "sense", "map")
+    record_calls(Vehicle, "drive", "drive and see how far")
+    record_calls(loop, "visit_stop", "track")
     leg = {"motion": "approach", "goal_m": 3.0, "step_share": 0.08, "autonav": True, "visual_odometry": True}
     run = run_case(RoverScenarioParameters.model_validate({**SHORT, "legs": [leg]}), Streams(1, "rover tests", 0))
     steps = re.sub("d( d)+", "d", " ".join(word[0] for word in done))

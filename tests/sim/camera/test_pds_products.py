@@ -137,5 +137,5 @@ def test_pictures_in_a_file_beside_their_label(tmp_path: Path, pointer: str, bef
 
 
 def test_a_picture_elsewhere_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CameraFileError, match=r"names '\.\./made\.img', a file elsewhere; allowed: a file beside"):
+    with pytest.raises(CameraFileError, match=r"names '\.\./made\.img', a file elsewhere; allowed: a file next to"):
         read_pds3_product(product(tmp_path, pointer='("../made.img", 3)'))

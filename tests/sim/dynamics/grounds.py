@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from marsyard.sim.dynamics import SlipParameters
 
-#: Wheels that do exactly as they are told.
+#: Wheels that do exactly as they are commanded.
 NO_SLIP = SlipParameters(
     flat=0.0, full_slope_deg=89.0, exponent=100.0, downhill=0.0, across=0.0, turn=0.0, turn_slope=0.0,
     soil_spread=0.0, step_spread=0.0, wander_deg_m=0.0,
