@@ -136,8 +136,8 @@ def drivers_section(subject: Subject) -> Section | None:
     note = (
         "Share: part of the variance of the ranks that the condition alone explains, for a curve of any shape "
         f"(first-order index). Intervals at {stated(CONFIDENCE)} confidence, fewer cases taken where terrains share "
-        "condition and response. p: that it explains nothing, corrected for the number of conditions (Holm). A failure is a case "
-        "without an answer within the bound. Nothing is claimed about causes."
+        "condition and response. p: that it explains nothing, corrected for the number of conditions (Holm). A failure "
+        "is a case without an answer within the bound. Nothing is claimed about causes."
     )
     blocks = [Block(heading=f"What explains {name}", grid=_ranked_grid(found)) for name, found in known.items()]
     data = {
