@@ -147,6 +147,7 @@ def main() -> int:
         RATIOS.write_text(json.dumps(record, indent=2) + "\n")
         print(f"kept in {RATIOS}")
         return 0
+    assert kept is not None, "without kept ratios nothing is compared"
     return _said(compared(now, kept["log_ratios"]), kept["measured"])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 
 import numpy as np
 
@@ -59,7 +60,7 @@ def new_terrains(repeats: int) -> list[Figure]:
     return [
         Figure(
             f"new descent terrain, {name}",
-            core_seconds(lambda kind=kind: synthesise(kind, np.random.default_rng(0)), repeats),
+            core_seconds(partial(synthesise, kind, np.random.default_rng(0)), repeats),
             bar=2.0,
         )
         for name, kind in kinds.items()

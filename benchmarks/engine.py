@@ -22,7 +22,7 @@ from marsyard.campaigns.execution.crew import Crew
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import write_table
-from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.sim.streams import Streams
 
 #: Columns of numbers of a row in the table of a million.
@@ -41,13 +41,14 @@ class BusyScenario:
     name = "busy"
     parameters_type = BusyParameters
 
-    def shared_inputs(self, parameters: BusyParameters) -> tuple[int, ...]:
+    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         return ()
 
-    def prepare(self, parameters: BusyParameters, shared_input: int) -> None:
+    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Nothing: there are no shared inputs."""
 
-    def run(self, parameters: BusyParameters, streams: Streams) -> CaseResult:
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        assert isinstance(parameters, BusyParameters)
         end = time.process_time() + parameters.busy_s
         while parameters.busy_s and time.process_time() < end:
             pass
@@ -159,8 +160,8 @@ def gain(campaign: str = "dimes-smoke", cases: int = 120) -> float:
 
 def table_seconds(rows: int) -> float:
     """Seconds of processor time to write the table of so many rows; numbers of full length, as measurements have."""
-    head = {"outcome": "VALID", "answered": True}
-    tail = {"wall_time_s": 0.1, "cpu_time_s": 0.1, "error": "", "traceback": ""}
+    head: dict[str, Scalar] = {"outcome": "VALID", "answered": True}
+    tail: dict[str, Scalar] = {"wall_time_s": 0.1, "cpu_time_s": 0.1, "error": "", "traceback": ""}
     with TemporaryDirectory() as folder:
         path = Path(folder, "cases.sqlite")
         create_store(path, {})

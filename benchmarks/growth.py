@@ -20,6 +20,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
+from pydantic import BaseModel
 
 from benchmarks.engine import BusyParameters, BusyScenario, Stopwatch
 from benchmarks.pictures import descent_pose, descent_scene
@@ -68,11 +69,12 @@ class Curve:
 
 
 class LightScenario(BusyScenario):
-    """Waits without computing, so that more workers than cores tell what the engine costs and not the cores."""
+    """Wait without computing: with more workers than cores the time is the engine's, not the cores'."""
 
     name = "light"
 
-    def run(self, parameters: BusyParameters, streams: Streams) -> CaseResult:
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        assert isinstance(parameters, BusyParameters)
         time.sleep(parameters.busy_s)
         return CaseResult("VALID", True, {"number": streams.case})
 
@@ -98,7 +100,7 @@ def _frames_of_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
     for side in sides:
         corner = (camera.size[0] - side) // 2
         rays = PixelRays.of(camera.cropped(corner, corner, (side, side)))
-        found.append((float(side**2), _least(lambda rays=rays: renderer.render(scene, rays, pose))))
+        found.append((float(side**2), _least(partial(renderer.render, scene, rays, pose))))
     return found
 
 
@@ -111,7 +113,7 @@ def _frames_of_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
         # as far as the frame's own mesh reaches, with lines further apart where they are fewer
         finest = scene.mesh_finest_m * (scene.mesh_lines - 1) / (count - 1)
         of_count = replace(scene, mesh_lines=count, mesh_finest_m=finest)
-        cost = _least(lambda of_count=of_count: renderer.render(of_count, rays, pose))
+        cost = _least(partial(renderer.render, of_count, rays, pose))
         found.append((2.0 * (count - 1) ** 2, cost))
     return found
 
@@ -151,8 +153,8 @@ def _campaign_s(cases: int, waiting_s: float, crew: Crew) -> float:
     )
     watch = Stopwatch((1, cases))
     with TemporaryDirectory() as folder:
-        of_kind = LightScenario() if waiting_s else BusyScenario()
-        run_campaign(Campaign(configuration, of_kind), Path(folder, "run"), crew, watch)
+        waiting = LightScenario() if waiting_s else BusyScenario()
+        run_campaign(Campaign(configuration, waiting), Path(folder, "run"), crew, watch)
     return watch.at[cases][0] - watch.at[1][0]
 
 

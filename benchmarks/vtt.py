@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -67,6 +68,11 @@ def updates(repeats: int) -> list[Figure]:
     ]
 
 
+def _repeat(search: Callable[[], object]) -> None:
+    for _ in range(BATCH):
+        search()
+
+
 def searches(repeats: int) -> list[Figure]:
     """The search alone, in turn: coarse to fine, everywhere, and OpenCV's matchTemplate."""
     figures = []
@@ -79,13 +85,13 @@ def searches(repeats: int) -> list[Figure]:
         template = cut_patch(first.left, place, 21)
         window = search_window(second.left, place, side)[0].astype(np.float64)
         a, b = template.astype(np.float32), window.astype(np.float32)
-        timed = {
-            "coarse to fine": lambda t=template, w=window: coarse_to_fine_peak(t, w, 1, 6),
-            "at every place": lambda t=template, w=window: normalized_correlation(t, w),
-            "by cv2.matchTemplate": lambda t=a, w=b: cv2.matchTemplate(w, t, cv2.TM_CCOEFF_NORMED),
+        timed: dict[str, Callable[[], object]] = {
+            "coarse to fine": partial(coarse_to_fine_peak, template, window, 1, 6),
+            "at every place": partial(normalized_correlation, template, window),
+            "by cv2.matchTemplate": partial(cv2.matchTemplate, b, a, cv2.TM_CCOEFF_NORMED),
         }
         for name, search in timed.items():
-            batch = [1e3 * s / BATCH for s in core_seconds(lambda f=search: [f() for _ in range(BATCH)], repeats)]
+            batch = [1e3 * s / BATCH for s in core_seconds(partial(_repeat, search), repeats)]
             figures.append(Figure(f"21 x 21 in {side} x {side} {name}, ms", batch))
     return figures
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -66,7 +66,7 @@ def _in_every_way(campaign: str, folder: Path, settings: Sequence[str], kills: i
     expected = _rows_of(campaign, folder / "one", Crew(1), settings)
     cases = len(expected)
     replayed = range(0, cases, max(cases // 8, 1))
-    ways = {
+    ways: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "two workers": lambda: _rows_of(campaign, folder / "two", Crew(2), settings),
         "a Dask cluster of two": lambda: _rows_of(campaign, folder / "cluster", Crew(cluster="local:2"), settings),
         f"a runner killed {kills} times": lambda: _killed(campaign, folder / "killed", settings, kills),

@@ -58,4 +58,4 @@ class ChaosScenario:
         while done == "swell":
             hoard.append(np.ones(4_000_000))
         number = float(streams.generator("number").normal())
-        return CaseResult("VALID", True, {"number": number, "hash": streams.generator("hash").integers(2**62)})
+        return CaseResult("VALID", True, {"number": number, "hash": int(streams.generator("hash").integers(2**62))})

@@ -148,9 +148,9 @@ def cast_ranges(view: View, count: int, farthest: float, step: float) -> Ranges:
         with np.errstate(invalid="ignore"):
             away &= np.abs(ahead + back - 2.0 * here) < BEND * here
         away &= (thing_ahead == thing) & (thing_back == thing)
-    down = -camera.rays(pixels.astype(np.float64))[1][:, 2]
+    descending = -camera.rays(pixels.astype(np.float64))[1][:, 2]
     angle = 1.0 / np.sqrt(np.prod(view.camera.focal_lengths))
-    fine = picture * angle / np.maximum(down, 0.01) < FINE_UNTIL * view.scene.surface.spacing_m
+    fine = picture * angle / np.maximum(descending, 0.01) < FINE_UNTIL * view.scene.surface.spacing_m
     return Ranges(picture[away & fine], here[away & fine], 1.0 - away.mean(), 1.0 - fine.mean())
 
 

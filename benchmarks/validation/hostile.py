@@ -70,6 +70,12 @@ def _stop_supervisor() -> None:
     time.sleep(3600)
 
 
+def _kill_supervisor() -> None:
+    _leave_fork()
+    os.kill(os.getppid(), signal.SIGKILL)
+    time.sleep(60)
+
+
 def _loop() -> None:
     # two to the power of 64 ways to share the letters out, in C
     re.match("(a+)+$", "a" * 64 + "b")
@@ -132,7 +138,7 @@ DEEDS: Mapping[str, tuple[Callable[[], object], str]] = {
     "stop the supervisor": (_stop_supervisor, "TIMED_OUT"),
     "kill itself": (lambda: os.kill(os.getpid(), signal.SIGKILL), "CRASHED"),
     "kill its group": (lambda: os.killpg(0, signal.SIGKILL), "CRASHED"),
-    "kill the supervisor": (lambda: (_leave_fork(), os.kill(os.getppid(), signal.SIGKILL), time.sleep(60)), "CRASHED"),
+    "kill the supervisor": (_kill_supervisor, "CRASHED"),
     "abort": (os.abort, "CRASHED"),
     "leave by exit": (lambda: os._exit(0), "CRASHED"),
     "raise at length": (_raise_long, "CRASHED"),

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
@@ -54,7 +55,7 @@ def run_opposition(quick: bool) -> Iterator[Measure]:
                 continue
             view = View(Scene(surface, (0.0, 0.0), Sun(-ray), law), camera, pose)
             radiance = render(renderer(), view).radiance.astype(np.float64)
-            errors.append(np.linalg.norm(_peak(radiance) - pixel))
+            errors.append(float(np.linalg.norm(_peak(radiance) - pixel)))
         how = f"{len(errors)} suns; centre of the light above 90 % of the peak's height"
         claim = f"opposition peak from the antisolar point: {name}"
         yield Measure(claim, max(errors), "px", bar_of(claim), how)
@@ -154,7 +155,7 @@ def _rendered_brightness(law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray
     return float(render(renderer(), view).radiance[4, 4])
 
 
-def _law(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: np.ndarray) -> np.ndarray:
+def _law(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: npt.ArrayLike) -> np.ndarray:
     """The law as `Photometry` states it, for unit albedo and K, written out again."""
     g = np.arccos(np.clip(cos_g, -1.0, 1.0))
     surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)
@@ -177,7 +178,7 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
             # I/F over the cosine of incidence is pi times the bidirectional reflectance
             away.append(abs(there / first[2] / (back / second[2]) - 1.0))
             expected = FLAT_ALBEDO * bare.normalisation() * _law(bare, first[2], second[2], float(first @ second))
-            off.append(abs(there / expected - 1.0))
+            off.append(float(abs(there / expected - 1.0)))
         how = f"{pairs} pairs of sun and eye over flat ground"
         albedo = abs(_spherical_albedo(bare, 20) * bare.normalisation() - 1.0)
         for claim, measured, by in (
@@ -224,7 +225,7 @@ def run_clouds(quick: bool) -> Iterator[Measure]:
         f"{len(covers)} pictures from 2 km over flat ground, {2 if quick else 8} layers; {given.cover:g} was asked for"
     )
     yield Measure(
-        "share of the ground in clouds' shadows, from the stated one", abs(np.mean(covers) - 0.3), "", 0.1, how
+        "share of the ground in clouds' shadows, from the stated one", abs(float(np.mean(covers)) - 0.3), "", 0.1, how
     )
     how = "two pictures 3.75 s apart, the later from a place that drifted with the wind; change over slope at the edges"
     # 0 was measured, as the same function is evaluated at a shifted place: the bar is what rounding may make of it

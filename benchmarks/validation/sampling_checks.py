@@ -32,7 +32,7 @@ class _Hash:
 
 
 def _mixed(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    result = np.uint32(_LEFT) * x - np.uint32(_RIGHT) * y
+    result = np.asarray(np.uint32(_LEFT) * x - np.uint32(_RIGHT) * y, dtype=np.uint32)
     return result ^ (result >> np.uint32(_SHIFT))
 
 

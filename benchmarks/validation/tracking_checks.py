@@ -76,7 +76,7 @@ def _drifts(rows: list[dict[str, Scalar]], name: str, *, judged: bool) -> Iterat
         f"{np.count_nonzero(np.isnan(px))} not tracked to the end"
     )
     if judged:
-        yield _lost(f"targets lost before 2 m: {name}", np.count_nonzero(np.isnan(px)), len(px), how)
+        yield _lost(f"targets lost before 2 m: {name}", int(np.isnan(px).sum()), len(px), how)
     tracked = px[~np.isnan(px)]
     rms, worst = float(np.sqrt(np.mean(tracked**2))), float(tracked.max())
     yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_BAR_PX if judged else None, how)
