@@ -45,12 +45,12 @@ def per_cent(text: str) -> float:
 
 @pytest.mark.parametrize("column", [1, 2])
 def test_the_bound_on_wrong_velocities_is_the_one_that_decides(column: int) -> None:
-    wrong, answers = counts(cells("dimes.md", "answers wrong by more than 5 m/s")[column])
+    wrong, answers = counts(cells("dimes.md", "wrong answers (error above 5 m/s)")[column])
     assert wrong == 0
-    deciding = cells("dimes.md", "the same, upper bound at 90 % confidence")[column]
+    deciding = cells("dimes.md", "upper bound of their rate at 90 % confidence, terrains counted")[column]
     terrains = int(deciding.split(" over ")[1].split()[0])
     assert per_cent(deciding) == round(100.0 * proportion_upper(0, terrains, 0.9), 2)
-    independent = cells("dimes.md", "the same, were the cases independent")[column]
+    independent = cells("dimes.md", "upper bound for independent cases")[column]
     assert per_cent(independent) == round(100.0 * proportion_upper(0, answers, 0.9), 2)
 
 
@@ -66,12 +66,12 @@ def test_few_wrong_answers_to_a_wrong_altitude_are_quoted_with_their_intervals()
 def test_what_the_landings_show_counts_terrains() -> None:
     terrains = int(load_campaign("dimes-landing").configuration.parameters["place"]["bank"])
     shown = f"{100.0 * proportion_lower(terrains, terrains, 0.9):.1f} %"
-    assert f"Every terrain counted once, that shows {shown} at 90 % confidence" in text_of("dimes.md")
+    assert f"Counting terrains, this shows {shown} at 90 % confidence" in text_of("dimes.md")
 
 
 @pytest.mark.parametrize(
     "start",
-    ["chosen sites truly safe", "safe sites exist, none of them has room", "`no safe site` where there is none"],
+    ["chosen sites truly safe", "safe sites exist, none with safe surroundings", "`no safe site` where there is none"],
 )
 def test_rates_of_hazardous_flights_have_their_bounds(start: str) -> None:
     _, measured, interval = cells("hda.md", start)
@@ -104,7 +104,8 @@ def test_runs_to_the_goal_have_their_bounds() -> None:
 
 def test_cases_without_a_failure_that_pass() -> None:
     numbers = [minimum_sample_size(0.99, 0.9, failures) for failures in range(3)]
-    expected = "So {} cases without a failure pass 99 % at 90 %, {} with one, {} with two.".format(*numbers)
+    expected = "For 99 % at 90 % confidence, {} cases without a failure pass, {} with one failure, and {} with two."
+    expected = expected.format(*numbers)
     assert expected in text_of("explanation/statistics.md")
 
 
