@@ -26,4 +26,4 @@ def test_it_is_set_up_as_the_readme_says(tmp_path: Path, monkeypatch: pytest.Mon
     ended = CliRunner().invoke(app, ["--install-completion"], prog_name="marsyard")
     assert ended.exit_code == 0, ended.output
     assert "marsyard" in (tmp_path / ".bashrc").read_text()
-    assert "marsyard --install-completion" in (Path(__file__).parents[2] / "README.md").read_text()
+    assert "marsyard --install-completion" in (Path(__file__).parents[2] / "docs" / "commands.md").read_text()
