@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks import beside, descent, engine, estimators, hda, pictures, reporting, starting, vtt
+from benchmarks import descent, engine, estimators, hda, pictures, renderers, reporting, starting, vtt
 from benchmarks.page import PAGE, write_page
 from benchmarks.timing import Figure
 from marsyard.sim.processor import processor_features
@@ -33,7 +33,7 @@ def main() -> None:
         *descent.frame(15),
         *descent.case(7),
         *estimators.side_by_side(8),
-        *beside.figures(5),
+        *renderers.figures(5),
         *pictures.rover_pictures(3),
         *descent.new_terrains(2),
         *vtt.figures(9),

@@ -63,7 +63,7 @@ def write(checks: Sequence[Check], kept: dict[str, dict]) -> None:
         for stored in kept.get(check.name, {}).get("measures", []):
             rows.append(_row(Measure(**stored)))
     for section, rows in sections.items():
-        head = ["| claim | bar | measured | | how |", "|---|---|---|---|---|"]
+        head = ["| property | bound | measured | | method |", "|---|---|---|---|---|"]
         text = text.replace("{" + section + "}", "\n".join(head + rows) if rows else "Not measured yet.")
     text = text.replace("{environment}", _environments(checks, kept))
     DOCUMENT.write_text(text)

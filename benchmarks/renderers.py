@@ -52,7 +52,7 @@ def figures(repeats: int) -> list[Figure]:
         Figure("how many times slower that is", [other / mine for mine, other in paired], least=3.0),
     ]
     if importlib.util.find_spec("pyvista") is not None:
-        command = [sys.executable, "-m", "benchmarks.beside"]
+        command = [sys.executable, "-m", "benchmarks.renderers"]
         found.append(Figure("PyVista's (VTK's) frame of that mesh, with shadows", _elsewhere(command, given, repeats)))
     if BLENDER in os.environ:
         command = [os.environ[BLENDER], str(Path(__file__).with_name("blender_frame.py"))]
