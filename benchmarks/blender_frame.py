@@ -1,4 +1,4 @@
-"""Draws a file's ground by Blender's Cycles: ``PYTHON blender_frame.py GROUND.npz REPEATS``; see `benchmarks.renderers`.
+"""Draw a ground by Blender Cycles: ``PYTHON blender_frame.py GROUND.npz REPEATS`` (`benchmarks.renderers`).
 
 Needs nothing of Marsyard's, as Blender's ``bpy`` lives in an environment of its own; called ``cycles.py`` it would hide
 Blender's own module of that name. One thread; the last line printed
