@@ -20,7 +20,7 @@ test: setup ## Run all checks and tests
 	@tools/lint.sh
 	@tools/test.sh $(PYTEST_ARGS)
 
-lint: setup ## Run the static checks: ruff, mypy, import-linter
+lint: setup ## Run the static checks: ruff, mypy, import-linter, codespell
 	@tools/lint.sh
 
 format: setup ## Rewrite the sources in the project's format, mending what can be mended

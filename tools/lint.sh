@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The static checks: all of them, or those named (lint format types imports). pre-commit and `make lint` run the same.
+# The static checks: all of them, or those named (lint format types imports spelling). pre-commit and `make lint` run the same.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bin=.venv/bin
@@ -12,6 +12,7 @@ check() {
         format) "$bin/ruff" format --check . ;;
         types) "$bin/mypy" ;;
         imports) "$bin/lint-imports" --no-logo ;;
+        spelling) "$bin/codespell" ;;
         *) echo "lint: no check named $1 (lint, format, types, imports)" >&2; return 2 ;;
     esac
 }
@@ -22,7 +23,7 @@ for name in "${@:-}"; do
     check "$name" || failed+=("$name")
 done
 if [ $# -eq 0 ]; then
-    for name in lint format types imports; do
+    for name in lint format types imports spelling; do
         echo "== $name"
         check "$name" || failed+=("$name")
     done
