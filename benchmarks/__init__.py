@@ -1,4 +1,4 @@
-"""Speed and memory, measured side by side in one run. One thread, as in a campaign's worker, if not told otherwise."""
+"""Benchmarks of run time and memory. One thread, as in a campaign's worker, unless stated otherwise."""
 
 import os
 

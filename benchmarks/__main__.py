@@ -1,4 +1,4 @@
-"""Runs every benchmark, prints the figures and keeps them: ``python -m benchmarks``."""
+"""Run all benchmarks, print and store the figures: ``python -m benchmarks``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PACKAGES = ("marsyard", "numpy", "numba", "pyrender2", "opencv-python-headless")
 
 
 def main() -> None:
-    """Measures, prints and keeps."""
+    """Run, print and store."""
     argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__).parse_args()
     cv2.setNumThreads(1)
     figures = [
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def keep(figures: list[Figure]) -> None:
-    """Writes the figures with the machine and the versions that they came from."""
+    """Write the figures with machine and versions."""
     record = {
         "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
         "machine": {"platform": platform.platform(), "processor": processor_features(), "cores": os.cpu_count()},

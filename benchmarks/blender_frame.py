@@ -21,7 +21,7 @@ SIDE_PX, SAMPLES = 1024, 16
 
 
 def prepared(given: Mapping[str, Any]) -> Callable[[], object]:
-    """What draws a frame, again and again."""
+    """Return a function that renders a frame."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     vertices, faces = given["vertices"], given["faces"]
@@ -54,7 +54,7 @@ def prepared(given: Mapping[str, Any]) -> Callable[[], object]:
 
 
 def main(file: Path, repeats: int) -> None:
-    """Draws and prints."""
+    """Render and print."""
     with np.load(file) as stored:
         draw = prepared({name: stored[name] for name in stored.files})
     draw()

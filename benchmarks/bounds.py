@@ -1,8 +1,8 @@
-"""What a whole `dimes-gusev` case cannot do without: lower bounds of its parts, each measured by itself, and their sum.
+"""Lower bounds of the run time of a `dimes-gusev` case: necessary operations, measured separately, and their sum.
 
-Three pictures of 1024 x 1024 pixels: each pixel's ray meets the ground by one spline of the heights at least, and its
-brightness takes another; each counts a random number of electrons and has noise of its readout; shadows read every
-height once. What OpenGL draws and what DIMES correlates is taken from cases: the calls of the libraries alone.
+Three pictures of 1024 x 1024 pixels. Each pixel needs one spline evaluation for its intersection and one for its
+radiance, a Poisson number of electrons and normal readout noise; shadows read every height once. OpenGL drawing and
+DIMES' transforms are the library calls of profiled cases.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from marsyard.sim.render.kernels.strips import STRIP, Near, fetch_cells, no_cell
 from marsyard.sim.terrain.kernels import Array, Level
 
 PICTURES, SIDE_PX = 3, 1024
-#: Splines that a pixel needs: where its ray meets the ground, and how bright that is.
+#: Spline evaluations per pixel: intersection and radiance.
 SPLINES = 2
-#: Mean of the electrons of a pixel; from some ten on, a Poisson number costs the same whatever its mean.
+#: Mean electrons of a pixel; above about ten, the cost of a Poisson number does not depend on the mean.
 ELECTRONS = 3e4
 #: Calls of libraries in cases.
 CALLS: Stages = {
@@ -47,7 +47,7 @@ def bounds(run_case: Callable[[], object], repeats: int) -> list[Figure]:
 
 
 def _splines() -> Callable[[], object]:
-    """Splines at as many places as the pictures have pixels, neighbours side by side, as kernels take them."""
+    """Evaluate splines at neighbouring positions, one per pixel, as the kernels do."""
     surface = descent_scene()[1]
     places = np.linspace(0.0, 1000.0, SIDE_PX)
     x, y = (side.ravel() for side in np.meshgrid(places, places))
@@ -56,7 +56,7 @@ def _splines() -> Callable[[], object]:
 
 @njit(cache=True)
 def _summed(field: Level, scale: float, x: Array, y: Array) -> float:
-    """Sum of heights, slopes and albedos at places."""
+    """Sum of heights, slopes and albedos at positions."""
     near: Near = no_cells()
     which = np.arange(STRIP)
     total = 0.0
@@ -76,7 +76,7 @@ def _strip(near: Near) -> float:
 
 
 def _random_numbers() -> Callable[[], object]:
-    """Poisson and normal numbers, as many as the pictures have pixels."""
+    """Draw one Poisson and one normal number per pixel."""
     rng = np.random.default_rng(0)
     mean: NDArray[np.float32] = np.full((SIDE_PX, SIDE_PX), ELECTRONS, dtype=np.float32)
 

@@ -1,9 +1,9 @@
-"""Whether a hot path is slower than when its ratios were last kept: ``python -m benchmarks.check [--keep]``.
+"""Detect hot paths that are slower than their stored ratios: ``python -m benchmarks.check [--keep]``.
 
-Each path runs in turn with a yardstick, fixed work of the same kinds (products of matrices, filters, sorting, copies),
-so that a slow or busy machine slows both. What is compared is the logarithm of their ratio, now and as kept, by
-Welch's test: a path is called slower where its mean ratio has grown by more than `ALLOWED`, at a rate of false alarms
-of `FALSE_ALARMS` for all paths together. Ratios belong to a kind of processor; on another they say nothing.
+Each path alternates with a reference workload of the same kinds of operations (matrix products, filters, sorting,
+copies), so that a slow or busy machine affects both. Welch's test compares the logarithms of their ratios with the
+stored ones. A path is slower if its mean ratio has grown by more than `ALLOWED`, with a false alarm rate of
+`FALSE_ALARMS` for all paths together. Ratios are valid for one type of processor.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from marsyard.algorithms.hda import ElevationMap, HdaEstimator, HdaOptions, haza
 from marsyard.sim.processor import processor_features
 
 RATIOS = Path(__file__).parent / "results" / "ratios.json"
-#: Pairs of a path's run and the yardstick's.
+#: Pairs of runs of a path and the reference workload.
 PAIRS = 15
-#: Growth of a ratio that is no regression yet: what memory and caches shared with others do to it.
+#: Growth of a ratio that is accepted, because memory and caches are shared with other programs.
 ALLOWED = 1.15
-#: Chance that any path of an unchanged program is called slower.
+#: Probability that any path of an unchanged program is reported.
 FALSE_ALARMS = 0.01
 
 
@@ -55,7 +55,7 @@ def _hazards() -> Callable[[], object]:
     return lambda: hazard_maps(ground, HdaOptions())
 
 
-#: By name: what makes a path ready to be run, again and again.
+#: Functions that prepare each path for repeated runs, by name.
 PATHS: Mapping[str, Callable[[], Callable[[], object]]] = {
     "descent picture with detector": descent_exposure,
     "DIMES, a triple": _dimes,
@@ -66,8 +66,8 @@ PATHS: Mapping[str, Callable[[], Callable[[], object]]] = {
 }
 
 
-def yardstick() -> Callable[[], object]:
-    """Fixed work of some 30 ms."""
+def reference_workload() -> Callable[[], object]:
+    """Return a workload of about 30 ms."""
     rng = np.random.default_rng(0)
     matrix = rng.standard_normal((300, 300))
     picture = rng.standard_normal((1024, 1024)).astype(np.float32)
@@ -82,12 +82,12 @@ def yardstick() -> Callable[[], object]:
     return work
 
 
-def log_ratios(path: Callable[[], object], beside: Callable[[], object], pairs: int) -> list[float]:
-    """Logarithm of the path's processor time over the mean of the yardstick's before and after it, for each pair."""
+def log_ratios(path: Callable[[], object], reference: Callable[[], object], pairs: int) -> list[float]:
+    """Logarithm of the path's processor time over the mean reference time before and after it, for each pair."""
     path()
-    found, before = [], _seconds(beside)
+    found, before = [], _seconds(reference)
     for _ in range(pairs):
-        taken, after = _seconds(path), _seconds(beside)
+        taken, after = _seconds(path), _seconds(reference)
         found.append(float(np.log(taken / (0.5 * (before + after)))))
         before = after
     return found
@@ -101,15 +101,15 @@ def _seconds(work: Callable[[], object]) -> float:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A path beside what was kept: how many times its ratio is the kept one, and the chance of that without growth."""
+    """A path compared with its stored ratio: the factor of its growth, and the p-value without growth."""
 
     name: str
     times: float
     p_value: float
 
 
-def compared(now: Mapping[str, Sequence[float]], kept: Mapping[str, Sequence[float]]) -> list[Comparison]:
-    """Every path that both have."""
+def compare(now: Mapping[str, Sequence[float]], kept: Mapping[str, Sequence[float]]) -> list[Comparison]:
+    """Compare every path that both records contain."""
     found = []
     for name in now.keys() & kept.keys():
         ours, before = np.asarray(now[name]), np.asarray(kept[name])
@@ -118,26 +118,28 @@ def compared(now: Mapping[str, Sequence[float]], kept: Mapping[str, Sequence[flo
     return sorted(found, key=lambda one: one.name)
 
 
-def slower(found: Sequence[Comparison]) -> list[Comparison]:
-    """Those that have grown beyond what is allowed; Bonferroni's correction for their number."""
+def select_slower(found: Sequence[Comparison]) -> list[Comparison]:
+    """Select paths that exceed the accepted growth, with Bonferroni's correction."""
     return [one for one in found if one.p_value < FALSE_ALARMS / len(found)]
 
 
 def main() -> int:
-    """Measures, then keeps or compares; 1 where a path is slower, 2 where there is nothing to compare with."""
+    """Measure, then store or compare. Returns 1 if a path is slower, 2 without stored ratios."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.check", description=__doc__)
-    parser.add_argument("--keep", action="store_true", help="keep these ratios for later runs to be compared with")
+    parser.add_argument("--keep", action="store_true", help="store these ratios for later comparisons")
     keep = parser.parse_args().keep
     kept = json.loads(RATIOS.read_text()) if RATIOS.exists() else None
     if not keep and (kept is None or kept["processor"] != processor_features()):
-        said = (
-            "no ratios are kept" if kept is None else f"the kept ratios are of another processor, {kept['processor']}"
+        reason = (
+            "no ratios are stored"
+            if kept is None
+            else f"the stored ratios are of another processor, {kept['processor']}"
         )
-        print(f"{said}: run 'python -m benchmarks.check --keep' on the version to compare with", file=sys.stderr)
+        print(f"{reason}: run 'python -m benchmarks.check --keep' on the version to compare with", file=sys.stderr)
         return 2
     cv2.setNumThreads(1)
-    beside = yardstick()
-    now = {name: log_ratios(make(), beside, PAIRS) for name, make in PATHS.items()}
+    reference = reference_workload()
+    now = {name: log_ratios(make(), reference, PAIRS) for name, make in PATHS.items()}
     if keep:
         record = {
             "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
@@ -148,13 +150,13 @@ def main() -> int:
         print(f"kept in {RATIOS}")
         return 0
     assert kept is not None, "without kept ratios nothing is compared"
-    return _said(compared(now, kept["log_ratios"]), kept["measured"])
+    return _print_comparison(compare(now, kept["log_ratios"]), kept["measured"])
 
 
-def _said(found: Sequence[Comparison], measured: str) -> int:
-    """Prints the comparison; 1 where a path is slower."""
-    bad = slower(found)
-    print(f"{'times the ratio kept ' + measured[:10]:<40}{'times':>8}{'p':>10}")
+def _print_comparison(found: Sequence[Comparison], measured: str) -> int:
+    """Print the comparison. Returns 1 if a path is slower."""
+    bad = select_slower(found)
+    print(f"{'factor to the ratio of ' + measured[:10]:<40}{'times':>8}{'p':>10}")
     for one in found:
         print(f"{one.name:<40}{one.times:8.2f}{one.p_value:10.2g}{'  SLOWER' if one in bad else ''}")
     return 1 if bad else 0

@@ -1,4 +1,4 @@
-"""How long a descent picture, a new terrain, DIMES and a whole smoke case take."""
+"""Run times of a descent picture, a new terrain, DIMES and a complete case."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from marsyard.sim.terrain.sites import sites
 
 
 def frame(repeats: int) -> list[Figure]:
-    """A frame of the descent scene, terrain, mesh and shadows built."""
+    """A frame of the descent scene with prepared terrain, mesh and shadows."""
     scene, surface = descent_scene()
     optics = camera_optics(CameraParameters())
     renderer = process_renderer(default_backend())
@@ -36,7 +36,7 @@ def frame(repeats: int) -> list[Figure]:
 
 
 def case(repeats: int) -> list[Figure]:
-    """Whole cases as the campaign `dimes-gusev` runs them, over one terrain that is built, their stages and bounds."""
+    """Complete `dimes-gusev` cases over one prepared terrain, their stages and lower bounds."""
     campaign = load_campaign("dimes-gusev")
     numbers = itertools.count()
 
@@ -53,7 +53,7 @@ def case(repeats: int) -> list[Figure]:
 
 
 def new_terrains(repeats: int) -> list[Figure]:
-    """A new terrain of 4096 x 4096 for a descent, of the plain kind and of every site."""
+    """A new descent terrain of 4096 x 4096 samples, by default parameters and for every site."""
     kinds = {"plain": TerrainParameters()} | {
         name: site.descent for name, site in sites().items() if site.descent is not None
     }

@@ -1,6 +1,6 @@
-"""Derives the threshold of DIMES' IMU check afresh and keeps it: ``python -m benchmarks.dimes_threshold``.
+"""Derive and store the threshold of DIMES' IMU check: ``python -m benchmarks.dimes_threshold``.
 
-Writes `algorithms/dimes/imu_threshold.json`; a test holds the option's default against it. Takes about two minutes.
+Writes `algorithms/dimes/imu_threshold.json`; a test compares the option's default with it. Takes about two minutes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WRONG_BY_M_S = ((10.0, 10.0), (10.0, 60.0))
 
 
 def derived(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
-    """The threshold, the distribution that it is a quantile of, and what it is worth against one wrong track."""
+    """Threshold, distribution of discrepancies, and effect of the check on one wrong track."""
     rng = np.random.default_rng(inputs.seed)
     errors = derivation.right_track_errors(inputs, rng)
     found = derivation.discrepancies(errors, inputs.imu_sd_m_s, rng)

@@ -1,4 +1,4 @@
-"""What a campaign costs beside its cases: time a case, memory of the parent, and the table of a million rows."""
+"""Overhead of campaigns: time per case, memory of the parent process, and writing a table of a million rows."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class BusyParameters(BaseModel):
 
 
 class BusyScenario:
-    """Keeps a processor busy for so long, and scores nothing."""
+    """Occupy a processor for a given time, without a score."""
 
     name = "busy"
     parameters_type = BusyParameters
@@ -56,7 +56,7 @@ class BusyScenario:
 
 
 class Stopwatch:
-    """A watch of a campaign that notes when a number of cases was done, and how much memory the parent then had."""
+    """Progress display that records time and memory of the parent at given numbers of cases."""
 
     def __init__(self, marks: tuple[int, ...]) -> None:
         self.at: dict[int, tuple[float, float]] = {}
@@ -78,7 +78,7 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Span:
-    """What lay between two marks of a campaign: wall-clock seconds a case, cases' own part of them, and growth."""
+    """Wall-clock time per case between two marks, the part spent in cases, and growth of memory."""
 
     case_s: float
     own_s: float
@@ -86,22 +86,24 @@ class Span:
 
 
 def figures(repeats: int = 3) -> list[Figure]:
-    """The bars of the engine. Shares of wall-clock time, so that another program's load counts on both sides."""
+    """Overhead of the engine. Fractions of wall-clock time, so that load of other programs affects both sides."""
     empty = [span(0.0, 2_000, 12_000) for _ in range(repeats)]
     busy = [span(0.05, 20, 140) for _ in range(repeats)]
     long = span(0.0, 10_000, 100_000)
     return [
-        Figure("engine: beside an empty case (ms)", [1e3 * (one.case_s - one.own_s) for one in empty], bar=2.0),
-        Figure("engine: beside a case of 50 ms (%)", [100.0 * (one.case_s / one.own_s - 1.0) for one in busy], bar=3.0),
-        Figure("engine: parent grows, 10,000 to 100,000 cases (MB)", [long.grown_mb], bar=10.0),
+        Figure("engine: overhead of an empty case (ms)", [1e3 * (one.case_s - one.own_s) for one in empty], bar=2.0),
+        Figure(
+            "engine: overhead of a case of 50 ms (%)", [100.0 * (one.case_s / one.own_s - 1.0) for one in busy], bar=3.0
+        ),
+        Figure("engine: growth of the parent, 10,000 to 100,000 cases (MB)", [long.grown_mb], bar=10.0),
         *_a_hundred_thousand(),
-        Figure("engine: two workers over one, rendered cases (times)", [gain() for _ in range(repeats)], least=1.85),
+        Figure("engine: speed-up by two workers, rendered cases", [gain() for _ in range(repeats)], minimum=1.85),
         Figure(f"engine: table of 1,000,000 rows of {COLUMNS} numbers (s)", [table_seconds(1_000_000)], bar=30.0),
     ]
 
 
 def _a_hundred_thousand(cases: int = 100_000) -> list[Figure]:
-    """A whole campaign of empty cases on two workers, from its start to its table, and joblib's loop over the same."""
+    """A complete campaign of empty cases on two workers, and a loop of joblib over the same cases."""
     configuration = CampaignConfiguration(
         name="empty", scenario="benchmarks.engine:BusyScenario", cases=cases, retain=Retain(showcase="none")
     )
@@ -115,7 +117,7 @@ def _a_hundred_thousand(cases: int = 100_000) -> list[Figure]:
     loop = time.perf_counter() - began
     return [
         Figure(f"engine: {cases:,} empty cases, two workers (wall s)", [ours], bar=60.0),
-        Figure("the same in a plain loop of joblib, nothing kept (wall s)", [loop]),
+        Figure("the same in a loop of joblib without storage (wall s)", [loop]),
     ]
 
 
@@ -124,11 +126,11 @@ def _one(campaign: Campaign, case: int) -> CaseResult:
 
 
 def span(busy_s: float, first: int, last: int) -> Span:
-    """Runs a campaign on one worker; measured between its first and last mark, so that starting up does not count."""
+    """Run a campaign on one worker and measure between the marks, so that start-up is excluded."""
     configuration = CampaignConfiguration(
         name="busy",
         scenario="benchmarks.engine:BusyScenario",
-        # behind the last mark workers run small batches, as the end is near
+        # after the last mark workers run small batches
         cases=last + (last - first) // 10,
         parameters={"busy_s": busy_s},
         retain=Retain(showcase="none"),
@@ -143,9 +145,9 @@ def span(busy_s: float, first: int, last: int) -> Span:
 
 
 def gain(campaign: str = "dimes-smoke", cases: int = 120) -> float:
-    """Rendered cases a second of two workers over those of one; tells something on a machine with idle cores alone.
+    """Speed-up of two workers with rendered cases; meaningful on idle cores only.
 
-    Between a mark when all workers are warm and one before the last batches, when one may wait for the other.
+    Measured between the start-up of all workers and the last batches.
     """
     first, last = 24, cases - 8
     times = []
@@ -159,7 +161,7 @@ def gain(campaign: str = "dimes-smoke", cases: int = 120) -> float:
 
 
 def table_seconds(rows: int) -> float:
-    """Seconds of processor time to write the table of so many rows; numbers of full length, as measurements have."""
+    """Processor time to write a table with full-precision numbers."""
     head: dict[str, Scalar] = {"outcome": "VALID", "answered": True}
     tail: dict[str, Scalar] = {"wall_time_s": 0.1, "cpu_time_s": 0.1, "error": "", "traceback": ""}
     with TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Velocity estimators side by side on the same rendered descents: DIMES, and what a user would take instead."""
+"""Velocity estimators on the same rendered descents: DIMES and baselines."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ REPEATS = 3
 
 
 class Recorder:
-    """An estimator that keeps what it is given, so that others can be tried on it."""
+    """Estimator that records its measurements for other estimators."""
 
     given: ClassVar[list[DescentMeasurements]] = []
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """Keeps the measurements and gives no answer."""
+        """Record the measurements without an answer."""
         self.given.append(measurements)
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 
 
 @dataclass(frozen=True)
 class Descent:
-    """Measurements of a descent, the true mean velocity over its second pair, and whether DIMES has room there."""
+    """Measurements of a descent, true mean velocity over the second pair, and whether templates overlap."""
 
     measurements: DescentMeasurements
     velocity_m_s: np.ndarray
@@ -49,7 +49,7 @@ class Descent:
 
 
 def recorded(campaign_name: str, cases: int) -> list[Descent]:
-    """The first cases of a campaign of descents."""
+    """Record the first cases of a descent campaign."""
     campaign = load_campaign(campaign_name, ["parameters.algorithm=benchmarks.estimators:Recorder"])
     found = []
     for case in range(cases):
@@ -62,19 +62,19 @@ def recorded(campaign_name: str, cases: int) -> list[Descent]:
 
 @dataclass(frozen=True)
 class Tried:
-    """An estimator's answers to some descents: errors in m/s (NaN where none was given), and core-seconds of each."""
+    """Errors of an estimator in m/s (NaN without an answer) and core-seconds per descent."""
 
     errors_m_s: np.ndarray
     seconds: np.ndarray
 
     @property
     def valid(self) -> np.ndarray:
-        """Errors of the answers that were given."""
+        """Errors of the answers."""
         return self.errors_m_s[np.isfinite(self.errors_m_s)]
 
 
 def tried(estimator: VelocityEstimator, descents: list[Descent]) -> Tried:
-    """What an estimator makes of descents."""
+    """Run an estimator on descents."""
     errors, seconds = [], []
     for descent in descents:
         times = []

@@ -1,4 +1,4 @@
-"""How costs grow: ``python -m benchmarks.growth`` measures, keeps the points, and draws docs/images/growth.svg.
+"""Growth of costs with size: ``python -m benchmarks.growth`` draws docs/images/growth.svg.
 
 Frame over pixels and over triangles, case over the terrain's size, campaign over cases and workers (light ones, as
 many as a cluster's would be here, and by Dask), report over cases. Core-seconds, but for workers: what they are for
@@ -24,7 +24,7 @@ from pydantic import BaseModel
 
 from benchmarks.engine import BusyParameters, BusyScenario, Stopwatch
 from benchmarks.pictures import descent_pose, descent_scene
-from benchmarks.reporting import made_up, marsyard
+from benchmarks.reporting import marsyard, synthetic_campaign
 from benchmarks.timing import core_seconds
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
@@ -40,13 +40,13 @@ from marsyard.sim.streams import Streams
 
 KEPT = Path(__file__).parent / "results" / "growth.json"
 FIGURE = Path(__file__).parents[1] / "docs" / "images" / "growth.svg"
-#: What a light worker is busy with, seconds a case.
+#: Waiting time of a light case, s.
 LIGHT_S = 0.02
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One cost over one size.
+    """Cost as a function of one size.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Curve:
 
     @property
     def power(self) -> float:
-        """Exponent of the power law between the largest size and the one before: what the growth comes to."""
+        """Exponent of the power law between the two largest sizes."""
         (before, cheap), (last, dear) = self.points[-2:]
         return float(np.log(dear / cheap) / np.log(last / before))
 
@@ -80,7 +80,7 @@ class LightScenario(BusyScenario):
 
 
 def curves() -> list[Curve]:
-    """All that is measured."""
+    """Measure all curves."""
     return [
         Curve("frame over pixels", "pixels", "core-s", _frames_of_sizes((128, 256, 512, 1024))),
         Curve("frame over triangles", "triangles of the mesh", "core-s", _frames_of_meshes((65, 129, 257, 513, 1025))),
@@ -100,7 +100,7 @@ def _frames_of_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
     for side in sides:
         corner = (camera.size[0] - side) // 2
         rays = PixelRays.of(camera.cropped(corner, corner, (side, side)))
-        found.append((float(side**2), _least(partial(renderer.render, scene, rays, pose))))
+        found.append((float(side**2), _minimum(partial(renderer.render, scene, rays, pose))))
     return found
 
 
@@ -113,7 +113,7 @@ def _frames_of_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
         # as far as the frame's own mesh reaches, with lines further apart where they are fewer
         finest = scene.mesh_finest_m * (scene.mesh_lines - 1) / (count - 1)
         of_count = replace(scene, mesh_lines=count, mesh_finest_m=finest)
-        cost = _least(partial(renderer.render, of_count, rays, pose))
+        cost = _minimum(partial(renderer.render, of_count, rays, pose))
         found.append((2.0 * (count - 1) ** 2, cost))
     return found
 
@@ -125,7 +125,7 @@ def _cases_over_terrains(samples: Sequence[int]) -> list[tuple[float, float]]:
         # one case again and again: cases differ by more than terrains do
         parameters = campaign.with_values({**campaign.draws(0), "place.terrain": 0})
         run = partial(campaign.scenario.run, parameters, campaign.streams(0))
-        found.append((float(count**2), _least(run)))
+        found.append((float(count**2), _minimum(run)))
     return found
 
 
@@ -142,7 +142,7 @@ def _clusters(workers: Sequence[int]) -> list[tuple[float, float]]:
 
 
 def _campaign_s(cases: int, waiting_s: float, crew: Crew) -> float:
-    """Wall-clock time from the first case done to the last."""
+    """Wall-clock time from the first to the last completed case."""
     scenario = "benchmarks.growth:LightScenario" if waiting_s else "benchmarks.engine:BusyScenario"
     configuration = CampaignConfiguration(
         name="growth",
@@ -160,17 +160,17 @@ def _campaign_s(cases: int, waiting_s: float, crew: Crew) -> float:
 
 def _reports(cases: Sequence[int]) -> list[tuple[float, float]]:
     with TemporaryDirectory() as folder:
-        runs = [(count, made_up(Path(folder, f"of-{count}"), count)) for count in cases]
+        runs = [(count, synthetic_campaign(Path(folder, f"of-{count}"), count)) for count in cases]
         return [(float(count), marsyard("report", str(run)).core_s) for count, run in runs]
 
 
-def _least(run: Callable[[], object]) -> float:
-    """The least of three: growth is what is asked, and what else runs on the machine only adds."""
+def _minimum(run: Callable[[], object]) -> float:
+    """Minimum of three runs, because other programs only add time."""
     return min(core_seconds(run, 3))
 
 
 def drawn(found: Sequence[Curve]) -> Figure:
-    """A panel each, both axes logarithmic, costs over a decade at least: what hardly grows shall look like it."""
+    """One panel per curve, logarithmic axes with at least a decade of cost, so that slow growth looks slow."""
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     panels = figure.subplots(2, 4).ravel()
     for axes, curve in zip(panels, found, strict=False):
@@ -195,7 +195,7 @@ def drawn(found: Sequence[Curve]) -> Figure:
 
 
 def main() -> None:
-    """Measures, keeps and draws."""
+    """Measure, store and draw."""
     cv2.setNumThreads(1)
     mpl.rcParams["svg.hashsalt"] = "marsyard"
     found = curves()

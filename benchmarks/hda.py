@@ -1,4 +1,4 @@
-"""Hazard detection beside the run times of its paper (Table I, on a 400 MHz R12000), and dense maps."""
+"""Run times of hazard detection next to those of the paper (Table I, 400 MHz R12000), and of dense maps."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ def _picture(texture: np.ndarray, pose: RigidTransform) -> np.ndarray:
 
 
 def figures(repeats: int) -> list[Figure]:
-    """Stages with the paper's parameters, the whole with them and dense, maps of a large map, a campaign's case."""
+    """Stages and total with the paper's parameters, dense estimation, hazard maps of a large map, a campaign case."""
     given = measurements()
     return [*table_one(given, repeats), *_whole(given, repeats), _large_map(repeats), case(repeats)]
 
 
 def table_one(given: LandingMeasurements, repeats: int) -> list[Figure]:
-    """The four stages of Table I; the scale belongs to structure from motion."""
+    """The four stages of Table I; the scale is part of structure from motion."""
     seen = sighting(given)
     details = HdaEstimator(PAPER).estimate(given).details
     assert isinstance(details, HdaDetails)
@@ -133,7 +133,7 @@ def _large_map(repeats: int) -> Figure:
 
 
 def case(cases: int) -> Figure:
-    """Whole cases of `hda-hazardous`, as a worker runs them that has had their ground before."""
+    """Complete cases of `hda-hazardous` with prepared terrain."""
     campaign = load_campaign("hda-hazardous")
 
     def fly(number: int) -> None:

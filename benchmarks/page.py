@@ -1,4 +1,4 @@
-"""The page of performance: what was measured, as `docs/performance.md`."""
+"""Write the measured figures as `docs/performance.md`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ PAGE = Path(__file__).parents[1] / "docs" / "performance.md"
 
 
 def write_page(record: Mapping[str, Any]) -> None:
-    """Writes the page from a record of figures, as `benchmarks.json` holds it."""
-    rows = ["| what | asked | median |", "|---|---|---|"]
+    """Write the page from the record in `benchmarks.json`."""
+    rows = ["| quantity | bound | median |", "|---|---|---|"]
     rows += [f"| {name} | {kept['asked']} | {kept['median']:.3g} |" for name, kept in record["figures"].items()]
     machine = record["machine"]
     where = f"{record['measured'][:10]}, {machine['cores']} cores of {machine['processor']}, {record['gl']}"

@@ -1,4 +1,4 @@
-"""Pictures near the ground, and a worker's memory."""
+"""Run times of rendered pictures, and memory of a worker."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def descent_scene() -> tuple[Scene, Surface]:
 
 
 def descent_exposure() -> Callable[[], object]:
-    """What renders and exposes a picture of the descent scene, its terrain and its shadow built once."""
+    """Return a function that renders and exposes the descent scene with prepared terrain and shadows."""
     scene, surface = descent_scene()
     optics = camera_optics(CameraParameters())
     renderer = process_renderer(default_backend())
@@ -49,7 +49,7 @@ def descent_exposure() -> Callable[[], object]:
 
 
 def descent_pose(surface: Surface) -> RigidTransform:
-    """Where the lander of the descent scene is a second after its first picture."""
+    """Pose of the lander one second after its first picture."""
     flown = flown_descent(DescentScenarioParameters(), surface, Streams(1, "bench", 0))
     return flown.motion.state(1.0).world_from_body
 
@@ -104,10 +104,10 @@ PICTURES_OF_A_SCENE, ROCKY_OF = 5, 4
 
 
 def memory(frames: int) -> list[Figure]:
-    """Memory of this process after half of some frames, and after all of them; every fifth frame loads a new scene.
+    """Memory of this process after half of the frames and after all; every fifth frame loads a new scene.
 
-    One scene in four stands on a site with rocks, so that bodies too are loaded and released, and the renderer changes
-    between drawing ground alone and drawing numbers of triangles.
+    One scene in four has rocks, so that bodies are loaded and released, and the renderer switches between drawing
+    ground only and drawing triangle numbers.
     """
     renderer = process_renderer(default_backend())
     _, surface = descent_scene()
@@ -139,7 +139,7 @@ def memory(frames: int) -> list[Figure]:
 
 
 def on_all_cores(repeats: int) -> list[Figure]:
-    """Wall-clock time of a descent frame with its detector in a process of its own that may use all cores."""
+    """Wall-clock time of a descent frame with detector in a separate process with all cores."""
     limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "LP_NUM_THREADS")
     free = os.environ | dict.fromkeys(limits, str(os.cpu_count()))
     told = subprocess.run(

@@ -1,4 +1,4 @@
-"""Other renderers' pictures of the ground that a descent's frame shows, in turn with ours.
+"""Run times of other renderers for the ground of a descent frame.
 
 pyrender is always there. VTK (through PyVista) is measured where it is installed (``pip install .[bench]``), Blender's
 Cycles where the variable `MARSYARD_BLENDER` names a Python that has ``bpy`` (from PyPI; it asks for a NumPy older than
@@ -38,8 +38,8 @@ BLENDER = "MARSYARD_BLENDER"
 def figures(repeats: int) -> list[Figure]:
     """A sensor-realistic descent frame against other renderers' shaded frames of the same ground.
 
-    Ours shows the terrain's samples, 1.5 m apart, whatever the mesh that starts the search; the others show what their
-    mesh holds: lines 3 m apart in the middle, twice as coarse as the terrain still. All cast shadows.
+    This renderer resolves the terrain's samples, 1.5 m apart, independently of its mesh. The others resolve their mesh:
+    lines 3 m apart in the centre, twice as coarse as the terrain. All cast shadows.
     """
     ours = descent_exposure()
     given = _descent_mesh()
@@ -49,7 +49,7 @@ def figures(repeats: int) -> list[Figure]:
         Figure("descent frame with shadows and detector", [mine for mine, _ in paired], bar=0.2),
         *on_all_cores(repeats),
         Figure("pyrender's shaded frame of a mesh as fine, with shadows", [other for _, other in paired]),
-        Figure("how many times slower that is", [other / mine for mine, other in paired], least=3.0),
+        Figure("how many times slower that is", [other / mine for mine, other in paired], minimum=3.0),
     ]
     if importlib.util.find_spec("pyvista") is not None:
         command = [sys.executable, "-m", "benchmarks.renderers"]
@@ -91,11 +91,10 @@ def _pyrender_shaded(given: Mapping[str, Any]) -> Callable[[], None]:
 
 
 def _compile_shaders_once(renderer: Any) -> None:
-    """Makes pyrender find the shaders that it has compiled.
+    """Make pyrender reuse its compiled shaders.
 
-    pyrender looks them up by the current context. PyOpenGL tells OSMesa's context by a new pointer object each time, so
-    that every picture would compile its shaders anew and leave the old ones behind, some 0.3 MB. A renderer has one
-    context for life.
+    pyrender looks them up by the current context. PyOpenGL represents OSMesa's context by a new pointer object each
+    time, so every picture would compile its shaders again and leak about 0.3 MB. A renderer has a single context.
     """
     programs = renderer._program_cache
     compile_program = programs.get_program
@@ -116,7 +115,7 @@ def _compile_shaders_once(renderer: Any) -> None:
 
 
 def _elsewhere(command: list[str], given: Mapping[str, Any], repeats: int) -> list[float]:
-    """Core-seconds of each frame that another process draws of a file."""
+    """Core-seconds of each frame that another process renders from a file."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "ground.npz"
         mesh = given["mesh"]
@@ -151,7 +150,7 @@ def _vtk(given: Mapping[str, Any]) -> Callable[[], object]:
 
 
 def _measure_vtk(file: Path, repeats: int) -> None:
-    """Draws frames by VTK and prints the core-seconds of each but the first, all threads counted."""
+    """Render frames by VTK and print the core-seconds of each but the first, over all threads."""
     with np.load(file) as stored:
         draw = _vtk({name: stored[name] for name in stored.files})
     print(json.dumps(core_seconds(draw, repeats)))

@@ -1,4 +1,4 @@
-"""Reports of very large and of small campaigns, and the dashboard over a thousand: time, memory, size, the browser."""
+"""Time, memory and size of reports of large and small campaigns, and of a dashboard over a thousand."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from benchmarks.timing import Figure
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.store.record import SCHEMA
 
-#: Columns of numbers beside those that reports know by name: a row of `dimes-gusev` has 99 columns.
+#: Further columns of numbers: a row of `dimes-gusev` has 99 columns.
 FURTHER = 82
-#: Cases that are made up together.
+#: Cases that are generated together.
 _BLOCK = 50_000
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a command took: core-seconds, wall-clock seconds, and its largest resident memory."""
+    """Cost of a command: core-seconds, wall-clock seconds, and maximum resident memory."""
 
     core_s: float
     wall_s: float
@@ -39,9 +39,9 @@ class Cost:
 
 
 def figures(cases: int = 1_000_000, campaigns: int = 1_000) -> list[Figure]:
-    """The bars of reports and of the dashboard. Core-seconds where other programs would be in a wall-clock time."""
+    """Figures of reports and dashboard, in core-seconds, which other programs do not affect."""
     with TemporaryDirectory() as folder:
-        large, small = (made_up(Path(folder, f"of-{count}"), count) for count in (cases, 24))
+        large, small = (synthetic_campaign(Path(folder, f"of-{count}"), count) for count in (cases, 24))
         of_large, of_small = (marsyard("report", str(run)) for run in (large, small))
         page = large / "report.html"
         site = _many(Path(folder, "many"), small, campaigns)
@@ -53,17 +53,17 @@ def figures(cases: int = 1_000_000, campaigns: int = 1_000) -> list[Figure]:
             Figure(f"report of {cases:,} cases", [of_large.core_s], bar=30.0),
             Figure(f"report of {cases:,} cases: memory (GB)", [of_large.memory_gb], bar=2.0),
             Figure(f"report of {cases:,} cases: page (MB)", [page.stat().st_size / 1e6], bar=10.0),
-            Figure("the same, from opening until a hover tells a case (wall s)", shown, bar=3.0),
+            Figure("the same, from opening until a tooltip appears (wall s)", shown, bar=3.0),
             Figure("report of 24 cases", [of_small.core_s], bar=8.0),
             Figure(f"dashboard of {campaigns:,} campaigns", [fresh.core_s]),
-            Figure("the same, renewed with nothing new", [again.core_s]),
+            Figure("the same, written again without changes", [again.core_s]),
             Figure("the same: index (MB)", [index.stat().st_size / 1e6], bar=10.0),
             Figure("the same, from opening until filtered (wall s)", filtered, bar=3.0),
         ]
 
 
-def made_up(directory: Path, cases: int, seed: int = 1, site: str = "gusev") -> Path:
-    """A stored campaign of made-up descents with rows as wide as real ones, in the store's own layout."""
+def synthetic_campaign(directory: Path, cases: int, seed: int = 1, site: str = "gusev") -> Path:
+    """Write a stored campaign of synthetic descents with as many columns as real ones."""
     rng = np.random.default_rng(seed)
     directory.mkdir(parents=True)
     writer: pq.ParquetWriter | None = None
@@ -123,7 +123,7 @@ def _record(cases: int, seed: int, site: str) -> dict[str, Any]:
 
 
 def _many(folder: Path, pattern: Path, campaigns: int) -> Path:
-    """Lays out so many campaigns like one that has its report, under records of their own; the site to be written."""
+    """Copy a reported campaign several times with separate records. Returns the site folder."""
     for number in range(campaigns):
         run = folder / "runs" / f"run-{number:04}"
         shutil.copytree(pattern, run, copy_function=os.link)
@@ -140,7 +140,7 @@ def _twin(pattern: Path, site: str) -> dict[str, Any]:
 
 
 def marsyard(*arguments: str) -> Cost:
-    """What a command of the program takes, in a process of its own."""
+    """Cost of a `marsyard` command in a separate process."""
     began = time.perf_counter()
     child = os.posix_spawn(
         sys.executable, [sys.executable, "-m", "marsyard", *arguments], os.environ, file_actions=_QUIETLY
@@ -155,7 +155,7 @@ _QUIETLY = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
 
 
 def opened(path: Path, done: Callable[[Page], None], repeats: int = 5) -> list[float]:
-    """Seconds from opening a page, in a window of its own of Debian's Chromium, until something has been done in it."""
+    """Time from opening a page in Debian's Chromium to the end of an action."""
     browser = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)
     times = []
     with sync_playwright() as playwright:
@@ -173,13 +173,13 @@ def opened(path: Path, done: Callable[[Page], None], repeats: int = 5) -> list[f
 
 
 def hover_a_case(page: Page) -> None:
-    """Points at a case in the plot and waits until its figures are told."""
+    """Point at a case in the plot and wait for its tooltip."""
     page.locator(".explorer-plot circle.point").nth(5).hover(force=True)
     page.locator(".explorer-tip").wait_for(state="visible")
 
 
 def filter_campaigns(page: Page) -> None:
-    """Chooses a site and waits until the table holds its campaigns alone."""
+    """Select a site and wait until the table contains only its campaigns."""
     page.locator("select[name=site]").select_option("isidis")
     expect(page.locator("#count")).to_have_text(re.compile(r"^\d{1,3} of \d+,?\d* campaigns"))
 

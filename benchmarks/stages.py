@@ -1,4 +1,4 @@
-"""Where the core-seconds of a whole `dimes-gusev` case go, stage by stage."""
+"""Core-seconds of a `dimes-gusev` case by stage."""
 
 from __future__ import annotations
 
@@ -33,17 +33,16 @@ REST = "all else"
 
 
 def stages(run: Callable[[], object], repeats: int) -> list[Figure]:
-    """Core-seconds of every stage of each of some runs, and of what belongs to none, after one that is not counted.
+    """Core-seconds of every stage and of the remainder, per run, after a warm-up run.
 
-    They are taken by Python's profiler, which slows stages of many small calls, the flight and the instruments, by up
-    to a half.
+    Python's profiler slows stages with many small calls (flight, instruments) by up to a half.
     """
     found = profiled(run, repeats, STAGES)
     return [Figure(f"  of a case, profiled: {name}", values) for name, values in found.items()]
 
 
 def profiled(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:
-    """What `stages` shows, of stages of one's own, by their names."""
+    """The same as `stages` for given stages, by name."""
     run()
     found: dict[str, list[float]] = {name: [] for name in (*stages, REST)}
     for _ in range(repeats):
@@ -55,7 +54,7 @@ def profiled(run: Callable[[], object], repeats: int, stages: Stages) -> dict[st
 
 
 def _of_each_stage(profile: cProfile.Profile, stages: Stages) -> dict[str, float]:
-    """Seconds in the functions of each stage and all that they call, and in all else."""
+    """Seconds in the functions of each stage with their callees, and in all other functions."""
     entries = profile.getstats()
     seconds = dict.fromkeys(stages, 0.0)
     for entry in entries:

@@ -1,4 +1,4 @@
-"""How long a user waits before anything happens: the command's start, and kernels on a fresh installation."""
+"""Start-up times: the command line, and compilation of kernels after installation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from benchmarks.timing import Figure
 
 
 def figures(repeats: int) -> list[Figure]:
-    """The start of the command, in wall-clock seconds of whole processes; kernels compiled ahead, and the first run."""
+    """Wall-clock times of starting the command, of compiling kernels and of the first run."""
     return [
         Figure("marsyard --help (wall s)", [_wall_s("--help") for _ in range(repeats)], bar=0.3),
         Figure("marsyard list (wall s)", [_wall_s("list") for _ in range(repeats)], bar=0.6),
@@ -23,9 +23,9 @@ def figures(repeats: int) -> list[Figure]:
 
 
 def _first_use() -> list[Figure]:
-    """What set-up compiles, and what the first campaigns after it still wait for beside the same campaign again.
+    """Time to compile kernels, and additional time of the first campaigns compared with a repetition.
 
-    The first of all builds its terrains; the first with terrains that are there waits for kernels alone.
+    The very first campaign also builds its terrains.
     """
     with TemporaryDirectory() as folder:
         new, built = Path(folder, "new"), Path(folder, "built")
@@ -42,8 +42,8 @@ def _first_use() -> list[Figure]:
         again = min(run(built, f"again {number}") for number in range(2))
     return [
         Figure("marsyard compile on a fresh installation, part of its set-up (wall s)", [ahead]),
-        Figure("the first run's wait for kernels (wall s)", [with_terrains - again], bar=3.0),
-        Figure("the same, and for the eight terrains that it builds (wall s)", [first - again]),
+        Figure("additional time of the first run for kernels (wall s)", [with_terrains - again], bar=3.0),
+        Figure("the same with the eight terrains that it builds (wall s)", [first - again]),
     ]
 
 

@@ -1,4 +1,4 @@
-"""Figures of a benchmark, and how they are taken."""
+"""Figures of a benchmark and their measurement."""
 
 from __future__ import annotations
 
@@ -10,45 +10,33 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Figure:
-    """Some measurements of one quantity.
-
-    Attributes
-    ----------
-    name
-        What was measured.
-    values
-        Each measurement; core-seconds unless the name says otherwise.
-    bar
-        What the median must not exceed; None where nothing is asked.
-    least
-        What the median must reach; None where nothing is asked.
-    """
+    """Measurements of one quantity in core-seconds, unless its name states another unit, and bounds of their median."""
 
     name: str
     values: list[float]
     bar: float | None = None
-    least: float | None = None
+    minimum: float | None = None
 
     @property
     def median(self) -> float:
-        """The figure to quote."""
+        """Median of the measurements."""
         return statistics.median(self.values)
 
     @property
     def asked(self) -> str:
-        """The bar as text."""
+        """The bound as text."""
         if self.bar is not None:
             return f"<= {self.bar:g}"
-        return f">= {self.least:g}" if self.least is not None else ""
+        return f">= {self.minimum:g}" if self.minimum is not None else ""
 
     @property
     def met(self) -> bool:
-        """Whether the median keeps the bar."""
-        return (self.bar is None or self.median <= self.bar) and (self.least is None or self.median >= self.least)
+        """Whether the median is within the bounds."""
+        return (self.bar is None or self.median <= self.bar) and (self.minimum is None or self.median >= self.minimum)
 
 
 def core_seconds(run: Callable[[], object], repeats: int) -> list[float]:
-    """Processor time of each of some runs, after one that is not counted."""
+    """Processor time of each run after a warm-up run."""
     run()
     times = []
     for _ in range(repeats):

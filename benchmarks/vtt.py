@@ -1,4 +1,4 @@
-"""How long an update of the target tracker and a whole run take, and its search beside the full search and OpenCV's."""
+"""Run times of a tracking update, of its search compared with OpenCV's, and of a complete run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BATCH = 20
 
 
 def _stops(options: VttOptions) -> tuple[RoverMeasurements, RoverMeasurements]:
-    """Two stops, 10 % of the distance apart, before a slanted face."""
+    """Two stops, 10 % of the distance apart, in front of a slanted face."""
     face = Plane(TARGET, np.array([-0.8, 0.0, 0.6]))
     drive = Drive(Scene((face,), waves(1), TARGET), navcam(), VisualTargetTracker(options))
     drive.tracker.designate(RoverTarget(TARGET), pose(0.0, 0.0))
@@ -37,7 +37,7 @@ def _stops(options: VttOptions) -> tuple[RoverMeasurements, RoverMeasurements]:
 
 
 def seeded_update(tracker: VisualTargetTracker | None = None) -> Callable[[], object]:
-    """What updates a tracker over and over from the same designation at the second of two stops."""
+    """Return a function that updates a tracker at the second of two stops."""
     tracker = tracker or VisualTargetTracker(VttOptions())
     first, second = _stops(tracker.options)
     tracker.designate(RoverTarget(TARGET), pose(0.0, 0.0))
@@ -74,7 +74,7 @@ def _repeat(search: Callable[[], object]) -> None:
 
 
 def searches(repeats: int) -> list[Figure]:
-    """The search alone, in turn: coarse to fine, everywhere, and OpenCV's matchTemplate."""
+    """Template search: coarse to fine, at every position, and OpenCV's matchTemplate."""
     figures = []
     for side in (161, 600):
         options = VttOptions(search_px=side)
@@ -87,7 +87,7 @@ def searches(repeats: int) -> list[Figure]:
         a, b = template.astype(np.float32), window.astype(np.float32)
         timed: dict[str, Callable[[], object]] = {
             "coarse to fine": partial(coarse_to_fine_peak, template, window, 1, 6),
-            "at every place": partial(normalized_correlation, template, window),
+            "at every position": partial(normalized_correlation, template, window),
             "by cv2.matchTemplate": partial(cv2.matchTemplate, b, a, cv2.TM_CCOEFF_NORMED),
         }
         for name, search in timed.items():
@@ -97,7 +97,7 @@ def searches(repeats: int) -> list[Figure]:
 
 
 def runs(repeats: int) -> list[Figure]:
-    """A closed loop from 10 m to 2 m in steps of 10 %: 17 stereo pairs of rendered subframes, among a yard's rocks."""
+    """A closed loop from 10 m to 2 m in steps of 10 %: 17 stereo pairs of rendered subframes among rocks."""
     of_run = {
         "camera": {"preset": "research-navcam"},
         "target": {"diameter_m": 0.9, "shape": 2, "yaw_deg": 74.0, "across": 0.1},
