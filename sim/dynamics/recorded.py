@@ -1,8 +1,7 @@
-"""A motion that was recorded: positions and attitudes at instants, continued between them.
+"""Recorded motion: positions and attitudes at instants, interpolated by splines.
 
-Positions are joined by a cubic spline of continuous acceleration (not-a-knot), attitudes by one of continuous angular
-acceleration (`scipy.spatial.transform.RotationSpline`). Velocity, body rate and specific force are the splines' own
-derivatives, so that instruments which feel them agree with what is seen.
+Positions have a cubic spline (not-a-knot), attitudes one of continuous angular acceleration
+(`scipy.spatial.transform.RotationSpline`). Velocity, body rate and specific force are the splines' derivatives.
 """
 
 from __future__ import annotations
@@ -17,34 +16,20 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory
 
-#: Fewest instants from which acceleration can be told.
-LEAST_INSTANTS = 4
-#: Most turn from one instant to the next: beyond, the way round is a guess.
-MOST_TURN_DEG = 90.0
-#: By how much a time may be outside of the span: sums of times that lead to its very end are off by rounding.
+#: Fewest poses that determine an acceleration.
+MIN_POSES = 4
+#: Largest rotation from one pose to the next: the interpolation between larger ones is ambiguous.
+MAX_ROTATION_DEG = 90.0
+#: Tolerated excess over the span: sums of times that end at its limit have rounding errors.
 ROUNDING_S = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion(Trajectory):
-    """A `Trajectory` through recorded poses.
+    """A `Trajectory` through recorded poses of a body, world axes; times increase.
 
-    Attributes
-    ----------
-    times_s
-        Increasing times, seconds, at least `LEAST_INSTANTS`.
-    positions_m
-        Of the body frame's origin, world axes.
-    attitudes
-        Rotations from body to world axes.
-    gravity_m_s2
-        By which specific force differs from acceleration.
-
-    Raises
-    ------
-    ValueError
-        If there are too few instants, times do not increase, a value is not finite, or the body turns by more than
-        `MOST_TURN_DEG` from one instant to the next.
+    Raises ValueError for fewer than `MIN_POSES` poses, times that do not increase, a value that is not finite, or a
+    rotation of more than `MAX_ROTATION_DEG` from one pose to the next.
     """
 
     times_s: Float64[np.ndarray, "n"]
@@ -53,19 +38,19 @@ class RecordedMotion(Trajectory):
     gravity_m_s2: float
 
     def __post_init__(self) -> None:
-        if self.times_s.size < LEAST_INSTANTS:
-            raise ValueError(f"has {self.times_s.size} poses; allowed: at least {LEAST_INSTANTS}")
+        if self.times_s.size < MIN_POSES:
+            raise ValueError(f"has {self.times_s.size} poses; allowed: at least {MIN_POSES}")
         if not (np.all(np.isfinite(self.times_s)) and np.all(np.isfinite(self.positions_m))):
             raise ValueError("holds a value that is not finite")
         late = np.flatnonzero(np.diff(self.times_s) <= 0.0)
         if late.size:
             raise ValueError(f"time does not increase after {self.times_s[late[0]]:.6f} s (pose {late[0] + 1})")
-        turns = np.degrees((self.attitudes[:-1].inv() * self.attitudes[1:]).magnitude())
-        wide = np.flatnonzero(turns > MOST_TURN_DEG)
+        angles = np.degrees((self.attitudes[:-1].inv() * self.attitudes[1:]).magnitude())
+        wide = np.flatnonzero(angles > MAX_ROTATION_DEG)
         if wide.size:
             raise ValueError(
-                f"turns by {turns[wide[0]]:.0f} deg after {self.times_s[wide[0]]:.6f} s (pose {wide[0] + 1}); "
-                f"allowed: up to {MOST_TURN_DEG:g} deg from one pose to the next"
+                f"turns by {angles[wide[0]]:.0f} deg after {self.times_s[wide[0]]:.6f} s (pose {wide[0] + 1}); "
+                f"allowed: up to {MAX_ROTATION_DEG:g} deg from one pose to the next"
             )
 
     @cached_property
@@ -82,18 +67,18 @@ class RecordedMotion(Trajectory):
         return float(self.times_s[0]), float(self.times_s[-1])
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
-        """Truth at many times. Raises ValueError outside of the span."""
+        """True states at many times. Raises ValueError outside of the span."""
         first, last = self.span_s
         outside = times_s[(times_s < first - ROUNDING_S) | (times_s > last + ROUNDING_S)]
         if outside.size:
             raise ValueError(f"time {outside[0]:.6g} s is not recorded; allowed: {first:.6g} to {last:.6g} s")
         attitudes = self._attitude(times_s)
-        felt = self._position(times_s, 2) + np.array([0.0, 0.0, self.gravity_m_s2])
+        without_gravity = self._position(times_s, 2) + np.array([0.0, 0.0, self.gravity_m_s2])
         return Motion(
             times_s=times_s,
             positions_m=self._position(times_s),
             velocities_m_s=self._position(times_s, 1),
             attitudes=attitudes,
             body_rates_rad_s=self._attitude(times_s, 1),
-            specific_forces_m_s2=attitudes.inv().apply(felt),
+            specific_forces_m_s2=attitudes.inv().apply(without_gravity),
         )

@@ -1,4 +1,4 @@
-"""Ground with rocks on it as wheels feel it: the terrain, and above it the tops of triangles on a fine grid."""
+"""Height map of ground and rocks under a rover's wheels, from the terrain and the rocks' triangles."""
 
 from __future__ import annotations
 
@@ -12,25 +12,19 @@ from marsyard.sim.dynamics.rover import Ground
 
 #: Side of the grid's cells, metres: a tenth of a wheel's radius.
 CELL_M = 0.0125
-#: Points laid on triangles are at most this share of a cell apart.
-_FILL = 0.7
+#: Largest distance between sample points on a triangle, in cells.
+_SAMPLE_SPACING = 0.7
 
 
 @dataclass(frozen=True)
 class RockyGround:
-    """A ground with bodies on it within a square; beyond, the ground alone.
+    """Ground with bodies on it within a square; the ground alone outside.
 
-    Heights are interpolated linearly between the middles of cells, each as high as the highest point of a body in it:
-    a body's side is drawn up to a cell too far out. Overhangs are filled.
+    Heights are interpolated bilinearly between cell centres. A cell is as high as the highest body point in it, so
+    that steep sides extend up to one cell outwards. Overhangs are filled.
 
-    Attributes
-    ----------
-    ground
-        What the bodies stand on.
-    corner_m
-        World x, y of the middle of cell (0, 0).
-    above_m
-        Height above the ground of each cell, 0 where there is no body; row i lies at y = corner + i cells.
+    - corner_m: world x, y of the centre of cell (0, 0)
+    - above_m: height of each cell above the ground, 0 without a body; row i lies at y = corner + i cells
     """
 
     ground: Ground
@@ -45,13 +39,13 @@ class RockyGround:
         centre_m: tuple[float, float],
         half_m: float,
     ) -> RockyGround:
-        """Ground with bodies given by their triangles (world axes, metres) within `half_m` of a centre, each way.
+        """Rasterize bodies (triangles in world axes, metres) within `half_m` of a centre along x and y.
 
-        ``mesh.vertices[mesh.faces]`` of a `marsyard.sim.terrain.RockMesh` gives a field's rocks.
+        A `marsyard.sim.terrain.RockMesh` gives the triangles of a rock field as ``mesh.vertices[mesh.faces]``.
         """
         cells = 2 * int(np.ceil(half_m / CELL_M)) + 1
         corner = np.array(centre_m) - 0.5 * (cells - 1) * CELL_M
-        points = _filled(triangles)
+        points = _sample_triangles(triangles)
         cell = np.rint((points[:, :2] - corner) / CELL_M).astype(np.int64)
         inside = np.all((cell >= 0) & (cell < cells), axis=1)
         column, row = cell[inside].T
@@ -71,10 +65,10 @@ class RockyGround:
         return np.asarray(self.ground.height(x, y) + above)
 
 
-def _filled(triangles: Float64[np.ndarray, "triangles 3 3"]) -> Float64[np.ndarray, "points 3"]:
-    """Points on triangles, closer to each other than `_FILL` cells."""
+def _sample_triangles(triangles: Float64[np.ndarray, "triangles 3 3"]) -> Float64[np.ndarray, "points 3"]:
+    """Points on triangles, at most `_SAMPLE_SPACING` cells apart."""
     edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-    steps = np.ceil(edges / (_FILL * CELL_M)).astype(np.int64)
+    steps = np.ceil(edges / (_SAMPLE_SPACING * CELL_M)).astype(np.int64)
     parts = [np.empty((0, 3))]
     for count in np.unique(steps):
         i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1))

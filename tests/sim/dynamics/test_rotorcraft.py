@@ -31,7 +31,7 @@ SMOOTH = RotorcraftParameters(vibration=VibrationParameters(acceleration_m_s2=0.
 
 def _air(seed: int, **changes: float) -> Air:
     span = TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S + GUIDANCE.wait_s + GUIDANCE.longest_s
-    return Air.drawn(AirParameters.model_validate(changes), CRAFT.step_s, span, np.random.default_rng(seed))
+    return Air.draw(AirParameters.model_validate(changes), CRAFT.step_s, span, np.random.default_rng(seed))
 
 
 def _transit(air: Air, craft: RotorcraftParameters = CRAFT) -> RotorcraftFlight:
@@ -58,7 +58,7 @@ def _landing(
 
 def test_an_air_that_ends_too_soon_is_refused() -> None:
     """The kernels would read past its end."""
-    air = Air.drawn(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s, np.random.default_rng(0))
+    air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s, np.random.default_rng(0))
     with pytest.raises(ValueError, match="the flight may take"):
         _transit(air)
 

@@ -17,10 +17,10 @@ EAST, NORTH = 0.5 * np.pi, 0.0
 
 
 def test_wheels_rest_at_the_stated_places() -> None:
-    places = dict(zip(WHEELS, MER.wheel_places_m, strict=True))
+    places = dict(zip(WHEELS, MER.wheel_centres_m, strict=True))
     assert places["left front"] == pytest.approx([0.705, 0.53, 0.125])
     assert places["right rear"] == pytest.approx([-0.705, -0.53, 0.125])
-    assert wheel_centres(MER, 0.0, (0.0, 0.0)) == pytest.approx(MER.wheel_places_m)
+    assert wheel_centres(MER, 0.0, (0.0, 0.0)) == pytest.approx(MER.wheel_centres_m)
 
 
 @pytest.mark.parametrize("rover", [MER, ROCKY_8])

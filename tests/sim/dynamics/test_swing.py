@@ -38,7 +38,9 @@ WILD = {
 
 def _flown(seed: int = 1, **parameters: Any) -> SwingDescent:
     rng = np.random.default_rng(seed)
-    return SwingDescent.flown(SwingParameters(**parameters), START, rng, ground_height_m=GROUND_M, gravity_m_s2=GRAVITY)
+    return SwingDescent.simulate(
+        SwingParameters(**parameters), START, rng, ground_height_m=GROUND_M, gravity_m_s2=GRAVITY
+    )
 
 
 def _off_nadir_deg(descent: SwingDescent, times_s: np.ndarray) -> np.ndarray:
@@ -275,7 +277,7 @@ def test_circular_cone_stays_at_its_angle_over_the_pictures(angle: float) -> Non
     np.testing.assert_allclose(_off_nadir_deg(descent, np.linspace(-5.0, 7.5, 200)), angle, atol=0.04 * angle)
     rates = descent.motion(np.zeros(1)).body_rates_rad_s[0]
     modes = Modes.of(descent.parameters, GRAVITY)
-    line_tilt = np.radians(angle) / modes.lander_share
+    line_tilt = np.radians(angle) / modes.lander_tilt_ratio
     # a conical pendulum goes round with omega / sqrt(cos); the lander turns with its axis
     expected = modes.cone_rad_s / np.sqrt(np.cos(line_tilt)) * np.sin(np.radians(angle))
     assert np.linalg.norm(rates) == pytest.approx(expected, rel=1e-9)
@@ -366,7 +368,7 @@ def test_says_what_is_allowed() -> None:
     with pytest.raises(ValueError, match=r"nod_rate_deg_s is 110; allowed: below \d+"):
         _flown(nod_rate_deg_s=110.0, mass_centre_m=0.2, gyration_transverse_m=1.0)
     with pytest.raises(ValueError, match=r"start_m is at z = 150\.0 m; allowed: above the thrusters' firing, 200\.0 m"):
-        SwingDescent.flown(
+        SwingDescent.simulate(
             SwingParameters(), np.array([0.0, 0.0, 150.0]), np.random.default_rng(0), ground_height_m=GROUND_M
         )
     with pytest.raises(
@@ -374,7 +376,7 @@ def test_says_what_is_allowed() -> None:
     ):
         _flown(mass_centre_m=0.1, gyration_transverse_m=5.0, nod_rate_deg_s=0.0)
     with pytest.raises(ValueError, match="lead_s is 60; allowed: above 0, up to 30 s"):
-        SwingDescent.flown(SwingParameters(), START, np.random.default_rng(0), ground_height_m=GROUND_M, lead_s=60.0)
+        SwingDescent.simulate(SwingParameters(), START, np.random.default_rng(0), ground_height_m=GROUND_M, lead_s=60.0)
     with pytest.raises(ValidationError, match="bridle_length_m is 60; allowed: up to line_length_m, 47"):
         SwingParameters(bridle_length_m=60.0)
 
