@@ -1,14 +1,13 @@
-"""From the answer to the ground: what the velocity that was reported does to the landing.
+"""Effect of a velocity estimate on the landing: steering of the rockets' burn, and touchdown velocity.
 
-A simple model of MER's last seconds. Near 100 m solid rockets in the backshell stop the fall; small rockets beside
-them (TIRS) can tilt the backshell first, so that the burn also pushes sideways. The lander keeps the horizontal
-velocity that it has when the rockets fire, to which the burn adds an error of its own. If a velocity was reported, in
-time, and is worth it, the burn is steered to take out what the inertial unit has made of it by then: all of it, or as
-much as the tilt allows. Without an answer the burn is not steered. Swinging and wind during the burn's three seconds
-are left out.
+A simple model of MER's last seconds. Near 100 m solid rockets in the backshell stop the fall; small rockets next to
+them (TIRS) can tilt the backshell first, so that the burn has a horizontal component. The lander keeps its horizontal
+velocity at the rockets' firing, and the burn adds an error. If an estimate is available in time and large enough, the
+burn is steered against the velocity that the inertial unit has propagated from it, up to the limit of the tilt. Without
+an estimate the burn is not steered. Swinging and wind during the burn's three seconds are not modelled.
 
-Whether an answer is used follows from an assumed time of computation, so that rows repeat bit for bit. Whether the time
-that the algorithm really took would have done is `is_in_time`.
+Steering depends on an assumed computation time, so that rows are reproducible bit for bit. `is_in_time` uses the
+algorithm's measured time instead.
 """
 
 from __future__ import annotations
@@ -25,14 +24,9 @@ Horizontal = Float64[np.ndarray, "2"]
 
 @dataclass(frozen=True)
 class Touchdown:
-    """Horizontal velocities at the ground of the same descent, m/s.
+    """Horizontal touchdown velocities of the same descent with and without the estimate, m/s.
 
-    Attributes
-    ----------
-    with_answer, without_answer
-        With the velocity used that was reported, and with none.
-    punctual
-        Whether the answer would be there when the rockets fire, by the assumed time of computation.
+    - punctual: the estimate is available at the rockets' firing by the assumed computation time
     """
 
     with_answer: Horizontal
@@ -41,7 +35,7 @@ class Touchdown:
 
 
 def is_in_time(p: LandingParameters, measured_s: float, available_s: float) -> bool:
-    """Whether an answer is there when the rockets fire, by its measured time on this host and the flight computer's."""
+    """Whether an estimate is available at the rockets' firing, by its measured time scaled to the flight computer."""
     return p.processor_factor * measured_s <= available_s
 
 
@@ -52,28 +46,17 @@ def touchdown(
     available_s: float,
     rng: np.random.Generator,
 ) -> Touchdown:
-    """Velocities at the ground.
+    """Compute touchdown velocities; `rng` draws the errors of burn and steering.
 
-    Parameters
-    ----------
-    p
-        Computer, steering and burn.
-    true_m_s
-        Horizontal velocity of the lander when the rockets fire.
-    believed_m_s
-        The velocity reported, carried on to then by the inertial unit; None where none was reported.
-    available_s
-        Time from the last picture until then.
-    rng
-        Draws the errors of burn and steering.
+    - true_m_s: horizontal velocity of the lander at the rockets' firing
+    - believed_m_s: the estimate, propagated to that time by the inertial unit; None without an estimate
+    - available_s: time from the last picture to the firing
     """
     burn, steering = p.burn_error_m_s * rng.standard_normal(2), p.steering_error * rng.standard_normal(2)
-    drifting = true_m_s + burn
+    unsteered = true_m_s + burn
     punctual = p.computation_s <= available_s
-    if believed_m_s is None or not punctual:
-        return Touchdown(drifting, drifting, punctual)
-    speed = float(np.hypot(*believed_m_s))
-    if speed <= p.least_steered_m_s:
-        return Touchdown(drifting, drifting, punctual)
-    taken_out = believed_m_s * min(1.0, p.most_steered_m_s / speed)
-    return Touchdown(drifting - taken_out + steering * np.hypot(*taken_out), drifting, punctual)
+    speed = 0.0 if believed_m_s is None else float(np.hypot(*believed_m_s))
+    if believed_m_s is None or not punctual or speed <= p.least_steered_m_s:
+        return Touchdown(unsteered, unsteered, punctual)
+    removed = believed_m_s * min(1.0, p.most_steered_m_s / speed)
+    return Touchdown(unsteered - removed + steering * np.hypot(*removed), unsteered, punctual)

@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from pydantic import Field, model_validator
 from scipy.interpolate import BPoly
 
-from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates, check_times
 from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded
 
 Angle = Annotated[float, Field(ge=0.0, le=45.0)]
@@ -133,23 +133,15 @@ class HelicopterFlight(Trajectory):
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """True states at many times. Raises ValueError outside of the span."""
-        first, last = self.span_s
-        if times_s.size and (times_s.min() < first or times_s.max() > last):
-            raise ValueError(f"the flight is known from {first} s to {last} s, not at {times_s.min()}..{times_s.max()}")
+        check_times(times_s, self.span_s)
         yaw = 0.5 * np.pi - self.azimuth_rad + self.platform(times_s)
         pitch, pitch_rate = self.tilt_along.derivatives(times_s)
         roll, roll_rate = self.tilt_across.derivatives(times_s)
         angle_rates = np.stack([self.platform.derivative()(times_s), pitch_rate, roll_rate], axis=-1)
         attitudes, rates = attitudes_and_body_rates(np.stack([yaw, pitch, roll], axis=-1), angle_rates)
-        without_gravity = self._displacement(times_s, 2) + np.array([0.0, 0.0, self.gravity_m_s2])
-        return Motion(
-            times_s=times_s,
-            positions_m=self.origin_m + self._displacement(times_s, 0),
-            velocities_m_s=self._displacement(times_s, 1),
-            attitudes=attitudes,
-            body_rates_rad_s=rates,
-            specific_forces_m_s2=attitudes.inv().apply(without_gravity),
-        )
+        derivatives = [self._displacement(times_s, order) for order in range(3)]
+        derivatives[0] = self.origin_m + derivatives[0]
+        return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
 
     def _displacement(self, times_s: Float64[np.ndarray, "n"], order: int) -> Float64[np.ndarray, "n 3"]:
         """Position relative to the origin (order 0) or a derivative of it, world axes."""
@@ -176,13 +168,23 @@ def helicopter_flight(
     half = 0.5 * p.fly_over_s
     fly_overs = ((-half, half), (p.between_s - half, p.between_s + half))
     times = np.arange(fly_overs[0][0], fly_overs[1][1] + 15.0, 15.0)
+    # height and platform angle are constant over the targets; a platform that rotates with the flight is turned by half
+    # a turn after each pass, left and right in turns
+    gain = p.climb_m_s * p.pass_s
+    heights = [(time, p.fly_over_m, 0.0) for fly_over in fly_overs for time in fly_over]
+    angles = [(time, 0.0) for fly_over in fly_overs for time in fly_over]
+    for one in passes:
+        height = p.lowest_m + one.number * gain
+        heights += [(one.start_s, height, p.climb_m_s), (one.end_s, height + gain, p.climb_m_s)]
+        angle = np.pi if one.direction < 0 and p.turns_with_flight else 0.0
+        angles += [(one.start_s, angle), (one.end_s, angle)]
     return HelicopterFlight(
         origin_m=origin_m,
         azimuth_rad=azimuth_rad,
         along=_along_curve(p, passes, fly_overs, rng),
         across=_rest_curve(times, p.wander_m * rng.standard_normal(times.size)),
-        up=_height_curve(p, passes, fly_overs),
-        platform=_platform_curve(p, passes, fly_overs),
+        up=_moving_curve(sorted(heights)),
+        platform=_rest_curve(*np.array(sorted(angles)).T),
         tilt_along=_draw_tilt(p, passes, times, rng),
         tilt_across=_draw_tilt(p, passes, times, rng),
         passes=passes,
@@ -213,31 +215,6 @@ def _along_curve(
         times = one.start_s + fraction * (one.end_s - one.start_s)
         points += list(zip(times.tolist(), positions.tolist(), speeds.tolist(), strict=True))
     return _moving_curve([*points, (third, -reach, p.fly_over_m_s), (fourth, reach, p.fly_over_m_s)])
-
-
-def _height_curve(
-    p: HelicopterParameters, passes: Sequence[FlownPass], fly_overs_s: Sequence[tuple[float, float]]
-) -> BPoly:
-    before, after = ([(time, p.fly_over_m, 0.0) for time in fly_over] for fly_over in fly_overs_s)
-    gain = p.climb_m_s * p.pass_s
-    heights = [p.lowest_m + one.number * gain for one in passes]
-    climbs = [
-        point
-        for one, height in zip(passes, heights, strict=True)
-        for point in ((one.start_s, height, p.climb_m_s), (one.end_s, height + gain, p.climb_m_s))
-    ]
-    return _moving_curve([*before, *climbs, *after])
-
-
-def _platform_curve(
-    p: HelicopterParameters, passes: Sequence[FlownPass], fly_overs_s: Sequence[tuple[float, float]]
-) -> BPoly:
-    """Angle of a platform that rotates with the flight: half a turn after each pass, left and right in turns."""
-    before, after = ([(time, 0.0) for time in fly_over] for fly_over in fly_overs_s)
-    angles = [np.pi if one.direction < 0 and p.turns_with_flight else 0.0 for one in passes]
-    flown = [(time, angle) for one, angle in zip(passes, angles, strict=True) for time in (one.start_s, one.end_s)]
-    times, values = zip(*before, *flown, *after, strict=True)
-    return _rest_curve(np.array(times), np.array(values))
 
 
 def _draw_tilt(

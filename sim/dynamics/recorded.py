@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from marsyard.sim.dynamics.trajectory import Motion, Trajectory
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
 
 #: Fewest poses that determine an acceleration.
 MIN_POSES = 4
@@ -68,17 +68,8 @@ class RecordedMotion(Trajectory):
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """True states at many times. Raises ValueError outside of the span."""
-        first, last = self.span_s
-        outside = times_s[(times_s < first - ROUNDING_S) | (times_s > last + ROUNDING_S)]
-        if outside.size:
-            raise ValueError(f"time {outside[0]:.6g} s is not recorded; allowed: {first:.6g} to {last:.6g} s")
-        attitudes = self._attitude(times_s)
-        without_gravity = self._position(times_s, 2) + np.array([0.0, 0.0, self.gravity_m_s2])
-        return Motion(
-            times_s=times_s,
-            positions_m=self._position(times_s),
-            velocities_m_s=self._position(times_s, 1),
-            attitudes=attitudes,
-            body_rates_rad_s=self._attitude(times_s, 1),
-            specific_forces_m_s2=attitudes.inv().apply(without_gravity),
+        check_times(times_s, self.span_s, ROUNDING_S)
+        derivatives = [self._position(times_s, order) for order in range(3)]
+        return Motion.from_accelerations(
+            times_s, derivatives, self._attitude(times_s), self._attitude(times_s, 1), self.gravity_m_s2
         )

@@ -3,7 +3,17 @@
 - CSV and Parquet: columns time_s, x_m, y_m, z_m, qx, qy, qz, qw, in any order; other columns are ignored.
 - TUM: lines ``timestamp tx ty tz qx qy qz qw``, seconds and metres; lines with # are comments.
 - EuRoC: a header that begins with ``#timestamp``; nanoseconds, position, quaternion with the scalar part first.
-- SPICE: a file that ends in ``.spice.toml`` names the kernels (`marsyard.sim.dynamics.spice`).
+- SPICE: a file that ends in ``.spice.toml`` names the kernels, the body, the observer and the frames. Positions are
+  geometric, without light time; times are TDB seconds since `begin`, without leap seconds. ::
+
+    kernels = ["naif0012.tls", "mission.bsp", "mission.bc", "mission.tsc", "site.tf"]   # relative to this file
+    target = "-999"            # the body: a name or number in the kernels
+    observer = "-999900"       # origin of the positions: a landing site, or another body
+    world = "SITE_ENU"         # frame of positions and attitudes
+    axes = "LANDER_CAMERA"     # frame whose attitude is recorded
+    begin = "2030-01-01T00:00:00"
+    end = "2030-01-01T00:01:30"
+    step_s = 0.1               # time between poses
 
 Quaternions rotate from the recorded body's axes to the world's. No format states which axes these are.
 """
@@ -11,18 +21,22 @@ Quaternions rotate from the recorded body's axes to the world's. No format state
 from __future__ import annotations
 
 import hashlib
+import tomllib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
+from pydantic import Field, ValidationError
+from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics.recorded import MIN_POSES
-from marsyard.sim.dynamics.spice import SUFFIX, spice_poses
 from marsyard.sim.files import check_regular
+from marsyard.sim.parameters import Parameters
 
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 #: Tolerated deviation of a quaternion's length from 1: that of three written digits.
@@ -31,6 +45,10 @@ UNIT_TOLERANCE = 5e-3
 MAX_BYTES = 1 << 29
 #: Longest table that is read, independent of compression.
 MAX_ROWS = 5_000_000
+#: Most poses sampled from SPICE kernels: five hours at 50 Hz.
+MAX_SPICE_POSES = 1_000_000
+#: End of the name of a file of SPICE kernels.
+SUFFIX = ".spice.toml"
 _MAX_CACHED_FILES = 4
 #: Cells of a text table without a number.
 _MISSING = ("na", "NA", "n/a", "N/A", "null", "NULL", "none", "None")
@@ -95,7 +113,7 @@ def _read_file(path: str, _changed_ns: int, size: int) -> RecordedPoses:
 
 def _read_kernels(path: str) -> RecordedPoses:
     try:
-        return _check_poses(path, *spice_poses(path))
+        return _check_poses(path, *_spice_poses(path))
     except ImportError as fault:
         install = "SPICE kernels need the package spiceypy: pip install marsyard[spice]"
         raise TrajectoryFileError(f"{path}: {install}") from fault
@@ -205,3 +223,58 @@ def _check_poses(path: str, digest: str, values: Float64[np.ndarray, "n 8"]) -> 
     # copies: a table's columns may be read-only, which rotations refuse
     times, positions = np.array(values[:, 0]), np.array(values[:, 1:4])
     return RecordedPoses(path, digest, times, positions, values[:, 4:] / lengths[:, None])
+
+
+class SpiceFlight(Parameters):
+    """Poses to be sampled from SPICE kernels."""
+
+    kernels: Annotated[tuple[str, ...], Field(min_length=1, description="paths, relative to the file")]
+    target: Annotated[str, Field(description="the body: a name or number in the kernels")]
+    observer: Annotated[str, Field(description="origin of the positions")]
+    world: Annotated[str, Field(description="frame of positions and attitudes")]
+    axes: Annotated[str, Field(description="frame whose attitude is recorded")]
+    begin: Annotated[str, Field(description="UTC, in a format of SPICE")]
+    end: Annotated[str, Field(description="UTC")]
+    step_s: Annotated[float, Field(gt=0.0, le=60.0, description="time between poses, s")]
+
+
+def _spice_poses(path: str) -> tuple[str, Float64[np.ndarray, "n 8"]]:
+    """SHA-256 of the file with its kernels; for each pose time (s from `begin`), position (m), quaternion (xyzw).
+
+    Raises ValueError for a fault of the file or of a kernel, ImportError without the package spiceypy.
+    """
+    try:
+        flight = SpiceFlight.model_validate(tomllib.loads(Path(path).read_text(encoding="utf-8")))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    kernels = [Path(path).parent / name for name in flight.kernels]
+    digest = hashlib.sha256(Path(path).read_bytes())
+    for kernel in kernels:
+        if not kernel.is_file():
+            raise ValueError(f"the kernel {kernel} is not there")
+        with kernel.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest(), _sample_kernels(flight, [str(kernel) for kernel in kernels])
+
+
+def _sample_kernels(flight: SpiceFlight, kernels: list[str]) -> Float64[np.ndarray, "n 8"]:
+    import spiceypy
+    from spiceypy.utils.exceptions import SpiceyError
+
+    try:
+        # the pool belongs to the process: kernels loaded by other code stay in it
+        with spiceypy.KernelPool(kernels):
+            begin, end = (float(spiceypy.str2et(utc)) for utc in (flight.begin, flight.end))
+            count = int(np.floor((end - begin) / flight.step_s + 1e-9)) + 1
+            if not 1 < count <= MAX_SPICE_POSES:
+                raise ValueError(f"begin, end and step_s make {max(count, 0)} poses; allowed: 2 to {MAX_SPICE_POSES}")
+            times = flight.step_s * np.arange(count)
+            positions = spiceypy.spkpos(flight.target, begin + times, flight.world, "NONE", flight.observer)[0]
+            rotations = np.stack([spiceypy.pxform(flight.axes, flight.world, begin + time) for time in times])
+    except SpiceyError as error:
+        # the message in one line, without SPICE's banner and traceback
+        words = [getattr(error, "short", ""), *str(getattr(error, "long", "") or error).split()]
+        raise ValueError(f"SPICE: {' '.join(words).strip()[:300]}") from error
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    return np.concatenate([times[:, None], 1e3 * np.asarray(positions), quaternions], axis=1)

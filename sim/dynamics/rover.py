@@ -251,14 +251,14 @@ class _StanceEquations:
                 unknowns = unknowns - np.linalg.solve(self._jacobian(unknowns, points), gaps)
             except np.linalg.LinAlgError:
                 break
-        solution = least_squares(
-            lambda x: self._lowest_points(x)[0],
-            start,
-            jac=lambda x: self._jacobian(x, self._lowest_points(x)[1]),
-            method="lm",
-            xtol=1e-8,
-            ftol=1e-12,
-        )
+
+        def gaps_of(x: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6"]:
+            return self._lowest_points(x)[0]
+
+        def jacobian_of(x: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6 6"]:
+            return self._jacobian(x, self._lowest_points(x)[1])
+
+        solution = least_squares(gaps_of, start, jac=jacobian_of, method="lm", xtol=1e-8, ftol=1e-12)
         return solution.x, solution.fun
 
     def _jacobian(

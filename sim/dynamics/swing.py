@@ -50,7 +50,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics.chain import Modes, SwingParameters, chain_of
 from marsyard.sim.dynamics.kernels.swing import AXIS, CANOPY, LINE, Chain, WindField, interpolated, packed, slope, truth
-from marsyard.sim.dynamics.trajectory import Motion, Trajectory
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
 from marsyard.sim.dynamics.wind import Wind
 
 Vector = Float64[np.ndarray, "3"]
@@ -111,10 +111,7 @@ class Path:
 
     def at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 22"]:
         """State vectors (`marsyard.sim.dynamics.kernels.swing`). Raises ValueError outside of the span."""
-        first, last = self.span_s
-        outside = times_s[(times_s < first) | (times_s > last)]
-        if outside.size:
-            raise ValueError(f"time {outside[0]:.6g} s is outside of the flight; allowed: {first:.6g} to {last:.6g} s")
+        check_times(times_s, self.span_s)
         return np.asarray(
             interpolated(times_s, self.knots_s, self.starts_s, self.lengths_s, self.states, self.polynomials)
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -46,16 +47,25 @@ class Motion:
     body_rates_rad_s: Float64[np.ndarray, "n 3"]
     specific_forces_m_s2: Float64[np.ndarray, "n 3"]
 
+    @classmethod
+    def from_accelerations(
+        cls,
+        times_s: Float64[np.ndarray, "n"],
+        derivatives: Sequence[Float64[np.ndarray, "n 3"]],
+        attitudes: Rotation,
+        body_rates_rad_s: Float64[np.ndarray, "n 3"],
+        gravity_m_s2: float,
+    ) -> Motion:
+        """Motion from position, velocity and acceleration in world axes."""
+        positions, velocities, accelerations = derivatives
+        forces = attitudes.inv().apply(accelerations + np.array([0.0, 0.0, gravity_m_s2]))
+        return cls(times_s, positions, velocities, attitudes, body_rates_rad_s, forces)
+
     def state(self, row: int) -> State:
         """True state at one of the instants."""
-        return State(
-            time_s=float(self.times_s[row]),
-            position_m=self.positions_m[row],
-            velocity_m_s=self.velocities_m_s[row],
-            attitude=self.attitudes[row],
-            body_rate_rad_s=self.body_rates_rad_s[row],
-            specific_force_m_s2=self.specific_forces_m_s2[row],
-        )
+        position, velocity, attitude = self.positions_m[row], self.velocities_m_s[row], self.attitudes[row]
+        rate, force = self.body_rates_rad_s[row], self.specific_forces_m_s2[row]
+        return State(float(self.times_s[row]), position, velocity, attitude, rate, force)
 
 
 @runtime_checkable
@@ -93,15 +103,17 @@ class Resting(Trajectory):
         """True states at many times."""
         count = times_s.size
         zeros = np.zeros((count, 3))
-        force = self.attitude.inv().apply(np.array([0.0, 0.0, self.gravity_m_s2]))
-        return Motion(
-            times_s=times_s,
-            positions_m=np.tile(self.position_m, (count, 1)),
-            velocities_m_s=zeros,
-            attitudes=Rotation.concatenate([self.attitude] * count) if count else Rotation.from_quat(np.zeros((0, 4))),
-            body_rates_rad_s=zeros,
-            specific_forces_m_s2=np.tile(force, (count, 1)),
-        )
+        forces = np.tile(self.attitude.inv().apply(np.array([0.0, 0.0, self.gravity_m_s2])), (count, 1))
+        attitudes = Rotation.concatenate([self.attitude] * count) if count else Rotation.from_quat(np.zeros((0, 4)))
+        return Motion(times_s, np.tile(self.position_m, (count, 1)), zeros, attitudes, zeros, forces)
+
+
+def check_times(times_s: Float64[np.ndarray, "n"], span_s: tuple[float, float], tolerance_s: float = 0.0) -> None:
+    """Raises ValueError for a time outside of a span."""
+    first, last = span_s
+    outside = times_s[(times_s < first - tolerance_s) | (times_s > last + tolerance_s)]
+    if outside.size:
+        raise ValueError(f"time {outside[0]:.6g} s is outside of the motion; allowed: {first:.6g} to {last:.6g} s")
 
 
 def attitudes_and_body_rates(

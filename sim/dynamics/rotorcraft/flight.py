@@ -30,7 +30,7 @@ from marsyard.sim.dynamics.rotorcraft.parameters import (
     TransitParameters,
     VibrationParameters,
 )
-from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates, check_times
 
 #: Duration of the flight after the last picture, s: clocks may be late.
 TAIL_S = 0.1
@@ -83,25 +83,15 @@ class FlownPath(Trajectory):
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """True states at many times. Raises ValueError outside of the span."""
-        first, last = self.span_s
-        tolerance = 1e-6 * self.step_s  # rounding of sums of steps
-        if times_s.size and (times_s.min() < first - tolerance or times_s.max() > last + tolerance):
-            raise ValueError(f"the flight is known from {first} s to {last} s, not at {times_s.min()}..{times_s.max()}")
-        interval = np.clip(((times_s - first) / self.step_s).astype(int), 0, len(self.rows) - 2)
-        elapsed = (times_s - first - self.step_s * interval)[:, None]
-        positions, velocities, accelerations = self._interpolate(interval, elapsed, kernels.POSITION)
-        angles, rates, _ = self._interpolate(interval, elapsed, kernels.ANGLE)
-        shift, speed, push = (self.vibration.derivative(times_s, order) for order in range(3))
-        attitudes, body_rates = attitudes_and_body_rates(angles + shift[:, 3:], rates + speed[:, 3:])
-        without_gravity = accelerations + push[:, :3] + np.array([0.0, 0.0, self.gravity_m_s2])
-        return Motion(
-            times_s=times_s,
-            positions_m=positions + shift[:, :3],
-            velocities_m_s=velocities + speed[:, :3],
-            attitudes=attitudes,
-            body_rates_rad_s=body_rates,
-            specific_forces_m_s2=attitudes.inv().apply(without_gravity),
-        )
+        check_times(times_s, self.span_s, 1e-6 * self.step_s)  # sums of steps have rounding errors
+        interval = np.clip(((times_s - self.start_s) / self.step_s).astype(int), 0, len(self.rows) - 2)
+        elapsed = (times_s - self.start_s - self.step_s * interval)[:, None]
+        angles, angle_rates, _ = self._interpolate(interval, elapsed, kernels.ANGLE)
+        vibration = [self.vibration.derivative(times_s, order) for order in range(3)]
+        attitudes, rates = attitudes_and_body_rates(angles + vibration[0][:, 3:], angle_rates + vibration[1][:, 3:])
+        path = self._interpolate(interval, elapsed, kernels.POSITION)
+        derivatives = [smooth + added[:, :3] for smooth, added in zip(path, vibration, strict=True)]
+        return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
 
     def _interpolate(
         self, interval: np.ndarray, t: Float64[np.ndarray, "n 1"], column: int

@@ -6,7 +6,7 @@ import numpy as np
 
 from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, Track
 from marsyard.algorithms.dimes.binning import altitudes_at_images
-from marsyard.scenarios.descent.exposure import expose
+from marsyard.scenarios.descent.exposure import take_exposures
 from marsyard.scenarios.descent.flight import flown_descent, mean_velocities, picture_states
 from marsyard.scenarios.descent.measurement import Instruments, measure
 from marsyard.scenarios.descent.optics import camera_optics
@@ -41,7 +41,7 @@ def _tracked(case: int, **parts: Any) -> tuple[list[Track], list[State], Descent
     states = picture_states(p, flown)
     optics = camera_optics(p.camera)
     detector = Detector.drawn(optics.fall_off, p.detector, streams.generator("detector response"))
-    pictures = expose(p, world, states, optics, detector, streams)
+    pictures = [one.counts for one in take_exposures(p, world, states, optics, detector, streams)]
     instruments = Instruments.drawn(p, world, flown, streams)
     measurements = measure(p, world, flown.motion, pictures, detector, instruments, streams)
     details = DimesEstimator().estimate(measurements).details

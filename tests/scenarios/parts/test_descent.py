@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -97,7 +97,7 @@ def clashing(case: ScoredDescent) -> dict[str, float]:
 
 velocity_error = clashing
 
-OWN = {
+OWN: dict[str, Any] = {
     "flight": {"motion": f"{HERE}Falling", "attitude_of": "body"},
     "altimeter": {"instrument": f"{HERE}Exact", "options": {"off_m": 6.0}},
     "attitude_source": {"instrument": f"{HERE}Turned"},

@@ -81,7 +81,8 @@ def test_all_wheels_stand_on_rough_ground() -> None:
     assert isinstance(surface, Ground)
     rng = np.random.default_rng(4)
     for _ in range(10):
-        stance = settle(MER, surface, *rng.uniform(0.0, 25.0, 2).tolist(), float(rng.uniform(-3.0, 3.0)))
+        east, north = rng.uniform(0.0, 25.0, 2).tolist()
+        stance = settle(MER, surface, east, north, float(rng.uniform(-3.0, 3.0)))
         assert np.abs(stance.gaps_m).max() < 1e-6
         # no point under the middle of a wheel is deeper than its rim
         centres = stance.world_from_rover.apply(wheel_centres(MER, stance.differential_rad, stance.bogies_rad))
@@ -92,7 +93,7 @@ def test_all_wheels_stand_on_rough_ground() -> None:
 def _block(east: float, north: float, top: float) -> Float64[np.ndarray, "triangles 3 3"]:
     """A block, 0.4 m square, half buried."""
     block = trimesh.creation.box(extents=(0.4, 0.4, 2.0 * top))
-    return np.asarray(block.triangles) + np.array([east, north, 0.0])
+    return np.asarray(np.asarray(block.triangles) + np.array([east, north, 0.0]))
 
 
 def test_bodies_stand_out_of_the_ground_they_lie_on() -> None:

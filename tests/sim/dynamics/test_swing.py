@@ -36,7 +36,7 @@ WILD = {
 }
 
 
-def _flown(seed: int = 1, **parameters: Any) -> SwingDescent:
+def _flown(seed: int = 1, /, **parameters: Any) -> SwingDescent:
     rng = np.random.default_rng(seed)
     return SwingDescent.simulate(
         SwingParameters(**parameters), START, rng, ground_height_m=GROUND_M, gravity_m_s2=GRAVITY
@@ -72,7 +72,7 @@ def _angular_momentum(y: np.ndarray, chain: Chain, p: SwingParameters) -> np.nda
     """About the world's origin."""
     orbital = sum(m * np.cross(r, v) for m, r, v in _bodies(y, chain, p))
     e, de = y[12:15], y[15:18]
-    return orbital + chain.transverse_inertia * np.cross(e, de) + chain.axial_inertia * y[21] * e
+    return np.asarray(orbital + chain.transverse_inertia * np.cross(e, de) + chain.axial_inertia * y[21] * e)
 
 
 def _some_state(rng: np.random.Generator) -> np.ndarray:
@@ -213,10 +213,10 @@ def test_finite_differences_give_velocity_rate_and_specific_force(changes: dict[
     h, times = 1e-3, np.linspace(-9.9, descent.span_s[1] - 0.1, 400)
     stencil = [descent.motion(times + k * h) for k in range(-2, 3)]
     middle = stencil[2]
-    velocity = sum(w * m.positions_m for w, m in zip(FIVE_POINTS, stencil, strict=True)) / h
-    acceleration = sum(w * m.velocities_m_s for w, m in zip(FIVE_POINTS, stencil, strict=True)) / h
+    velocity = np.tensordot(FIVE_POINTS, [m.positions_m for m in stencil], 1) / h
+    acceleration = np.tensordot(FIVE_POINTS, [m.velocities_m_s for m in stencil], 1) / h
     inverse = middle.attitudes.inv()
-    rate = sum(w * (inverse * m.attitudes).as_rotvec() for w, m in zip(FIVE_POINTS, stencil, strict=True)) / h
+    rate = np.tensordot(FIVE_POINTS, [(inverse * m.attitudes).as_rotvec() for m in stencil], 1) / h
     # the dense output follows the equations to some 1e-6
     np.testing.assert_allclose(velocity, middle.velocities_m_s, atol=1e-5)
     np.testing.assert_allclose(inverse.apply(acceleration + GRAVITY * UP), middle.specific_forces_m_s2, atol=1e-5)
@@ -251,6 +251,7 @@ def test_falls_at_terminal_velocity_in_ever_denser_air() -> None:
         return [y[1], np.exp((START[2] - y[0]) / 10000.0) * braking * (y[1] / 75.0) ** 2 - GRAVITY]
 
     alone = solve_ivp(fall, (0.0, 26.0), [START[2], -75.0], rtol=1e-10, atol=1e-10, dense_output=True).sol
+    assert alone is not None
     times = np.linspace(0.0, 26.0, 27)
     motion = descent.motion(times)
     np.testing.assert_allclose(motion.positions_m[:, 2], alone(times)[0], atol=1e-5)
@@ -361,7 +362,7 @@ def test_horizontal_velocities_are_those_of_the_paper() -> None:
 
 def test_says_what_is_allowed() -> None:
     descent = _flown(**HANGING)
-    with pytest.raises(ValueError, match=r"time -11 s is outside of the flight; allowed: -10 to 27\.\d+ s"):
+    with pytest.raises(ValueError, match=r"time -11 s is outside of the motion; allowed: -10 to 27\.\d+ s"):
         descent.state(-11.0)
     with pytest.raises(ValueError, match=r"altitude 5000 m is not flown through; allowed: .* to 27\d\d"):
         descent.time_of_altitude(5000.0)
@@ -396,4 +397,5 @@ def test_compiled_steps_are_those_of_scipy() -> None:
             atol=1e-9,
         )
         times = np.linspace(0.0, end_s, 200)
+        assert expected.sol is not None
         np.testing.assert_allclose(descent.path.at(times), expected.sol(times).T, rtol=0.0, atol=1e-8)
