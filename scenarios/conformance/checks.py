@@ -93,7 +93,7 @@ class Suite(ABC):
 
     #: Advice of the check `deterministic`, and verb of the check `time`.
     deterministic_advice = (
-        "draw from numpy.random.default_rng(a fixed seed), made in estimate; keep nothing between cases"
+        "draw from numpy.random.default_rng(a fixed seed), made in estimate; keep no state between cases"
     )
     answers = "answers"
     #: Problem of an answer that differs after other cases.
@@ -137,8 +137,8 @@ class Suite(ABC):
         faster = "be faster, or allow more with --time-limit"
         yield Check("time", f"{self.answers} within {self.limit_s:g} s", faster, self._answers_in_time)
         if self.closed_to_truth and not self.program:
-            advice = f"use what you are handed; of sim import {', '.join(OPEN_MODULES)} only"
-            yield Check("truth", "imports nothing that knows the truth", advice, self._imports_no_truth)
+            advice = f"use the inputs alone; of marsyard import only {', '.join(OPEN_MODULES)}"
+            yield Check("truth", "imports no module with access to the truth", advice, self._imports_no_truth)
 
     def _leaves_inputs(self) -> str:
         """Raises BreachError for changed inputs."""
@@ -180,7 +180,7 @@ class Suite(ABC):
     def _imports_no_truth(self) -> str:
         closed = closed_imports(self.spec)
         if closed:
-            raise BreachError(f"it imports what knows the truth: {'; '.join(closed[:5])}")
+            raise BreachError(f"it imports modules with access to the truth: {'; '.join(closed[:5])}")
         return ""
 
 
@@ -207,21 +207,15 @@ def closed_imports(spec: str) -> list[str]:
     closed = []
     for name, path in sources_of(spec):
         try:
-            tree = ast.parse(path.read_bytes())
+            nodes = list(ast.walk(ast.parse(path.read_bytes())))
         except (SyntaxError, ValueError):
             continue
-        closed += [f"{name}, line {line}: {module}" for line, module in _imports(tree) if _is_closed(module)]
+        imports = [(node.lineno, alias.name) for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+        for node in nodes:
+            if isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
+                imports += [(node.lineno, f"{node.module}.{alias.name}") for alias in node.names]
+        for line, module in imports:
+            is_open = any(f"{module}.".startswith(f"{one}.") for one in OPEN_MODULES)
+            if module.partition(".")[0] == "marsyard" and not is_open:
+                closed.append(f"{name}, line {line}: {module}")
     return closed
-
-
-def _imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
-            yield from ((node.lineno, f"{node.module}.{alias.name}") for alias in node.names)
-
-
-def _is_closed(module: str) -> bool:
-    ours = module.partition(".")[0] == "marsyard"
-    return ours and not any(f"{module}.".startswith(f"{one}.") for one in OPEN_MODULES)

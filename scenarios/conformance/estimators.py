@@ -75,7 +75,7 @@ class EstimatorSuite(Suite):
         yield Check("answer", asked, form, lambda: p.describe(self._answer(p.measurements())))
         advice = f"return one of the failures: {p.failures}"
         for name, blank in inputs.BLANKS.items():
-            asked = f"ends with a failure where pictures are {name}"
+            asked = f"ends with a failure if pictures are {name}"
             yield Check(name, asked, advice, partial(self._fails_on, name, blank))
         asked = "gives a well-formed answer to pictures of noise"
         yield Check("noise", asked, advice, lambda: self._outcome(inputs.noisy(p.measurements())))
@@ -86,11 +86,11 @@ class EstimatorSuite(Suite):
         yield from self.common_checks()
         if p is STREAM:
             advice = f"return one of the failures from finish: {VELOCITY.failures}"
-            yield Check("few", "ends with a failure where there is no picture, or one", advice, self._fails_on_few)
+            yield Check("few", "ends with a failure if there is no picture, or one", advice, self._fails_on_few)
             asked = f"gives a well-formed answer to {', '.join(map(str, _ENOUGH))} and {_MANY} pictures"
             advice = "expect any number: see VelocityStream in algorithms/interface.py"
             yield Check("number", asked, advice, self._answers_any_number)
-            asked, advice = "forgets a descent that was broken off", "reset in start all that was kept"
+            asked, advice = "resets its state after an interrupted descent", "reset the whole state in start"
             yield Check("start", asked, advice, self._starts_again)
 
     def cases(self) -> Sequence[Any]:

@@ -68,7 +68,7 @@ class PartSuite(Suite):
 
     kind: Kind
 
-    deterministic_advice = "draw from the generator that is handed over alone; keep nothing from case to case"
+    deterministic_advice = "draw only from the generator in the arguments; keep no state between cases"
     answers = "answers a case"
     closed_to_truth = False
     writable = True
@@ -80,15 +80,15 @@ class PartSuite(Suite):
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
-        form = "see docs/own-parts.md for what it is handed and what it gives"
-        asked = "gives what its kind gives, of the right shapes, finite and in order"
+        form = "see docs/own-parts.md for inputs and outputs"
+        asked = "returns the output of its kind: right shapes, finite and in order"
         yield Check("answer", asked, form, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases()))
-        asked = "names the same columns in every case: identifiers, with numbers or truth values"
-        yield Check("columns", asked, "give every column in every case; NaN where there is no number", self._columns)
+        asked = "reports the same columns in every case: identifiers, with numbers or truth values"
+        yield Check("columns", asked, "report every column in every case; NaN for no number", self._columns)
         yield from self.common_checks()
         if self.kind is not SCORE:
-            asked = "depends on its random stream where it states so, and else does not"
-            advice = "set random to whether it draws, and draw from the generator that is handed over"
+            asked = "depends on its random stream if it states so, and only then"
+            advice = "set random to true if it draws, and draw only from the generator in the arguments"
             yield Check("random", asked, advice, self._depends_on_stream)
 
     def cases(self) -> Sequence[Any]:

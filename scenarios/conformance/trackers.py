@@ -82,13 +82,13 @@ class TrackerSuite(Suite):
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
-        form = "see algorithms/interface.py for what aim, update and state give"
-        yield Check("answer", "aims and answers well-formed at every stop of a drive", form, self._answers)
+        form = "see algorithms/interface.py for aim, update and state"
+        yield Check("answer", "gives a well-formed aim and answer at every stop of a drive", form, self._answers)
         yield Check("states", "has no target before one is designated and after it is cleared", form, self._has_states)
         advice = "return a TargetUpdate with the state LOST and the reasons in losses"
         for name, blank in BLANKS.items():
-            yield Check(name, f"loses its target where pictures are {name}", advice, partial(self._loses, name, blank))
-        asked = "answers where the pose jumps and pictures show other ground"
+            yield Check(name, f"loses its target if pictures are {name}", advice, partial(self._loses, name, blank))
+        asked = "answers if the pose jumps and pictures show other ground"
         yield Check("pose", asked, advice, self._answers_after_jump)
         yield from self.common_checks()
 

@@ -32,14 +32,6 @@ OFF_NADIR_RAD = 0.2
 OUTSIDE, INSIDE = 0.1, 0.5
 
 
-@dataclass(frozen=True)
-class Exposure:
-    """A picture in detector counts, and its rendered frame."""
-
-    counts: UInt16[np.ndarray, "rows columns"]
-    frame: Frame
-
-
 def take_exposures(
     p: DescentScenarioParameters,
     world: World,
@@ -47,8 +39,8 @@ def take_exposures(
     optics: Optics,
     detector: Detector,
     streams: Streams,
-) -> Iterator[Exposure]:
-    """Render and expose the pictures of these states one by one, without delivery faults."""
+) -> Iterator[tuple[UInt16[np.ndarray, "rows columns"], Frame]]:
+    """Detector counts and rendered frame of each picture, one by one, without delivery faults."""
     first, last = states[0].position_m, states[-1].position_m
     below_first, below_last = (float(world.surface.height(point[0], point[1])) for point in (first, last))
     scene = world.scene(
@@ -74,7 +66,7 @@ def take_exposures(
             radiance = add_haze(frame, p.faults.haze, world.sun, world.air)
         if shield is not None:
             radiance = shield.draw_over(radiance, frame, world.sun, state.time_s)
-        yield Exposure(detector.expose(radiance * np.float32(world.brightness), noise, motion), frame)
+        yield detector.expose(radiance * np.float32(world.brightness), noise, motion), frame
 
 
 def add_haze(frame: Frame, optical_depth: float, sun: Sun, air: Environment) -> Float32[np.ndarray, "rows columns"]:

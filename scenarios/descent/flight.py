@@ -14,7 +14,7 @@ from marsyard.scenarios.descent.recorded import AFTER_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import DescentPlace, OwnMotion
 from marsyard.sim.dynamics import State, SwingDescent, Trajectory
-from marsyard.sim.dynamics.recorded_files import TrajectoryFileError
+from marsyard.sim.dynamics.recorded import TrajectoryFileError
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 

@@ -73,7 +73,7 @@ class LanderParameters(Parameters):
 
 
 class LandingParameters(Parameters):
-    """Landing with the estimate: see `marsyard.scenarios.descent.landing`. All values but the burn's are assumed."""
+    """Landing with the estimate (`marsyard.scenarios.descent.score.touchdown`); values but the burn's are assumed."""
 
     computation_s: Annotated[float, bounded(0.0, 1000.0, "time to the answer on the flight computer")] = 14.0
     processor_factor: Annotated[float, Field(gt=0.0, le=1e6, description="flight computer over host (assumed)")] = 600.0

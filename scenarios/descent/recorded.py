@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.own_axes import RecordedAxes
 from marsyard.scenarios.own_files import OwnFile
-from marsyard.sim.dynamics.recorded import RecordedMotion
-from marsyard.sim.dynamics.recorded_files import RecordedPoses, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.recorded import RecordedMotion, RecordedPoses, TrajectoryFileError, read_poses
 from marsyard.sim.parameters import bounded
 
 #: Required duration of the flight after the last picture, s.

@@ -14,7 +14,6 @@ from marsyard.scenarios.base import TerrainScenario, judged_attempt
 from marsyard.scenarios.descent.exposure import take_exposures
 from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import Flown, flown_descent, picture_states, true_velocity
-from marsyard.scenarios.descent.landing import touchdown
 from marsyard.scenarios.descent.measurement import Instruments, measure
 from marsyard.scenarios.descent.optics import camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
@@ -27,6 +26,7 @@ from marsyard.scenarios.descent.score import (
     landing_row,
     pictures_of_figures,
     propagate_to_firing,
+    touchdown,
 )
 from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.estimators import VELOCITY
@@ -91,8 +91,8 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         optics = camera_optics(p.camera)
         camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
         exposed = take_exposures(p, world, states, optics, draw_detector(p, optics, streams), streams)
-        for state, exposure in zip(states, exposed, strict=True):
-            pose = exposure.frame.world_from_body
+        for state, (counts, frame) in zip(states, exposed, strict=True):
+            pose = frame.world_from_body
             about: dict[str, Any] = {
                 "site": p.site or "plain",
                 "time_s": state.time_s,
@@ -102,7 +102,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
                 "velocity_m_s": state.velocity_m_s.tolist(),
                 "sun_direction": world.sun.direction.tolist(),
             }
-            yield pixel_sample(exposure.counts, exposure.frame, p.detector, camera, about)
+            yield pixel_sample(counts, frame, p.detector, camera, about)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Simulate one descent and score all algorithms."""
@@ -145,7 +145,7 @@ class Descent:
         optics = camera_optics(p.camera)
         detector = draw_detector(p, optics, streams)
         exposed = take_exposures(p, world, states, optics, detector, streams)
-        pictures = deliver([one.counts for one in exposed], p.faults.repeated_picture, p.faults.black_picture)
+        pictures = deliver([counts for counts, _ in exposed], p.faults.repeated_picture, p.faults.black_picture)
         instruments = Instruments.drawn(p, world, flown, streams)
         measurements = measure(p, world, flown.motion, pictures, detector, instruments, streams)
         overlap: Mapping[str, Scalar] = {}

@@ -156,7 +156,7 @@ class OwnPart(Parameters):
         for name, value in (*options.items(), *check_columns(self.spec, reported).items()):
             column = f"{prefix}_{name}"
             if column in row:
-                raise ValueError(f"'{self.spec}' tells the column {name} twice, or it is one of its options")
+                raise ValueError(f"'{self.spec}' reports the column {name} twice, or it is one of its options")
             row[column] = value
         return row
 

@@ -82,7 +82,7 @@ def estimator(lines: str) -> str:
             "return VelocityEstimate(Outcome.VALID, np.full(2, was))",
             "answer",
         ),
-        ("truth", "import marsyard.sim.terrain\nreturn NOTHING", "it imports what knows the truth: bad_"),
+        ("truth", "import marsyard.sim.terrain\nreturn NOTHING", "it imports modules with access to the truth: bad_"),
         ("truth", "from marsyard.sim import sensor\nreturn NOTHING", ": marsyard.sim.sensor"),
     ],
 )
@@ -188,7 +188,7 @@ def test_state_of_the_estimator_is_found(tmp_path: Path, monkeypatch: pytest.Mon
         (
             "truth",
             "def update(self, m): import marsyard.sim.terrain; return super().update(m)",
-            "knows the truth: bad_",
+            "access to the truth: bad_",
         ),
     ],
 )

@@ -16,15 +16,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SIZE = 22
-CANOPY = 0
-CANOPY_RATE = 3
-LINE = 6
-LINE_RATE = 9
-AXIS = 12
-AXIS_RATE = 15
-SIDE = 18
-SPIN = 21
+#: First components of the vectors in a state, and its size.
+CANOPY, CANOPY_RATE, LINE, LINE_RATE, AXIS, AXIS_RATE, SIDE, SPIN, SIZE = 0, 3, 6, 9, 12, 15, 18, 21, 22
 
 
 class Chain(NamedTuple):
@@ -108,27 +101,27 @@ def _dot(a: Array, i: int, b: Array, j: int) -> float:
 
 
 @njit(cache=True)
-def _cross(a: Array, i: int, b: Array, j: int, out: Array) -> None:
+def _cross(a: Array, i: int, b: Array, j: int) -> Array:
+    out = np.empty(3)
     out[0] = a[i + 1] * b[j + 2] - a[i + 2] * b[j + 1]
     out[1] = a[i + 2] * b[j] - a[i] * b[j + 2]
     out[2] = a[i] * b[j + 1] - a[i + 1] * b[j]
+    return out
 
 
 @njit(cache=True)
-def aerodynamic_force(y: Array, chain: Chain, field: WindField, force: Array) -> None:
-    """Compute the force of the air on the canopy, N, world axes."""
+def aerodynamic_force(y: Array, chain: Chain, field: WindField) -> Array:
+    """Force of the air on the canopy, N, world axes."""
     height = y[CANOPY + 2]
-    east, north, up = wind_at(height, field)
-    relative = np.empty(3)
-    relative[0] = y[CANOPY_RATE] - east
-    relative[1] = y[CANOPY_RATE + 1] - north
-    relative[2] = y[CANOPY_RATE + 2] - up
+    relative = y[CANOPY_RATE : CANOPY_RATE + 3] - np.array(wind_at(height, field))
+    force = np.empty(3)
     speed = math.sqrt(_dot(relative, 0, relative, 0))
     along = _dot(relative, 0, y, LINE)
     density = math.exp((chain.reference_height_m - height) / chain.scale_height_m)
     for i in range(3):
         across = relative[i] - along * y[LINE + i]
         force[i] = -density * speed * (chain.tangential * speed * y[LINE + i] + chain.normal * across)
+    return force
 
 
 @njit(cache=True)
@@ -169,23 +162,17 @@ def derivatives(y: Array, chain: Chain, field: WindField) -> Array:
     c = lander_moment * (chain.line_m - chain.first_moment / chain.mass_kg)
     b = chain.transverse_inertia + lander_moment * (chain.mass_centre_m - lander_moment / chain.mass_kg)
 
-    force = np.empty(3)
-    aerodynamic_force(y, chain, field, force)
-    line_rotation = np.empty(3)
-    lander_rotation = np.empty(3)
-    _cross(y, LINE, y, LINE_RATE, line_rotation)
-    _cross(y, AXIS, y, AXIS_RATE, lander_rotation)
+    force = aerodynamic_force(y, chain, field)
+    line_rotation = _cross(y, LINE, y, LINE_RATE)
+    lander_rotation = _cross(y, AXIS, y, AXIS_RATE)
     spin = y[SPIN]
     rolling = _dot(lander_rotation, 0, y, LINE) + spin * _dot(y, AXIS, y, LINE)
     slip = np.empty(3)
     for i in range(3):
         slip[i] = lander_rotation[i] + spin * y[AXIS + i] - rolling * y[LINE + i] - line_rotation[i]
-    slip_line = np.empty(3)
-    slip_axis = np.empty(3)
-    gyro = np.empty(3)
-    _cross(slip, 0, y, LINE, slip_line)
-    _cross(slip, 0, y, AXIS, slip_axis)
-    _cross(y, AXIS_RATE, y, AXIS, gyro)
+    slip_line = _cross(slip, 0, y, LINE)
+    slip_axis = _cross(slip, 0, y, AXIS)
+    gyro = _cross(y, AXIS_RATE, y, AXIS)
 
     line_speed2 = _dot(y, LINE_RATE, y, LINE_RATE)
     axis_speed2 = _dot(y, AXIS_RATE, y, AXIS_RATE)
@@ -239,9 +226,7 @@ def derivatives(y: Array, chain: Chain, field: WindField) -> Array:
         ) / chain.mass_kg
         turn[i] = lander_rotation[i] + spin * y[AXIS + i]
     rates[CANOPY_RATE + 2] -= chain.gravity_m_s2
-    side = np.empty(3)
-    _cross(turn, 0, y, SIDE, side)
-    rates[SIDE : SIDE + 3] = side
+    rates[SIDE : SIDE + 3] = _cross(turn, 0, y, SIDE)
     rates[SPIN] = -chain.hinge_damping * _dot(slip, 0, y, AXIS) / chain.axial_inertia
     return rates
 
@@ -255,8 +240,6 @@ def truth(states: Array, chain: Chain, field: WindField) -> tuple[Array, Array, 
     matrices = np.empty((count, 3, 3))
     body_rates = np.empty((count, 3))
     forces = np.empty((count, 3))
-    turn = np.empty(3)
-    third = np.empty(3)
     force = np.empty(3)
     for k in range(count):
         y = states[k]
@@ -276,9 +259,8 @@ def truth(states: Array, chain: Chain, field: WindField) -> tuple[Array, Array, 
         side_norm = math.sqrt(matrices[k, 0, 0] ** 2 + matrices[k, 1, 0] ** 2 + matrices[k, 2, 0] ** 2)
         for i in range(3):
             matrices[k, i, 0] /= side_norm
-        _cross(matrices[k, :, 2].copy(), 0, matrices[k, :, 0].copy(), 0, third)
-        matrices[k, :, 1] = third
-        _cross(y, AXIS, y, AXIS_RATE, turn)
+        matrices[k, :, 1] = _cross(matrices[k, :, 2].copy(), 0, matrices[k, :, 0].copy(), 0)
+        turn = _cross(y, AXIS, y, AXIS_RATE)
         for i in range(3):
             turn[i] += y[SPIN] * y[AXIS + i]
         for j in range(3):

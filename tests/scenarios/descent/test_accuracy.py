@@ -41,7 +41,7 @@ def _tracked(case: int, **parts: Any) -> tuple[list[Track], list[State], Descent
     states = picture_states(p, flown)
     optics = camera_optics(p.camera)
     detector = Detector.drawn(optics.fall_off, p.detector, streams.generator("detector response"))
-    pictures = [one.counts for one in take_exposures(p, world, states, optics, detector, streams)]
+    pictures = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
     instruments = Instruments.drawn(p, world, flown, streams)
     measurements = measure(p, world, flown.motion, pictures, detector, instruments, streams)
     details = DimesEstimator().estimate(measurements).details

@@ -129,7 +129,7 @@ def _pictures(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]:
     states = picture_states(p, flown_descent(p, world.surface, streams))
     optics = camera_optics(p.camera)
     detector = Detector.drawn(optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector"))
-    return [one.counts for one in take_exposures(p, world, states, optics, detector, streams)]
+    return [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
 
 
 def test_faults_show_in_pictures() -> None:

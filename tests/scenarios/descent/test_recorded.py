@@ -15,7 +15,7 @@ from marsyard.scenarios.descent.flight import flown_descent
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.descent.world import World
-from marsyard.sim.dynamics.recorded_files import COLUMNS
+from marsyard.sim.dynamics.recorded import COLUMNS
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import parameters, run
 

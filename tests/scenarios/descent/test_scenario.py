@@ -65,7 +65,7 @@ def test_the_error_is_the_estimate_less_the_truth(nominal: CaseResult, name: str
 def test_figures_are_drawn_from_what_was_scored(nominal: CaseResult) -> None:
     row = nominal.row
     for kind in ("true", "estimated"):
-        stored = [row[f"velocity_{kind}_x_m_s"], row[f"velocity_{kind}_y_m_s"]]
+        stored = [float(row[f"velocity_{kind}_{axis}_m_s"]) for axis in "xy"]
         np.testing.assert_allclose(nominal.products[f"velocity_{kind}_m_s"], stored)
     assert all(nominal.products[f"image_{k}"].shape == (256, 1024) for k in (1, 2, 3))
 

@@ -149,11 +149,11 @@ def test_the_motion_of_a_case_is_its_own() -> None:
         ("up", "at picture 1 the camera looks up"),
         ("order", "flies 25.95 to -5 s"),
         ("nan", "gives positions_m that are not finite"),
-        ("column", "tells the column height_m twice, or it is one of its options"),
+        ("column", "reports the column height_m twice, or it is one of its options"),
     ],
 )
 def test_a_motion_that_is_none_is_told(wrong: str, said: str) -> None:
-    flight = {**OWN["flight"], "options": {"wrong": wrong}}  # type: ignore[dict-item]
+    flight = {**OWN["flight"], "options": {"wrong": wrong}}
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=said):
         flown_descent(p, World.of(p).surface, Streams(1, "test", 0))
@@ -162,7 +162,7 @@ def test_a_motion_that_is_none_is_told(wrong: str, said: str) -> None:
 @pytest.mark.parametrize("lasts_s", [20.0, 20.05, 27.95, 28.0])
 def test_a_motion_that_ends_early_is_followed_to_its_end(lasts_s: float) -> None:
     """To its last instant, whatever the sum of the times that lead there comes to."""
-    flight = {**OWN["flight"], "options": {"east_m_s": 0.0, "lasts_s": lasts_s, "height_m": 5000.0}}  # type: ignore[dict-item]
+    flight = {**OWN["flight"], "options": {"east_m_s": 0.0, "lasts_s": lasts_s, "height_m": 5000.0}}
     p = parameters(terrain=FLAT, flight=flight)
     world, streams = World.of(p), Streams(1, "test", 0)
     flown = flown_descent(p, world.surface, streams)
@@ -171,7 +171,7 @@ def test_a_motion_that_ends_early_is_followed_to_its_end(lasts_s: float) -> None
 
 
 def test_a_motion_below_the_ground_is_told() -> None:
-    flight = {**OWN["flight"], "options": {"height_m": 500.0}}  # type: ignore[dict-item]
+    flight = {**OWN["flight"], "options": {"height_m": 500.0}}
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=r"at picture 3 the camera is 62\.5 m below the ground"):
         flown_descent(p, World.of(p).surface, Streams(1, "test", 0))

@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
-from marsyard.sim.dynamics.recorded import RecordedMotion
-from marsyard.sim.dynamics.recorded_files import COLUMNS, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.recorded import COLUMNS, RecordedMotion, TrajectoryFileError, read_poses
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
 #: The beginning of freiburg1_xyz of the TUM RGB-D benchmark (Sturm et al. 2012): its two first poses, twice, the
