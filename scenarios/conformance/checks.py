@@ -141,7 +141,6 @@ class Suite(ABC):
             yield Check("truth", "imports no module with access to the truth", advice, self._imports_no_truth)
 
     def _leaves_inputs(self) -> str:
-        """Raises BreachError for changed inputs."""
         for case in self.cases():
             copy = handed_copy(case, writable=True)
             before = fingerprint(copy)

@@ -73,11 +73,6 @@ class PartSuite(Suite):
     closed_to_truth = False
     writable = True
 
-    @classmethod
-    def of(cls, kind: Kind, spec: str, limit_s: float) -> PartSuite:
-        """Suite of a named part."""
-        return cls(lambda: load_part(kind, spec), spec, False, limit_s, kind)
-
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         form = "see docs/own-parts.md for inputs and outputs"

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
-from marsyard.scenarios.conformance import estimators, inputs, parts, trackers
-from marsyard.scenarios.conformance.checks import Check, Finding
+from marsyard.scenarios.conformance import estimators, parts, trackers
+from marsyard.scenarios.conformance.checks import Finding, Suite
 from marsyard.scenarios.dotted import found_at
 from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
 from marsyard.scenarios.parts.named import KINDS
 
-_INPUTS: Mapping[str, Sequence[Callable[[], object]]] = {
-    "velocity": [inputs.descent, estimators.STREAM.measurements],
-    "landing": [inputs.landing],
-    "tracking": [trackers.mast, inputs.texture],
-}
 #: Tasks and kinds with a suite, words of the command line.
 EXAMINED = (*TASKS, *KINDS)
 
@@ -37,28 +31,25 @@ class Subject:
     task: str
     limit_s: float
 
-    def checks(self) -> Iterator[Check]:
-        """Checks of its suite."""
+    def suite(self) -> Suite:
+        """Its conformance suite."""
         if self.task in KINDS:
-            return parts.PartSuite.of(KINDS[self.task], self.spec, self.limit_s).checks()
+            kind = KINDS[self.task]
+            return parts.PartSuite(partial(parts.load_part, kind, self.spec), self.spec, False, self.limit_s, kind)
         task: Task[Any, Any] = TASKS[self.task]
         make = partial(task.make, self.spec, task.options(), ExecutableLimits(time_s=self.limit_s))
         program = self.spec.startswith(tuple(PREFIXES))
         if task is TRACKING:
-            return trackers.TrackerSuite(make, self.spec, program, self.limit_s).checks()
+            return trackers.TrackerSuite(make, self.spec, program, self.limit_s)
         protocol = estimators.VELOCITY if task is VELOCITY else estimators.LANDING
         if task.takes_stream(self.spec):
             protocol = estimators.STREAM
-        return estimators.EstimatorSuite(make, self.spec, program, self.limit_s, protocol).checks()
+        return estimators.EstimatorSuite(make, self.spec, program, self.limit_s, protocol)
 
     def prepare(self) -> None:
         """Load and compile the suite's own code, and the algorithm's code."""
         check_subject(self.spec, self.task)
-        if self.task in KINDS:
-            parts.PartSuite.of(KINDS[self.task], self.spec, self.limit_s).cases()
-            return
-        for create in _INPUTS[TASKS[self.task].name]:
-            create()
+        self.suite().cases()
 
 
 def check_subject(spec: str, task: str) -> None:
@@ -71,12 +62,12 @@ def check_subject(spec: str, task: str) -> None:
 
 def check_names(subject: Subject) -> list[tuple[str, str]]:
     """Names and requirements of a subject's checks."""
-    return [(check.name, check.asked) for check in subject.checks()]
+    return [(check.name, check.asked) for check in subject.suite().checks()]
 
 
 def run_check(subject: Subject, number: int) -> Finding:
     """Run one check."""
-    return list(subject.checks())[number].finding()
+    return list(subject.suite().checks())[number].finding()
 
 
 def task_of(spec: str) -> str:

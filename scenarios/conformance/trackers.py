@@ -14,7 +14,7 @@ from marsyard.algorithms.answers import checked_aim, checked_update
 from marsyard.algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.pointing import mast_angles
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, timed
-from marsyard.scenarios.conformance.inputs import MEAN, TexturedPlane
+from marsyard.scenarios.conformance.inputs import MEAN, TexturedPlane, texture
 from marsyard.scenarios.handover import fingerprint, handed_copy
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
@@ -94,6 +94,7 @@ class TrackerSuite(Suite):
 
     def cases(self) -> Sequence[PixelTarget]:
         """See `Suite`."""
+        texture()
         return [designation()]
 
     def _call(self, algorithm: Any, case: PixelTarget, seed: int) -> Sequence[TargetUpdate]:
@@ -103,8 +104,7 @@ class TrackerSuite(Suite):
         return updates
 
     def _check_answer(self, answer: Any, case: PixelTarget) -> Any:
-        """The updates: `drive` has checked them."""
-        return answer
+        return answer  # checked by `drive`
 
     def _answers(self) -> str:
         return ", ".join(update.state.name for update in drive(self.make()))
@@ -140,7 +140,6 @@ class TrackerSuite(Suite):
         return checked_update(tracker.update(handed_copy(measurements))).state.name
 
     def _leaves_inputs(self) -> str:
-        """Raises BreachError for a changed designation or changed measurements."""
         tracker, target = self.make(), handed_copy(designation(), writable=True)
         target_before = fingerprint(target)
         tracker.designate(target, pose(0.0))

@@ -180,7 +180,6 @@ class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
     @model_validator(mode="before")
     @classmethod
     def _terrain_of_the_site(cls, stated: Any) -> Any:
-        """Merge the table `terrain` into the site's own."""
         if not isinstance(stated, Mapping) or stated.get("site") not in descent_sites():
             return stated
         changes = stated.get("terrain", {})
@@ -271,7 +270,6 @@ def descent_sites() -> list[str]:
 
 
 def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested tables with some values replaced."""
     merged = dict(base)
     for key, value in changes.items():
         inner = merged.get(key)

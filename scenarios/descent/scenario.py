@@ -177,7 +177,6 @@ class Descent:
 
 
 def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scalar]) -> Judged:
-    """Run one algorithm, and score its answer and the landing with it."""
     p, firing, measurements = descent.p, descent.at_firing, descent.measurements
     make = partial(VELOCITY.make, algorithm, p.dimes, p.executable, descent.streams.case)
     attempt = asked(make, measurements, p.triple_indices)

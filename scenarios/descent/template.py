@@ -12,7 +12,6 @@ from marsyard.sim.camera import read_camera
 
 
 def _binned_size(choices: Choices) -> Mapping[str, Any]:
-    """Size to which DIMES bins the pictures of a user's camera."""
     return {"binned_size": binned_size_for(*read_camera(choices.camera).size)} if choices.camera else {}
 
 

@@ -102,7 +102,6 @@ def defaults(part: Any) -> dict[str, JsonValue]:
 
 
 def _message(error: Exception) -> str:
-    """Message of an error in one line."""
     if isinstance(error, ValidationError):
         faults = [(".".join(map(str, one["loc"])), str(one["msg"])) for one in error.errors()]
         return "; ".join(f"{where}: {message}" if where else message for where, message in faults)
