@@ -29,7 +29,7 @@ _SAMPLES = 2000
 
 
 @dataclass(frozen=True)
-class Flown:
+class DescentFlight:
     """Motion of a descent.
 
     - motion: truth over time; time 0 is the first picture's
@@ -49,7 +49,7 @@ def gravity_m_s2(p: DescentScenarioParameters) -> float:
     return MARS_GRAVITY_M_S2 if p.preset is None else p.preset.environment.gravity_m_s2
 
 
-def flown_descent(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> Flown:
+def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> DescentFlight:
     """Create the motion of a case: its first picture is at the stated height, or at the recorded position.
 
     Raises ValueError where a recorded or own motion is below the ground at a picture, or an own motion is invalid.
@@ -62,7 +62,7 @@ def flown_descent(p: DescentScenarioParameters, surface: Surface, streams: Strea
         recorded = p.flight.motion(below, gravity_m_s2(p))
         check_clearance(p.flight.file, recorded, faulty_times(p.faults, p.picture_times_s), surface)
         columns: dict[str, Scalar] = {"flight_file": p.flight.file, "flight_first_picture_s": p.flight.start_s}
-        return Flown(recorded, p.flight.lead_s, _firing_s(p, recorded, surface), columns)
+        return DescentFlight(recorded, p.flight.lead_s, _firing_s(p, recorded, surface), columns)
     descent = SwingDescent.simulate(
         p.descent,
         below + np.array([0.0, 0.0, p.descent.altitude_first_m]),
@@ -72,7 +72,7 @@ def flown_descent(p: DescentScenarioParameters, surface: Surface, streams: Strea
         lead_s=LEAD_S,
     )
     row = {f"descent_{name}": value for name, value in descent.parameters.model_dump().items()}
-    return Flown(descent, LEAD_S, descent.thruster_firing_s, row)
+    return DescentFlight(descent, LEAD_S, descent.thruster_firing_s, row)
 
 
 def _own_motion(
@@ -81,7 +81,7 @@ def _own_motion(
     below: Float64[np.ndarray, "3"],
     surface: Surface,
     streams: Streams,
-) -> Flown:
+) -> DescentFlight:
     times = faulty_times(p.faults, p.picture_times_s)
     place = DescentPlace(
         ground_height=lambda east, north: float(surface.height(below[0] + east, below[1] + north) - below[2]),
@@ -94,7 +94,7 @@ def _own_motion(
     motion, row = flight.compute(place, below, streams.generator("own motion"))
     check_looks_down(flight.motion, motion, times)
     check_clearance(flight.motion, motion, times, surface)
-    return Flown(motion, flight.lead_s, _firing_s(p, motion, surface), row)
+    return DescentFlight(motion, flight.lead_s, _firing_s(p, motion, surface), row)
 
 
 def _firing_s(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
@@ -121,16 +121,16 @@ def check_clearance(name: str, motion: Trajectory, times_s: Sequence[float], sur
         )
 
 
-def picture_states(p: DescentScenarioParameters, flown: Flown) -> list[State]:
+def picture_states(p: DescentScenarioParameters, flight: DescentFlight) -> list[State]:
     """True states at the exposures. Raises ValueError for a picture after the thrusters' firing."""
     times = faulty_times(p.faults, p.picture_times_s)
-    late = [number for number, time in enumerate(times, start=1) if time > flown.firing_s]
+    late = [number for number, time in enumerate(times, start=1) if time > flight.firing_s]
     if late:
         raise ValueError(
             f"picture {late[0]} of {p.pictures} would be taken at {times[late[0] - 1]:.2f} s, after the thrusters' "
-            f"firing at {flown.firing_s:.2f} s; allowed: fewer pictures, or a smaller descent.interval_s"
+            f"firing at {flight.firing_s:.2f} s; allowed: fewer pictures, or a smaller descent.interval_s"
         )
-    return [flown.motion.state(time) for time in times]
+    return [flight.motion.state(time) for time in times]
 
 
 def mean_velocities(states: Sequence[State]) -> Float64[np.ndarray, "intervals 3"]:

@@ -10,7 +10,7 @@ from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.descent.faults import faulty_altitudes, faulty_attitudes
-from marsyard.scenarios.descent.flight import MARGIN_S, Flown, gravity_m_s2
+from marsyard.scenarios.descent.flight import MARGIN_S, DescentFlight, gravity_m_s2
 from marsyard.scenarios.descent.optics import calibrated_camera
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import World
@@ -44,18 +44,18 @@ class Instruments:
     row: Mapping[str, Scalar]
 
     @classmethod
-    def drawn(cls, p: DescentScenarioParameters, world: World, flown: Flown, streams: Streams) -> Instruments:
+    def draw(cls, p: DescentScenarioParameters, world: World, flight: DescentFlight, streams: Streams) -> Instruments:
         """Draw the instruments of a case, propagate the navigation, and read a user's own instruments."""
-        start, end = -flown.lead_s + MARGIN_S, flown.firing_s + MARGIN_S
+        start, end = -flight.lead_s + MARGIN_S, flight.firing_s + MARGIN_S
         approach = Approach(p.approach, start)
         unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
         imu = approach.calibrated(unit, streams.generator("inertial unit's calibration"))
         clock = Clock.drawn(p.clock, streams.generator("image clock"))
-        own = _read_own_instruments(p, world, flown.motion, _time_tags(p, clock, streams), streams)
+        own = _read_own_instruments(p, world, flight.motion, _time_tags(p, clock, streams), streams)
         return cls(
             approach=approach,
             imu=imu,
-            navigation=_propagate_navigation(p, approach, imu, flown, streams),
+            navigation=_propagate_navigation(p, approach, imu, flight, streams),
             altimeter=own["altimeter"][0]
             if isinstance(p.altimeter, OwnAltimeter)
             else RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
@@ -94,13 +94,13 @@ def _read_own_instruments(
 
 
 def _propagate_navigation(
-    p: DescentScenarioParameters, approach: Approach, imu: Imu, flown: Flown, streams: Streams
+    p: DescentScenarioParameters, approach: Approach, imu: Imu, flight: DescentFlight, streams: Streams
 ) -> InertialSolution:
     """Inertial navigation from the last star reference, before entry, to the thrusters' firing."""
-    start, end = approach.end_s, flown.firing_s + MARGIN_S
+    start, end = approach.end_s, flight.firing_s + MARGIN_S
     errors = approach.errors(imu, streams.generator("approach"))
-    increments = imu.increments(flown.motion, start, end, streams.generator("inertial noise"))
-    state = flown.motion.state(start)
+    increments = imu.increments(flight.motion, start, end, streams.generator("inertial noise"))
+    state = flight.motion.state(start)
     attitude, velocity = errors.believed(state.attitude, state.velocity_m_s)
     return InertialSolution.propagated(increments, attitude, velocity, gravity_m_s2(p))
 

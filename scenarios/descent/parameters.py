@@ -138,13 +138,8 @@ class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
     sun: SunParameters = SunParameters()
     descent: SwingParameters = SwingParameters()
     pictures: Annotated[int, bounded(2, 100, "pictures, descent.interval_s apart; a stream gets all")] = PICTURES
-    triple: Annotated[
-        tuple[int, int, int] | None,
-        Field(
-            description="numbers, from 1, of the pictures for estimators of three; default: the last and two others, "
-            "as far apart as possible at equal intervals"
-        ),
-    ] = None
+    #: By default the last picture and two others, as far apart as possible at equal intervals.
+    triple: Annotated[tuple[int, int, int] | None, Field(description="numbers of the three used, from 1")] = None
     flight: Annotated[Flight | None, Field(description="recorded flight or own motion instead of the dynamics")] = None
     lander: LanderParameters = LanderParameters()
     camera: CameraParameters = CameraParameters()
@@ -155,9 +150,7 @@ class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
     imu: ImuParameters = ImuParameters()
     approach: ApproachParameters = ApproachParameters()
     altimeter: Altimeter = RadarParameters()
-    attitude_source: Annotated[
-        OwnAttitudeSource | None, Field(description="own instrument for attitudes at the pictures")
-    ] = None
+    attitude_source: Annotated[OwnAttitudeSource | None, Field(description="own source of attitudes")] = None
     clock: Annotated[ClockParameters, Field(description="of the pictures' time tags")] = ClockParameters(
         offset_sd_s=0.001, jitter_sd_s=0.0005
     )

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from marsyard.scenarios.base import TerrainScenario, judged_attempt
 from marsyard.scenarios.descent.exposure import take_exposures
 from marsyard.scenarios.descent.faults import faulty_terrain
-from marsyard.scenarios.descent.flight import Flown, flown_descent, picture_states, true_velocity
+from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
 from marsyard.scenarios.descent.measurement import Instruments, measure
 from marsyard.scenarios.descent.optics import camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
@@ -87,7 +87,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         """Pictures of a case without delivery faults, with the truth of their pixels."""
         p = self.checked(parameters)
         world = World.of(p)
-        states = picture_states(p, flown_descent(p, world.surface, streams))
+        states = picture_states(p, create_flight(p, world.surface, streams))
         optics = camera_optics(p.camera)
         camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
         exposed = take_exposures(p, world, states, optics, draw_detector(p, optics, streams), streams)
@@ -129,7 +129,7 @@ class Descent:
     p: DescentScenarioParameters
     streams: Streams
     world: World
-    flown: Flown
+    flight: DescentFlight
     instruments: Instruments
     states: Sequence[State]
     pictures: Pictures
@@ -140,25 +140,25 @@ class Descent:
     def simulate(cls, p: DescentScenarioParameters, streams: Streams) -> Descent:
         """Simulate a case."""
         world = World.of(p)
-        flown = flown_descent(p, world.surface, streams)
-        states = picture_states(p, flown)
+        flight = create_flight(p, world.surface, streams)
+        states = picture_states(p, flight)
         optics = camera_optics(p.camera)
         detector = draw_detector(p, optics, streams)
         exposed = take_exposures(p, world, states, optics, detector, streams)
         pictures = deliver([counts for counts, _ in exposed], p.faults.repeated_picture, p.faults.black_picture)
-        instruments = Instruments.drawn(p, world, flown, streams)
-        measurements = measure(p, world, flown.motion, pictures, detector, instruments, streams)
+        instruments = Instruments.draw(p, world, flight, streams)
+        measurements = measure(p, world, flight.motion, pictures, detector, instruments, streams)
         overlap: Mapping[str, Scalar] = {}
         if p.triple_indices is not None:
             three = [states[index] for index in p.triple_indices]
             camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
             overlap = feasible_overlap_row(three, world, camera, detector.calibration, p.dimes)
-        return cls(p, streams, world, flown, instruments, states, pictures, measurements, overlap)
+        return cls(p, streams, world, flight, instruments, states, pictures, measurements, overlap)
 
     @cached_property
     def at_firing(self) -> State:
         """True state at the thrusters' firing."""
-        return self.flown.motion.state(self.flown.firing_s)
+        return self.flight.motion.state(self.flight.firing_s)
 
     def conditions(self) -> dict[str, Scalar]:
         """Columns independent of the algorithm."""
@@ -167,13 +167,13 @@ class Descent:
             **conditions(self.p, self.world, self.states, self.at_firing),
             **instrument_conditions(self.instruments),
             **instrument_errors(self.world, self.states, self.measurements),
-            **self.flown.row,
+            **self.flight.row,
             **rendered(self.p.render.backend, self.pictures),
         }
 
     def truth(self, span_s: Span) -> Horizontal:
         """True horizontal velocity over a span of time tags."""
-        return true_velocity(self.flown.motion, self.states, self.measurements.tags_s, span_s)
+        return true_velocity(self.flight.motion, self.states, self.measurements.tags_s, span_s)
 
 
 def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scalar]) -> Judged:
@@ -200,7 +200,7 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
             answer=estimate,
             true_velocity_m_s=true,
             states=tuple(descent.states),
-            motion=descent.flown.motion,
+            motion=descent.flight.motion,
             at_firing=firing,
             touchdown_m_s=landed.with_answer,
         )

@@ -17,7 +17,7 @@ from marsyard.scenarios.descent.faults import (
     faulty_terrain,
     faulty_times,
 )
-from marsyard.scenarios.descent.flight import flown_descent, picture_states
+from marsyard.scenarios.descent.flight import create_flight, picture_states
 from marsyard.scenarios.descent.optics import calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
 from marsyard.scenarios.descent.world import World
@@ -126,7 +126,7 @@ def test_readings_are_wrong_by_what_is_asked_for() -> None:
 def _pictures(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]:
     p = parameters(faults=faults, detector=NOISELESS, **parts)
     world, streams = World.of(p), Streams(1, "faults", 0)
-    states = picture_states(p, flown_descent(p, world.surface, streams))
+    states = picture_states(p, create_flight(p, world.surface, streams))
     optics = camera_optics(p.camera)
     detector = Detector.drawn(optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector"))
     return [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]

@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.flight import flown_descent
+from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.descent.world import World
@@ -44,7 +44,7 @@ def test_a_simulated_flight_from_its_file_is_the_same_case(tmp_path: Path) -> No
     """At 50 Hz, in north, east, down and the camera's axes, times counted from another zero."""
     simulated, p = run(), parameters()
     world = World.of(p)
-    flown = flown_descent(p, world.surface, Streams(1, "test", 0))
+    flown = create_flight(p, world.surface, Streams(1, "test", 0))
     times = np.arange(-5.0, flown.firing_s + 1.0, 0.02)
     truth = flown.motion.motion(times)
     place = np.array([p.place.east_m, p.place.north_m, world.surface.height(p.place.east_m, p.place.north_m)])
