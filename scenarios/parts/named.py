@@ -28,26 +28,26 @@ class Kind:
 
     - name: word of the command line
     - group: entry point group of installed packages
-    - what: description in messages
+    - noun: its name in messages
     - members: required members of a class; empty for functions
     """
 
     name: str
     group: str
-    what: str
+    noun: str
     members: tuple[str, ...] = ()
 
     def path(self, spec: str) -> str:
         """Import path ``module:name`` of a part. Raises ValueError for an unknown entry point."""
         if ":" in spec:
             return spec
-        known = installed(self.group)
-        if spec in known:
-            return known[spec]
-        near = difflib.get_close_matches(spec, known, n=1)
+        names = installed(self.group)
+        if spec in names:
+            return names[spec]
+        near = difflib.get_close_matches(spec, names, n=1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise ValueError(
-            f"unknown {self.what} '{spec}'{hint}; allowed: {', '.join([*known, 'your own as module:name'])}"
+            f"unknown {self.noun} '{spec}'{hint}; allowed: {', '.join([*names, 'your own as module:name'])}"
         )
 
     def load(self, spec: str) -> Any:
@@ -55,16 +55,16 @@ class Kind:
         try:
             return found_at(self.path(spec))
         except ImportError as error:
-            raise ValueError(f"no {self.what} at '{spec}': {error}") from error
+            raise ValueError(f"no {self.noun} at '{spec}': {error}") from error
 
     def create(self, spec: str, options: Mapping[str, Any]) -> Any:
         """Construct a part's class. Raises ValueError for a missing class, another kind, or invalid options."""
         part = self.load(spec)
         if not isinstance(part, type):
-            raise ValueError(f"'{spec}' is no {self.what}: it is a {type(part).__name__}, not a class")
+            raise ValueError(f"'{spec}' is no {self.noun}: it is a {type(part).__name__}, not a class")
         missing = [member for member in self.members if not hasattr(part, member)]
         if missing:
-            raise ValueError(f"'{spec}' is no {self.what}: it has no {', '.join(missing)}")
+            raise ValueError(f"'{spec}' is no {self.noun}: it has no {', '.join(missing)}")
         try:
             return part(**options)
         except Exception as error:  # a user's class may raise anything
