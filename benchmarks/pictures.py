@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.timing import Figure, core_seconds
 from marsyard.algorithms.processes import used_memory
-from marsyard.scenarios.descent.flight import flown_descent
+from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.optics import camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
 from marsyard.scenarios.views import Eye, SiteGround, nadir_pose, site_scene
@@ -50,7 +50,7 @@ def descent_exposure() -> Callable[[], object]:
 
 def descent_pose(surface: Surface) -> RigidTransform:
     """Pose of the lander one second after its first picture."""
-    flown = flown_descent(DescentScenarioParameters(), surface, Streams(1, "bench", 0))
+    flown = create_flight(DescentScenarioParameters(), surface, Streams(1, "bench", 0))
     return flown.motion.state(1.0).world_from_body
 
 

@@ -11,8 +11,8 @@ from benchmarks.timing import Figure
 #: Stages by their functions: the end of the file's name, and the function. What a stage calls counts as its own.
 Stages = Mapping[str, tuple[tuple[str, str], ...]]
 STAGES: Stages = {
-    "terrain, its rocks": (("descent/world.py", "of"), ("descent/exposure.py", "_scene")),
-    "flight": (("descent/flight.py", "flown_descent"),),
+    "terrain, its rocks": (("descent/world.py", "of"), ("descent/world.py", "scene")),
+    "flight": (("descent/flight.py", "create_flight"),),
     "mesh and OpenGL": (("render/renderer.py", "_load"), ("render/renderer.py", "_draw")),
     "what rays meet": (("kernels/primary.py", "trace_primary_rays"),),
     "shadow of the ground": (("render/ground_shadow.py", "ground_shadow"),),
@@ -23,9 +23,9 @@ STAGES: Stages = {
         ("kernels/edges.py", "trace_subpixel_rays"),
     ),
     "detector": (("sensor/detector.py", "drawn"), ("sensor/detector.py", "expose"), ("sensor/motion.py", "seen")),
-    "instruments": (("descent/measurement.py", "drawn"), ("descent/measurement.py", "measure")),
+    "instruments": (("descent/measurement.py", "draw"), ("descent/measurement.py", "measure")),
     "DIMES": (("dimes/estimator.py", "estimate"),),
-    "room for templates": (("descent/room.py", "room"),),
+    "feasible overlap": (("descent/score.py", "feasible_overlap_row"),),
 }
 
 #: What belongs to no stage.

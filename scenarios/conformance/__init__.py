@@ -1,8 +1,7 @@
-"""The protocols' suite: what an algorithm or a part must do, and must not, whatever it is given.
+"""Conformance suites: checks of an algorithm or a user-defined part against its protocol.
 
-Read it in this order: `surfaces` and `inputs` make measurements without terrain or renderer; `checks` has a check, its
-finding and the checks that all suites share; `estimators`, `trackers` and `parts` hold the others; `suite` puts them
-together.
+`inputs` synthesizes measurements without terrain or renderer; `checks` has the checks common to all suites;
+`estimators`, `trackers` and `parts` add those of their protocols; `suite` selects them.
 """
 
 from marsyard.scenarios.conformance.checks import Finding

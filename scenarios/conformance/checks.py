@@ -1,4 +1,4 @@
-"""Checks and their findings, and the checks that estimators, trackers and parts share."""
+"""Conformance checks and their findings, and the checks common to estimators, trackers and parts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import random
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 
 from marsyard.algorithms.faults import AlgorithmError
 from marsyard.scenarios.estimators import sources_of
-from marsyard.scenarios.handover import fingerprint
+from marsyard.scenarios.handover import fingerprint, handed_copy
 
 #: Modules of `marsyard` that an algorithm may import (docs/architecture.md).
 OPEN_MODULES = ("marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements", "marsyard.algorithms")
@@ -25,18 +25,11 @@ _SCENARIOS = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check.
+    """Result of one check.
 
-    Attributes
-    ----------
-    check
-        Its name.
-    asked
-        What the protocol asks for, in words.
-    problem, next_step
-        What is wrong and what to do about it; empty where nothing is wrong.
-    note
-        The answer, or the time that it took.
+    - asked: the requirement of the protocol
+    - problem, next_step: the violation and its remedy; empty if passed
+    - note: the answer, or its computation time
     """
 
     check: str
@@ -47,27 +40,17 @@ class Finding:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether the check found no problem."""
         return not self.problem
 
 
 class BreachError(Exception):
-    """What an algorithm does against its protocol."""
+    """A violation of the protocol."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """A check of the suite.
-
-    Attributes
-    ----------
-    name, asked
-        As in `Finding`.
-    advice
-        What to do where it fails.
-    run
-        Does it; returns a note, and raises BreachError, or what the algorithm raised.
-    """
+    """A check: `run` returns a note, or raises BreachError or an error of the algorithm; `advice` is the remedy."""
 
     name: str
     asked: str
@@ -75,7 +58,7 @@ class Check:
     run: Callable[[], str]
 
     def finding(self) -> Finding:
-        """Run it; an exception is a problem."""
+        """Run the check; an exception is a problem."""
         try:
             return Finding(self.name, self.asked, note=self.run())
         except BreachError as error:
@@ -85,35 +68,22 @@ class Check:
             stderr = f"; its standard error ends with: {last[0]}" if last else ""
             problem = f"{error.fault.name}: {error}{stderr}"
         except Exception as error:
-            problem = f"it raised {_located(error)}"
+            # the last line of the user's code in the traceback
+            frames = traceback.extract_tb(error.__traceback__)
+            own = [frame for frame in frames if not Path(frame.filename).resolve().is_relative_to(_SCENARIOS)]
+            where = f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
+            problem = f"it raised {type(error).__name__}: {error}{where}"
         return Finding(self.name, self.asked, problem, self.advice)
-
-
-def _located(error: Exception) -> str:
-    """An error with the last line of the user's code that it passed."""
-    frames = traceback.extract_tb(error.__traceback__)
-    theirs = [frame for frame in frames if not Path(frame.filename).resolve().is_relative_to(_SCENARIOS)]
-    where = f" ({Path(theirs[-1].filename).name}, line {theirs[-1].lineno})" if theirs else ""
-    return f"{type(error).__name__}: {error}{where}"
 
 
 @dataclass(frozen=True)
 class Suite(ABC):
-    """The suite of one algorithm or part, which is made again for each check.
+    """Conformance suite of one algorithm or part, which is constructed again for each check.
 
-    State that is left behind in the process is found by the process in which a check runs
-    (`marsyard.campaigns.running.conformance`).
+    The process of a check detects state left behind in it (`marsyard.campaigns.running.conformance`).
 
-    Attributes
-    ----------
-    make
-        Makes it.
-    spec
-        How it is named.
-    program
-        Whether it is a program, which gets files and so cannot change our inputs.
-    limit_s
-        Longest time that an answer may take.
+    - make: constructs the algorithm or part
+    - program: it is a program with files as input, which cannot change the suite's objects
     """
 
     make: Callable[[], Any]
@@ -121,94 +91,130 @@ class Suite(ABC):
     program: bool
     limit_s: float
 
-    #: Advice of the check `deterministic`, and what an answer is called in `time`.
+    #: Advice of the check `deterministic`, and verb of the check `time`.
     deterministic_advice = (
-        "draw from numpy.random.default_rng(a fixed seed), made in estimate; keep nothing between cases"
+        "draw from numpy.random.default_rng(a fixed seed), made in estimate; keep no state between cases"
     )
     answers = "answers"
-    #: Whether imports that know the truth are forbidden.
+    #: Problem of an answer that differs after other cases.
+    dependence = "its answer depends on earlier cases"
+    #: Whether imports of the truth are forbidden.
     closed_to_truth = True
+    #: Whether the arrays of inputs are writable in all checks.
+    writable = False
 
     @abstractmethod
     def checks(self) -> Iterator[Check]:
-        """All of them, the ordinary case first."""
+        """All checks, the ordinary case first."""
 
     @abstractmethod
-    def _change_inputs(self) -> str:
-        """Raises BreachError where writable inputs are changed."""
+    def cases(self) -> Sequence[Any]:
+        """Inputs of ordinary cases."""
+
+    def _other_cases(self) -> Sequence[Any]:
+        """Inputs of cases before the one whose answer must not depend on them."""
+        return self.cases()
 
     @abstractmethod
-    def _answer_again(self) -> str:
-        """Raises BreachError where the same inputs lead to different answers."""
+    def _call(self, algorithm: Any, case: Any, seed: int) -> Any:
+        """Call an algorithm or part with the input of a case."""
 
     @abstractmethod
-    def _taken_s(self) -> float:
-        """Time of an answer, kernels compiled."""
+    def _check_answer(self, answer: Any, case: Any) -> Any:
+        """The answer, valid by the protocol; raises BreachError or AlgorithmError otherwise."""
+
+    def _answer(self, case: Any, seed: int = 1) -> Any:
+        """Checked answer of a new algorithm or part to a copy of a case's input."""
+        return self._check_answer(self._call(self.make(), handed_copy(case, writable=self.writable), seed), case)
 
     def common_checks(self) -> Iterator[Check]:
-        """Inputs, repetition, time, imports."""
+        """Checks of unchanged inputs, repeatability, time, and imports."""
         if not self.program:
             copies = "work on copies: counts.astype(...), array.copy()"
-            yield Check("inputs", "leaves its inputs as they are", copies, self._change_inputs)
+            yield Check("inputs", "leaves its inputs as they are", copies, self._leaves_inputs)
         asked = "gives the same answers to the same case, after any other cases"
-        yield Check("deterministic", asked, self.deterministic_advice, self._answer_again)
+        yield Check("deterministic", asked, self.deterministic_advice, self._repeats_answers)
         faster = "be faster, or allow more with --time-limit"
-        yield Check("time", f"{self.answers} within {self.limit_s:g} s", faster, self._answer_in_time)
+        yield Check("time", f"{self.answers} within {self.limit_s:g} s", faster, self._answers_in_time)
         if self.closed_to_truth and not self.program:
-            advice = f"use what you are handed; of sim import {', '.join(OPEN_MODULES)} only"
-            yield Check("truth", "imports nothing that knows the truth", advice, self._import_no_truth)
+            advice = f"use the inputs alone; of marsyard import only {', '.join(OPEN_MODULES)}"
+            yield Check("truth", "imports no module with access to the truth", advice, self._imports_no_truth)
 
-    def _answer_in_time(self) -> str:
-        taken = self._taken_s()
+    def _leaves_inputs(self) -> str:
+        for case in self.cases():
+            copy = handed_copy(case, writable=True)
+            before = fingerprint(copy)
+            self._call(self.make(), copy, 1)
+            if fingerprint(copy) != before:
+                raise BreachError(f"it changed its input, a {type(case).__name__}")
+        return ""
+
+    def _repeats_answers(self) -> str:
+        used = self.make()
+        for case in self.cases():
+            _seed_global_generators(1)
+            first = answer_print(self._answer(case))
+            _seed_global_generators(2)
+            if answer_print(self._answer(case)) != first:
+                raise BreachError("asked twice, it answers differently to the same case")
+            for other in self._other_cases():
+                self._call(used, handed_copy(other, writable=self.writable), 2)
+            again = self._call(used, handed_copy(case, writable=self.writable), 1)
+            if answer_print(self._check_answer(again, case)) != first:
+                raise BreachError(self.dependence)
+        return ""
+
+    def _answers_in_time(self) -> str:
+        taken = self._answer_time_s()
         if taken > self.limit_s:
             raise BreachError(f"it took {taken:.3g} s")
         return f"{taken:.3g} s"
 
-    def _import_no_truth(self) -> str:
-        found = closed_imports(self.spec)
-        if found:
-            raise BreachError(f"it imports what knows the truth: {'; '.join(found[:5])}")
+    def _answer_time_s(self) -> float:
+        """Time of an answer after a first one, which compiles kernels."""
+        case = self.cases()[0]
+        self._answer(case)
+        return timed(lambda: self._answer(case))
+
+    def _imports_no_truth(self) -> str:
+        closed = closed_imports(self.spec)
+        if closed:
+            raise BreachError(f"it imports modules with access to the truth: {'; '.join(closed[:5])}")
         return ""
 
 
-def timed(answer: Callable[[], object]) -> float:
-    """Wall-clock time of an answer, s."""
+def timed(call: Callable[[], object]) -> float:
+    """Wall-clock time of a call, s."""
     began = time.perf_counter()
-    answer()
+    call()
     return time.perf_counter() - began
 
 
 def answer_print(answer: Any) -> str:
-    """Fingerprint of an answer without its details, which may hold times."""
+    """Fingerprint of an answer without its details, which may contain times."""
     return fingerprint(answer, ("details",))
 
 
-def seed_global_generators(seed: int) -> None:
-    """Set the generators that everyone in the process shares, for code that draws from them by mistake."""
+def _seed_global_generators(seed: int) -> None:
+    """Seed the process's global generators, for code that uses them by mistake."""
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002
 
 
 def closed_imports(spec: str) -> list[str]:
-    """Imports of a Python algorithm's sources that know more than an algorithm may: file, line and name."""
-    found = []
+    """Imports in a Python algorithm's sources that give access to the truth: file, line and name."""
+    closed = []
     for name, path in sources_of(spec):
         try:
-            tree = ast.parse(path.read_bytes())
+            nodes = list(ast.walk(ast.parse(path.read_bytes())))
         except (SyntaxError, ValueError):
             continue
-        found += [f"{name}, line {line}: {module}" for line, module in _imports(tree) if _is_closed(module)]
-    return found
-
-
-def _imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
-            yield from ((node.lineno, f"{node.module}.{alias.name}") for alias in node.names)
-
-
-def _is_closed(module: str) -> bool:
-    ours = module.partition(".")[0] == "marsyard"
-    return ours and not any(f"{module}.".startswith(f"{one}.") for one in OPEN_MODULES)
+        imports = [(node.lineno, alias.name) for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+        for node in nodes:
+            if isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
+                imports += [(node.lineno, f"{node.module}.{alias.name}") for alias in node.names]
+        for line, module in imports:
+            is_open = any(f"{module}.".startswith(f"{one}.") for one in OPEN_MODULES)
+            if module.partition(".")[0] == "marsyard" and not is_open:
+                closed.append(f"{name}, line {line}: {module}")
+    return closed

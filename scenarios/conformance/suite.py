@@ -1,102 +1,79 @@
-"""The suite of each task, check by check."""
+"""Selection of the conformance suite of an algorithm or part, and its checks one by one."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
-from marsyard.scenarios.conformance import estimators, inputs, parts, surfaces, trackers
-from marsyard.scenarios.conformance.checks import Check, Finding
+from marsyard.scenarios.conformance import estimators, parts, trackers
+from marsyard.scenarios.conformance.checks import Finding, Suite
 from marsyard.scenarios.dotted import found_at
 from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
 from marsyard.scenarios.parts.named import KINDS
 
-_INPUTS: Mapping[str, Sequence[Callable[[], object]]] = {
-    "velocity": [inputs.descent, estimators.STREAM.measurements],
-    "landing": [inputs.landing],
-    "tracking": [trackers.mast, surfaces.texture],
-}
+#: Tasks and kinds with a suite, words of the command line.
+EXAMINED = (*TASKS, *KINDS)
 
 
 @dataclass(frozen=True)
 class Subject:
-    """An algorithm, or a part of a user's own, to be examined.
+    """An algorithm or a user-defined part under examination.
 
-    Attributes
-    ----------
-    spec
-        How it is named; see `marsyard.scenarios.estimators`, `marsyard.scenarios.parts`.
-    task
-        The name of its task, or of its kind.
-    limit_s
-        Longest time that an answer may take.
+    - spec: its name; see `marsyard.scenarios.estimators`, `marsyard.scenarios.parts`
+    - task: name of its task or kind
+    - limit_s: maximum time of an answer
     """
 
     spec: str
     task: str
     limit_s: float
 
-    def checks(self) -> Iterator[Check]:
-        """The task's suite for it."""
+    def suite(self) -> Suite:
+        """Its conformance suite."""
         if self.task in KINDS:
-            return parts.PartSuite.of(KINDS[self.task], self.spec, self.limit_s).checks()
+            kind = KINDS[self.task]
+            return parts.PartSuite(partial(parts.load_part, kind, self.spec), self.spec, False, self.limit_s, kind)
         task: Task[Any, Any] = TASKS[self.task]
-        limits = ExecutableLimits(time_s=self.limit_s)
+        make = partial(task.make, self.spec, task.options(), ExecutableLimits(time_s=self.limit_s))
         program = self.spec.startswith(tuple(PREFIXES))
-
-        def make() -> Any:
-            return task.make(self.spec, task.options(), limits)
-
         if task is TRACKING:
-            return trackers.TrackerSuite(make, self.spec, program, self.limit_s).checks()
+            return trackers.TrackerSuite(make, self.spec, program, self.limit_s)
         protocol = estimators.VELOCITY if task is VELOCITY else estimators.LANDING
         if task.takes_stream(self.spec):
             protocol = estimators.STREAM
-        return estimators.EstimatorSuite(make, self.spec, program, self.limit_s, protocol).checks()
+        return estimators.EstimatorSuite(make, self.spec, program, self.limit_s, protocol)
 
     def prepare(self) -> None:
-        """Loads and compiles what the suite itself needs, and the algorithm's code."""
+        """Load and compile the suite's own code, and the algorithm's code."""
         check_subject(self.spec, self.task)
-        if self.task in KINDS:
-            parts.PartSuite.of(KINDS[self.task], self.spec, self.limit_s).cases()
-            return
-        task: Task[Any, Any] = TASKS[self.task]
-        for one in _INPUTS[task.name]:
-            one()
-
-
-#: What can be examined, by the words of the command line.
-EXAMINED = (*TASKS, *KINDS)
+        self.suite().cases()
 
 
 def check_subject(spec: str, task: str) -> None:
-    """Raises ValueError where there is nothing of this name for a task, or of a kind; it says what is allowed."""
+    """Raises ValueError with the allowed names if there is nothing of this name for a task or kind."""
     if task in KINDS:
-        parts.check_part(KINDS[task], spec)
+        parts.load_part(KINDS[task], spec)
     else:
         TASKS[task].check(spec)
 
 
 def check_names(subject: Subject) -> list[tuple[str, str]]:
-    """The checks that a subject is put to: their names, and what they ask for."""
-    return [(check.name, check.asked) for check in subject.checks()]
+    """Names and requirements of a subject's checks."""
+    return [(check.name, check.asked) for check in subject.suite().checks()]
 
 
 def run_check(subject: Subject, number: int) -> Finding:
-    """Does one check."""
-    return list(subject.checks())[number].finding()
+    """Run one check."""
+    return list(subject.suite().checks())[number].finding()
 
 
 def task_of(spec: str) -> str:
-    """What a name is for, or of: as far as it, its methods or their annotations tell; else velocity.
+    """Task or kind of a name by its entry point, methods or annotations; velocity if they do not determine it.
 
-    Raises
-    ------
-    ValueError
-        Where there is no such algorithm.
+    Raises ValueError if the algorithm does not exist.
     """
     shipped = next((task.name for task in TASKS.values() if spec in task.shipped), None)
     if shipped is not None:
@@ -110,11 +87,11 @@ def task_of(spec: str) -> str:
     if ":" not in path:
         VELOCITY.check(spec)
     try:
-        found = found_at(path)
+        algorithm = found_at(path)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"no algorithm at '{spec}': {error}") from error
-    if hasattr(found, "designate"):
+    if hasattr(algorithm, "designate"):
         return TRACKING.name
-    annotations = inspect.get_annotations(getattr(found, "estimate", None) or found)
+    annotations = inspect.get_annotations(getattr(algorithm, "estimate", None) or algorithm)
     landing = any("Landing" in str(one) or "Site" in str(one) for one in annotations.values())
     return LANDING.name if landing else VELOCITY.name

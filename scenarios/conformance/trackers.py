@@ -1,4 +1,4 @@
-"""The checks of target trackers: a drive towards a textured wall, with what can go wrong on the way."""
+"""Conformance checks of target trackers: a drive towards a textured wall, with faults on the way."""
 
 from __future__ import annotations
 
@@ -13,15 +13,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.answers import checked_aim, checked_update
 from marsyard.algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.pointing import mast_angles
-from marsyard.scenarios.conformance.checks import (
-    BreachError,
-    Check,
-    Suite,
-    answer_print,
-    seed_global_generators,
-    timed,
-)
-from marsyard.scenarios.conformance.surfaces import MEAN, TexturedPlane
+from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, timed
+from marsyard.scenarios.conformance.inputs import MEAN, TexturedPlane, texture
 from marsyard.scenarios.handover import fingerprint, handed_copy
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
@@ -31,27 +24,26 @@ from marsyard.sim.sensor import stereo_mast
 FULL_SCALE_DN = 4095
 _LEVEL_DN = 1500.0
 _WALL_M, _STEP_M = 8.0, 0.4
-#: The designated point, in the world, and the stops of the drive, metres ahead.
+#: The designated point in the world, and the stops of the drive, metres ahead.
 TARGET_M = np.array([_WALL_M, 0.3, 1.2])
 _STOPS = 4
-
-#: Pictures that show nothing, by name: their count.
+#: Counts of blank pictures.
 BLANKS = {"featureless": 1500, "dark": 0, "saturated": FULL_SCALE_DN}
 
 
 @cache
 def mast() -> MastCalibration:
-    """The mast of the suite's rover."""
+    """Mast of the suite's rover."""
     return stereo_mast("research-navcam")
 
 
 def pose(ahead_m: float) -> RigidTransform:
-    """The rover's pose so far along its way."""
+    """Pose of the rover at a distance along its path."""
     return rigid(Rotation.identity(), np.array([ahead_m, 0.0, 0.0]))
 
 
 def designation() -> PixelTarget:
-    """The target, picked in a picture taken at the start."""
+    """The target, designated in a picture at the start."""
     angles = mast_angles(TARGET_M, mast())
     if angles is None:
         raise ValueError("the mast cannot point at the suite's target")
@@ -60,11 +52,11 @@ def designation() -> PixelTarget:
 
 
 def taken(aim: MastAim, world_from_rover: RigidTransform, blank: int | None = None) -> RoverMeasurements:
-    """What a stop delivers at the angles asked for: the wall, or pictures of one count."""
+    """Measurements of a stop at the aim: pictures of the wall, or blank pictures of one count."""
     head = world_from_rover * mast().geometry.rover_from_head(aim.azimuth_rad, aim.elevation_rad)
     return RoverMeasurements(
-        left=_picture(mast().left.moved(head), aim.left, blank),
-        right=_picture(mast().right.moved(head), aim.right, blank),
+        left=_take_picture(mast().left.moved(head), aim.left, blank),
+        right=_take_picture(mast().right.moved(head), aim.right, blank),
         mast=mast(),
         azimuth_rad=aim.azimuth_rad,
         elevation_rad=aim.elevation_rad,
@@ -72,7 +64,7 @@ def taken(aim: MastAim, world_from_rover: RigidTransform, blank: int | None = No
     )
 
 
-def _picture(camera: CameraModel, box: PixelBox, blank: int | None) -> MastImage:
+def _take_picture(camera: CameraModel, box: PixelBox, blank: int | None) -> MastImage:
     if blank is not None:
         return MastImage(np.full(box.size[::-1], blank, np.uint16), box.corner)
     wall = TexturedPlane(np.array([_WALL_M, 0.0, 0.0]), np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]), 0.006)
@@ -82,34 +74,48 @@ def _picture(camera: CameraModel, box: PixelBox, blank: int | None) -> MastImage
 
 @dataclass(frozen=True)
 class TrackerSuite(Suite):
-    """The suite of one tracker."""
+    """Suite of one tracker; its case is a drive to the designated target."""
 
     deterministic_advice = "draw from numpy.random.default_rng(a fixed seed); reset everything in clear and designate"
     answers = "updates"
+    dependence = "cleared and given the target again, it answers differently"
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
-        form = "see algorithms/interface.py for what aim, update and state give"
-        yield Check("answer", "aims and answers well-formed at every stop of a drive", form, self._answers)
-        yield Check("states", "has no target before one is designated and after it is cleared", form, self._states)
+        form = "see algorithms/interface.py for aim, update and state"
+        yield Check("answer", "gives a well-formed aim and answer at every stop of a drive", form, self._answers)
+        yield Check("states", "has no target before one is designated and after it is cleared", form, self._has_states)
         advice = "return a TargetUpdate with the state LOST and the reasons in losses"
         for name, blank in BLANKS.items():
-            yield Check(name, f"loses its target where pictures are {name}", advice, partial(self._loses, name, blank))
-        asked = "answers where the pose jumps and pictures show other ground"
-        yield Check("pose", asked, advice, self._answers_elsewhere)
+            yield Check(name, f"loses its target if pictures are {name}", advice, partial(self._loses, name, blank))
+        asked = "answers if the pose jumps and pictures show other ground"
+        yield Check("pose", asked, advice, self._answers_after_jump)
         yield from self.common_checks()
 
-    def _answers(self) -> str:
-        updates = drive(self.make())
-        return ", ".join(update.state.name for update in updates)
+    def cases(self) -> Sequence[PixelTarget]:
+        """See `Suite`."""
+        texture()
+        return [designation()]
 
-    def _states(self) -> str:
+    def _call(self, algorithm: Any, case: PixelTarget, seed: int) -> Sequence[TargetUpdate]:
+        """A drive; the target is cleared afterwards."""
+        updates = drive(algorithm)
+        algorithm.clear()
+        return updates
+
+    def _check_answer(self, answer: Any, case: PixelTarget) -> Any:
+        return answer  # checked by `drive`
+
+    def _answers(self) -> str:
+        return ", ".join(update.state.name for update in drive(self.make()))
+
+    def _has_states(self) -> str:
         tracker = self.make()
-        _expect(tracker, "before a target is designated", TrackingState.NO_TARGET)
+        _expect_state(tracker, "before a target is designated", TrackingState.NO_TARGET)
         tracker.designate(handed_copy(designation()), pose(0.0))
-        _expect(tracker, "once a target is designated", TrackingState.NORMAL)
+        _expect_state(tracker, "once a target is designated", TrackingState.NORMAL)
         tracker.clear()
-        _expect(tracker, "once it is cleared", TrackingState.NO_TARGET)
+        _expect_state(tracker, "once it is cleared", TrackingState.NO_TARGET)
         update = checked_update(tracker.update(handed_copy(taken(_box_ahead(), pose(0.0)))))
         if update.state is not TrackingState.NO_TARGET:
             raise BreachError(f"asked without a target, it answers {update.state.name}; allowed: NO_TARGET")
@@ -127,50 +133,38 @@ class TrackerSuite(Suite):
             raise BreachError("it does not say why the target is lost: losses is empty")
         return ", ".join([update.state.name, *(loss.name for loss in update.losses)])
 
-    def _answers_elsewhere(self) -> str:
+    def _answers_after_jump(self) -> str:
         tracker = self.make()
         drive(tracker)
         measurements = replace(taken(_box_ahead(), pose(0.0)), world_from_rover=pose(3.0))
         return checked_update(tracker.update(handed_copy(measurements))).state.name
 
-    def _change_inputs(self) -> str:
+    def _leaves_inputs(self) -> str:
         tracker, target = self.make(), handed_copy(designation(), writable=True)
-        before = fingerprint(target)
+        target_before = fingerprint(target)
         tracker.designate(target, pose(0.0))
-        measurements = handed_copy(taken(_aimed(tracker, pose(0.0)), pose(0.0)), writable=True)
-        seen = fingerprint(measurements)
+        measurements = handed_copy(taken(_aim_at_target(tracker, pose(0.0)), pose(0.0)), writable=True)
+        before = fingerprint(measurements)
         tracker.update(measurements)
-        if fingerprint(target) != before or fingerprint(measurements) != seen:
-            raise BreachError("its designation or measurements are not what they were before")
+        if fingerprint(target) != target_before or fingerprint(measurements) != before:
+            raise BreachError("it changed its input, the designation or the measurements")
         return ""
 
-    def _answer_again(self) -> str:
-        seed_global_generators(1)
-        first = answer_print(drive(self.make()))
-        seed_global_generators(2)
-        again = self.make()
-        if answer_print(drive(again)) != first:
-            raise BreachError("two that are made alike answer differently on the same drive")
-        again.clear()
-        if answer_print(drive(again)) != first:
-            raise BreachError("cleared and given the target again, it answers differently")
-        return ""
-
-    def _taken_s(self) -> float:
-        """The longest of a drive's updates; the first drive compiles what is compiled."""
+    def _answer_time_s(self) -> float:
+        """Longest time of an update in a drive after a first one, which compiles kernels."""
         drive(self.make())
         tracker = self.make()
         tracker.designate(handed_copy(designation()), pose(0.0))
         times = []
         for number in range(_STOPS):
             here = pose(number * _STEP_M)
-            measurements = handed_copy(taken(_aimed(tracker, here), here))
-            times.append(timed(lambda given=measurements: tracker.update(given)))  # type: ignore[misc]
+            measurements = handed_copy(taken(_aim_at_target(tracker, here), here))
+            times.append(timed(partial(tracker.update, measurements)))
         return max(times)
 
 
 def drive(tracker: Any) -> Sequence[TargetUpdate]:
-    """Designates the target and drives towards it; the updates at the stops, up to a failure."""
+    """Designate the target and drive towards it; returns the updates at the stops, up to a failure."""
     tracker.designate(handed_copy(designation()), pose(0.0))
     updates: list[TargetUpdate] = []
     for number in range(_STOPS):
@@ -184,7 +178,7 @@ def drive(tracker: Any) -> Sequence[TargetUpdate]:
 
 
 def stop(tracker: Any, here: RigidTransform, blank: int | None = None) -> TargetUpdate | None:
-    """Aims, takes pictures and updates, all held against the interface; None where there is no aim."""
+    """Aim, take pictures and update, checked against the interface; None without an aim."""
     aim = checked_aim(tracker.aim(here, handed_copy(mast())), mast())
     if aim is None:
         return None
@@ -194,7 +188,7 @@ def stop(tracker: Any, here: RigidTransform, blank: int | None = None) -> Target
     return update
 
 
-def _aimed(tracker: Any, here: RigidTransform) -> MastAim:
+def _aim_at_target(tracker: Any, here: RigidTransform) -> MastAim:
     aim = checked_aim(tracker.aim(here, handed_copy(mast())), mast())
     if aim is None:
         raise BreachError("it finds no aim at a target 8 m ahead, in full view")
@@ -202,12 +196,12 @@ def _aimed(tracker: Any, here: RigidTransform) -> MastAim:
 
 
 def _box_ahead() -> MastAim:
-    """Straight ahead, the middle of both frames."""
+    """Aim straight ahead with the middle of both frames."""
     columns, rows = mast().left.size
     box = PixelBox((columns // 4, rows // 4), (columns // 2, rows // 2))
     return MastAim(0.0, -0.2, box, box)
 
 
-def _expect(tracker: Any, when: str, state: TrackingState) -> None:
+def _expect_state(tracker: Any, when: str, state: TrackingState) -> None:
     if tracker.state is not state:
         raise BreachError(f"its state {when} is {tracker.state}; allowed: {state}")

@@ -1,5 +1,5 @@
-"""Parachute descent over Mars with three pictures: DIMES' scenario.
+"""Parachute descent over Mars with a downward camera: the scenario of DIMES.
 
-Read it in the order of a case: `parameters`, `world`, `flight`, `optics`, `exposure`, `measurement`, `score`;
-`scenario` runs them one after the other.
+Modules in the order of a case: `parameters`, `world`, `flight`, `optics`, `exposure`, `measurement`, `score`;
+`scenario` runs them.
 """

@@ -1,4 +1,4 @@
-"""The three pictures, taken through the camera as it truly is."""
+"""Pictures of a descent through the true camera, with dust haze and the falling heat shield in the view."""
 
 from __future__ import annotations
 
@@ -6,97 +6,131 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, UInt16
+from jaxtyping import Float32, Float64, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.descent.faults import clouds_over, delivered
-from marsyard.scenarios.descent.haze import veiled
-from marsyard.scenarios.descent.heat_shield import HeatShield
+from marsyard.scenarios.descent.faults import draw_clouds
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.exposure import render_state
 from marsyard.scenarios.optics import Optics
 from marsyard.sim.dynamics import State
-from marsyard.sim.render import Frame, Scene
+from marsyard.sim.render import Frame, Sun
 from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import Environment
+
+#: Height over which the optical depth of haze is stated, m: that of the first picture.
+HAZE_HEIGHT_M = 2000.0
+#: MER's aeroshell (Desai & Knocke 2004), m.
+SHIELD_DIAMETER_M = 2.65
+#: Heat shield relative to the lander: faster fall, sideways drift, tumble rate; all assumed.
+FASTER_M_S, DRIFT_M_S, TUMBLE_RAD_S = 20.0, 2.0, 1.0
+#: Largest angle of the heat shield from nadir in the first picture, radians (assumed).
+OFF_NADIR_RAD = 0.2
+#: Assumed albedo of the charred outside and of the inside's insulation.
+OUTSIDE, INSIDE = 0.1, 0.5
 
 
-def expose(
+def take_exposures(
     p: DescentScenarioParameters,
     world: World,
     states: Sequence[State],
     optics: Optics,
     detector: Detector,
     streams: Streams,
-) -> list[UInt16[np.ndarray, "rows columns"]]:
-    """The pictures of these states as they are delivered, in their order."""
-    taken = exposures(p, world, states, optics, detector, streams)
-    return delivered(p.faults, [one.counts for one in taken])
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """A picture as the detector made it, and the frame that it saw."""
-
-    counts: UInt16[np.ndarray, "rows columns"]
-    frame: Frame
-
-
-def exposures(
-    p: DescentScenarioParameters,
-    world: World,
-    states: Sequence[State],
-    optics: Optics,
-    detector: Detector,
-    streams: Streams,
-) -> Iterator[Exposure]:
-    """The pictures of these states before faults of their delivery, one after the other."""
-    scene = _scene(p, world, states, optics, streams)
-    mounting = _mounting(p, streams)
-    shield = _shield(p, states[0], streams)
-    noise = streams.generator("detector noise")
-    for state in states:
-        # the camera sits at the body's origin: its mounting turns it, but moves it nowhere
-        frame, motion = render_state(p.render.backend, scene, optics, state, mounting)
-        yield Exposure(detector.expose(_light(p, world, frame, shield, state.time_s), noise, motion), frame)
-
-
-def _scene(
-    p: DescentScenarioParameters, world: World, states: Sequence[State], optics: Optics, streams: Streams
-) -> Scene:
-    """One scene for all pictures."""
+) -> Iterator[tuple[UInt16[np.ndarray, "rows columns"], Frame]]:
+    """Detector counts and rendered frame of each picture, one by one, without delivery faults."""
     first, last = states[0].position_m, states[-1].position_m
-    below_first, below_last = (float(world.surface.height(place[0], place[1])) for place in (first, last))
-    return world.scene(
+    below_first, below_last = (float(world.surface.height(point[0], point[1])) for point in (first, last))
+    scene = world.scene(
         float(first[0]),
         float(first[1]),
         float(last[2]) - below_last,
         optics.rays.pixel_rad,
         caster_diameter_m=p.lander.caster_diameter_m,
-        clouds=clouds_over(p.faults, below_first, streams.generator("clouds")),
+        clouds=draw_clouds(p.faults, below_first, streams.generator("clouds")),
     )
-
-
-def _light(
-    p: DescentScenarioParameters, world: World, frame: Frame, shield: HeatShield | None, time_s: float
-) -> Float32[np.ndarray, "rows columns"]:
-    """Radiance factor at the lens, over the sunlight for which the detector's responsivity is stated."""
-    radiance = frame.radiance
-    if p.faults.haze > 0.0:
-        radiance = veiled(frame, p.faults.haze, world.sun, world.air)
-    if shield is not None:
-        radiance = shield.over(radiance, frame, world.sun, time_s)
-    return radiance * np.float32(world.brightness)
-
-
-def _mounting(p: DescentScenarioParameters, streams: Streams) -> RigidTransform:
-    """How the camera is truly turned in the body: by a little, not known to the lander."""
+    # the camera is at the body's origin; its alignment error, unknown to the lander, is a rotation alone
     tilt = np.radians(p.camera.alignment_error_deg) * streams.generator("camera alignment").standard_normal(3)
-    return RigidTransform.from_rotation(Rotation.from_rotvec(tilt))
+    mounting = RigidTransform.from_rotation(Rotation.from_rotvec(tilt))
+    shield = None
+    if p.faults.heat_shield_deg:
+        angle = float(np.radians(p.faults.heat_shield_deg))
+        shield = HeatShield.draw(states[0], angle, streams.generator("heat shield"))
+    noise = streams.generator("detector noise")
+    for state in states:
+        frame, motion = render_state(p.render.backend, scene, optics, state, mounting)
+        radiance = frame.radiance
+        if p.faults.haze > 0.0:
+            radiance = add_haze(frame, p.faults.haze, world.sun, world.air)
+        if shield is not None:
+            radiance = shield.draw_over(radiance, frame, world.sun, state.time_s)
+        yield detector.expose(radiance * np.float32(world.brightness), noise, motion), frame
 
 
-def _shield(p: DescentScenarioParameters, first: State, streams: Streams) -> HeatShield | None:
-    if p.faults.heat_shield_deg == 0.0:
-        return None
-    return HeatShield.drawn(first, float(np.radians(p.faults.heat_shield_deg)), streams.generator("heat shield"))
+def add_haze(frame: Frame, optical_depth: float, sun: Sun, air: Environment) -> Float32[np.ndarray, "rows columns"]:
+    """Radiance factor of a picture through a homogeneous layer of dusty air between ground and lander.
+
+    The ground's light is attenuated by ``T = exp(-optical depth x range / HAZE_HEIGHT_M)``; ``1 - T`` of the air's
+    source function is added: single scattering of sunlight (Henyey & Greenstein 1941) and of the mean light from sky
+    and ground. Contrast decreases, brightness changes less.
+    """
+    transmission = np.exp(-optical_depth * frame.range_m / HAZE_HEIGHT_M)
+    directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
+    # sunlight travels along -sun and is scattered along -direction, towards the camera
+    cosine = (directions @ sun.direction).reshape(frame.radiance.shape)
+    g = air.asymmetry
+    phase = (1.0 - g**2) / (1.0 + g**2 - 2.0 * g * cosine) ** 1.5
+    sky = air.sky_share(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
+    ambient = 0.5 * (sky + float(frame.radiance.mean()))
+    source = air.single_scattering_albedo * (0.25 * phase + ambient)
+    return np.asarray(transmission * frame.radiance + (1.0 - transmission) * source, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class HeatShield:
+    """A freely falling, tumbling disc; approximates the shield's cone of 70 deg half angle.
+
+    Centre, velocity, outward normal and angular velocity are those at the first picture, world axes.
+    """
+
+    centre_m: Float64[np.ndarray, "3"]
+    velocity_m_s: Float64[np.ndarray, "3"]
+    normal: Float64[np.ndarray, "3"]
+    spin_rad_s: Float64[np.ndarray, "3"]
+    start_s: float
+
+    @classmethod
+    def draw(cls, first: State, angle_rad: float, rng: np.random.Generator) -> HeatShield:
+        """Draw a shield below the lander at its first picture; `angle_rad` is its angular diameter face on."""
+        azimuth, off_nadir, aside, turn = rng.uniform(0.0, 1.0, 4) * [2 * np.pi, OFF_NADIR_RAD, 2 * np.pi, 2 * np.pi]
+        below = np.array([np.sin(azimuth) * np.sin(off_nadir), np.cos(azimuth) * np.sin(off_nadir), -np.cos(off_nadir)])
+        drift = np.array([DRIFT_M_S * np.sin(aside), DRIFT_M_S * np.cos(aside), -FASTER_M_S])
+        axis = np.array([np.cos(turn), np.sin(turn), 0.0])
+        return cls(
+            centre_m=first.position_m + SHIELD_DIAMETER_M / (2.0 * np.tan(0.5 * angle_rad)) * below,
+            velocity_m_s=first.velocity_m_s + drift,
+            normal=Rotation.from_rotvec(rng.uniform(-np.pi, np.pi) * axis).apply([0.0, 0.0, -1.0]),
+            spin_rad_s=TUMBLE_RAD_S * axis,
+            start_s=first.time_s,
+        )
+
+    def draw_over(
+        self, radiance: Float32[np.ndarray, "rows columns"], frame: Frame, sun: Sun, time_s: float
+    ) -> Float32[np.ndarray, "rows columns"]:
+        """A picture's radiance factor with the shield in it, a Lambert surface lit by the sun alone."""
+        elapsed = time_s - self.start_s
+        centre = self.centre_m + elapsed * self.velocity_m_s
+        normal = Rotation.from_rotvec(elapsed * self.spin_rad_s).apply(self.normal)
+        origin = frame.world_from_body.apply(frame.rays.centre)
+        directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
+        towards = directions @ normal
+        distance = ((centre - origin) @ normal) / np.where(np.abs(towards) > 1e-9, towards, 1e-9)
+        from_centre = np.linalg.norm(origin + distance[:, None] * directions - centre, axis=1)
+        hit = (distance > 0.0) & (from_centre < 0.5 * SHIELD_DIAMETER_M)
+        # the visible side faces against the ray
+        lit = np.maximum(-np.sign(towards) * float(normal @ sun.direction), 0.0)
+        reflected = np.where(towards < 0.0, OUTSIDE, INSIDE) * lit
+        covered = np.where(hit, reflected, radiance.reshape(-1))
+        return covered.astype(np.float32).reshape(radiance.shape)

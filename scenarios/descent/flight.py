@@ -1,4 +1,4 @@
-"""The true motion of a descent: flown by the dynamics, by a user's own, or recorded."""
+"""True motion of a descent: simulated dynamics, a user's own motion, or a recorded flight."""
 
 from __future__ import annotations
 
@@ -10,39 +10,32 @@ from jaxtyping import Float64
 
 from marsyard.scenarios.descent.faults import faulty_times
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.descent.recorded import AFTER_S, FlightFile, check_looks_down
+from marsyard.scenarios.descent.recorded import AFTER_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import DescentPlace, OwnMotion
 from marsyard.sim.dynamics import State, SwingDescent, Trajectory
-from marsyard.sim.dynamics.recorded_files import TrajectoryFileError
+from marsyard.sim.dynamics.recorded import TrajectoryFileError
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
 #: Gravity over a plain terrain: Mars.
 MARS_GRAVITY_M_S2 = 3.72
-#: How long before the first picture a flight of the dynamics is known, s.
+#: Start of a simulated descent before the first picture, s.
 LEAD_S = 5.0
-#: How long before the first picture and after the last instant of interest the inertial unit is read, s.
+#: Margin of the inertial unit's data before the first picture and after the last instant of interest, s.
 MARGIN_S = 0.1
-#: Instants at which a flight by poses is searched for the height of the thrusters' firing.
-_SEARCHED = 2000
+#: Samples in the search for the height of the thrusters' firing on a flight given by poses.
+_SAMPLES = 2000
 
 
 @dataclass(frozen=True)
-class Flown:
-    """A descent's motion.
+class DescentFlight:
+    """Motion of a descent.
 
-    Attributes
-    ----------
-    motion
-        Truth over time; its time 0 is that of the first picture.
-    lead_s
-        How long before the first picture it is known.
-    firing_s
-        When the thrusters fire: at `thruster_firing_m` above the ground; where a flight by poses ends before, at its
-        end.
-    row
-        What it was flown by, as columns of the results.
+    - motion: truth over time; time 0 is the first picture's
+    - lead_s: start of the motion before the first picture
+    - firing_s: time of the thrusters' firing, at `thruster_firing_m` above the ground, or the end of a flight by poses
+    - row: columns of the results
     """
 
     motion: Trajectory
@@ -56,21 +49,21 @@ def gravity_m_s2(p: DescentScenarioParameters) -> float:
     return MARS_GRAVITY_M_S2 if p.preset is None else p.preset.environment.gravity_m_s2
 
 
-def flown_descent(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> Flown:
-    """The descent whose first picture is taken at the stated height above the ground below; or the recorded one.
+def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> DescentFlight:
+    """Create the motion of a case: its first picture is at the stated height, or at the recorded position.
 
-    Raises
-    ------
-    ValueError
-        If a recorded flight or an own motion is below the ground at a picture, or an own motion gives no flight.
+    Raises ValueError where a recorded or own motion is below the ground at a picture, or an own motion is invalid.
     """
     ground = float(surface.height(p.place.east_m, p.place.north_m))
     below = np.array([p.place.east_m, p.place.north_m, ground])
     if isinstance(p.flight, OwnMotion):
-        return _own(p, p.flight, below, surface, streams)
+        return _own_motion(p, p.flight, below, surface, streams)
     if p.flight is not None:
-        return _recorded(p, p.flight, below, surface)
-    descent = SwingDescent.flown(
+        recorded = p.flight.motion(below, gravity_m_s2(p))
+        check_clearance(p.flight.file, recorded, faulty_times(p.faults, p.picture_times_s), surface)
+        columns: dict[str, Scalar] = {"flight_file": p.flight.file, "flight_first_picture_s": p.flight.start_s}
+        return DescentFlight(recorded, p.flight.lead_s, _firing_s(p, recorded, surface), columns)
+    descent = SwingDescent.simulate(
         p.descent,
         below + np.array([0.0, 0.0, p.descent.altitude_first_m]),
         streams.generator("gusts"),
@@ -79,25 +72,16 @@ def flown_descent(p: DescentScenarioParameters, surface: Surface, streams: Strea
         lead_s=LEAD_S,
     )
     row = {f"descent_{name}": value for name, value in descent.parameters.model_dump().items()}
-    return Flown(descent, LEAD_S, descent.thruster_firing_s, row)
+    return DescentFlight(descent, LEAD_S, descent.thruster_firing_s, row)
 
 
-def _recorded(
-    p: DescentScenarioParameters, flight: FlightFile, below: Float64[np.ndarray, "3"], surface: Surface
-) -> Flown:
-    motion = flight.motion(below, gravity_m_s2(p))
-    check_clearance(flight.file, motion, faulty_times(p.faults, p.picture_times_s), surface)
-    row: dict[str, Scalar] = {"flight_file": flight.file, "flight_first_picture_s": flight.start_s}
-    return Flown(motion, flight.lead_s, _firing_s(p, motion, surface), row)
-
-
-def _own(
+def _own_motion(
     p: DescentScenarioParameters,
     flight: OwnMotion,
     below: Float64[np.ndarray, "3"],
     surface: Surface,
     streams: Streams,
-) -> Flown:
+) -> DescentFlight:
     times = faulty_times(p.faults, p.picture_times_s)
     place = DescentPlace(
         ground_height=lambda east, north: float(surface.height(below[0] + east, below[1] + north) - below[2]),
@@ -107,26 +91,26 @@ def _own(
         until_s=max(times) + AFTER_S,
         firing_height_m=p.descent.thruster_firing_m,
     )
-    motion, row = flight.flown(place, below, streams.generator("own motion"))
+    motion, row = flight.compute(place, below, streams.generator("own motion"))
     check_looks_down(flight.motion, motion, times)
     check_clearance(flight.motion, motion, times, surface)
-    return Flown(motion, flight.lead_s, _firing_s(p, motion, surface), row)
+    return DescentFlight(motion, flight.lead_s, _firing_s(p, motion, surface), row)
 
 
 def _firing_s(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
-    """When a flight by poses first comes down to the thrusters' firing, over the ground below its first picture."""
-    times = np.linspace(max(p.picture_times_s), motion.span_s[1] - MARGIN_S, _SEARCHED)
+    """First time at the thrusters' firing height above the ground below the first picture; else the last time."""
+    times = np.linspace(max(p.picture_times_s), motion.span_s[1] - MARGIN_S, _SAMPLES)
     first = motion.state(0.0).position_m
     heights = motion.motion(times).positions_m[:, 2] - float(surface.height(first[0], first[1]))
     low = np.flatnonzero(heights <= p.descent.thruster_firing_m)
     if not low.size or low[0] == 0:
         return float(times[0 if low.size else -1])
-    around = slice(low[0] - 1, low[0] + 1)
-    return float(np.interp(-p.descent.thruster_firing_m, -heights[around], times[around]))
+    crossing = slice(low[0] - 1, low[0] + 1)
+    return float(np.interp(-p.descent.thruster_firing_m, -heights[crossing], times[crossing]))
 
 
 def check_clearance(name: str, motion: Trajectory, times_s: Sequence[float], surface: Surface) -> None:
-    """Raises TrajectoryFileError where a flight of this name is below the ground at a picture."""
+    """Raises TrajectoryFileError where the named flight is below the ground at a picture."""
     positions = motion.motion(np.array(times_s)).positions_m
     heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
     buried = np.flatnonzero(heights <= 0.0)
@@ -137,47 +121,40 @@ def check_clearance(name: str, motion: Trajectory, times_s: Sequence[float], sur
         )
 
 
-def picture_states(p: DescentScenarioParameters, flown: Flown) -> list[State]:
-    """Truth at the exposures.
-
-    Raises
-    ------
-    ValueError
-        If a picture would be taken after the thrusters' firing.
-    """
+def picture_states(p: DescentScenarioParameters, flight: DescentFlight) -> list[State]:
+    """True states at the exposures. Raises ValueError for a picture after the thrusters' firing."""
     times = faulty_times(p.faults, p.picture_times_s)
-    late = [number for number, time in enumerate(times, start=1) if time > flown.firing_s]
+    late = [number for number, time in enumerate(times, start=1) if time > flight.firing_s]
     if late:
         raise ValueError(
             f"picture {late[0]} of {p.pictures} would be taken at {times[late[0] - 1]:.2f} s, after the thrusters' "
-            f"firing at {flown.firing_s:.2f} s; allowed: fewer pictures, or a smaller descent.interval_s"
+            f"firing at {flight.firing_s:.2f} s; allowed: fewer pictures, or a smaller descent.interval_s"
         )
-    return [flown.motion.state(time) for time in times]
+    return [flight.motion.state(time) for time in times]
 
 
 def mean_velocities(states: Sequence[State]) -> Float64[np.ndarray, "intervals 3"]:
     """True mean velocities of the camera between the pictures, world axes, m/s."""
-    positions = np.stack([state.position_m for state in states])
     times = np.array([state.time_s for state in states])
-    velocities: Float64[np.ndarray, "intervals 3"] = np.diff(positions, axis=0) / np.diff(times)[:, None]
-    return velocities
+    positions = np.stack([state.position_m for state in states])
+    return np.asarray(np.diff(positions, axis=0) / np.diff(times)[:, None])
 
 
 def true_velocity(
     motion: Trajectory, states: Sequence[State], tags_s: Sequence[float], span_s: tuple[float, float]
 ) -> Float64[np.ndarray, "2"]:
-    """True horizontal velocity of the camera over a span of time tags: its mean, or that of the instant, m/s.
+    """True mean horizontal velocity of the camera over a span of time tags, or that of an instant, m/s.
 
-    Tags are taken to be at the true times of the pictures that carry them, and in proportion between two of them: a
-    span from picture to picture is one from exposure to exposure, whatever errors their tags have.
+    A picture's tag corresponds to its true time, and tags between two pictures are interpolated: a span from picture to
+    picture is one from exposure to exposure, independent of tag errors.
     """
-    first, second = (_at_tag(motion, states, tags_s, tag) for tag in span_s)
+
+    def state_at(tag_s: float) -> State:
+        if tag_s in tags_s:
+            return states[list(tags_s).index(tag_s)]
+        return motion.state(float(np.interp(tag_s, tags_s, [state.time_s for state in states])))
+
+    first, second = (state_at(tag) for tag in span_s)
     if second.time_s == first.time_s:
         return np.asarray(first.velocity_m_s[:2])
     return np.asarray((second.position_m - first.position_m)[:2] / (second.time_s - first.time_s))
-
-
-def _at_tag(motion: Trajectory, states: Sequence[State], tags_s: Sequence[float], tag_s: float) -> State:
-    if tag_s in tags_s:
-        return states[list(tags_s).index(tag_s)]
-    return motion.state(float(np.interp(tag_s, tags_s, [state.time_s for state in states])))

@@ -1,4 +1,4 @@
-"""What the lander's computer holds: pictures, attitudes propagated from the stars, altitudes, velocity changes."""
+"""Measurements of a descent: pictures, attitudes propagated from a star reference, altitudes, velocity changes."""
 
 from __future__ import annotations
 
@@ -10,18 +10,12 @@ from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.descent.faults import faulty_altitudes, faulty_attitudes
-from marsyard.scenarios.descent.flight import MARGIN_S, Flown, gravity_m_s2
+from marsyard.scenarios.descent.flight import MARGIN_S, DescentFlight, gravity_m_s2
 from marsyard.scenarios.descent.optics import calibrated_camera
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.parts.instruments import (
-    InstrumentReadings,
-    InstrumentTruth,
-    OwnAltimeter,
-    OwnAttitudeSource,
-    attitudes_of,
-)
+from marsyard.scenarios.parts.instruments import InstrumentReadings, InstrumentTruth, OwnAltimeter, OwnAttitudeSource
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from marsyard.sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter, Readings
@@ -31,24 +25,14 @@ from marsyard.sim.streams import Streams
 
 @dataclass(frozen=True)
 class Instruments:
-    """One descent's instruments, their constant errors drawn.
+    """Instruments of one descent with drawn constant errors.
 
-    Attributes
-    ----------
-    approach
-        The flight before the descent, along which navigation's errors grow.
-    imu
-        The inertial unit.
-    navigation
-        Attitude and velocity as propagated on board, from shortly before the first picture to the thrusters' firing.
-    altimeter
-        The radar; or what a user's own read.
-    clock
-        Of the pictures' time tags.
-    attitude_source
-        What a user's own instrument read at the pictures' time tags; None where attitudes are navigation's.
-    row
-        What the user's own were, as columns of the results.
+    - approach: flight before the descent, along which navigation errors grow
+    - navigation: propagated attitude and velocity, from shortly before the first picture to the thrusters' firing
+    - altimeter: the radar, or the readings of a user's own instrument
+    - clock: source of the pictures' time tags
+    - attitude_source: readings of a user's own instrument at the time tags; None for attitudes of the navigation
+    - row: columns of the user's own instruments
     """
 
     approach: Approach
@@ -60,18 +44,18 @@ class Instruments:
     row: Mapping[str, Scalar]
 
     @classmethod
-    def drawn(cls, p: DescentScenarioParameters, world: World, flown: Flown, streams: Streams) -> Instruments:
-        """The instruments of a case, and what navigation makes of its motion."""
-        start, end = -flown.lead_s + MARGIN_S, flown.firing_s + MARGIN_S
+    def draw(cls, p: DescentScenarioParameters, world: World, flight: DescentFlight, streams: Streams) -> Instruments:
+        """Draw the instruments of a case, propagate the navigation, and read a user's own instruments."""
+        start, end = -flight.lead_s + MARGIN_S, flight.firing_s + MARGIN_S
         approach = Approach(p.approach, start)
         unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
         imu = approach.calibrated(unit, streams.generator("inertial unit's calibration"))
         clock = Clock.drawn(p.clock, streams.generator("image clock"))
-        own = _own_readings(p, world, flown.motion, _tags(p, clock, streams), streams)
+        own = _read_own_instruments(p, world, flight.motion, _time_tags(p, clock, streams), streams)
         return cls(
             approach=approach,
             imu=imu,
-            navigation=_navigated(p, approach, imu, flown, streams),
+            navigation=_propagate_navigation(p, approach, imu, flight, streams),
             altimeter=own["altimeter"][0]
             if isinstance(p.altimeter, OwnAltimeter)
             else RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
@@ -81,23 +65,21 @@ class Instruments:
         )
 
 
-def _tags(p: DescentScenarioParameters, clock: Clock, streams: Streams) -> Float64[np.ndarray, "n"]:
-    """The pictures' time tags."""
+def _time_tags(p: DescentScenarioParameters, clock: Clock, streams: Streams) -> Float64[np.ndarray, "n"]:
     return clock.tags(np.array(p.picture_times_s), streams.generator("image time tags"))
 
 
-def _own_readings(
+def _read_own_instruments(
     p: DescentScenarioParameters,
     world: World,
     motion: Trajectory,
     tags_s: Float64[np.ndarray, "n"],
     streams: Streams,
 ) -> dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]]:
-    """What a user's own instruments read, with their columns, by the table that names them."""
+    """Readings and columns of the user's own instruments, by parameter table."""
     surface = world.surface
-    read: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
-    asked = {"altimeter": np.array(p.picture_times_s), "attitude_source": tags_s}
-    for table, times in asked.items():
+    results: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
+    for table, times in (("altimeter", np.array(p.picture_times_s)), ("attitude_source", tags_s)):
         own = getattr(p, table)
         if isinstance(own, OwnAltimeter | OwnAttitudeSource):
             truth = InstrumentTruth(
@@ -107,18 +89,18 @@ def _own_readings(
                 nearest_ground=lambda apex, axis, half, far: first_return(surface, apex, axis, half, far),
             )
             readings = own.read(truth, streams.generator(f"own {table}"))
-            read[table] = readings, own.columns(table, readings.columns)
-    return read
+            results[table] = readings, own.columns(table, readings.columns)
+    return results
 
 
-def _navigated(
-    p: DescentScenarioParameters, approach: Approach, imu: Imu, flown: Flown, streams: Streams
+def _propagate_navigation(
+    p: DescentScenarioParameters, approach: Approach, imu: Imu, flight: DescentFlight, streams: Streams
 ) -> InertialSolution:
-    """Navigation from the last star reference, before entry, to the thrusters' firing."""
-    start, end = approach.end_s, flown.firing_s + MARGIN_S
+    """Inertial navigation from the last star reference, before entry, to the thrusters' firing."""
+    start, end = approach.end_s, flight.firing_s + MARGIN_S
     errors = approach.errors(imu, streams.generator("approach"))
-    increments = imu.increments(flown.motion, start, end, streams.generator("inertial noise"))
-    state = flown.motion.state(start)
+    increments = imu.increments(flight.motion, start, end, streams.generator("inertial noise"))
+    state = flight.motion.state(start)
     attitude, velocity = errors.believed(state.attitude, state.velocity_m_s)
     return InertialSolution.propagated(increments, attitude, velocity, gravity_m_s2(p))
 
@@ -132,51 +114,33 @@ def measure(
     instruments: Instruments,
     streams: Streams,
 ) -> DescentMeasurements:
-    """Pictures and readings: attitudes at the pictures' tags, altitudes of the radar's last readings before them."""
-    times = np.array(p.picture_times_s)
-    tags = _tags(p, instruments.clock, streams)
+    """Measurements of an estimator: attitudes at the pictures' tags, altitudes of the last readings before them."""
+    tags = _time_tags(p, instruments.clock, streams)
     model = calibrated_camera(p.camera, streams.generator("camera calibration"))
     camera = model.binned(columns=1, rows=p.detector.rows_summed)
     images = [
         DetectorImage(counts, float(tag), camera, detector.calibration)
         for counts, tag in zip(pictures, tags, strict=True)
     ]
-    attitudes = [
-        AttitudeMeasurement(attitude, float(tag))
-        for attitude, tag in zip(_attitudes(instruments, tags), tags, strict=True)
-    ]
+    own = instruments.attitude_source
+    rotations = instruments.navigation.attitude(tags) if own is None else Rotation.from_quat(own.values)
+    attitudes = [AttitudeMeasurement(one, float(tag)) for one, tag in zip(rotations, tags, strict=True)]
     attitudes = faulty_attitudes(p.faults, attitudes, streams.generator("attitude fault"))
-    altitudes = faulty_altitudes(p.faults, _altitudes(motion, times, instruments.altimeter, streams))
+    readings: Readings | InstrumentReadings
+    if isinstance(instruments.altimeter, RadarAltimeter):
+        at = instruments.altimeter.sampling.latest(np.array(p.picture_times_s))
+        readings = instruments.altimeter.measure(motion, at, streams.generator("altimeter noise"))
+    else:
+        readings = instruments.altimeter
+    altitudes = [
+        AltitudeMeasurement(float(value), float(tag))
+        for value, tag in zip(readings.values, readings.times_s, strict=True)
+    ]
     return DescentMeasurements(
         images=tuple(images),
         attitudes=tuple(attitudes),
-        altitudes=tuple(altitudes),
+        altitudes=tuple(faulty_altitudes(p.faults, altitudes)),
         interval_velocities_m_s=instruments.navigation.mean_velocities(tags),
         sun_direction=world.sun.direction,
         inertial_velocities_m_s=instruments.navigation.velocity(tags),
     )
-
-
-def _attitudes(instruments: Instruments, tags_s: Float64[np.ndarray, "n"]) -> Rotation:
-    """Attitudes at the pictures' time tags: navigation's, or a user's own."""
-    own = instruments.attitude_source
-    return instruments.navigation.attitude(tags_s) if own is None else attitudes_of(own)
-
-
-def _altitudes(
-    motion: Trajectory,
-    times_s: Float64[np.ndarray, "n"],
-    altimeter: RadarAltimeter | InstrumentReadings,
-    streams: Streams,
-) -> list[AltitudeMeasurement]:
-    """The radar's last readings before the pictures, or those of a user's own altimeter, with their own tags."""
-    readings: Readings | InstrumentReadings
-    if isinstance(altimeter, RadarAltimeter):
-        at = altimeter.sampling.latest(times_s)
-        readings = altimeter.measure(motion, at, streams.generator("altimeter noise"))
-    else:
-        readings = altimeter
-    return [
-        AltitudeMeasurement(float(value), float(tag))
-        for value, tag in zip(readings.values, readings.times_s, strict=True)
-    ]

@@ -1,4 +1,4 @@
-"""The descent camera: as designed, and as it truly is."""
+"""The descent camera: as designed, and as calibrated with errors."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from marsyard.sim.camera import Cahv, Cahvor, CameraModel
 
 
 def camera_optics(parameters: CameraParameters) -> Optics:
-    """The descent camera in the body frame: at its origin, looking down, columns to the east at zero attitude."""
+    """True camera in the body frame: at its origin, looking down, columns to the east at zero attitude."""
     own = parameters.model
     return shared_optics(_camera(parameters, 1.0, (0.0, 0.0), 0.0) if own is None else own.camera())
 
 
 def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) -> CameraModel:
-    """The camera as calibrated: that of `camera_optics`, which is the true one, with the calibration's errors."""
+    """The true camera of `camera_optics` with drawn calibration errors."""
     p = parameters
     focal, column, row, distortion = rng.standard_normal(4)
     if p.model is not None:
@@ -32,7 +32,7 @@ def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) ->
 def _camera(
     p: CameraParameters, focal: float, centre_px: Float64[np.ndarray, "2"] | tuple[float, float], corner_px: float
 ) -> Cahvor:
-    """The camera with its focal length scaled, its centre moved, and its corners moved outwards by distortion."""
+    """The camera with a factor on its focal length, a shift of its centre, and outward distortion of its corners."""
     middle = (0.5 * (p.columns - 1), 0.5 * (p.rows - 1))
     focal_px = p.focal_length_mm / (1e-3 * p.pixel_pitch_um)
     pinhole = Cahv.from_axes(

@@ -1,4 +1,4 @@
-"""Everything that a descent campaign may set or disperse."""
+"""Parameters of a descent campaign."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from marsyard.scenarios.parts.named import usual_or
 from marsyard.scenarios.parts.scores import OwnScores, ScoredDescent
 from marsyard.scenarios.terrain_files import check_terrain
 from marsyard.sim.dynamics import SwingParameters
-from marsyard.sim.parameters import Parameters
+from marsyard.sim.parameters import Parameters, bounded
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
     ApproachParameters,
@@ -33,18 +33,18 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 
-#: Pictures of a descent as flown, which estimators without a stream take.
+#: Pictures of a descent as flown, the input of estimators without a stream.
 PICTURES = 3
 
 
 class Place(Parameters):
-    """Where over which terrain the descent happens."""
+    """Terrain and position of the descent."""
 
-    bank: Annotated[int, Field(ge=1, le=100000, description="terrains in the bank")] = 4
+    bank: Annotated[int, bounded(1, 100000, "terrains in the bank")] = 4
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
-    east_m: Annotated[float, Field(description="where the first picture is taken, on the periodic terrain")] = 0.0
-    north_m: Annotated[float, Field(description="where the first picture is taken, on the periodic terrain")] = 0.0
+    east_m: Annotated[float, Field(description="position of the first picture on the periodic terrain")] = 0.0
+    north_m: Annotated[float, Field(description="position of the first picture on the periodic terrain")] = 0.0
 
     @model_validator(mode="after")
     def _terrain_is_in_bank(self) -> Place:
@@ -54,85 +54,57 @@ class Place(Parameters):
 
 
 class SunParameters(Parameters):
-    """Where the sun stands."""
+    """Direction to the sun."""
 
-    azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 270.0
+    azimuth_deg: Annotated[float, bounded(-360.0, 720.0, "clockwise from north")] = 270.0
     elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="above the horizon")] = 40.0
 
 
 class LanderParameters(Parameters):
-    """What of the lander shows in its own pictures.
+    """The lander's shadow in its own pictures: a disc at the camera's position.
 
-    Its shadow is that of one disc at the camera's place. The canopy's is the largest by far: 15.09 m nominal, inflated
-    to 0.72 of that across (Witkowski & Bruno 2003, the MER parachute), it hides the sun wholly; backshell and lander,
-    2.65 m across, hide a twentieth of it from 2 km and lie within the canopy's shadow when the sun is high. That the
-    canopy hangs some 40 m above, which moves its shadow by 1 deg of the view, is left out: the zero-phase spot that
-    DIMES masks is 4 deg in radius.
+    The canopy's shadow dominates: 15.09 m nominal, inflated to 0.72 of that (Witkowski & Bruno 2003, MER parachute),
+    it covers the sun wholly. Backshell and lander, 2.65 m in diameter, cover a twentieth of it from 2 km and lie within
+    the canopy's shadow when the sun is high. The canopy's height of some 40 m above the camera, which moves its shadow
+    by 1 deg of the view, is not modelled: the zero-phase spot that DIMES masks is 4 deg in radius.
     """
 
-    caster_diameter_m: Annotated[
-        float, Field(ge=0.0, le=100.0, description="diameter of the disc that casts the lander's shadow, m")
-    ] = 10.9
+    caster_diameter_m: Annotated[float, bounded(0.0, 100.0, "disc that casts the lander's shadow")] = 10.9
 
 
 class LandingParameters(Parameters):
-    """From the answer to the ground: see `marsyard.scenarios.descent.landing`. All but the burn are assumed."""
+    """Landing with the estimate (`marsyard.scenarios.descent.score.touchdown`); values but the burn's are assumed."""
 
-    computation_s: Annotated[
-        float, Field(ge=0.0, le=1000.0, description="from the third picture to the answer on the flight computer, s")
-    ] = 14.0
-    processor_factor: Annotated[
-        float,
-        Field(gt=0.0, le=1e6, description="time on the flight computer over that measured on this host (assumed)"),
-    ] = 600.0
-    least_steered_m_s: Annotated[
-        float, Field(ge=0.0, le=100.0, description="speed up to which the thrusters do not steer, m/s")
-    ] = 5.0
-    most_steered_m_s: Annotated[
-        float, Field(ge=0.0, le=100.0, description="most that steering takes out: the burn's 80 m/s tilted by 15 deg")
-    ] = 20.0
-    steering_error: Annotated[
-        float, Field(ge=0.0, le=1.0, description="RMS error of the steering per axis over what it takes out")
-    ] = 0.1
-    burn_error_m_s: Annotated[
-        float, Field(ge=0.0, le=50.0, description="RMS of what the burn adds per axis, steered or not, m/s")
-    ] = 1.0
+    computation_s: Annotated[float, bounded(0.0, 1000.0, "time to the answer on the flight computer")] = 14.0
+    processor_factor: Annotated[float, Field(gt=0.0, le=1e6, description="flight computer over host (assumed)")] = 600.0
+    least_steered_m_s: Annotated[float, bounded(0.0, 100.0, "speed up to which the thrusters do not steer")] = 5.0
+    most_steered_m_s: Annotated[float, bounded(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
+    steering_error: Annotated[float, bounded(0.0, 1.0, "RMS relative error of the steering per axis")] = 0.1
+    burn_error_m_s: Annotated[float, bounded(0.0, 50.0, "RMS of the burn's velocity error per axis")] = 1.0
 
 
 class CameraParameters(Parameters):
-    """The descent camera: 14.67 mm, 12 um pixels, 45 deg; distortion that of an Opportunity navcam (its PDS label).
+    """The descent camera: 14.67 mm, 12 um pixels, 45 deg; distortion of an Opportunity navcam (its PDS label).
 
-    With `model` it is a user's own, and what is stated here of focal length, pixels and distortion is not used.
+    A user's own `model` replaces focal length, pixels and distortion.
     """
 
-    model: Annotated[
-        OwnCameraChoice | None, Field(description="an own camera: the path of its file, or a table with file")
-    ] = None
-
+    model: Annotated[OwnCameraChoice | None, Field(description="own camera: path of its file, or table")] = None
     focal_length_mm: Annotated[float, Field(gt=1.0, le=1000.0)] = 14.67
     pixel_pitch_um: Annotated[float, Field(gt=0.5, le=100.0)] = 12.0
     columns: Annotated[int, Field(ge=64, le=4096)] = 1024
     rows: Annotated[int, Field(ge=64, le=4096)] = 1024
-    radial_0: Annotated[float, Field(ge=-0.1, le=0.1, description="first term of CAHVOR's R")] = 0.00096
-    radial_1: Annotated[float, Field(ge=-0.5, le=0.5, description="second term of CAHVOR's R")] = -0.002183
-    radial_2: Annotated[float, Field(ge=-0.5, le=0.5, description="third term of CAHVOR's R")] = 0.018547
-    alignment_error_deg: Annotated[
-        float, Field(ge=0.0, le=10.0, description="RMS per axis of the mounting's error, not known to the lander")
-    ] = 0.02
-    focal_error: Annotated[
-        float, Field(ge=0.0, le=0.05, description="RMS relative error of the calibrated focal length")
-    ] = 0.0002
-    centre_error_px: Annotated[
-        float,
-        Field(ge=0.0, le=50.0, description="RMS error of the calibrated image centre per axis, full-frame pixels"),
-    ] = 0.5
-    distortion_error_px: Annotated[
-        float, Field(ge=0.0, le=50.0, description="RMS error of the calibrated distortion in the picture's corners, px")
-    ] = 0.3
+    radial_0: Annotated[float, bounded(-0.1, 0.1, "first term of CAHVOR's R")] = 0.00096
+    radial_1: Annotated[float, bounded(-0.5, 0.5, "second term of CAHVOR's R")] = -0.002183
+    radial_2: Annotated[float, bounded(-0.5, 0.5, "third term of CAHVOR's R")] = 0.018547
+    alignment_error_deg: Annotated[float, bounded(0.0, 10.0, "RMS error of the mounting per axis")] = 0.02
+    focal_error: Annotated[float, bounded(0.0, 0.05, "RMS relative error of the calibrated focal length")] = 0.0002
+    centre_error_px: Annotated[float, bounded(0.0, 50.0, "RMS error of the calibrated centre, full-frame")] = 0.5
+    distortion_error_px: Annotated[float, bounded(0.0, 50.0, "RMS error of the distortion in the corners")] = 0.3
 
 
 class RenderParameters(Parameters):
-    """How pictures are drawn."""
+    """Rendering of the pictures."""
 
     backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
         default_factory=default_backend
@@ -149,52 +121,36 @@ Altimeter = Annotated[
 
 
 class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
-    """Everything that a descent campaign may set or disperse.
+    """Parameters of a descent campaign.
 
-    With a `site`, the keys that the table `terrain` sets are changes of the site's own terrain, and light, gravity,
-    texture and rocks are the site's. A site belongs to a campaign, not to a case: it is put into `terrain` when the
-    campaign is read, and cannot be dispersed.
+    A `site` sets light, gravity, texture and rocks; keys of the table `terrain` change the site's own terrain. A site
+    belongs to a campaign, not to a case: it is merged into `terrain` when the campaign is read, and not dispersed.
     """
 
     task = VELOCITY
     scored = ScoredDescent
 
     site: Annotated[str | None, Field(description="preset of terrain, light and gravity; none: a plain terrain")] = None
-    terrain_site: Annotated[
-        str | None, Field(description="whose terrain is below; filled in with `site`, and not to be set otherwise")
-    ] = None
+    terrain_site: Annotated[str | None, Field(description="site of the terrain; filled in with `site`, not set")] = None
     place: Place = Place()
     terrain: TerrainParameters = TerrainParameters()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
     sun: SunParameters = SunParameters()
     descent: SwingParameters = SwingParameters()
-    pictures: Annotated[
-        int, Field(ge=2, le=100, description="pictures that are taken, descent.interval_s apart; all go to a stream")
-    ] = PICTURES
-    triple: Annotated[
-        tuple[int, int, int] | None,
-        Field(
-            description="numbers, from 1, of the three that estimators of three pictures get; not stated: those as far "
-            "apart as they can be evenly, the last among them"
-        ),
-    ] = None
-    flight: Annotated[
-        Flight | None, Field(description="a recorded flight or an own motion, in place of the descent's dynamics")
-    ] = None
+    pictures: Annotated[int, bounded(2, 100, "pictures, descent.interval_s apart; a stream gets all")] = PICTURES
+    #: By default the last picture and two others, as far apart as possible at equal intervals.
+    triple: Annotated[tuple[int, int, int] | None, Field(description="numbers of the three used, from 1")] = None
+    flight: Annotated[Flight | None, Field(description="recorded flight or own motion instead of the dynamics")] = None
     lander: LanderParameters = LanderParameters()
     camera: CameraParameters = CameraParameters()
     faults: Faults = Faults()
-    algorithm: Annotated[
-        str, Field(description="estimator under test: dimes, phase-correlation, homography, or your own")
-    ] = "dimes"
+    algorithm: Annotated[str, Field(description="dimes, phase-correlation, homography, or your own")] = "dimes"
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
     detector: DetectorChoice = DetectorParameters()
     imu: ImuParameters = ImuParameters()
     approach: ApproachParameters = ApproachParameters()
     altimeter: Altimeter = RadarParameters()
-    attitude_source: Annotated[
-        OwnAttitudeSource | None, Field(description="an own instrument in place of navigation's attitudes at pictures")
-    ] = None
+    attitude_source: Annotated[OwnAttitudeSource | None, Field(description="own source of attitudes")] = None
     clock: Annotated[ClockParameters, Field(description="of the pictures' time tags")] = ClockParameters(
         offset_sd_s=0.001, jitter_sd_s=0.0005
     )
@@ -217,25 +173,24 @@ class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
     @model_validator(mode="before")
     @classmethod
     def _terrain_of_the_site(cls, stated: Any) -> Any:
-        """Completes the table `terrain` with the site's own."""
         if not isinstance(stated, Mapping) or stated.get("site") not in descent_sites():
             return stated
         changes = stated.get("terrain", {})
         if not isinstance(changes, Mapping):
             return stated
         of_site = site(stated["site"]).terrain("descent").model_dump()
-        return {"terrain_site": stated["site"], **stated, "terrain": _merged(of_site, changes)}
+        return {"terrain_site": stated["site"], **stated, "terrain": _merge(of_site, changes)}
 
     @model_validator(mode="after")
     def _terrain_is_the_sites(self) -> DescentScenarioParameters:
-        """A terrain that was completed for one site must not be lit as another's."""
+        """A terrain merged for one site must not be lit as another's."""
         if self.terrain_site != self.site:
             raise ValueError(f"site is {self.site}, but the terrain is of {self.terrain_site}; a site is not dispersed")
         return self
 
     @model_validator(mode="after")
     def _pictures_can_be_binned(self) -> DescentScenarioParameters:
-        """By the detector's rows, and for the room that DIMES has, which every case tells."""
+        """By the detector's rows, and to DIMES' size, as each case reports DIMES' feasible overlap."""
         camera: CameraParameters | OwnCamera = self.camera if self.camera.model is None else self.camera.model
         columns, rows = camera.columns, camera.rows
         if rows % self.detector.rows_summed:
@@ -255,9 +210,9 @@ class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
                 raise ValueError(
                     f"pictures is {self.pictures}, but '{of_three[0]}' takes {PICTURES}; allowed: {PICTURES} to 100"
                 )
-        struck = max(self.faults.repeated_picture, self.faults.black_picture)
-        if struck > self.pictures:
-            raise ValueError(f"a fault strikes picture {struck}, but pictures is {self.pictures}")
+        affected = max(self.faults.repeated_picture, self.faults.black_picture)
+        if affected > self.pictures:
+            raise ValueError(f"a fault strikes picture {affected}, but pictures is {self.pictures}")
         return self
 
     @model_validator(mode="after")
@@ -268,15 +223,14 @@ class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
 
     @property
     def picture_times_s(self) -> list[float]:
-        """When pictures should be taken, s after the first."""
+        """Nominal times of the pictures after the first."""
         return [number * self.descent.interval_s for number in range(self.pictures)]
 
     @property
-    def triple_places(self) -> tuple[int, int, int] | None:
-        """Places, from 0, of the three pictures that estimators of three get; None where fewer are taken."""
+    def triple_indices(self) -> tuple[int, int, int] | None:
+        """Indices of the pictures for estimators of three; None where fewer are taken."""
         if self.triple is not None:
-            first, second, third = (number - 1 for number in self.triple)
-            return first, second, third
+            return self.triple[0] - 1, self.triple[1] - 1, self.triple[2] - 1
         if self.pictures < PICTURES:
             return None
         last, apart = self.pictures - 1, (self.pictures - 1) // 2
@@ -298,20 +252,19 @@ def check_binning(binned: tuple[int, int], delivered: tuple[int, int]) -> None:
 
 
 def binned_size_for(columns: int, rows: int) -> tuple[int, int]:
-    """The size to which DIMES may bin a delivered picture: square blocks that leave about 256 columns, or no fewer."""
+    """Binned size for DIMES: square blocks that leave at least, and about, 256 columns."""
     factors = [f for f in range(1, max(columns // 256, 1) + 1) if columns % f == 0 and rows % f == 0]
     return columns // factors[-1], rows // factors[-1]
 
 
 def descent_sites() -> list[str]:
-    """Names of the sites that have a terrain for descents."""
+    """Names of the sites with a terrain for descents."""
     return [name for name, one in sites().items() if one.descent is not None]
 
 
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested tables with some of their values changed."""
+def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in changes.items():
-        below = merged.get(key)
-        merged[key] = _merged(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+        inner = merged.get(key)
+        merged[key] = _merge(inner, value) if isinstance(inner, Mapping) and isinstance(value, Mapping) else value
     return merged

@@ -1,4 +1,4 @@
-"""A flight from a file, in place of the descent's dynamics: `[parameters.flight]` of a descent campaign."""
+"""Recorded flight from a file, in place of the simulated dynamics: `[parameters.flight]` of a descent campaign."""
 
 from __future__ import annotations
 
@@ -12,54 +12,49 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.own_axes import RecordedAxes
 from marsyard.scenarios.own_files import OwnFile
-from marsyard.sim.dynamics.recorded import RecordedMotion
-from marsyard.sim.dynamics.recorded_files import RecordedPoses, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.recorded import RecordedMotion, RecordedPoses, TrajectoryFileError, read_poses
+from marsyard.sim.parameters import bounded
 
-#: How long after the last picture the flight must be known, s.
+#: Required duration of the flight after the last picture, s.
 AFTER_S = 0.5
 
 
 class FlightFile(OwnFile, RecordedAxes):
-    """A recorded or computed flight: a CSV, Parquet, TUM or EuRoC file of poses.
+    """A recorded flight: a CSV, Parquet, TUM or EuRoC file of poses, or SPICE kernels.
 
-    Positions are the camera's, unless `lever_m` says where the camera is. The file's time `first_picture_s` is that of
-    the first picture; others follow after `descent.interval_s` each. All instruments measure this motion as they would
-    a simulated one.
+    Positions are the camera's, or with `lever_m` the vehicle's. The first picture is at the file's time
+    `first_picture_s`; others follow every `descent.interval_s`. Instruments measure it like a simulated one.
     """
 
     origin: Annotated[
         Literal["place", "terrain"],
-        Field(description="positions count from the ground at `place`, or from the terrain's own origin"),
+        Field(description="origin of positions: ground at `place`, or the terrain's origin"),
     ] = "place"
     first_picture_s: Annotated[
-        float | None, Field(description="file's time of the first picture; not stated: `lead_s` after its beginning")
+        float | None, Field(description="file's time of the first picture; default: `lead_s` after its beginning")
     ] = None
-    lead_s: Annotated[
-        float, Field(ge=0.2, le=30.0, description="how long before the first picture navigation is followed, s")
-    ] = 5.0
-    turn_deg: Annotated[
-        float, Field(ge=-720.0, le=720.0, description="turns the flight about the vertical, clockwise from above")
-    ] = 0.0
+    lead_s: Annotated[float, bounded(0.2, 30.0, "start of the navigation before the first picture")] = 5.0
+    turn_deg: Annotated[float, bounded(-720.0, 720.0, "rotation about the vertical, clockwise from above")] = 0.0
 
     @classmethod
     def hash_of(cls, file: str) -> str:
-        """SHA-256 of the file of poses, which are checked."""
+        """SHA-256 of the file; its poses are checked."""
         return read_poses(file).sha256
 
     @property
     def poses(self) -> RecordedPoses:
-        """The file's poses."""
+        """Poses of the file."""
         return read_poses(self.file)
 
     @property
     def start_s(self) -> float:
-        """The file's time of the first picture."""
+        """File's time of the first picture."""
         if self.first_picture_s is not None:
             return self.first_picture_s
         return float(self.poses.times_s[0]) + self.lead_s
 
     def check(self, pictures_s: Sequence[float]) -> None:
-        """Raises ValueError where the flight is not known at the pictures, or cannot be one over the ground."""
+        """Raises ValueError where the flight does not cover the pictures, looks up, or is below the ground at one."""
         motion = self.motion(np.zeros(3), 0.0)
         first, last = motion.span_s
         if first > -self.lead_s + 1e-9 or last < max(pictures_s) + AFTER_S:
@@ -78,18 +73,9 @@ class FlightFile(OwnFile, RecordedAxes):
                 )
 
     def motion(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
-        """The flight in the terrain's world, its time 0 at the first picture.
-
-        Parameters
-        ----------
-        ground_m
-            The ground at the place, which positions count from where `origin` says so; shape (3,).
-        gravity_m_s2
-            Gravity of the site.
-        """
+        """The flight in the terrain's world, time 0 at the first picture; `ground_m` is the ground at the place."""
         poses = self.poses
-        turn = Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0]))
-        world = turn * self.world
+        world = Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0])) * self.world
         recorded = world * Rotation.from_quat(poses.quaternions)
         positions = world.apply(poses.positions_m) + self.levers(recorded)
         if self.origin == "place":
@@ -98,7 +84,7 @@ class FlightFile(OwnFile, RecordedAxes):
 
 
 def check_looks_down(name: str, motion: RecordedMotion, pictures_s: Sequence[float]) -> None:
-    """Raises TrajectoryFileError where the camera of a flight of this name looks up at a picture."""
+    """Raises TrajectoryFileError where the camera of the named flight looks up at a picture."""
     for number, attitude in enumerate(motion.motion(np.array(pictures_s)).attitudes, start=1):
         axis = attitude.apply(np.array([0.0, 0.0, -1.0]))
         if axis[2] >= 0.0:

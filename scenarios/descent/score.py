@@ -1,39 +1,87 @@
-"""What is stored of a descent: errors, conditions as read back from the simulated objects, pictures."""
+"""Result columns of a descent: conditions, measurement errors, and the landing with the estimate."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from marsyard.algorithms.dimes import DimesDetails, propagated
-from marsyard.algorithms.dimes.binning import altitudes_at_images
+from marsyard.algorithms.dimes import DimesDetails, DimesOptions, propagated
+from marsyard.algorithms.dimes.binning import View, altitudes_at_images, bin_factors, placed_camera
+from marsyard.algorithms.dimes.overlap import search_geometry, template_candidates
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, sun_columns
 from marsyard.scenarios.descent.flight import mean_velocities
-from marsyard.scenarios.descent.landing import Touchdown, is_in_time
 from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
 from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.interface import Scalar
+from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
-from marsyard.sim.measurements import DescentMeasurements
+from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration
 from marsyard.sim.sensor import height_above_ground
 
 Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
 Horizontal = Float64[np.ndarray, "2"]
 
+#: Width of the ground patch whose mean height is the reference of DIMES' altitude, m.
+PATCH_M = 200.0
 
-def carried_to_firing(
+
+@dataclass(frozen=True)
+class Touchdown:
+    """Horizontal touchdown velocities of the same descent with and without the estimate, m/s.
+
+    - punctual: the estimate is available at the rockets' firing by the assumed computation time
+    """
+
+    with_answer: Horizontal
+    without_answer: Horizontal
+    punctual: bool
+
+
+def touchdown(
+    p: LandingParameters,
+    true_m_s: Horizontal,
+    believed_m_s: Horizontal | None,
+    available_s: float,
+    rng: np.random.Generator,
+) -> Touchdown:
+    """Compute touchdown velocities with a simple model of MER's last seconds; `rng` draws errors of burn and steering.
+
+    Near 100 m solid rockets in the backshell stop the fall; small rockets next to them (TIRS) can tilt the backshell
+    first, so that the burn has a horizontal component. The lander keeps its horizontal velocity at the rockets' firing,
+    and the burn adds an error. If an estimate is available in time and large enough, the burn is steered against the
+    velocity that the inertial unit has propagated from it, up to the limit of the tilt. Without an estimate the burn is
+    not steered. Swinging and wind during the burn's three seconds are not modelled. Steering depends on an assumed
+    computation time, so that rows are reproducible bit for bit.
+
+    - true_m_s: horizontal velocity of the lander at the rockets' firing
+    - believed_m_s: the estimate, propagated to that time by the inertial unit; None without an estimate
+    - available_s: time from the last picture to the firing
+    """
+    burn, steering = p.burn_error_m_s * rng.standard_normal(2), p.steering_error * rng.standard_normal(2)
+    unsteered = true_m_s + burn
+    punctual = p.computation_s <= available_s
+    speed = 0.0 if believed_m_s is None else float(np.hypot(*believed_m_s))
+    if believed_m_s is None or not punctual or speed <= p.least_steered_m_s:
+        return Touchdown(unsteered, unsteered, punctual)
+    removed = believed_m_s * min(1.0, p.most_steered_m_s / speed)
+    return Touchdown(unsteered - removed + steering * np.hypot(*removed), unsteered, punctual)
+
+
+def propagate_to_firing(
     estimate: VelocityEstimate | None, instruments: Instruments, firing_s: float
 ) -> Horizontal | None:
-    """The reported velocity, carried on to the thrusters' firing by the inertial unit; None where none was reported."""
+    """The estimate, propagated to the thrusters' firing by the inertial unit; None without an estimate."""
     if estimate is None or estimate.velocity_m_s is None or estimate.span_s is None:
         return None
     navigation, span = instruments.navigation, np.array(estimate.span_s)
-    of_instant = estimate.span_s[0] == estimate.span_s[1]
-    then = (navigation.velocity(span) if of_instant else navigation.mean_velocities(span))[0]
+    is_instant = estimate.span_s[0] == estimate.span_s[1]
+    then = (navigation.velocity(span) if is_instant else navigation.mean_velocities(span))[0]
     now = navigation.velocity(np.array([firing_s]))[0]
     return propagated(estimate.velocity_m_s, then[:2], now[:2])
 
@@ -41,7 +89,7 @@ def carried_to_firing(
 def conditions(
     p: DescentScenarioParameters, world: World, states: Sequence[State], at_firing: State
 ) -> dict[str, Scalar]:
-    """What the case was like, read from the simulated objects."""
+    """Columns of the case's conditions, from the simulated objects."""
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
     row: dict[str, Scalar] = {
         "site": p.site or "plain",
@@ -65,7 +113,7 @@ def conditions(
 
 
 def instrument_conditions(instruments: Instruments) -> dict[str, Scalar]:
-    """What the instruments went through: the azimuth of flight before entry, and the change of temperature."""
+    """Columns of the azimuth of flight before entry, the change of temperature, and own instruments."""
     approach = instruments.approach
     flight = -approach.attitudes(np.array([approach.start_s])).as_matrix()[0, :, 2]
     change_k = instruments.imu.gyro.warm_up.temperature_k(np.array([np.inf]))[0]
@@ -77,61 +125,83 @@ def instrument_conditions(instruments: Instruments) -> dict[str, Scalar]:
 
 
 def instrument_errors(world: World, states: Sequence[State], measurements: DescentMeasurements) -> dict[str, Scalar]:
-    """Errors of what was measured, divided into what the pictures share and what each has of its own.
+    """Columns of measurement errors, divided into a part common to the pictures and each picture's own part.
 
-    The shared part of an attitude error is the mean of the three rotation vectors (world axes), the own part the RMS
-    length of what is left; altitude errors, as shares of the altitude, likewise. Altitudes are those at the pictures,
-    over the ground straight below: relief that the radar sees nearer is part of their error. The change of velocity is
-    that from the last interval but one to the last.
+    The common attitude error is the mean of the pictures' rotation vectors (world axes), the own part the RMS length of
+    the residuals; relative altitude errors likewise. Altitudes are those at the pictures, over the ground straight
+    below, so that closer relief in the radar's beam is an error. The velocity change is between the last two intervals.
     """
-    turned = np.stack(
+    rotations = np.stack(
         [
             (measured.world_from_body * state.attitude.inv()).as_rotvec()
             for measured, state in zip(measurements.attitudes, states, strict=True)
         ]
     )
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
-    shares = altitudes_at_images(measurements) / heights - 1.0
+    relative = altitudes_at_images(measurements) / heights - 1.0
     tags = np.array([image.time_s for image in measurements.images]) - np.array([state.time_s for state in states])
     true_changes, changes = (
         np.diff(velocities[:, :2], axis=0)
         for velocities in (mean_velocities(states), measurements.interval_velocities_m_s)
     )
+    own_rotations = rotations - rotations.mean(axis=0)
     row: dict[str, Scalar] = {
-        "attitude_error_common_deg": float(np.degrees(np.linalg.norm(turned.mean(axis=0)))),
-        "attitude_error_own_deg": float(
-            np.degrees(np.sqrt(np.mean(np.sum((turned - turned.mean(axis=0)) ** 2, axis=1))))
-        ),
-        "altitude_error_common": float(shares.mean()),
-        "altitude_error_own": float(np.sqrt(np.mean((shares - shares.mean()) ** 2))),
+        "attitude_error_common_deg": float(np.degrees(np.linalg.norm(rotations.mean(axis=0)))),
+        "attitude_error_own_deg": float(np.degrees(np.sqrt(np.mean(np.sum(own_rotations**2, axis=1))))),
+        "altitude_error_common": float(relative.mean()),
+        "altitude_error_own": float(np.sqrt(np.mean((relative - relative.mean()) ** 2))),
     }
     if len(changes):
         row["velocity_change_error_m_s"] = float(np.hypot(*(changes[-1] - true_changes[-1])))
-    for number, (rotation, share, tag) in enumerate(zip(turned, shares, tags, strict=True), start=1):
+    for number, (rotation, error, tag) in enumerate(zip(rotations, relative, tags, strict=True), start=1):
         row[f"attitude_error_{number}_deg"] = float(np.degrees(np.linalg.norm(rotation)))
-        row[f"altitude_error_{number}_m"] = float(share * heights[number - 1])
+        row[f"altitude_error_{number}_m"] = float(error * heights[number - 1])
         row[f"tag_error_{number}_s"] = float(tag)
     return row
 
 
 def landing_row(p: LandingParameters, landed: Touchdown, measured_s: float, available_s: float) -> dict[str, Scalar]:
-    """What the answer did to the landing, and whether it came in time by the time that was measured."""
+    """Columns of the landing; `answer_in_time` scales the measured computation time to the flight computer."""
     return {
         "touchdown_speed_with_m_s": float(np.hypot(*landed.with_answer)),
         "touchdown_speed_without_m_s": float(np.hypot(*landed.without_answer)),
         "answer_punctual": landed.punctual,
-        "answer_in_time": is_in_time(p, measured_s, available_s),
+        "answer_in_time": p.processor_factor * measured_s <= available_s,
     }
 
 
-def room_row(places: tuple[int, int] | None) -> dict[str, Scalar]:
-    """In how many places DIMES has room in its pairs of pictures; nothing where it has no three pictures."""
-    if places is None:
-        return {}
-    return {"room": min(places) > 0, "room_first_pair": places[0], "room_second_pair": places[1]}
+def feasible_overlap_row(
+    states: Sequence[State],
+    world: World,
+    camera: CameraModel,
+    calibration: DetectorCalibration,
+    options: DimesOptions,
+) -> dict[str, Scalar]:
+    """Columns of the feasible overlap of three pictures: DIMES' grid points at which template and search area fit.
+
+    Attitudes, times, altitudes and camera are the true ones; as in DIMES the zero-phase spot is excluded. Without a
+    point in either pair of pictures the geometry makes DIMES fail.
+    """
+    columns, rows = bin_factors(camera.size[::-1], options.binned_size)
+    samples = PATCH_M / world.surface.spacing_m
+    level = int(np.clip(np.rint(np.log2(max(samples, 1.0))), 0, len(world.surface.levels) - 1))
+    blank = np.zeros(options.binned_size[::-1], dtype=np.float32)
+    views = []
+    for state in states:
+        altitude_m = float(state.position_m[2] - world.surface.height(state.position_m[0], state.position_m[1], level))
+        placed, centre = placed_camera(camera.binned(columns, rows), state.attitude, altitude_m)
+        views.append(View(blank, blank, placed, centre, state.time_s, calibration, calibration.rows_summed * rows))
+    sun = world.sun.direction
+    first, second = (
+        len(template_candidates(one, other, search_geometry(one, other, options), sun, options).pixels)
+        for one, other in pairwise(views)
+    )
+    return {"room": min(first, second) > 0, "room_first_pair": first, "room_second_pair": second}
 
 
-def shown(pictures: Pictures, estimate: VelocityEstimate | None, triple: tuple[int, int, int] | None) -> Pictures:
-    """The pictures that a case's figures show: of DIMES the three that it was given."""
-    ours = estimate is not None and isinstance(estimate.details, DimesDetails)
-    return [pictures[place] for place in triple] if ours and triple is not None else pictures
+def pictures_of_figures(
+    pictures: Pictures, estimate: VelocityEstimate | None, triple: tuple[int, int, int] | None
+) -> Pictures:
+    """Pictures in a case's figures: for DIMES the three of its input, else all."""
+    is_dimes = estimate is not None and isinstance(estimate.details, DimesDetails)
+    return [pictures[index] for index in triple] if is_dimes and triple is not None else pictures

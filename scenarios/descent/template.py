@@ -1,4 +1,4 @@
-"""The template of a new campaign of descents."""
+"""Template of a new campaign of descents."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from marsyard.sim.camera import read_camera
 
 
 def _binned_size(choices: Choices) -> Mapping[str, Any]:
-    """The size that DIMES bins the pictures of a user's camera to."""
     return {"binned_size": binned_size_for(*read_camera(choices.camera).size)} if choices.camera else {}
 
 

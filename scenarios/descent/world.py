@@ -1,4 +1,4 @@
-"""The world of a descent: its terrain, its light, and what the camera sees of both."""
+"""World of a descent: terrain, light, and the scene of its pictures."""
 
 from __future__ import annotations
 
@@ -16,26 +16,17 @@ from marsyard.sim.render import Photometry, Scene, Sun
 from marsyard.sim.render.clouds import CloudLayer
 from marsyard.sim.terrain import Environment, Surface, TerrainBank
 
-#: Finest spacing of a plain terrain's mesh: that of pictures from 1200 m and more, and its share of a lower height.
+#: Finest spacing of a plain terrain's mesh: that of pictures from 1200 m and above, and as a fraction of lower heights.
 MESH_FINEST_M, MESH_FINEST_HEIGHTS = 12.0, 0.01
 
 
 @dataclass(frozen=True)
 class World:
-    """Where a descent happens.
+    """Terrain and light of a descent.
 
-    Attributes
-    ----------
-    surface
-        The terrain.
-    ground
-        The same with its site's light, texture and rocks; None for a plain terrain.
-    sun
-        The sun.
-    meshes
-        Own bodies on the ground.
-    brightness
-        Sunlight at the ground over that for which the detector's responsivity is stated.
+    - ground: the terrain with its site's light, texture and rocks; None for a plain terrain
+    - meshes: own bodies on the ground
+    - brightness: sunlight at the ground over the reference sunlight of the detector's responsivity
     """
 
     surface: Surface
@@ -46,12 +37,12 @@ class World:
 
     @property
     def air(self) -> Environment:
-        """The site's air; that of Mars over a plain terrain."""
+        """Atmosphere of the site; Mars for a plain terrain."""
         return Environment() if self.ground is None else self.ground.site.environment
 
     @classmethod
     def of(cls, p: DescentScenarioParameters) -> World:
-        """The world of a case; its terrain comes from the disk, or is built."""
+        """Create a case's world; its terrain is read from the cache or built."""
         terrain = faulty_terrain(p.faults, p.terrain)
         bank = TerrainBank(terrain, p.place.bank_seed)
         surface = bank.terrain(p.place.terrain)
@@ -61,9 +52,8 @@ class World:
             return cls(surface, None, Sun(towards_sun), p.meshes)
         air = p.preset.environment
         sun = Sun(towards_sun, air.sun_radius_rad)
-        brightness = sunlight_ratio(air, elevation, p.detector)
         ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.place.terrain))
-        return cls(surface, ground, sun, p.meshes, brightness)
+        return cls(surface, ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 
     def scene(
         self,
@@ -75,20 +65,11 @@ class World:
         caster_diameter_m: float = 0.0,
         clouds: CloudLayer | None = None,
     ) -> Scene:
-        """One scene for all pictures of a descent.
+        """Scene of all pictures of a descent.
 
-        Parameters
-        ----------
-        east_m, north_m
-            Below the first picture.
-        lowest_m
-            Height above the ground of the last picture, which shows the smallest rocks.
-        pixel_rad
-            Angle that a pixel takes.
-        caster_diameter_m
-            Diameter of what casts the lander's shadow.
-        clouds
-            Clouds that drift above.
+        - east_m, north_m: position below the first picture
+        - lowest_m: height above ground of the last picture, which determines the smallest rocks
+        - caster_diameter_m: diameter of the disc that casts the lander's shadow
         """
         if self.ground is None:
             finest = min(MESH_FINEST_M, MESH_FINEST_HEIGHTS * lowest_m)

@@ -201,7 +201,7 @@ class Transit:
         """
         p = parameters
         start, end = p.span_s
-        air = Air.drawn(p.air, p.craft.step_s, end - start, streams.generator("gusts"))
+        air = Air.draw(p.air, p.craft.step_s, end - start, streams.generator("gusts"))
         flight = transit_flight(
             p.craft, p.transit, over_m, course_rad, heading_rad, gravity_m_s2, air, streams.generator("vibration")
         )

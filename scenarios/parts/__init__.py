@@ -1,7 +1,6 @@
-"""Parts of a case that a user brings: the motion of a descent, an instrument, a score.
+"""Parts of a case that a user supplies: the motion of a descent, an instrument, a score.
 
-Read `named` first: how a part is named, found and made from its options. `motions`, `instruments` and `scores` hold
-what each kind is handed and what it gives.
+`named` finds a part by its name and constructs it; `motions`, `instruments` and `scores` define inputs and outputs.
 """
 
 from marsyard.scenarios.parts.instruments import InstrumentReadings, InstrumentTruth

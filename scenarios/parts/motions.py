@@ -1,20 +1,20 @@
-"""The motion of a descent by a class of a user's own: `[parameters.flight]` with `motion`.
+"""User-defined motion of a descent: `[parameters.flight]` with `motion`.
 
-A class that has
+A motion is a class with
 
-- options, which it takes by name when it is made, each with a default;
+- options, the arguments of its constructor, each with a default;
 - ``random``, whether its poses depend on the random stream;
 - ``fly(place: DescentPlace, rng: numpy.random.Generator) -> Poses``, the poses of one case.
 
-Poses are continued between their instants as those of a recorded flight are (`marsyard.sim.dynamics.recorded`), and
-every instrument measures the motion as it would a simulated one.
+Poses are interpolated like those of a recorded flight (`marsyard.sim.dynamics.recorded`); every instrument measures the
+motion like a simulated one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -25,28 +25,20 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.own_axes import RecordedAxes
 from marsyard.scenarios.parts.named import DYNAMICS, OwnPart
 from marsyard.sim.dynamics.recorded import RecordedMotion
+from marsyard.sim.parameters import bounded
 
-#: A quaternion's length may be off 1 by this.
+#: Tolerated deviation of a quaternion's length from 1.
 UNIT_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
 class DescentPlace:
-    """What a motion is told of its case.
+    """A case as the input of a motion.
 
-    Attributes
-    ----------
-    ground_height
-        Height of the ground (metres) above that at the place, by metres east and north of it.
-    gravity_m_s2
-        Gravity of the site.
-    pictures_s
-        When pictures are taken, seconds; the first at 0.
-    from_s, until_s
-        The poses must reach from there, or before, to there, or after. A motion that is known until it is down at the
-        thrusters' firing height fires there; one that ends before, at its end.
-    firing_height_m
-        The thrusters' firing height above the ground.
+    - ground_height: height of the ground above that at the place, by metres east and north of it
+    - pictures_s: times of the pictures, the first at 0
+    - from_s, until_s: span that the poses must cover; a motion that ends above the firing height fires at its end
+    - firing_height_m: height of the thrusters' firing above the ground
     """
 
     ground_height: Callable[[float, float], float]
@@ -59,18 +51,12 @@ class DescentPlace:
 
 @dataclass(frozen=True)
 class Poses:
-    """A motion, by its poses at instants close enough for a cubic spline.
+    """A motion by its poses, close enough for a cubic spline.
 
-    Attributes
-    ----------
-    times_s
-        Increasing times, seconds, at least four; the first picture is at 0.
-    positions_m
-        Metres from the ground at the place, in the world axes that the campaign states: east, north, up by default.
-    quaternions_xyzw
-        Rotations to those axes from those of the camera or body that the campaign states; of length 1, scalar last.
-    columns
-        What else is to be told of the case in its row, as `flight_NAME`: what was drawn, for one.
+    - times_s: increasing times, at least four; the first picture is at 0
+    - positions_m: relative to the ground at the place, in the world axes of the campaign, by default east, north, up
+    - quaternions_xyzw: rotations to those axes from the campaign's camera or body axes; of length 1, scalar last
+    - columns: further columns of the row, as `flight_NAME`, such as drawn values
     """
 
     times_s: Float[np.ndarray, "n"]
@@ -79,44 +65,24 @@ class Poses:
     columns: Mapping[str, Scalar] = field(default_factory=dict)
 
 
-class Dynamics(Protocol):
-    """A motion of a user's own. `random`: whether the poses depend on the random stream."""
-
-    random: bool
-
-    def fly(self, place: DescentPlace, rng: np.random.Generator) -> Poses:
-        """The poses of one case."""
-        ...
-
-
 class OwnMotion(OwnPart, RecordedAxes):
-    """A motion that a class of a user's own computes (see `marsyard.scenarios.parts.motions`).
+    """A user-defined motion (see `marsyard.scenarios.parts.motions`).
 
-    Positions count from the ground at `place`; they are the camera's, unless `lever_m` says where the camera is.
+    Positions count from the ground at `place`; they are the camera's, or with `lever_m` the vehicle's.
     """
 
     kind = DYNAMICS
     named_by = "motion"
 
-    motion: Annotated[str, Field(description="an own motion's class: module:Class, or the name of an entry point")]
-    axes: Annotated[
-        Literal["enu", "ned"], Field(description="its world axes: east, north, up; or north, east, down")
-    ] = "enu"
-    lead_s: Annotated[
-        float, Field(ge=0.2, le=30.0, description="how long before the first picture navigation is followed, s")
-    ] = 5.0
+    motion: Annotated[str, Field(description="own motion's class: module:Class, or an entry point's name")]
+    axes: Annotated[Literal["enu", "ned"], Field(description="east, north, up; or north, east, down")] = "enu"
+    lead_s: Annotated[float, bounded(0.2, 30.0, "start of the navigation before the first picture")] = 5.0
 
-    def flown(
+    def compute(
         self, place: DescentPlace, ground_m: Float[np.ndarray, "3"], rng: np.random.Generator
     ) -> tuple[RecordedMotion, dict[str, Scalar]]:
-        """The motion of a case in the terrain's world, and columns that say what it was.
-
-        Raises
-        ------
-        ValueError
-            Where the poses are not what they should be.
-        """
-        poses = checked_poses(self.spec, self.made().fly(place, rng), place)
+        """The motion of a case in the terrain's world, and its columns. Raises ValueError for invalid poses."""
+        poses = check_poses(self.spec, self.create().fly(place, rng), place)
         recorded = self.world * Rotation.from_quat(poses.quaternions_xyzw)
         positions = self.world.apply(poses.positions_m) + self.levers(recorded) + ground_m
         try:
@@ -126,18 +92,17 @@ class OwnMotion(OwnPart, RecordedAxes):
         return motion, self.columns("flight", poses.columns)
 
 
-def checked_poses(spec: str, poses: object, place: DescentPlace) -> Poses:
-    """The poses that a motion gave, as arrays of 64 bits. Raises ValueError where they are not as they should be."""
+def check_poses(spec: str, poses: object, place: DescentPlace) -> Poses:
+    """A motion's poses as 64-bit arrays. Raises ValueError for invalid poses."""
     if not isinstance(poses, Poses):
         raise ValueError(f"'{spec}' flies a {type(poses).__name__}; allowed: marsyard.scenarios.parts.Poses")
-    times = np.array(poses.times_s, dtype=np.float64)
-    positions = np.array(poses.positions_m, dtype=np.float64)
-    quaternions = np.array(poses.quaternions_xyzw, dtype=np.float64)
-    shapes = (("times_s", times, (times.size,)), ("positions_m", positions, (times.size, 3)))
-    for name, given, allowed in (*shapes, ("quaternions_xyzw", quaternions, (times.size, 4))):
-        if given.shape != allowed:
-            raise ValueError(f"'{spec}' gives {name} of shape {given.shape}; allowed: {allowed}")
-        if not np.all(np.isfinite(given)):
+    names = ("times_s", "positions_m", "quaternions_xyzw")
+    times, positions, quaternions = (np.array(getattr(poses, name), dtype=np.float64) for name in names)
+    shapes = ((times.size,), (times.size, 3), (times.size, 4))
+    for name, array, shape in zip(names, (times, positions, quaternions), shapes, strict=True):
+        if array.shape != shape:
+            raise ValueError(f"'{spec}' gives {name} of shape {array.shape}; allowed: {shape}")
+        if not np.all(np.isfinite(array)):
             raise ValueError(f"'{spec}' gives {name} that are not finite")
     if times.size == 0 or times[0] > place.from_s or times[-1] < place.until_s:
         known = f"{times[0]:.6g} to {times[-1]:.6g} s" if times.size else "no time at all"

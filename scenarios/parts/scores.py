@@ -1,12 +1,12 @@
-"""Scores by functions of a user's own: `scores` of a campaign.
+"""User-defined scores: `scores` of a campaign.
 
-A function ``score(case) -> Mapping[str, float | bool]``, handed one case, gives numbers (NaN where there is none) or
-truth values, the same names in every case. They become columns of the row, behind the function's name: `energy` that
-gives `lateral_j` fills `energy_lateral_j`. Requirements take them as metrics, or truth values as populations. Each
-algorithm's answer is scored; where an algorithm crashed there is no answer, and nothing is scored.
+A score is a function ``score(case) -> Mapping[str, float | bool]``, with the same names in every case; NaN: no number.
+Its values become columns prefixed with the function's name: `lateral_j` of `energy` becomes `energy_lateral_j`.
+Requirements use them as metrics, or truth values as populations. Each algorithm's answer is scored, except after a
+crash of the algorithm.
 
-The annotation of its argument says which cases it takes, one kind or a union of several; without one it must take them
-all. A kind is taken with those that hold more: who takes `ScoredVelocity` takes `ScoredFlight` and `ScoredDescent`.
+The annotation of the argument states the accepted kinds of cases, one or a union of several; without annotation the
+score must accept all. A kind includes its subclasses: `ScoredVelocity` accepts `ScoredFlight` and `ScoredDescent`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.interface import SiteEstimate, TargetUpdate, VelocityEstimate
 from marsyard.scenarios.estimators import labels
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.parts.named import SCORE, checked_columns
+from marsyard.scenarios.parts.named import SCORE, check_columns
 from marsyard.sim.dynamics import State, Trajectory
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, RoverMeasurements
 from marsyard.sim.parameters import Parameters
@@ -35,17 +35,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredVelocity:
-    """An answer to three pictures of a descent or more, wherever they are from: rendered, or really taken.
+    """An estimator's answer to pictures of a descent, simulated or real.
 
-    Attributes
-    ----------
-    measurements
-        What the estimator was handed.
-    answer
-        What it said; `answer.velocity_m_s` is None where it ended with a failure.
-    true_velocity_m_s
-        True horizontal velocity of what the answer is of, east and north: its span, by default the last interval; None
-        where it is not known.
+    - measurements: the estimator's input
+    - answer: its output; `answer.velocity_m_s` is None after a failure
+    - true_velocity_m_s: true mean horizontal velocity (east, north) over the answer's span, by default the last
+      interval; None if unknown
     """
 
     measurements: DescentMeasurements
@@ -55,15 +50,7 @@ class ScoredVelocity:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredFlight(ScoredVelocity):
-    """The same of pictures whose true motion is known: of a simulated descent, or of the field test's helicopter.
-
-    Attributes
-    ----------
-    states
-        True states at the pictures, in their order.
-    motion
-        The true motion, all of it.
-    """
+    """The same with known true motion and states at the pictures: simulated descent, or field test helicopter."""
 
     states: tuple[State, ...]
     motion: Trajectory
@@ -71,14 +58,10 @@ class ScoredFlight(ScoredVelocity):
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredDescent(ScoredFlight):
-    """A simulated descent, down to the ground.
+    """A simulated descent down to the ground.
 
-    Attributes
-    ----------
-    at_firing
-        True state at the thrusters' firing.
-    touchdown_m_s
-        True horizontal velocity at the ground, east and north, the answer used.
+    - at_firing: true state at the thrusters' firing
+    - touchdown_m_s: true horizontal touchdown velocity, east and north, with the answer used
     """
 
     at_firing: State
@@ -87,16 +70,11 @@ class ScoredDescent(ScoredFlight):
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredSite:
-    """An answer to two pictures of the ground, rendered or really taken.
+    """An estimator's answer to two pictures of the ground, simulated or real.
 
-    Attributes
-    ----------
-    measurements
-        What the estimator was handed.
-    answer
-        What it said; `answer.site_world` is None where it found no site.
-    true_poses
-        Of the body at the two pictures, in the world; None where they are not known.
+    - measurements: the estimator's input
+    - answer: its output; `answer.site_world` is None without a site
+    - true_poses: of the body at the two pictures, in the world; None if unknown
     """
 
     measurements: LandingMeasurements
@@ -106,15 +84,7 @@ class ScoredSite:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredLanding(ScoredSite):
-    """A simulated flight for a landing site.
-
-    Attributes
-    ----------
-    states
-        True states at the two pictures.
-    ground
-        The true ground: where a lander would stand safely (`marsyard.scenarios.landing.truth.GroundTruth`).
-    """
+    """A simulated flight for a landing site: true states at the two pictures, and the true safety of the ground."""
 
     states: tuple[State, State]
     ground: GroundTruth
@@ -124,18 +94,11 @@ class ScoredLanding(ScoredSite):
 class ScoredRun:
     """A rover's run with a tracker's answers, stop by stop.
 
-    Attributes
-    ----------
-    outcome
-        How the run ended: a name of `marsyard.scenarios.rover.stops.RunOutcome`.
-    target_world
-        The designated point, metres.
-    world_from_rover
-        True pose of the rover at each stop.
-    point_px
-        Where the left camera truly showed the designated point at each stop, full-frame (u, v); NaN where it did not.
-    measurements, answers
-        What the tracker was handed at each stop, and what it said.
+    - outcome: end of the run, a name of `marsyard.scenarios.rover.stops.RunOutcome`
+    - target_world: the designated point, metres
+    - world_from_rover: true pose of the rover at each stop
+    - point_px: true image of the designated point in the left camera at each stop, full-frame (u, v); NaN if hidden
+    - measurements, answers: the tracker's input and output at each stop
     """
 
     outcome: str
@@ -147,81 +110,56 @@ class ScoredRun:
 
 
 ScoredCase = ScoredVelocity | ScoredSite | ScoredRun
-SCORED: tuple[type[Any], ...] = (
-    ScoredVelocity,
-    ScoredFlight,
-    ScoredDescent,
-    ScoredSite,
-    ScoredLanding,
-    ScoredRun,
-)
+SCORED: tuple[type[Any], ...] = (ScoredVelocity, ScoredFlight, ScoredDescent, ScoredSite, ScoredLanding, ScoredRun)
 
 
-def taken_by(found: Any) -> tuple[type[Any], ...]:
-    """The cases that a score takes, by its annotation, and with each what holds more; all where it has none."""
-    if inspect.isroutine(found):
-        annotations = inspect.get_annotations(found)
-    else:
-        annotations = inspect.get_annotations(type(found).__call__)
+def accepted_cases(score: Any) -> tuple[type[Any], ...]:
+    """Kinds of cases that a score accepts by its annotation, with their subclasses; all without an annotation."""
+    annotations = inspect.get_annotations(score if inspect.isroutine(score) else type(score).__call__)
     stated = [str(kind) for name, kind in annotations.items() if name != "return"]
     named = tuple(one for one in SCORED if any(one.__name__ in kind for kind in stated))
     return tuple(one for one in SCORED if issubclass(one, named)) if stated else SCORED
 
 
-def score_of(spec: str, kind: type[Any] | None = None) -> Any:
-    """A score by its name.
-
-    Raises
-    ------
-    ValueError
-        Where there is none, it is no function, or takes no cases of a kind.
-    """
-    found = SCORE.found(spec)
-    if isinstance(found, type) or not callable(found):
-        what = "a class" if isinstance(found, type) else f"a {type(found).__name__}"
+def load_score(spec: str, kind: type[Any] | None = None) -> Any:
+    """Import a score. Raises ValueError if it does not exist, is no function, or does not accept a kind of case."""
+    score = SCORE.load(spec)
+    if isinstance(score, type) or not callable(score):
+        what = "a class" if isinstance(score, type) else f"a {type(score).__name__}"
         raise ValueError(f"'{spec}' is no score: it is {what}, not a function")
     try:
-        inspect.signature(found).bind(None)
+        inspect.signature(score).bind(None)
     except (TypeError, ValueError) as error:
         raise ValueError(f"'{spec}' is no score: it does not take one argument, the case ({error})") from error
-    taken = taken_by(found)
-    if kind is not None and kind not in taken:
-        names = ", ".join(one.__name__ for one in taken) or "no case"
+    accepted = accepted_cases(score)
+    if kind is not None and kind not in accepted:
+        names = ", ".join(one.__name__ for one in accepted) or "no case"
         raise ValueError(f"'{spec}' scores {names}; allowed here: {kind.__name__}")
-    return found
+    return score
 
 
 class OwnScores(Parameters):
-    """What the parameters of scenarios hold whose cases a user's own scores can be asked about."""
+    """Parameters of a scenario with user-defined scores; `scored` is its kind of case."""
 
     scored: ClassVar[type[Any]]
 
-    scores: Annotated[
-        tuple[str, ...],
-        Field(description="own scores: module:function, or names of entry points; each fills columns of the row"),
-    ] = ()
+    scores: Annotated[tuple[str, ...], Field(description="own scores: module:function, or names of entry points")] = ()
 
     @field_validator("scores")
     @classmethod
-    def _scores_are_there(cls, specs: tuple[str, ...]) -> tuple[str, ...]:
-        for place, spec in enumerate(specs):
-            score_of(spec, cls.scored)
-            if spec in specs[:place]:
+    def _scores_exist(cls, specs: tuple[str, ...]) -> tuple[str, ...]:
+        for index, spec in enumerate(specs):
+            load_score(spec, cls.scored)
+            if spec in specs[:index]:
                 raise ValueError(f"the score '{spec}' is named twice")
         return specs
 
 
 def scored(specs: Sequence[str], case: ScoredCase, taken: Collection[str]) -> dict[str, Scalar]:
-    """What scores say of a case, as columns.
-
-    Raises
-    ------
-    ValueError
-        Where a score gives what cannot be a column, or one of those that are `taken`.
-    """
+    """Columns of all scores of a case. Raises ValueError for an invalid column, or one that the row has already."""
     row: dict[str, Scalar] = {}
     for spec, label in zip(specs, labels(specs), strict=True):
-        for name, value in checked_columns(spec, score_of(spec)(case), texts=False).items():
+        for name, value in check_columns(spec, load_score(spec)(case), texts=False).items():
             column = f"{label}_{name}"
             if column in row or column in taken:
                 raise ValueError(f"'{spec}' gives the column {column}, which the row has already")

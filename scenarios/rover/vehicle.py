@@ -62,7 +62,7 @@ class Vehicle:
         return cls(
             rover=rover,
             ground=ground,
-            soil=Soil.drawn(p.slip, streams.generator("soil")),
+            soil=Soil.draw(p.slip, streams.generator("soil")),
             stance=stance,
             odometer=odometer,
             estimate=odometer.first,

@@ -1,12 +1,10 @@
-"""How vehicles move: truth states over time."""
+"""Dynamics of vehicles: true motion over time of landers, helicopters and rovers."""
 
 from marsyard.sim.dynamics.chain import SwingParameters
 from marsyard.sim.dynamics.driving import Drive, DrivenPart, SlipParameters, Soil, drive
-from marsyard.sim.dynamics.relief import RockyGround
-from marsyard.sim.dynamics.rover import MER, ROCKY_8, Ground, RoverParameters, Stance, settle
-from marsyard.sim.dynamics.state import State
+from marsyard.sim.dynamics.rover import MER, ROCKY_8, Ground, RockyGround, RoverParameters, Stance, settle
 from marsyard.sim.dynamics.swing import SwingDescent
-from marsyard.sim.dynamics.trajectory import Motion, Resting, Trajectory
+from marsyard.sim.dynamics.trajectory import Motion, Resting, State, Trajectory
 from marsyard.sim.dynamics.wind import Wind, WindParameters
 
 __all__ = [

@@ -1,11 +1,11 @@
-"""A helicopter's flight back and forth along a line while it climbs, its camera on a gimbal (field test paper, III.C).
+"""Helicopter flight back and forth along a line with climb, its camera on a gimbal (field test paper, III.C).
 
 The flight begins and ends with a slow pass over surveyed targets. In between the helicopter flies passes along a
-horizontal line, each in the direction opposite to the one before; between two passes it slows down, turns about and
-comes back. It climbs on the passes and turns level. The stabilised platform keeps the gimbal's base level and its
-azimuth, or turns it with the helicopter; the gimbal tilts the camera along and across, and swings it on some passes.
+horizontal line in alternating directions; it climbs on the passes and turns at constant height between them. A
+stabilised platform keeps the gimbal's base level and its azimuth constant, or rotates it with the helicopter. The
+gimbal tilts the camera along and across the line, and swings it on some passes.
 
-Every coordinate is a piecewise quintic polynomial or such a polynomial times a sine: twice continuously
+Every coordinate is a piecewise quintic polynomial, or such a polynomial times a sine: twice continuously
 differentiable, so that velocity, rates and specific force are exact derivatives of position and attitude.
 """
 
@@ -19,63 +19,49 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field, model_validator
 from scipy.interpolate import BPoly
-from scipy.spatial.transform import Rotation
 
-from marsyard.sim.dynamics.angles import turning
-from marsyard.sim.dynamics.trajectory import Motion, Trajectory
-from marsyard.sim.parameters import Parameters, Positive
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates, check_times
+from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded
+
+Angle = Annotated[float, Field(ge=0.0, le=45.0)]
 
 
 class HelicopterParameters(Parameters):
-    """A flight. Numbers are the field test paper's (III.C, III.D) unless they are called assumed.
+    """A flight. Values are the field test paper's (III.C, III.D) unless marked as assumed.
 
-    At 1 m/s on passes of 100 s, with turns of 60 s, ten passes climb from 1000 m to 2000 m in 27 min: the paper says
+    At 1 m/s on passes of 100 s with turns of 60 s, ten passes climb from 1000 m to 2000 m in 27 min. The paper states
     1 to 2 m/s, about 30 min of pictures, and about 40 min between the passes over the targets.
     """
 
-    passes: Annotated[int, Field(ge=1, le=100, description="passes along the line")] = 10
-    pass_s: Annotated[Positive, Field(le=1000.0, description="duration of a pass, s (assumed)")] = 100.0
-    turn_s: Annotated[Positive, Field(le=1000.0, description="duration of a turn, s (assumed)")] = 60.0
-    speed_m_s: Annotated[Positive, Field(le=100.0, description="mean speed along a pass, m/s")] = 30.0
-    speed_change_m_s: Annotated[
-        float, Field(ge=0.0, le=10.0, description="RMS change of speed within a pass, m/s (assumed)")
-    ] = 1.0
-    lowest_m: Annotated[Positive, Field(description="height of the first pass's start above the line's ground, m")] = (
+    passes: Annotated[int, bounded(1, 100, "passes along the line")] = 10
+    pass_s: Annotated[Positive, Field(le=1000.0, description="duration of a pass (assumed)")] = 100.0
+    turn_s: Annotated[Positive, Field(le=1000.0, description="duration of a turn (assumed)")] = 60.0
+    speed_m_s: Annotated[Positive, Field(le=100.0, description="mean speed along a pass")] = 30.0
+    speed_change_m_s: Annotated[float, bounded(0.0, 10.0, "RMS change of speed within a pass (assumed)")] = 1.0
+    lowest_m: Annotated[Positive, Field(description="initial height of the first pass above the line's ground")] = (
         1000.0
     )
-    climb_m_s: Annotated[float, Field(ge=0.0, le=10.0, description="climb on a pass, m/s")] = 1.0
-    wander_m: Annotated[float, Field(ge=0.0, le=200.0, description="RMS distance from the line, m (assumed)")] = 8.0
-    pointing_deg: Annotated[
-        float, Field(ge=0.0, le=45.0, description="RMS tilt of the camera along and across the flight (assumed)")
-    ] = 9.0
-    most_tilt_deg: Annotated[float, Field(ge=0.0, le=45.0, description="greatest tilt along and across")] = 30.0
-    swinging_share: Annotated[
-        float, Field(ge=0.0, le=1.0, description="share of passes on which the gimbal swings the camera (assumed)")
-    ] = 0.5
-    swing_rate_deg_s: Annotated[float, Field(ge=0.0, le=120.0, description="greatest rate of the swinging")] = 60.0
+    climb_m_s: Annotated[float, bounded(0.0, 10.0, "climb on a pass")] = 1.0
+    wander_m: Annotated[float, bounded(0.0, 200.0, "RMS distance from the line (assumed)")] = 8.0
+    pointing_deg: Annotated[Angle, Field(description="RMS tilt along and across (assumed)")] = 9.0
+    most_tilt_deg: Annotated[Angle, Field(description="maximum tilt of the camera along and across")] = 30.0
+    swinging_share: Annotated[Fraction, Field(description="fraction of passes with a swinging camera (assumed)")] = 0.5
+    swing_rate_deg_s: Annotated[float, bounded(0.0, 120.0, "maximum rate of the swinging")] = 60.0
     swing_hz: Annotated[Positive, Field(le=5.0, description="frequency of the swinging, 1/s (assumed)")] = 0.6
-    platform_deg: Annotated[
-        float, Field(ge=0.0, le=10.0, description="RMS of what the stabilised platform leaves of the motion (assumed)")
-    ] = 0.2
-    turns_with_flight: Annotated[
-        bool,
-        Field(
-            description="whether the platform turns about with the helicopter; if not it keeps its azimuth (assumed)"
-        ),
-    ] = False
-    fly_over_m: Annotated[Positive, Field(description="height of the passes over the targets, m (assumed)")] = 500.0
-    fly_over_m_s: Annotated[Positive, Field(description="speed of the passes over the targets, m/s (assumed)")] = 3.0
-    fly_over_s: Annotated[Positive, Field(le=120.0, description="duration of a pass over the targets, s")] = 90.0
-    between_s: Annotated[Positive, Field(description="time between the passes over the targets, s")] = 2400.0
-    approach_s: Annotated[
-        Positive, Field(description="from the end of the first pass over the targets to the first pass, s (assumed)")
-    ] = 350.0
+    platform_deg: Annotated[float, bounded(0.0, 10.0, "RMS residual motion of the platform (assumed)")] = 0.2
+    turns_with_flight: Annotated[bool, Field(description="the platform rotates with the helicopter (assumed)")] = False
+    fly_over_m: Annotated[Positive, Field(description="height of the passes over the targets (assumed)")] = 500.0
+    fly_over_m_s: Annotated[Positive, Field(description="speed of the passes over the targets (assumed)")] = 3.0
+    fly_over_s: Annotated[Positive, Field(le=120.0, description="duration of a pass over the targets")] = 90.0
+    between_s: Annotated[Positive, Field(description="time between the passes over the targets")] = 2400.0
+    approach_s: Annotated[Positive, Field(description="from the first targets to the first pass (assumed)")] = 350.0
 
     @model_validator(mode="after")
-    def _there_is_time_to_come_back(self) -> HelicopterParameters:
-        if self.return_s <= 0.0:
+    def _return_takes_time(self) -> HelicopterParameters:
+        collection_s = self.passes * self.pass_s + (self.passes - 1) * self.turn_s
+        if self.between_s - self.fly_over_s - self.approach_s - collection_s <= 0.0:
             raise ValueError(
-                f"passes and turns of {self.collection_s} s do not fit into the {self.between_s} s between the passes "
+                f"passes and turns of {collection_s} s do not fit into the {self.between_s} s between the passes "
                 "over the targets"
             )
         return self
@@ -85,20 +71,10 @@ class HelicopterParameters(Parameters):
         """Length of the line."""
         return self.speed_m_s * self.pass_s
 
-    @property
-    def collection_s(self) -> float:
-        """From the start of the first pass to the end of the last."""
-        return self.passes * self.pass_s + (self.passes - 1) * self.turn_s
-
-    @property
-    def return_s(self) -> float:
-        """From the end of the last pass to the start of the second pass over the targets."""
-        return self.between_s - self.fly_over_s - self.approach_s - self.collection_s
-
 
 @dataclass(frozen=True)
 class FlownPass:
-    """A pass along the line: its number, when it was flown, and its direction, +1 or -1 along the line."""
+    """A pass along the line: its number, its times, and its direction, +1 or -1 along the line."""
 
     number: int
     start_s: float
@@ -108,46 +84,34 @@ class FlownPass:
 
 @dataclass(frozen=True)
 class Tilt:
-    """An angle of the gimbal over time: a pointing, and a swinging of varying size about it; radians."""
+    """An angle of the gimbal over time: a pointing, and a sine of variable amplitude about it; radians."""
 
     pointing: BPoly
-    swing: BPoly
+    amplitude: BPoly
     swing_rad_s: float
 
     def derivatives(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "2 n"]:
         """The angle and its rate."""
-        size, growth = self.swing(times_s), self.swing.derivative()(times_s)
+        amplitude, growth = self.amplitude(times_s), self.amplitude.derivative()(times_s)
         sine, cosine = np.sin(self.swing_rad_s * times_s), np.cos(self.swing_rad_s * times_s)
-        rate = self.pointing.derivative()(times_s) + growth * sine + size * self.swing_rad_s * cosine
-        return np.stack([self.pointing(times_s) + size * sine, rate])
+        rate = self.pointing.derivative()(times_s) + growth * sine + amplitude * self.swing_rad_s * cosine
+        return np.stack([self.pointing(times_s) + amplitude * sine, rate])
 
 
 @dataclass(frozen=True)
 class HelicopterFlight(Trajectory):
-    """A flight, known from the start of the first pass over the targets to the end of the second.
+    """A flight from the start of the first pass over the targets to the end of the second.
 
-    The body frame is the camera's: x along the line, y to its left, z up when the gimbal is at rest and the platform
-    not turned; the camera looks along -z. Time 0 is the middle of the first pass over the targets.
+    The body frame is the camera's: x along the line, y to its left, z up for a gimbal at rest and a platform at its
+    initial azimuth; the camera looks along -z. Time 0 is the middle of the first pass over the targets.
 
-    Attributes
-    ----------
-    origin_m
-        World point at ground level in the middle of the line, above which heights count.
-    azimuth_rad
-        Direction of the line, clockwise from north.
-    along, across, up
-        Distance along the line from its middle, to the left of it, and above the origin, metres.
-    turned
-        Angle of the platform from the line, counterclockwise, radians.
-    tilt_along, tilt_across
-        The gimbal's angles, about the body's y axis (positive: looks back) and then about its x axis (positive: looks
-        to the right).
-    passes
-        The passes along the line, in the order flown.
-    fly_overs_s
-        Start and end of both passes over the targets.
-    gravity_m_s2
-        Acceleration of gravity.
+    - origin_m: world point at ground level in the middle of the line, reference of the heights
+    - azimuth_rad: direction of the line, clockwise from north
+    - along, across, up: distance along the line from its middle, to its left, and above the origin, metres
+    - platform: angle of the platform from the line, counterclockwise, radians
+    - tilt_along, tilt_across: the gimbal's angles, about the body's y axis (positive: looks back) and then about its x
+      axis (positive: looks to the right)
+    - fly_overs_s: start and end of both passes over the targets
     """
 
     origin_m: Float64[np.ndarray, "3"]
@@ -155,7 +119,7 @@ class HelicopterFlight(Trajectory):
     along: BPoly
     across: BPoly
     up: BPoly
-    turned: BPoly
+    platform: BPoly
     tilt_along: Tilt
     tilt_across: Tilt
     passes: tuple[FlownPass, ...]
@@ -164,42 +128,29 @@ class HelicopterFlight(Trajectory):
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """First and last time at which the motion is known."""
+        """First and last time of the flight."""
         return self.fly_overs_s[0][0], self.fly_overs_s[1][1]
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
-        """Truth at many times. Raises ValueError outside of the span."""
-        first, last = self.span_s
-        if times_s.size and (times_s.min() < first or times_s.max() > last):
-            raise ValueError(f"the flight is known from {first} s to {last} s, not at {times_s.min()}..{times_s.max()}")
-        attitudes, rates = self._turning(times_s)
-        weightless = self._moving(times_s, 2) + np.array([0.0, 0.0, self.gravity_m_s2])
-        return Motion(
-            times_s=times_s,
-            positions_m=self.origin_m + self._moving(times_s, 0),
-            velocities_m_s=self._moving(times_s, 1),
-            attitudes=attitudes,
-            body_rates_rad_s=rates,
-            specific_forces_m_s2=attitudes.inv().apply(weightless),
-        )
+        """True states at many times. Raises ValueError outside of the span."""
+        check_times(times_s, self.span_s)
+        yaw = 0.5 * np.pi - self.azimuth_rad + self.platform(times_s)
+        pitch, pitch_rate = self.tilt_along.derivatives(times_s)
+        roll, roll_rate = self.tilt_across.derivatives(times_s)
+        angle_rates = np.stack([self.platform.derivative()(times_s), pitch_rate, roll_rate], axis=-1)
+        attitudes, rates = attitudes_and_body_rates(np.stack([yaw, pitch, roll], axis=-1), angle_rates)
+        derivatives = [self._displacement(times_s, order) for order in range(3)]
+        derivatives[0] = self.origin_m + derivatives[0]
+        return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
 
-    def _moving(self, times_s: Float64[np.ndarray, "n"], order: int) -> Float64[np.ndarray, "n 3"]:
-        """Place relative to the origin, or a derivative of it, world axes."""
+    def _displacement(self, times_s: Float64[np.ndarray, "n"], order: int) -> Float64[np.ndarray, "n 3"]:
+        """Position relative to the origin (order 0) or a derivative of it, world axes."""
         along, across, up = (one.derivative(order)(times_s) for one in (self.along, self.across, self.up))
         forward = np.array([np.sin(self.azimuth_rad), np.cos(self.azimuth_rad), 0.0])
         left = np.array([-forward[1], forward[0], 0.0])
-        place: Float64[np.ndarray, "n 3"] = np.outer(along, forward) + np.outer(across, left)
-        place[:, 2] += up
-        return place
-
-    def _turning(self, times_s: Float64[np.ndarray, "n"]) -> tuple[Rotation, Float64[np.ndarray, "n 3"]]:
-        """Attitudes, and angular velocities in body axes."""
-        yaw = 0.5 * np.pi - self.azimuth_rad + self.turned(times_s)
-        yaw_rate = self.turned.derivative()(times_s)
-        pitch, pitch_rate = self.tilt_along.derivatives(times_s)
-        roll, roll_rate = self.tilt_across.derivatives(times_s)
-        angles = np.stack([yaw, pitch, roll], axis=-1)
-        return turning(angles, np.stack([yaw_rate, pitch_rate, roll_rate], axis=-1))
+        displacement: Float64[np.ndarray, "n 3"] = np.outer(along, forward) + np.outer(across, left)
+        displacement[:, 2] += up
+        return displacement
 
 
 def helicopter_flight(
@@ -209,105 +160,88 @@ def helicopter_flight(
     gravity_m_s2: float,
     rng: np.random.Generator,
 ) -> HelicopterFlight:
-    """A flight along a line through a point of the ground, its irregularities drawn from this stream."""
+    """Draw a flight along a line through a point of the ground."""
     p = parameters
-    flown = _passes(p)
+    first = 0.5 * p.fly_over_s + p.approach_s
+    starts = [first + number * (p.pass_s + p.turn_s) for number in range(p.passes)]
+    passes = tuple(FlownPass(k, start, start + p.pass_s, 1 - 2 * (k % 2)) for k, start in enumerate(starts))
     half = 0.5 * p.fly_over_s
     fly_overs = ((-half, half), (p.between_s - half, p.between_s + half))
     times = np.arange(fly_overs[0][0], fly_overs[1][1] + 15.0, 15.0)
+    # height and platform angle are constant over the targets; a platform that rotates with the flight is turned by half
+    # a turn after each pass, left and right in turns
+    gain = p.climb_m_s * p.pass_s
+    heights = [(time, p.fly_over_m, 0.0) for fly_over in fly_overs for time in fly_over]
+    angles = [(time, 0.0) for fly_over in fly_overs for time in fly_over]
+    for one in passes:
+        height = p.lowest_m + one.number * gain
+        heights += [(one.start_s, height, p.climb_m_s), (one.end_s, height + gain, p.climb_m_s)]
+        angle = np.pi if one.direction < 0 and p.turns_with_flight else 0.0
+        angles += [(one.start_s, angle), (one.end_s, angle)]
     return HelicopterFlight(
         origin_m=origin_m,
         azimuth_rad=azimuth_rad,
-        along=_along(p, flown, fly_overs, rng),
-        across=_resting(times, p.wander_m * rng.standard_normal(times.size)),
-        up=_up(p, flown, fly_overs),
-        turned=_turned(p, flown, fly_overs),
-        tilt_along=_tilt(p, flown, times, rng),
-        tilt_across=_tilt(p, flown, times, rng),
-        passes=flown,
+        along=_along_curve(p, passes, fly_overs, rng),
+        across=_rest_curve(times, p.wander_m * rng.standard_normal(times.size)),
+        up=_moving_curve(sorted(heights)),
+        platform=_rest_curve(*np.array(sorted(angles)).T),
+        tilt_along=_draw_tilt(p, passes, times, rng),
+        tilt_across=_draw_tilt(p, passes, times, rng),
+        passes=passes,
         fly_overs_s=fly_overs,
         gravity_m_s2=gravity_m_s2,
     )
 
 
-def _passes(p: HelicopterParameters) -> tuple[FlownPass, ...]:
-    first = 0.5 * p.fly_over_s + p.approach_s
-    starts = [first + number * (p.pass_s + p.turn_s) for number in range(p.passes)]
-    return tuple(FlownPass(k, start, start + p.pass_s, 1 - 2 * (k % 2)) for k, start in enumerate(starts))
+#: Breakpoints within a pass, with small changes of the speed.
+_BREAKPOINTS = 4
 
 
-#: Breakpoints within a pass, at which the speed is a little off the mean.
-_WITHIN_PASS = 4
-
-
-def _along(
+def _along_curve(
     p: HelicopterParameters,
-    flown: Sequence[FlownPass],
+    passes: Sequence[FlownPass],
     fly_overs_s: Sequence[tuple[float, float]],
     rng: np.random.Generator,
 ) -> BPoly:
-    """Distance along the line."""
     reach = 0.5 * p.fly_over_s * p.fly_over_m_s
-    points = [(fly_overs_s[0][0], -reach, p.fly_over_m_s), (fly_overs_s[0][1], reach, p.fly_over_m_s)]
-    for one in flown:
-        share = np.linspace(0.0, 1.0, _WITHIN_PASS + 2)
-        changes = p.speed_change_m_s * rng.standard_normal(share.size)
+    (first, second), (third, fourth) = fly_overs_s
+    points = [(first, -reach, p.fly_over_m_s), (second, reach, p.fly_over_m_s)]
+    for one in passes:
+        fraction = np.linspace(0.0, 1.0, _BREAKPOINTS + 2)
+        changes = p.speed_change_m_s * rng.standard_normal(fraction.size)
         changes[[0, -1]] = 0.0
-        places = one.direction * p.length_m * (share - 0.5)
+        positions = one.direction * p.length_m * (fraction - 0.5)
         speeds = one.direction * (p.speed_m_s + changes)
-        times = one.start_s + share * (one.end_s - one.start_s)
-        points += list(zip(times.tolist(), places.tolist(), speeds.tolist(), strict=True))
-    points += [(fly_overs_s[1][0], -reach, p.fly_over_m_s), (fly_overs_s[1][1], reach, p.fly_over_m_s)]
-    return _moving(points)
+        times = one.start_s + fraction * (one.end_s - one.start_s)
+        points += list(zip(times.tolist(), positions.tolist(), speeds.tolist(), strict=True))
+    return _moving_curve([*points, (third, -reach, p.fly_over_m_s), (fourth, reach, p.fly_over_m_s)])
 
 
-def _up(p: HelicopterParameters, flown: Sequence[FlownPass], fly_overs_s: Sequence[tuple[float, float]]) -> BPoly:
-    """Height above the origin."""
-    points = [(time, p.fly_over_m, 0.0) for time in fly_overs_s[0]]
-    gained = p.climb_m_s * p.pass_s
-    for one in flown:
-        start = p.lowest_m + one.number * gained
-        points += [(one.start_s, start, p.climb_m_s), (one.end_s, start + gained, p.climb_m_s)]
-    points += [(time, p.fly_over_m, 0.0) for time in fly_overs_s[1]]
-    return _moving(points)
-
-
-def _turned(p: HelicopterParameters, flown: Sequence[FlownPass], fly_overs_s: Sequence[tuple[float, float]]) -> BPoly:
-    """The platform's angle: where it turns with the flight, half a turn after each pass, left and right in turns."""
-    angles = [np.pi if one.direction < 0 and p.turns_with_flight else 0.0 for one in flown]
-    points = [(time, 0.0) for time in fly_overs_s[0]]
-    points += [(time, angle) for one, angle in zip(flown, angles, strict=True) for time in (one.start_s, one.end_s)]
-    points += [(time, 0.0) for time in fly_overs_s[1]]
-    times, values = zip(*points, strict=True)
-    return _resting(np.array(times), np.array(values))
-
-
-def _tilt(
-    p: HelicopterParameters, flown: Sequence[FlownPass], times: Float64[np.ndarray, "n"], rng: np.random.Generator
+def _draw_tilt(
+    p: HelicopterParameters, passes: Sequence[FlownPass], times: Float64[np.ndarray, "n"], rng: np.random.Generator
 ) -> Tilt:
     """An angle of the gimbal: a new pointing every few seconds on the passes, none over the targets."""
-    on_pass = np.any([(times > one.start_s) & (times < one.end_s) for one in flown], axis=0)
+    on_pass = np.any([(times > one.start_s) & (times < one.end_s) for one in passes], axis=0)
     limit = p.most_tilt_deg
     pointing = np.clip(p.pointing_deg * rng.standard_normal(times.size), -limit, limit) * on_pass
     pointing = pointing + p.platform_deg * rng.standard_normal(times.size)
     swing_rad_s = 2.0 * np.pi * p.swing_hz
     # both axes swing: each has the rate over the square root of 2
     largest = np.radians(p.swing_rate_deg_s) / np.sqrt(2.0) / swing_rad_s
-    sizes = np.zeros(times.size)
-    for one in flown:
+    amplitudes = np.zeros(times.size)
+    for one in passes:
         swings = rng.uniform() < p.swinging_share
-        size = largest * rng.uniform(0.2, 1.0)
-        inside = (times > one.start_s) & (times < one.end_s)
-        sizes[inside] = size if swings else 0.0
-    return Tilt(_resting(times, np.radians(pointing)), _resting(times, sizes), swing_rad_s)
+        amplitude = largest * rng.uniform(0.2, 1.0)
+        amplitudes[(times > one.start_s) & (times < one.end_s)] = amplitude if swings else 0.0
+    return Tilt(_rest_curve(times, np.radians(pointing)), _rest_curve(times, amplitudes), swing_rad_s)
 
 
-def _moving(points: Sequence[tuple[float, float, float]]) -> BPoly:
-    """The curve through (time, value, rate), without acceleration there."""
+def _moving_curve(points: Sequence[tuple[float, float, float]]) -> BPoly:
+    """Curve through (time, value, rate) with zero acceleration at these points."""
     return BPoly.from_derivatives([time for time, _, _ in points], [[value, rate, 0.0] for _, value, rate in points])
 
 
-def _resting(times_s: Float64[np.ndarray, "n"], values: Float64[np.ndarray, "n"]) -> BPoly:
-    """The curve through values, at rest at each of them."""
+def _rest_curve(times_s: Float64[np.ndarray, "n"], values: Float64[np.ndarray, "n"]) -> BPoly:
+    """Curve through values with zero rate and acceleration at each of them."""
     zero = np.zeros_like(values)
     return BPoly.from_derivatives(times_s, np.stack([values, zero, zero], axis=-1))

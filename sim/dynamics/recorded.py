@@ -1,50 +1,81 @@
-"""A motion that was recorded: positions and attitudes at instants, continued between them.
+"""Recorded motion: poses interpolated by splines, and their files.
 
-Positions are joined by a cubic spline of continuous acceleration (not-a-knot), attitudes by one of continuous angular
-acceleration (`scipy.spatial.transform.RotationSpline`). Velocity, body rate and specific force are the splines' own
-derivatives, so that instruments which feel them agree with what is seen.
+Formats are CSV and Parquet tables, TUM's text files, EuRoC's ground truth, and SPICE kernels:
+
+- CSV and Parquet: columns time_s, x_m, y_m, z_m, qx, qy, qz, qw, in any order; other columns are ignored.
+- TUM: lines ``timestamp tx ty tz qx qy qz qw``, seconds and metres; lines with # are comments.
+- EuRoC: a header that begins with ``#timestamp``; nanoseconds, position, quaternion with the scalar part first.
+- SPICE: a file that ends in ``.spice.toml`` names the kernels, the body, the observer and the frames. Positions are
+  geometric, without light time; times are TDB seconds since `begin`, without leap seconds. ::
+
+    kernels = ["naif0012.tls", "mission.bsp", "mission.bc", "mission.tsc", "site.tf"]   # relative to this file
+    target = "-999"            # the body: a name or number in the kernels
+    observer = "-999900"       # origin of the positions: a landing site, or another body
+    world = "SITE_ENU"         # frame of positions and attitudes
+    axes = "LANDER_CAMERA"     # frame whose attitude is recorded
+    begin = "2030-01-01T00:00:00"
+    end = "2030-01-01T00:01:30"
+    step_s = 0.1               # time between poses
+
+Quaternions rotate from the recorded body's axes to the world's. No format states which axes these are.
 """
 
 from __future__ import annotations
 
+import hashlib
+import tomllib
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
+from pydantic import Field, ValidationError
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from marsyard.sim.dynamics.trajectory import Motion, Trajectory
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
+from marsyard.sim.files import check_regular
+from marsyard.sim.parameters import Parameters
 
-#: Fewest instants from which acceleration can be told.
-LEAST_INSTANTS = 4
-#: Most turn from one instant to the next: beyond, the way round is a guess.
-MOST_TURN_DEG = 90.0
-#: By how much a time may be outside of the span: sums of times that lead to its very end are off by rounding.
+#: Fewest poses that determine an acceleration.
+MIN_POSES = 4
+#: Largest rotation from one pose to the next: the interpolation between larger ones is ambiguous.
+MAX_ROTATION_DEG = 90.0
+#: Tolerated excess over the span: sums of times that end at its limit have rounding errors.
 ROUNDING_S = 1e-9
+COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+#: Tolerated deviation of a quaternion's length from 1: that of three written digits.
+UNIT_TOLERANCE = 5e-3
+#: Largest file that is read: ten hours at 100 Hz are 400 MB of text.
+MAX_BYTES = 1 << 29
+#: Longest table that is read, independent of compression.
+MAX_ROWS = 5_000_000
+#: Most poses sampled from SPICE kernels: five hours at 50 Hz.
+MAX_SPICE_POSES = 1_000_000
+#: End of the name of a file of SPICE kernels.
+SUFFIX = ".spice.toml"
+_MAX_CACHED_FILES = 4
+#: Cells of a text table without a number.
+_MISSING = ("na", "NA", "n/a", "N/A", "null", "NULL", "none", "None")
+_ALLOWED = (
+    f"a CSV or Parquet table with the columns {', '.join(COLUMNS)}; TUM's lines of timestamp tx ty tz qx qy qz qw; "
+    f"EuRoC's ground truth, whose header begins with #timestamp; or SPICE kernels, named in a file *{SUFFIX}"
+)
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion(Trajectory):
-    """A `Trajectory` through recorded poses.
+    """A `Trajectory` through recorded poses of a body, world axes.
 
-    Attributes
-    ----------
-    times_s
-        Increasing times, seconds, at least `LEAST_INSTANTS`.
-    positions_m
-        Of the body frame's origin, world axes.
-    attitudes
-        Rotations from body to world axes.
-    gravity_m_s2
-        By which specific force differs from acceleration.
+    Positions have a cubic spline (not-a-knot), attitudes one of continuous angular acceleration. Velocity, rate and
+    specific force are the splines' derivatives.
 
-    Raises
-    ------
-    ValueError
-        If there are too few instants, times do not increase, a value is not finite, or the body turns by more than
-        `MOST_TURN_DEG` from one instant to the next.
+    Raises ValueError for fewer than `MIN_POSES` poses, times that do not increase, a value that is not finite, or a
+    rotation of more than `MAX_ROTATION_DEG` from one pose to the next.
     """
 
     times_s: Float64[np.ndarray, "n"]
@@ -53,19 +84,19 @@ class RecordedMotion(Trajectory):
     gravity_m_s2: float
 
     def __post_init__(self) -> None:
-        if self.times_s.size < LEAST_INSTANTS:
-            raise ValueError(f"has {self.times_s.size} poses; allowed: at least {LEAST_INSTANTS}")
+        if self.times_s.size < MIN_POSES:
+            raise ValueError(f"has {self.times_s.size} poses; allowed: at least {MIN_POSES}")
         if not (np.all(np.isfinite(self.times_s)) and np.all(np.isfinite(self.positions_m))):
             raise ValueError("holds a value that is not finite")
         late = np.flatnonzero(np.diff(self.times_s) <= 0.0)
         if late.size:
             raise ValueError(f"time does not increase after {self.times_s[late[0]]:.6f} s (pose {late[0] + 1})")
-        turns = np.degrees((self.attitudes[:-1].inv() * self.attitudes[1:]).magnitude())
-        wide = np.flatnonzero(turns > MOST_TURN_DEG)
+        angles = np.degrees((self.attitudes[:-1].inv() * self.attitudes[1:]).magnitude())
+        wide = np.flatnonzero(angles > MAX_ROTATION_DEG)
         if wide.size:
             raise ValueError(
-                f"turns by {turns[wide[0]]:.0f} deg after {self.times_s[wide[0]]:.6f} s (pose {wide[0] + 1}); "
-                f"allowed: up to {MOST_TURN_DEG:g} deg from one pose to the next"
+                f"turns by {angles[wide[0]]:.0f} deg after {self.times_s[wide[0]]:.6f} s (pose {wide[0] + 1}); "
+                f"allowed: up to {MAX_ROTATION_DEG:g} deg from one pose to the next"
             )
 
     @cached_property
@@ -82,18 +113,231 @@ class RecordedMotion(Trajectory):
         return float(self.times_s[0]), float(self.times_s[-1])
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
-        """Truth at many times. Raises ValueError outside of the span."""
-        first, last = self.span_s
-        outside = times_s[(times_s < first - ROUNDING_S) | (times_s > last + ROUNDING_S)]
-        if outside.size:
-            raise ValueError(f"time {outside[0]:.6g} s is not recorded; allowed: {first:.6g} to {last:.6g} s")
-        attitudes = self._attitude(times_s)
-        felt = self._position(times_s, 2) + np.array([0.0, 0.0, self.gravity_m_s2])
-        return Motion(
-            times_s=times_s,
-            positions_m=self._position(times_s),
-            velocities_m_s=self._position(times_s, 1),
-            attitudes=attitudes,
-            body_rates_rad_s=self._attitude(times_s, 1),
-            specific_forces_m_s2=attitudes.inv().apply(felt),
+        """True states at many times. Raises ValueError outside of the span."""
+        check_times(times_s, self.span_s, ROUNDING_S)
+        derivatives = [self._position(times_s, order) for order in range(3)]
+        return Motion.from_accelerations(
+            times_s, derivatives, self._attitude(times_s), self._attitude(times_s, 1), self.gravity_m_s2
         )
+
+
+class TrajectoryFileError(ValueError):
+    """A file of poses that cannot be used; the message names the file, the fault, and the allowed formats or values."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPoses:
+    """Poses of a file, in its own world and body axes; unit quaternions x, y, z, w from body to world."""
+
+    path: str
+    sha256: str
+    times_s: Float64[np.ndarray, "n"]
+    positions_m: Float64[np.ndarray, "n 3"]
+    quaternions: Float64[np.ndarray, "n 4"]
+
+
+def read_poses(path: str | Path) -> RecordedPoses:
+    """Read and check a file of poses; cached until the file changes.
+
+    Raises TrajectoryFileError for a file that cannot be read, an unknown format, too few poses, a value that is not
+    finite, times that do not increase, or a quaternion that is not of length 1.
+    """
+    try:
+        status = check_regular(path)
+    except OSError as fault:
+        raise TrajectoryFileError(f"{path}: cannot be read ({fault.strerror})") from fault
+    return _read_file(str(path), status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=_MAX_CACHED_FILES)
+def _read_file(path: str, _changed_ns: int, size: int) -> RecordedPoses:
+    if path.endswith(SUFFIX):
+        return _read_kernels(path)
+    if size > MAX_BYTES:
+        raise TrajectoryFileError(f"{path}: is larger than {MAX_BYTES >> 20} MiB; {_ALLOWED} is needed")
+    try:
+        with Path(path).open("rb") as file:
+            head = file.read(4096)
+            if not head.startswith(b"PAR1") and b"\0" in head:
+                raise TrajectoryFileError(f"{path}: is no table of poses; allowed: {_ALLOWED}")
+            file.seek(0)
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as fault:
+        raise TrajectoryFileError(f"{path}: cannot be read ({fault.strerror})") from fault
+    try:
+        values = _read_table(path, head)
+    except TrajectoryFileError:
+        raise
+    except (OSError, ValueError, UnicodeError) as fault:
+        reason = " ".join(str(fault).split())[:200]
+        raise TrajectoryFileError(f"{path}: cannot be read as a table ({reason}); allowed: {_ALLOWED}") from fault
+    return _check_poses(path, digest, values)
+
+
+def _read_kernels(path: str) -> RecordedPoses:
+    try:
+        return _check_poses(path, *_spice_poses(path))
+    except ImportError as fault:
+        install = "SPICE kernels need the package spiceypy: pip install marsyard[spice]"
+        raise TrajectoryFileError(f"{path}: {install}") from fault
+    except TrajectoryFileError:
+        raise
+    except (OSError, ValueError) as fault:
+        raise TrajectoryFileError(f"{path}: {fault}") from fault
+
+
+def _read_table(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
+    """Time, position and quaternion (x, y, z, w) of each row; the first bytes determine the format."""
+    first = head.decode("utf-8", errors="replace").lstrip("\ufeff").split("\n", 1)[0].strip()
+    if head.startswith(b"PAR1"):
+        return _read_parquet(path)
+    if first.startswith("#timestamp") and "," in first:
+        return _read_euroc(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # empty files are reported below; cells without a column name are ignored
+        if "," in first and not first.startswith("#"):
+            return _read_csv(path)
+        values = np.loadtxt(path, comments="#", ndmin=2)
+    if values.size and values.shape[1] != 8:
+        raise TrajectoryFileError(f"{path}: has {values.shape[1]} numbers in a line; allowed: {_ALLOWED}")
+    return values.reshape(-1, 8)
+
+
+def _read_euroc(path: str) -> Float64[np.ndarray, "n 8"]:
+    import pandas as pd  # imported here: slow, and few campaigns use such a file
+
+    frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
+    values = frame.to_numpy(dtype=np.float64)
+    # nanoseconds since 1970 exceed the precision of a float: differences are taken first
+    values[:, 0] = 1e-9 * (frame[0] - int(frame[0].iloc[0])).to_numpy(dtype=np.float64)
+    values[:, 0] += 1e-9 * int(frame[0].iloc[0])
+    return np.asarray(values[:, [0, 1, 2, 3, 5, 6, 7, 4]])
+
+
+def _read_parquet(path: str) -> Float64[np.ndarray, "n 8"]:
+    """The pose columns; row count and types are checked in the metadata before any data is decompressed."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    file = pq.ParquetFile(path)
+    rows = file.metadata.num_rows
+    if rows > MAX_ROWS:
+        raise TrajectoryFileError(f"{path}: has {rows} rows; allowed: up to {MAX_ROWS}")
+    fields = list(file.schema_arrow)
+    fields = [fields[index] for index in _column_indices(path, [field.name.strip() for field in fields])]
+    for field in fields:
+        if not (pa.types.is_floating(field.type) or pa.types.is_integer(field.type)):
+            raise TrajectoryFileError(f"{path}: the column {field.name} holds {field.type}; allowed: numbers")
+    values = np.empty((rows, len(COLUMNS)))
+    read = 0
+    for batch in file.iter_batches(columns=[field.name for field in fields]):
+        if read + batch.num_rows > rows:
+            raise TrajectoryFileError(f"{path}: has more rows than the {rows} that it states")
+        for column, field in enumerate(fields):
+            numbers = batch.column(field.name).cast(pa.float64(), safe=False)
+            values[read : read + batch.num_rows, column] = numbers.to_numpy(zero_copy_only=False)
+        read += batch.num_rows
+    return values[:read]
+
+
+def _read_csv(path: str) -> Float64[np.ndarray, "n 8"]:
+    """A text table with a header; cells without a number become NaN."""
+    import pandas as pd  # imported here: slow, and few campaigns use such a file
+
+    frame = pd.read_csv(
+        path,
+        usecols=lambda name: name.strip() in COLUMNS,
+        dtype=np.float64,
+        index_col=False,
+        skipinitialspace=True,
+        na_values=list(_MISSING),
+        float_precision="round_trip",
+    )
+    return np.asarray(frame.to_numpy()[:, _column_indices(path, [name.strip() for name in frame.columns])])
+
+
+def _column_indices(path: str, names: Sequence[str]) -> list[int]:
+    missing = [name for name in COLUMNS if name not in names]
+    if missing:
+        raise TrajectoryFileError(f"{path}: has no column {', '.join(missing)}; allowed: {_ALLOWED}")
+    return [names.index(name) for name in COLUMNS]
+
+
+def _check_poses(path: str, digest: str, values: Float64[np.ndarray, "n 8"]) -> RecordedPoses:
+    if len(values) < MIN_POSES:
+        raise TrajectoryFileError(f"{path}: has {len(values)} poses; allowed: at least {MIN_POSES}")
+    faulty = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
+    if faulty.size:
+        names = [COLUMNS[column] for column in np.flatnonzero(~np.isfinite(values[faulty[0]]))]
+        raise TrajectoryFileError(f"{path}: pose {faulty[0] + 1}: {', '.join(names)} is not finite; allowed: numbers")
+    late = np.flatnonzero(np.diff(values[:, 0]) <= 0.0)
+    if late.size:
+        before, after = values[late[0] : late[0] + 2, 0]
+        raise TrajectoryFileError(
+            f"{path}: pose {late[0] + 2}: time goes from {before:.6f} to {after:.6f} s; allowed: times that increase"
+        )
+    lengths = np.linalg.norm(values[:, 4:], axis=1)
+    wrong = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE)
+    if wrong.size:
+        raise TrajectoryFileError(
+            f"{path}: pose {wrong[0] + 1}: the quaternion's length is {lengths[wrong[0]]:.4g}; "
+            f"allowed: 1 to {UNIT_TOLERANCE:g}"
+        )
+    # copies: a table's columns may be read-only, which rotations refuse
+    times, positions = np.array(values[:, 0]), np.array(values[:, 1:4])
+    return RecordedPoses(path, digest, times, positions, values[:, 4:] / lengths[:, None])
+
+
+class SpiceFlight(Parameters):
+    """Poses to be sampled from SPICE kernels."""
+
+    kernels: Annotated[tuple[str, ...], Field(min_length=1, description="paths, relative to the file")]
+    target: Annotated[str, Field(description="the body: a name or number in the kernels")]
+    observer: Annotated[str, Field(description="origin of the positions")]
+    world: Annotated[str, Field(description="frame of positions and attitudes")]
+    axes: Annotated[str, Field(description="frame whose attitude is recorded")]
+    begin: Annotated[str, Field(description="UTC, in a format of SPICE")]
+    end: Annotated[str, Field(description="UTC")]
+    step_s: Annotated[float, Field(gt=0.0, le=60.0, description="time between poses, s")]
+
+
+def _spice_poses(path: str) -> tuple[str, Float64[np.ndarray, "n 8"]]:
+    """SHA-256 of the file with its kernels; for each pose time (s from `begin`), position (m), quaternion (xyzw).
+
+    Raises ValueError for a fault of the file or of a kernel, ImportError without the package spiceypy.
+    """
+    try:
+        flight = SpiceFlight.model_validate(tomllib.loads(Path(path).read_text(encoding="utf-8")))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    kernels = [Path(path).parent / name for name in flight.kernels]
+    digest = hashlib.sha256(Path(path).read_bytes())
+    for kernel in kernels:
+        if not kernel.is_file():
+            raise ValueError(f"the kernel {kernel} is not there")
+        with kernel.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest(), _sample_kernels(flight, [str(kernel) for kernel in kernels])
+
+
+def _sample_kernels(flight: SpiceFlight, kernels: list[str]) -> Float64[np.ndarray, "n 8"]:
+    import spiceypy
+    from spiceypy.utils.exceptions import SpiceyError
+
+    try:
+        # the pool belongs to the process: kernels loaded by other code stay in it
+        with spiceypy.KernelPool(kernels):
+            begin, end = (float(spiceypy.str2et(utc)) for utc in (flight.begin, flight.end))
+            count = int(np.floor((end - begin) / flight.step_s + 1e-9)) + 1
+            if not 1 < count <= MAX_SPICE_POSES:
+                raise ValueError(f"begin, end and step_s make {max(count, 0)} poses; allowed: 2 to {MAX_SPICE_POSES}")
+            times = flight.step_s * np.arange(count)
+            positions = spiceypy.spkpos(flight.target, begin + times, flight.world, "NONE", flight.observer)[0]
+            rotations = np.stack([spiceypy.pxform(flight.axes, flight.world, begin + time) for time in times])
+    except SpiceyError as error:
+        # the message in one line, without SPICE's banner and traceback
+        words = [getattr(error, "short", ""), *str(getattr(error, "long", "") or error).split()]
+        raise ValueError(f"SPICE: {' '.join(words).strip()[:300]}") from error
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    return np.concatenate([times[:, None], 1e3 * np.asarray(positions), quaternions], axis=1)

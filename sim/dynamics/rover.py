@@ -1,19 +1,16 @@
-"""A rover of six wheels on a rocker-bogie suspension, at rest on the ground.
+"""Six-wheeled rover on a rocker-bogie suspension, at rest on ground with rocks.
 
-Model. Each side has a rocker, which carries the front wheel and the bogie's pivot, and a bogie, which carries the
-middle and the rear wheel. Rockers and bogies turn about axes parallel to the body's y axis. A differential turns the
-two rockers against the body by opposite angles: the body's pitch is the mean of the rockers'. Wheels are cylinders
-whose axles keep the direction of the body's y axis, as if they were not steered; nothing is sprung, and the joints have
-no stops.
+Each side has a rocker, which carries the front wheel and the bogie's pivot, and a bogie, which carries the middle and
+the rear wheel. Rockers and bogies rotate about axes parallel to the body's y axis. A differential rotates the two
+rockers against the body by opposite angles: the body's pitch is the mean of the rockers'. Wheels are unsteered
+cylinders whose axles are parallel to the body's y axis. There are no springs, and the joints have no stops.
 
-At a place (east, north) and an azimuth six numbers are left: height, pitch and roll of the body, the differential's
-angle and the two bogies'. They are those at which all six wheels touch the ground and none goes into it: six equations,
-solved by Levenberg-Marquardt. On a plane the joints rest and the body lies as the plane does.
+At a position (east, north) and an azimuth six unknowns remain: height, pitch and roll of the body, the angles of the
+differential and of both bogies. All six wheels touch the ground and none penetrates it: six equations, solved by
+Newton's method or Levenberg-Marquardt. On a plane the joint angles are zero and the body is parallel to the plane.
 
-Frame
------
-The rover's (body) frame has x forward, y to the left and z up. Its origin is the point of the ground between the two
-middle wheels when the rover stands on level ground.
+The rover (body) frame has x forward, y to the left and z up. Its origin is the point of level ground between the two
+middle wheels.
 """
 
 from __future__ import annotations
@@ -25,66 +22,127 @@ from typing import Annotated, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Float64
 from pydantic import Field, model_validator
+from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.dynamics.kernels import suspension
 from marsyard.sim.frames import rigid, turn_matrix
-from marsyard.sim.parameters import Parameters
+from marsyard.sim.parameters import Parameters, bounded
 
 Metres = Annotated[float, Field(gt=0.0, le=5.0)]
 
 #: Names of the wheels in the order of all arrays: two columns, left and right, of three.
 WHEELS = ("left front", "left middle", "left rear", "right front", "right middle", "right rear")
-#: The sides' signs along y, and in the differential.
+#: Signs of the sides along y and in the differential.
 _SIDE = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
-#: Points of a tread that may touch: angles about the axle from straight below, and lines across the tread.
+#: Sample points of a tread: angles about the axle from straight below, and lines across the tread.
 _TREAD_RAD = np.radians(np.linspace(-72.0, 72.0, 25))
 _TREAD_LINES = np.array([-0.5, 0.0, 0.5])
-#: Steps of the six numbers in which derivatives are taken: metres and radians.
+#: Steps of finite differences, metres and radians.
 _DIFFERENCE = 1e-6
-#: Steps of Newton's method before another is asked, and the gap at which a wheel is on the ground.
+#: Iterations of Newton's method, and the gap at which a wheel touches the ground.
 _NEWTON_STEPS, _CLOSED_M = 12, 1e-10
+
+#: Side of the grid's cells, metres: a tenth of a wheel's radius.
+CELL_M = 0.0125
+#: Largest distance between sample points on a triangle, in cells.
+_SAMPLE_SPACING = 0.7
 
 
 @runtime_checkable
 class Ground(Protocol):
-    """What wheels stand on: `marsyard.sim.terrain.Surface`, or one with rocks
-    (`marsyard.sim.dynamics.relief.RockyGround`).
-    """
+    """Ground under the wheels: `marsyard.sim.terrain.Surface`, or `RockyGround`."""
 
     def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         """Height of the ground at world positions, metres."""
         ...
 
 
-class RoverParameters(Parameters):
-    """Shape of a rover. The defaults are a MER's.
+@dataclass(frozen=True)
+class RockyGround:
+    """Ground with bodies on it within a square; the ground alone outside.
 
-    Wheels: 0.25 m across (press kit: 26 cm with cleats; Opportunity's odometer counts 0.8 m a turn), 0.16 m wide; the
-    wheel base is 1.41 m and the track 1.06 m, 1.22 m between the middle wheels (Lindemann & Voorhees 2005). Where the
-    pivots are is assumed. The body's size is the press kit's (1.6 m long, 2.3 m wide with its solar panels; the mast
-    carries the cameras at 1.54 m, Maki et al. 2003).
+    Heights are interpolated bilinearly between cell centres. A cell is as high as the highest body point in it, so
+    that steep sides extend up to one cell outwards. Overhangs are filled.
+
+    - corner_m: world x, y of the centre of cell (0, 0)
+    - above_m: height of each cell above the ground, 0 without a body; row i lies at y = corner + i cells
     """
 
-    wheel_radius_m: Annotated[Metres, Field(description="radius of a wheel, m")] = 0.125
-    wheel_width_m: Annotated[Metres, Field(description="width of a wheel's tread, m")] = 0.16
-    front_m: Annotated[Metres, Field(description="x of the front wheels, m")] = 0.705
-    rear_m: Annotated[Metres, Field(description="how far the rear wheels are behind the middle ones, m")] = 0.705
-    half_track_m: Annotated[Metres, Field(description="|y| of the front and rear wheels, m")] = 0.53
-    middle_half_track_m: Annotated[Metres, Field(description="|y| of the middle wheels, m")] = 0.61
-    rocker_pivot_x_m: Annotated[
-        float, Field(ge=-2.0, le=2.0, description="x of the axis about which rockers turn against the body, m")
-    ] = 0.08
-    rocker_pivot_z_m: Annotated[Metres, Field(description="its height, m")] = 0.40
-    bogie_pivot_x_m: Annotated[
-        float, Field(ge=-2.0, le=2.0, description="x of the axes about which bogies turn against rockers, m")
-    ] = -0.35
-    bogie_pivot_z_m: Annotated[Metres, Field(description="their height, m")] = 0.28
-    body_length_m: Annotated[Metres, Field(description="length of the body's deck, m")] = 1.6
-    body_width_m: Annotated[Metres, Field(description="width of the deck with its panels, m")] = 2.3
-    clearance_m: Annotated[Metres, Field(description="height of the body's belly, m")] = 0.29
-    deck_m: Annotated[Metres, Field(description="height of the deck, m")] = 0.64
+    ground: Ground
+    corner_m: tuple[float, float]
+    above_m: Float64[np.ndarray, "rows columns"]
+
+    @classmethod
+    def of(
+        cls,
+        ground: Ground,
+        triangles: Float64[np.ndarray, "triangles 3 3"],
+        centre_m: tuple[float, float],
+        half_m: float,
+    ) -> RockyGround:
+        """Rasterize bodies (triangles in world axes, metres) within `half_m` of a centre along x and y.
+
+        A `marsyard.sim.terrain.RockMesh` gives the triangles of a rock field as ``mesh.vertices[mesh.faces]``.
+        """
+        cells = 2 * int(np.ceil(half_m / CELL_M)) + 1
+        corner = np.array(centre_m) - 0.5 * (cells - 1) * CELL_M
+        points = _sample_triangles(triangles)
+        cell = np.rint((points[:, :2] - corner) / CELL_M).astype(np.int64)
+        inside = np.all((cell >= 0) & (cell < cells), axis=1)
+        column, row = cell[inside].T
+        top = np.full((cells, cells), -np.inf)
+        np.maximum.at(top, (row, column), points[inside, 2])
+        y, x = np.nonzero(np.isfinite(top))
+        above = np.zeros((cells, cells))
+        below = ground.height(corner[0] + CELL_M * x, corner[1] + CELL_M * y)
+        above[y, x] = np.maximum(top[y, x] - below, 0.0)
+        above.setflags(write=False)
+        return cls(ground, (float(corner[0]), float(corner[1])), above)
+
+    def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """Height of ground or rocks at world positions, metres."""
+        cells = [(y - self.corner_m[1]) / CELL_M, (x - self.corner_m[0]) / CELL_M]
+        above = map_coordinates(self.above_m, cells, order=1, mode="constant", prefilter=False)
+        return np.asarray(self.ground.height(x, y) + above)
+
+
+def _sample_triangles(triangles: Float64[np.ndarray, "triangles 3 3"]) -> Float64[np.ndarray, "points 3"]:
+    """Points on triangles, at most `_SAMPLE_SPACING` cells apart."""
+    edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    steps = np.ceil(edges / (_SAMPLE_SPACING * CELL_M)).astype(np.int64)
+    parts = [np.empty((0, 3))]
+    for count in np.unique(steps):
+        i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1))
+        first, second = i[i + j <= count] / count, j[i + j <= count] / count
+        weights = np.stack([1.0 - first - second, first, second], axis=1)
+        parts.append(np.einsum("pk,tki->tpi", weights, triangles[steps == count]).reshape(-1, 3))
+    return np.concatenate(parts)
+
+
+class RoverParameters(Parameters):
+    """Dimensions of a rover; the defaults are MER's.
+
+    Wheels: 0.25 m in diameter (press kit: 26 cm with cleats; Opportunity's odometer counts 0.8 m a turn), 0.16 m wide;
+    wheel base 1.41 m, track 1.06 m, 1.22 m between the middle wheels (Lindemann & Voorhees 2005). Positions of the
+    pivots are assumed. Body: press kit (1.6 m long, 2.3 m wide with solar panels; cameras at 1.54 m, Maki et al. 2003).
+    """
+
+    wheel_radius_m: Annotated[Metres, Field(description="radius of a wheel")] = 0.125
+    wheel_width_m: Annotated[Metres, Field(description="width of a wheel's tread")] = 0.16
+    front_m: Annotated[Metres, Field(description="x of the front wheels")] = 0.705
+    rear_m: Annotated[Metres, Field(description="distance of the rear wheels behind the middle wheels")] = 0.705
+    half_track_m: Annotated[Metres, Field(description="|y| of the front and rear wheels")] = 0.53
+    middle_half_track_m: Annotated[Metres, Field(description="|y| of the middle wheels")] = 0.61
+    rocker_pivot_x_m: Annotated[float, bounded(-2.0, 2.0, "x of the axis of rockers against the body")] = 0.08
+    rocker_pivot_z_m: Annotated[Metres, Field(description="its height")] = 0.40
+    bogie_pivot_x_m: Annotated[float, bounded(-2.0, 2.0, "x of the axes of bogies against rockers")] = -0.35
+    bogie_pivot_z_m: Annotated[Metres, Field(description="their height")] = 0.28
+    body_length_m: Annotated[Metres, Field(description="length of the body's deck")] = 1.6
+    body_width_m: Annotated[Metres, Field(description="width of the deck with its panels")] = 2.3
+    clearance_m: Annotated[Metres, Field(description="height of the body's belly")] = 0.29
+    deck_m: Annotated[Metres, Field(description="height of the deck")] = 0.64
 
     @model_validator(mode="after")
     def _is_a_rover(self) -> RoverParameters:
@@ -101,7 +159,7 @@ class RoverParameters(Parameters):
         return self
 
     @property
-    def wheel_places_m(self) -> Float64[np.ndarray, "6 3"]:
+    def wheel_centres_m(self) -> Float64[np.ndarray, "6 3"]:
         """Centres of the wheels on level ground, rover frame, in the order of `WHEELS`."""
         along = np.tile([self.front_m, 0.0, -self.rear_m], 2)
         across = _SIDE * np.tile([self.half_track_m, self.middle_half_track_m, self.half_track_m], 2)
@@ -115,7 +173,7 @@ class RoverParameters(Parameters):
 
     @property
     def reach_m(self) -> float:
-        """Radius of the circle about the origin that holds wheels and body, seen from above, metres."""
+        """Radius of the circle about the origin that encloses wheels and body, seen from above."""
         wheel = np.hypot(
             max(self.front_m, self.rear_m) + self.wheel_radius_m, self.half_track_m + 0.5 * self.wheel_width_m
         )
@@ -124,8 +182,8 @@ class RoverParameters(Parameters):
 
 #: The Mars Exploration Rover, and its engineering model on Earth.
 MER = RoverParameters()
-#: The research rover of the tracking paper's section 5: six steered and driven wheels, about as large as a MER without
-#: panels (Rocky 8; its exact measures are assumed).
+#: Rocky 8, the research rover of the tracking paper's section 5: six steered and driven wheels, about the size of a MER
+#: without panels. Its exact dimensions are assumed.
 ROCKY_8 = RoverParameters(
     wheel_radius_m=0.10,
     wheel_width_m=0.12,
@@ -146,19 +204,12 @@ ROCKY_8 = RoverParameters(
 
 @dataclass(frozen=True)
 class Stance:
-    """A rover at rest on the ground: truth.
+    """True pose and joint angles of a rover at rest on the ground.
 
-    Attributes
-    ----------
-    world_from_rover
-        Pose of the rover.
-    differential_rad
-        Angle of the left rocker against the body; the right one's is its opposite. Positive: its front wheel is low.
-    bogies_rad
-        Angles of the left and the right bogie against their rockers; positive: the middle wheel is low.
-    gaps_m
-        What is left between each wheel and the ground, in the order of `WHEELS`; not zero where no stance has all six
-        on the ground.
+    - differential_rad: angle of the left rocker against the body, the negative of the right one's; positive: its front
+      wheel is lowered
+    - bogies_rad: angles of the left and the right bogie against their rockers; positive: the middle wheel is lowered
+    - gaps_m: height of each wheel above the ground in the order of `WHEELS`; not zero where no pose has all six on it
     """
 
     world_from_rover: RigidTransform
@@ -168,27 +219,23 @@ class Stance:
 
     @property
     def east_m(self) -> float:
-        """World x of the rover's origin, metres."""
+        """World x of the rover's origin."""
         return float(self.world_from_rover.translation[0])
 
     @property
     def north_m(self) -> float:
-        """World y of the rover's origin, metres."""
+        """World y of the rover's origin."""
         return float(self.world_from_rover.translation[1])
 
     @cached_property
     def _yaw_pitch_roll(self) -> tuple[float, float, float]:
-        turn = turn_matrix(self.world_from_rover)
-        yaw, pitch, roll = (
-            np.arctan2(turn[1, 0], turn[0, 0]),
-            np.arctan2(-turn[2, 0], np.hypot(turn[2, 1], turn[2, 2])),
-            np.arctan2(turn[2, 1], turn[2, 2]),
-        )
-        return float(yaw), float(pitch), float(roll)
+        m = turn_matrix(self.world_from_rover)
+        pitch = np.arctan2(-m[2, 0], np.hypot(m[2, 1], m[2, 2]))
+        return float(np.arctan2(m[1, 0], m[0, 0])), float(pitch), float(np.arctan2(m[2, 1], m[2, 2]))
 
     @property
     def azimuth_rad(self) -> float:
-        """Where the rover heads: azimuth of its x axis, clockwise from north, in (-pi, pi]."""
+        """Heading: azimuth of the x axis, clockwise from north, in (-pi, pi]."""
         azimuth = 0.5 * np.pi - self._yaw_pitch_roll[0]
         return float(np.arctan2(np.sin(azimuth), np.cos(azimuth)))
 
@@ -199,7 +246,7 @@ class Stance:
 
     @property
     def roll_rad(self) -> float:
-        """Turn about the x axis: positive with the left side up."""
+        """Rotation about the x axis: positive with the left side up."""
         return self._yaw_pitch_roll[2]
 
     @property
@@ -216,119 +263,102 @@ def settle(
     azimuth_rad: float,
     near: Stance | None = None,
 ) -> Stance:
-    """The rover at rest at a place.
+    """Solve for the rover's pose and joint angles at rest at a position.
 
-    Parameters
-    ----------
-    rover
-        Its shape.
-    ground
-        What it stands on.
-    east_m, north_m
-        World place of its origin.
-    azimuth_rad
-        Where it heads, clockwise from north.
-    near
-        A stance close by, from which the solution starts; by default from level on the ground's height.
+    The azimuth is clockwise from north. The solution starts from the stance `near`, or from level on the ground.
     """
-    frame = _Frame(rover, ground, np.array([east_m, north_m]), 0.5 * np.pi - azimuth_rad)
-    unknown, gaps = frame.solved(frame.start(near))
-    differential, left, right = (float(angle) for angle in unknown[3:])
-    pose = rigid(frame.rotation(unknown), np.array([east_m, north_m, unknown[0]]))
-    return Stance(pose, differential, (left, right), gaps)
+    equations = _StanceEquations(rover, ground, np.array([east_m, north_m]), 0.5 * np.pi - azimuth_rad)
+    if near is None:
+        start = np.array([float(ground.height(*equations.position_m[:, None])[0]), 0.0, 0.0, 0.0, 0.0, 0.0])
+    else:
+        height = float(near.world_from_rover.translation[2])
+        start = np.array([height, near.pitch_rad, near.roll_rad, near.differential_rad, *near.bogies_rad])
+    unknowns, gaps = equations.solve(start)
+    differential, left, right = (float(angle) for angle in unknowns[3:])
+    rotation = Rotation.from_euler("ZYX", [equations.yaw_rad, -unknowns[1], unknowns[2]])
+    return Stance(rigid(rotation, np.array([east_m, north_m, unknowns[0]])), differential, (left, right), gaps)
 
 
 def wheel_centres(
     rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]
 ) -> Float64[np.ndarray, "6 3"]:
-    """Centres of the wheels in the rover frame at these angles of the joints, metres."""
+    """Centres of the wheels in the rover frame at the given joint angles, metres."""
     joints = np.array([differential_rad, *bogies_rad])
-    return np.asarray(suspension.wheel_centres(rover.wheel_places_m, *rover.pivots_m, joints))
+    return np.asarray(suspension.wheel_centres(rover.wheel_centres_m, *rover.pivots_m, joints))
 
 
 def bogie_pivots(rover: RoverParameters, differential_rad: float) -> Float64[np.ndarray, "2 3"]:
-    """Where the rockers carry the left and the right bogie, rover frame, metres."""
+    """Positions of the left and the right bogie's pivot, rover frame, metres."""
     (x, z), about = rover.pivots_m[1], rover.pivots_m[0]
     half = rover.half_track_m
-    left, right = (suspension.turned(x, z, angle, about) for angle in (differential_rad, -differential_rad))
+    left, right = (suspension.rotate(x, z, angle, about) for angle in (differential_rad, -differential_rad))
     return np.array([[left[0], half, left[1]], [right[0], -half, right[1]]])
 
 
 @dataclass(frozen=True)
-class _Frame:
-    """The equations of a stance: gaps under the wheels as a function of (height, pitch, roll, differential, bogies)."""
+class _StanceEquations:
+    """Gaps under the wheels as a function of (height, pitch, roll, differential, left bogie, right bogie)."""
 
     rover: RoverParameters
     ground: Ground
-    place_m: Float64[np.ndarray, "2"]
+    position_m: Float64[np.ndarray, "2"]
     yaw_rad: float
 
-    def start(self, near: Stance | None) -> Float64[np.ndarray, "6"]:
-        if near is None:
-            return np.array([float(self.ground.height(*self.place_m[:, None])[0]), 0.0, 0.0, 0.0, 0.0, 0.0])
-        height = float(near.world_from_rover.translation[2])
-        return np.array([height, near.pitch_rad, near.roll_rad, near.differential_rad, *near.bogies_rad])
+    def solve(self, start: Float64[np.ndarray, "6"]) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6"]]:
+        """Unknowns that close the gaps, and the remaining gaps, by Newton's method: few iterations on most ground.
 
-    def rotation(self, unknown: Float64[np.ndarray, "6"]) -> Rotation:
-        return Rotation.from_euler("ZYX", [self.yaw_rad, -unknown[1], unknown[2]])
-
-    def solved(self, start: Float64[np.ndarray, "6"]) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6"]]:
-        """What closes the gaps, and what is left of them: by Newton's method, which needs few steps on most ground.
-
-        A wheel's lowest place jumps along its tread; where that leads the method astray, and where no stance has all
-        wheels on the ground, Levenberg-Marquardt finds the least gaps.
+        A wheel's lowest point jumps along its tread. If Newton's method then diverges, or no stance has all wheels on
+        the ground, Levenberg-Marquardt minimizes the gaps.
         """
-        unknown = start
+        unknowns = start
         for _ in range(_NEWTON_STEPS):
-            gaps, places = self._lowest(unknown)
+            gaps, points = self._lowest_points(unknowns)
             if float(np.abs(gaps).max()) < _CLOSED_M:
-                return unknown, gaps
+                return unknowns, gaps
             try:
-                unknown = unknown - np.linalg.solve(self._slopes(unknown, places), gaps)
+                unknowns = unknowns - np.linalg.solve(self._jacobian(unknowns, points), gaps)
             except np.linalg.LinAlgError:
                 break
-        found = least_squares(self.gaps, start, jac=self.gap_slopes, method="lm", xtol=1e-8, ftol=1e-12)
-        return found.x, found.fun
 
-    def gaps(self, unknown: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6"]:
-        return self._lowest(unknown)[0]
+        def gaps_of(x: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6"]:
+            return self._lowest_points(x)[0]
 
-    def gap_slopes(self, unknown: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6 6"]:
-        return self._slopes(unknown, self._lowest(unknown)[1])
+        def jacobian_of(x: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6 6"]:
+            return self._jacobian(x, self._lowest_points(x)[1])
 
-    def _slopes(
-        self, unknown: Float64[np.ndarray, "6"], places: Float64[np.ndarray, "6 3"]
+        solution = least_squares(gaps_of, start, jac=jacobian_of, method="lm", xtol=1e-8, ftol=1e-12)
+        return solution.x, solution.fun
+
+    def _jacobian(
+        self, unknowns: Float64[np.ndarray, "6"], points: Float64[np.ndarray, "6 3"]
     ) -> Float64[np.ndarray, "6 6"]:
-        """By differences, how the gaps change with each unknown, given the lowest place of each tread.
+        """Derivatives of the gaps by finite differences, at the lowest point of each tread alone."""
+        step = _DIFFERENCE * np.eye(6)
+        heights = self._heights(np.concatenate([unknowns - step, unknowns + step]), points[:, None])[..., 0]
+        return np.asarray(((heights[6:] - heights[:6]) / (2.0 * _DIFFERENCE)).T)
 
-        A wheel's gap changes as the height of that place of its tread which is lowest: only there are the differences
-        taken.
-        """
-        beside = _DIFFERENCE * np.eye(6)
-        ends = self._heights(np.concatenate([unknown - beside, unknown + beside]), places[:, None])[..., 0]
-        return np.asarray(((ends[6:] - ends[:6]) / (2.0 * _DIFFERENCE)).T)
-
-    def _lowest(self, unknown: Float64[np.ndarray, "6"]) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 3"]]:
-        """Least height of each tread above the ground, and the place on the tread, from its wheel's middle."""
-        heights = self._heights(unknown[None], self.tread[None])[0]
+    def _lowest_points(
+        self, unknowns: Float64[np.ndarray, "6"]
+    ) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 3"]]:
+        """Smallest height of each tread above the ground, and its point on the tread, from the wheel's centre."""
+        heights = self._heights(unknowns[None], self._tread[None])[0]
         lowest = heights.argmin(axis=1)
-        return heights[np.arange(6), lowest], self.tread[lowest]
+        return heights[np.arange(6), lowest], self._tread[lowest]
 
     @cached_property
-    def shape(self) -> tuple[Float64[np.ndarray, "6 3"], Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
-        """Where the wheels are at rest, and the axes that they turn about."""
-        return (self.rover.wheel_places_m, *self.rover.pivots_m)
+    def _shape(self) -> tuple[Float64[np.ndarray, "6 3"], Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
+        return (self.rover.wheel_centres_m, *self.rover.pivots_m)
 
     @cached_property
-    def tread(self) -> Float64[np.ndarray, "places 3"]:
-        """Places of a wheel's tread that may touch the ground, from its centre."""
+    def _tread(self) -> Float64[np.ndarray, "points 3"]:
+        """Sample points of a wheel's tread, from its centre."""
         angle, line = np.meshgrid(_TREAD_RAD, _TREAD_LINES)
         radius, width = self.rover.wheel_radius_m, self.rover.wheel_width_m
         return np.stack([radius * np.sin(angle), width * line, -radius * np.cos(angle)], axis=-1).reshape(-1, 3)
 
     def _heights(
-        self, unknown: Float64[np.ndarray, "n 6"], treads: Float64[np.ndarray, "wheels places 3"]
-    ) -> Float64[np.ndarray, "n 6 places"]:
-        """Heights above the ground of places of the wheels' treads, the same for all wheels or each wheel's own."""
-        x, y, z = suspension.tread_places(unknown, self.yaw_rad, self.place_m, *self.shape, treads)
+        self, unknowns: Float64[np.ndarray, "n 6"], treads: Float64[np.ndarray, "wheels points 3"]
+    ) -> Float64[np.ndarray, "n 6 points"]:
+        """Heights of tread points above the ground; the points are common to all wheels, or each wheel's own."""
+        x, y, z = suspension.tread_points(unknowns, self.yaw_rad, self.position_m, *self._shape, treads)
         return np.asarray(z - self.ground.height(x, y))

@@ -10,7 +10,7 @@ import pytest
 
 from marsyard.campaigns.running.conformance import examine
 from marsyard.scenarios.conformance import Finding, Subject, check_names, inputs, run_check, task_of, trackers
-from marsyard.scenarios.conformance.surfaces import TexturedPlane
+from marsyard.scenarios.conformance.inputs import TexturedPlane
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY
 from marsyard.sim.camera import Cahv
 
@@ -73,8 +73,8 @@ def estimator(lines: str) -> str:
         ("answer", "m.images[0].counts[:] = m.images[0].counts\nreturn NOTHING", "read-only"),
         ("featureless", "return VelocityEstimate(Outcome.VALID, np.zeros(2))", "it answers VALID to pictures that are"),
         ("saturated", "return NOTHING if seen(m) else 1 / 0", "it raised ZeroDivisionError"),
-        ("inputs", "m.images[0].counts[:] = 0\nreturn NOTHING", "are not what they were before"),
-        ("inputs", "m.interval_velocities_m_s[0] -= 1\nreturn NOTHING", "are not what they were before"),
+        ("inputs", "m.images[0].counts[:] = 0\nreturn NOTHING", "it changed its input"),
+        ("inputs", "m.interval_velocities_m_s[0] -= 1\nreturn NOTHING", "it changed its input"),
         ("deterministic", "return VelocityEstimate(Outcome.VALID, np.random.random(2))", "answers differently"),
         (
             "deterministic",
@@ -82,7 +82,7 @@ def estimator(lines: str) -> str:
             "return VelocityEstimate(Outcome.VALID, np.full(2, was))",
             "answer",
         ),
-        ("truth", "import marsyard.sim.terrain\nreturn NOTHING", "it imports what knows the truth: bad_"),
+        ("truth", "import marsyard.sim.terrain\nreturn NOTHING", "it imports modules with access to the truth: bad_"),
         ("truth", "from marsyard.sim import sensor\nreturn NOTHING", ": marsyard.sim.sensor"),
     ],
 )
@@ -119,12 +119,12 @@ MOVING = "return VelocityEstimate(Outcome.VALID, np.ones(2)) if len(self.kept) >
         ),
         ("answer", "return None", "return VelocityEstimate(Outcome.VALID, np.ones(2), span_s=(105.0, 101.0))", "first"),
         ("saturated", "return None", MOVING, "it answers VALID to pictures that are saturated"),
-        ("inputs", "frame.image.counts[:] = 0", "return NOTHING", "are not what they were before"),
+        ("inputs", "frame.image.counts[:] = 0", "return NOTHING", "it changed its input"),
         (
             "inputs",
             "frame.interval_velocity_m_s is None or frame.interval_velocity_m_s.fill(0)",
             MOVING,
-            "are not what",
+            "it changed its input",
         ),
         ("few", "return None", "return NOTHING if len(self.kept) == 1 else 1 / 0", "ZeroDivisionError"),
         (
@@ -153,7 +153,7 @@ def test_a_stream_that_keeps_a_descent_is_found(tmp_path: Path, monkeypatch: pyt
         def finish(self): return VelocityEstimate(Outcome.VALID, np.full(2, self.seen), span_s=(100.0, 100.0))
     """
     found = findings(bad(tmp_path, monkeypatch, body), "deterministic", "start", "time")
-    assert found["deterministic"].problem == "its answer depends on the case that it was asked before"
+    assert found["deterministic"].problem == "its answer depends on earlier cases"
     assert found["start"].problem == "started again after two pictures, it answers differently"
     assert found["time"].passed
 
@@ -168,7 +168,7 @@ def test_state_of_the_estimator_is_found(tmp_path: Path, monkeypatch: pytest.Mon
             return VelocityEstimate(Outcome.VALID, answer)
     """
     found = findings(bad(tmp_path, monkeypatch, body), "deterministic", "inputs", "time")
-    assert found["deterministic"].problem == "its answer depends on the case that it was asked before"
+    assert found["deterministic"].problem == "its answer depends on earlier cases"
     assert found["inputs"].passed
     assert found["time"].passed
 
@@ -184,11 +184,11 @@ def test_state_of_the_estimator_is_found(tmp_path: Path, monkeypatch: pytest.Mon
             "def clear(self): pass\n    def designate(self, t, p): self.track or super().designate(t, p)",
             "cleared and given the target again, it answers differently",
         ),
-        ("inputs", "def update(self, m): m.left.counts[:] = 0; return super().update(m)", "not what they were before"),
+        ("inputs", "def update(self, m): m.left.counts[:] = 0; return super().update(m)", "it changed its input"),
         (
             "truth",
             "def update(self, m): import marsyard.sim.terrain; return super().update(m)",
-            "knows the truth: bad_",
+            "access to the truth: bad_",
         ),
     ],
 )

@@ -24,7 +24,7 @@ from marsyard.scenarios.measured.table import read_table
 from marsyard.scenarios.meshes import MOST_BYTES, MeshFileError, read_mesh
 from marsyard.scenarios.offline import VELOCITY_FORM, answers_of
 from marsyard.sim.camera import read_cameras
-from marsyard.sim.dynamics.recorded_files import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.recorded import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
 from marsyard.sim.sensor import read_datasheet
 
 

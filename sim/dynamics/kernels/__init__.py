@@ -1,1 +1,1 @@
-"""Compiled kernels of how things move."""
+"""Compiled kernels of the dynamics."""

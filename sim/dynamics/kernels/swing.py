@@ -1,5 +1,4 @@
-"""Compiled equations of motion of the two-stage swing; `marsyard.sim.dynamics.swing` derives them and names every
-symbol.
+"""Compiled equations of motion of the two-stage pendulum; `marsyard.sim.dynamics.swing` derives them and their symbols.
 
 A state is a vector of 22: position and velocity of the canopy, the line's direction and its rate, the lander's axis and
 its rate, and the lander's x axis, each with three components in world axes; and the lander's spin about its axis.
@@ -17,22 +16,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SIZE = 22
-CANOPY = 0
-CANOPY_RATE = 3
-LINE = 6
-LINE_RATE = 9
-AXIS = 12
-AXIS_RATE = 15
-SIDE = 18
-SPIN = 21
+#: First components of the vectors in a state, and its size.
+CANOPY, CANOPY_RATE, LINE, LINE_RATE, AXIS, AXIS_RATE, SIDE, SPIN, SIZE = 0, 3, 6, 9, 12, 15, 18, 21, 22
 
 
 class Chain(NamedTuple):
-    """Canopy, backshell and lander, and the air they fall through.
+    """Constants of canopy, backshell, lander and air.
 
     `tangential` and `normal` are half density times area times coefficient, kg/m, at `reference_height_m`; `reach_m` is
-    the camera's distance from the hinge, `mass_centre_m` that of the lander's centre of mass.
+    the camera's distance from the hinge, `mass_centre_m` the lander's centre of mass.
     """
 
     mass_kg: float
@@ -55,7 +47,7 @@ class Chain(NamedTuple):
 class WindField(NamedTuple):
     """Mean wind and gusts as functions of height: see `marsyard.sim.dynamics.wind`.
 
-    A row of `waves` has its wavenumber, rad/m, then the amplitudes east, north and up of its cosine, then of its sine.
+    A row of `waves`: wavenumber, rad/m; amplitudes east, north and up of its cosine, then of its sine.
     """
 
     ground_height_m: float
@@ -67,10 +59,10 @@ class WindField(NamedTuple):
 
 
 CHAIN_SIZE = len(Chain._fields)
-#: Without the waves.
+#: Fields without the waves.
 FIELD_SIZE = len(WindField._fields) - 1
 
-#: Terms of SciPy's polynomial over a step of DOP853.
+#: Coefficients of SciPy's polynomial over a step of DOP853.
 TERMS = 7
 
 
@@ -78,11 +70,11 @@ TERMS = 7
 def wind_at(height: float, field: WindField) -> tuple[float, float, float]:
     """East, north and upward wind at a height of the world's z."""
     above = max(height - field.ground_height_m, 0.0)
-    share = 1.0
+    profile = 1.0
     if above < field.layer_m:
-        share = math.log1p(above / field.roughness_m) / math.log1p(field.layer_m / field.roughness_m)
-    east = share * field.mean_east_m_s
-    north = share * field.mean_north_m_s
+        profile = math.log1p(above / field.roughness_m) / math.log1p(field.layer_m / field.roughness_m)
+    east = profile * field.mean_east_m_s
+    north = profile * field.mean_north_m_s
     up = 0.0
     for k in range(field.waves.shape[0]):
         wave = field.waves[k]
@@ -109,32 +101,32 @@ def _dot(a: Array, i: int, b: Array, j: int) -> float:
 
 
 @njit(cache=True)
-def _cross(a: Array, i: int, b: Array, j: int, out: Array) -> None:
+def _cross(a: Array, i: int, b: Array, j: int) -> Array:
+    out = np.empty(3)
     out[0] = a[i + 1] * b[j + 2] - a[i + 2] * b[j + 1]
     out[1] = a[i + 2] * b[j] - a[i] * b[j + 2]
     out[2] = a[i] * b[j + 1] - a[i + 1] * b[j]
+    return out
 
 
 @njit(cache=True)
-def aerodynamic_force(y: Array, chain: Chain, field: WindField, force: Array) -> None:
-    """Writes the force of the air on the canopy, N, world axes."""
+def aerodynamic_force(y: Array, chain: Chain, field: WindField) -> Array:
+    """Force of the air on the canopy, N, world axes."""
     height = y[CANOPY + 2]
-    east, north, up = wind_at(height, field)
-    through = np.empty(3)
-    through[0] = y[CANOPY_RATE] - east
-    through[1] = y[CANOPY_RATE + 1] - north
-    through[2] = y[CANOPY_RATE + 2] - up
-    speed = math.sqrt(_dot(through, 0, through, 0))
-    along = _dot(through, 0, y, LINE)
-    thickness = math.exp((chain.reference_height_m - height) / chain.scale_height_m)
+    relative = y[CANOPY_RATE : CANOPY_RATE + 3] - np.array(wind_at(height, field))
+    force = np.empty(3)
+    speed = math.sqrt(_dot(relative, 0, relative, 0))
+    along = _dot(relative, 0, y, LINE)
+    density = math.exp((chain.reference_height_m - height) / chain.scale_height_m)
     for i in range(3):
-        across = through[i] - along * y[LINE + i]
-        force[i] = -thickness * speed * (chain.tangential * speed * y[LINE + i] + chain.normal * across)
+        across = relative[i] - along * y[LINE + i]
+        force[i] = -density * speed * (chain.tangential * speed * y[LINE + i] + chain.normal * across)
+    return force
 
 
 @njit(cache=True)
 def slope(_t: float, y: Array, constants: Array, waves: Array) -> Array:
-    """`derivatives` as an integrator calls it, with the constants of `packed`: numba converts tuples slowly."""
+    """`derivatives` with the signature of an integrator; constants are `packed`, as numba converts tuples slowly."""
     chain = Chain(*to_fixed_tuple(constants[:CHAIN_SIZE], CHAIN_SIZE))
     mean = to_fixed_tuple(constants[CHAIN_SIZE:], FIELD_SIZE)
     rates: Array = derivatives(y, chain, WindField(mean[0], mean[1], mean[2], mean[3], mean[4], waves))
@@ -148,7 +140,7 @@ def packed(chain: Chain, field: WindField) -> tuple[Array, Array]:
 
 @njit(cache=True)
 def interpolated(times: Array, knots: Array, starts: Array, lengths: Array, states: Array, polynomials: Array) -> Array:
-    """States at some times, a row each: the polynomials of `marsyard.sim.dynamics.integration.Path`, all at once."""
+    """States at many times, a row each, from the polynomials of `marsyard.sim.dynamics.swing.Path`."""
     rows = np.empty((times.size, SIZE))
     for n in range(times.size):
         i = max(np.searchsorted(knots, times[n], side="right") - 1, 0)
@@ -163,38 +155,32 @@ def interpolated(times: Array, knots: Array, starts: Array, lengths: Array, stat
 
 @njit(cache=True)
 def derivatives(y: Array, chain: Chain, field: WindField) -> Array:
-    """Rates of change of the state."""
+    """Time derivatives of the state."""
     lander_moment = chain.lander_mass_kg * chain.mass_centre_m
-    # reduced moments of the line, of both, and of the lander: the canopy's position is eliminated
+    # moments of the line, of both, and of the lander with the canopy's position eliminated
     a = chain.second_moment - chain.first_moment**2 / chain.mass_kg
     c = lander_moment * (chain.line_m - chain.first_moment / chain.mass_kg)
     b = chain.transverse_inertia + lander_moment * (chain.mass_centre_m - lander_moment / chain.mass_kg)
 
-    force = np.empty(3)
-    aerodynamic_force(y, chain, field, force)
-    line_rotation = np.empty(3)
-    lander_rotation = np.empty(3)
-    _cross(y, LINE, y, LINE_RATE, line_rotation)
-    _cross(y, AXIS, y, AXIS_RATE, lander_rotation)
+    force = aerodynamic_force(y, chain, field)
+    line_rotation = _cross(y, LINE, y, LINE_RATE)
+    lander_rotation = _cross(y, AXIS, y, AXIS_RATE)
     spin = y[SPIN]
     rolling = _dot(lander_rotation, 0, y, LINE) + spin * _dot(y, AXIS, y, LINE)
     slip = np.empty(3)
     for i in range(3):
         slip[i] = lander_rotation[i] + spin * y[AXIS + i] - rolling * y[LINE + i] - line_rotation[i]
-    slip_line = np.empty(3)
-    slip_axis = np.empty(3)
-    gyro = np.empty(3)
-    _cross(slip, 0, y, LINE, slip_line)
-    _cross(slip, 0, y, AXIS, slip_axis)
-    _cross(y, AXIS_RATE, y, AXIS, gyro)
+    slip_line = _cross(slip, 0, y, LINE)
+    slip_axis = _cross(slip, 0, y, AXIS)
+    gyro = _cross(y, AXIS_RATE, y, AXIS)
 
     line_speed2 = _dot(y, LINE_RATE, y, LINE_RATE)
     axis_speed2 = _dot(y, AXIS_RATE, y, AXIS_RATE)
     cosine = _dot(y, LINE, y, AXIS)
     force_line = _dot(force, 0, y, LINE)
     force_axis = _dot(force, 0, y, AXIS)
-    push_line = chain.first_moment / chain.mass_kg
-    push_axis = lander_moment / chain.mass_kg
+    pull_line = chain.first_moment / chain.mass_kg
+    pull_axis = lander_moment / chain.mass_kg
     on_line = np.empty(3)
     on_axis = np.empty(3)
     for i in range(3):
@@ -202,13 +188,13 @@ def derivatives(y: Array, chain: Chain, field: WindField) -> Array:
         e = y[AXIS + i]
         on_line[i] = (
             chain.hinge_damping * slip_line[i]
-            - push_line * (force[i] - force_line * n)
+            - pull_line * (force[i] - force_line * n)
             + c * axis_speed2 * (e - cosine * n)
         )
         on_axis[i] = (
             -chain.hinge_damping * slip_axis[i]
             - chain.axial_inertia * spin * gyro[i]
-            - push_axis * (force[i] - force_axis * e)
+            - pull_axis * (force[i] - force_axis * e)
             + c * line_speed2 * (n - cosine * e)
         )
     # A w + C P_n x = on_line and B x + C P_e w = on_axis, w across the line n, x across the axis e
@@ -240,9 +226,7 @@ def derivatives(y: Array, chain: Chain, field: WindField) -> Array:
         ) / chain.mass_kg
         turn[i] = lander_rotation[i] + spin * y[AXIS + i]
     rates[CANOPY_RATE + 2] -= chain.gravity_m_s2
-    side = np.empty(3)
-    _cross(turn, 0, y, SIDE, side)
-    rates[SIDE : SIDE + 3] = side
+    rates[SIDE : SIDE + 3] = _cross(turn, 0, y, SIDE)
     rates[SPIN] = -chain.hinge_damping * _dot(slip, 0, y, AXIS) / chain.axial_inertia
     return rates
 
@@ -256,33 +240,30 @@ def truth(states: Array, chain: Chain, field: WindField) -> tuple[Array, Array, 
     matrices = np.empty((count, 3, 3))
     body_rates = np.empty((count, 3))
     forces = np.empty((count, 3))
-    turn = np.empty(3)
-    third = np.empty(3)
-    felt = np.empty(3)
+    force = np.empty(3)
     for k in range(count):
         y = states[k]
         rates = derivatives(y, chain, field)
-        # what integration has left of the side along the axis is taken off, so that the matrix is a rotation
+        # Gram-Schmidt: removes the integration error of the side along the axis
         axis_norm = math.sqrt(_dot(y, AXIS, y, AXIS))
-        lean = _dot(y, SIDE, y, AXIS) / axis_norm**2
+        along_axis = _dot(y, SIDE, y, AXIS) / axis_norm**2
         for i in range(3):
             positions[k, i] = y[CANOPY + i] + chain.line_m * y[LINE + i] + chain.reach_m * y[AXIS + i]
             velocities[k, i] = y[CANOPY_RATE + i] + chain.line_m * y[LINE_RATE + i] + chain.reach_m * y[AXIS_RATE + i]
-            felt[i] = (
+            force[i] = (
                 rates[CANOPY_RATE + i] + chain.line_m * rates[LINE_RATE + i] + chain.reach_m * rates[AXIS_RATE + i]
             )
             matrices[k, i, 2] = -y[AXIS + i] / axis_norm
-            matrices[k, i, 0] = y[SIDE + i] - lean * y[AXIS + i]
-        felt[2] += chain.gravity_m_s2
+            matrices[k, i, 0] = y[SIDE + i] - along_axis * y[AXIS + i]
+        force[2] += chain.gravity_m_s2
         side_norm = math.sqrt(matrices[k, 0, 0] ** 2 + matrices[k, 1, 0] ** 2 + matrices[k, 2, 0] ** 2)
         for i in range(3):
             matrices[k, i, 0] /= side_norm
-        _cross(matrices[k, :, 2].copy(), 0, matrices[k, :, 0].copy(), 0, third)
-        matrices[k, :, 1] = third
-        _cross(y, AXIS, y, AXIS_RATE, turn)
+        matrices[k, :, 1] = _cross(matrices[k, :, 2].copy(), 0, matrices[k, :, 0].copy(), 0)
+        turn = _cross(y, AXIS, y, AXIS_RATE)
         for i in range(3):
             turn[i] += y[SPIN] * y[AXIS + i]
         for j in range(3):
             body_rates[k, j] = matrices[k, 0, j] * turn[0] + matrices[k, 1, j] * turn[1] + matrices[k, 2, j] * turn[2]
-            forces[k, j] = matrices[k, 0, j] * felt[0] + matrices[k, 1, j] * felt[1] + matrices[k, 2, j] * felt[2]
+            forces[k, j] = matrices[k, 0, j] * force[0] + matrices[k, 1, j] * force[1] + matrices[k, 2, j] * force[2]
     return positions, velocities, matrices, body_rates, forces

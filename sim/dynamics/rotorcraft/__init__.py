@@ -1,11 +1,13 @@
-"""A small autonomous helicopter: flight for pictures at constant height, and landing on a site."""
+"""Small autonomous helicopter: flight at constant height while pictures are taken, and landing on a site."""
 
 from marsyard.sim.dynamics.rotorcraft.flight import (
     Air,
+    FlownPath,
     GroundPatch,
     LandingLaser,
     Phase,
     RotorcraftFlight,
+    Vibration,
     landing_flight,
     transit_flight,
 )
@@ -16,7 +18,6 @@ from marsyard.sim.dynamics.rotorcraft.parameters import (
     TransitParameters,
     VibrationParameters,
 )
-from marsyard.sim.dynamics.rotorcraft.path import FlownPath, Vibration
 
 __all__ = [
     "Air",

@@ -1,16 +1,16 @@
-"""Flying a small helicopter: over the ground for pictures, then to a site and down onto it (landing paper, V).
+"""Flight of a small helicopter: over the ground while pictures are taken, then to a site and down (landing paper, V).
 
-Thrust acts along the body's z axis, drag in proportion to the speed through the air, so that it pitches forward to fly
-and leans into the wind. Pitch, roll and yaw follow the autopilot's commands as second-order systems and yield to gusts;
-thrust follows with a lag. The autopilot commands speed by distance, acceleration by speed, and tilt by acceleration,
-with a trim against steady wind, on the state a little earlier.
+Thrust acts along the body's z axis, drag is proportional to the airspeed, so that the helicopter pitches forward to fly
+and leans into the wind. Pitch, roll and yaw follow the autopilot's commands as second-order systems, disturbed by
+gusts; thrust follows with a lag. The autopilot commands speed by distance, acceleration by speed, and tilt by
+acceleration, with a trim against steady wind, from a delayed state.
 
-The flight for pictures is flown on true states: how far off its path it is matters to nobody. The landing is flown on
-what is believed, so that navigation's errors become errors of the touchdown; below the height of the flare it only
-stops its drift, and gusts carry it off.
+The flight over the ground is controlled with true states, as its deviation from the path does not matter. The landing
+is controlled with navigation's states, so that navigation errors become touchdown errors. Below the height of the flare
+the helicopter only stops its drift, and gusts displace it.
 
-Left out: the inflow near the ground, sliding or tipping after the touchdown (the skids stay where they first touch
-and level out), and any wind that depends on place.
+Not modelled: inflow near the ground, sliding or tipping after the touchdown (the skids stay at the first contact and
+level out), and wind that depends on position.
 """
 
 from __future__ import annotations
@@ -19,41 +19,110 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
-import scipy  # its signal is slow to import, and so left until it is called
+import scipy  # scipy.signal is slow to import: it is loaded at its first use
 from jaxtyping import Float64, Int64
 
 from marsyard.sim.dynamics.rotorcraft import kernels
-from marsyard.sim.dynamics.rotorcraft.kernels import CARRIED, PLACE, SIZE, THRUST
 from marsyard.sim.dynamics.rotorcraft.parameters import (
     AirParameters,
     LandingGuidance,
     RotorcraftParameters,
     TransitParameters,
+    VibrationParameters,
 )
-from marsyard.sim.dynamics.rotorcraft.path import FlownPath, Vibration
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates, check_times
 
-#: How long after the last picture the flight for pictures ends, s: clocks may be late.
+#: Duration of the flight after the last picture, s: clocks may be late.
 TAIL_S = 0.1
 
 
 @dataclass(frozen=True)
+class Vibration:
+    """Sines along the world's axes and in yaw, pitch and roll, added to positions (m) and angles (rad)."""
+
+    rate_rad_s: float
+    amplitudes: Float64[np.ndarray, "6"]
+    phases_rad: Float64[np.ndarray, "6"]
+
+    @classmethod
+    def draw(cls, parameters: VibrationParameters, rng: np.random.Generator) -> Vibration:
+        """Draw the phases."""
+        rate = 2.0 * np.pi * parameters.rate_hz
+        amplitudes = np.repeat([parameters.acceleration_m_s2 / rate**2, np.radians(parameters.angle_deg)], 3)
+        return cls(rate, amplitudes, 2.0 * np.pi * rng.random(6))
+
+    def derivative(self, times_s: Float64[np.ndarray, "n"], order: int) -> Float64[np.ndarray, "n 6"]:
+        """Displacement (order 0) or a derivative of it."""
+        phases = self.rate_rad_s * times_s[:, None] + self.phases_rad + 0.5 * np.pi * order
+        return np.asarray(self.amplitudes * self.rate_rad_s**order * np.sin(phases))
+
+
+@dataclass(frozen=True)
+class FlownPath(Trajectory):
+    """Motion through states at equidistant times (rows: see `kernels`), exact between them, with vibration added.
+
+    Position and angles are twice continuously differentiable. The body frame has its origin in camera, laser and
+    instruments, x forward, y to the left, z up along the rotor.
+    """
+
+    start_s: float
+    step_s: float
+    rows: Float64[np.ndarray, "knots 18"]
+    vibration: Vibration
+    gravity_m_s2: float
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last time of the simulation."""
+        return self.start_s, self.start_s + self.step_s * (len(self.rows) - 1)
+
+    @property
+    def knots_s(self) -> Float64[np.ndarray, "knots"]:
+        """Times of the rows."""
+        return np.asarray(self.start_s + self.step_s * np.arange(len(self.rows)))
+
+    def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
+        """True states at many times. Raises ValueError outside of the span."""
+        check_times(times_s, self.span_s, 1e-6 * self.step_s)  # sums of steps have rounding errors
+        interval = np.clip(((times_s - self.start_s) / self.step_s).astype(int), 0, len(self.rows) - 2)
+        elapsed = (times_s - self.start_s - self.step_s * interval)[:, None]
+        angles, angle_rates, _ = self._interpolate(interval, elapsed, kernels.ANGLE)
+        vibration = [self.vibration.derivative(times_s, order) for order in range(3)]
+        attitudes, rates = attitudes_and_body_rates(angles + vibration[0][:, 3:], angle_rates + vibration[1][:, 3:])
+        path = self._interpolate(interval, elapsed, kernels.POSITION)
+        derivatives = [smooth + added[:, :3] for smooth, added in zip(path, vibration, strict=True)]
+        return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
+
+    def _interpolate(
+        self, interval: np.ndarray, t: Float64[np.ndarray, "n 1"], column: int
+    ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+        """A vector and its first two derivatives, in consecutive columns; the second is linear between knots."""
+        value, first, second = np.split(self.rows[interval, column : column + 9], 3, axis=1)
+        third = (self.rows[interval + 1, column + 6 : column + 9] - second) / self.step_s
+        return (
+            value + t * (first + t * (second / 2.0 + t * third / 6.0)),
+            first + t * (second + t * third / 2.0),
+            second + t * third,
+        )
+
+
+@dataclass(frozen=True)
 class Air:
-    """The wind over a span of time: its mean, and gusts at the knots of the simulation from the flight's start on."""
+    """Wind at the helicopter: its mean, and gusts at the knots of the simulation from the flight's start on."""
 
     mean_m_s: Float64[np.ndarray, "3"]
     gusts_m_s: Float64[np.ndarray, "knots 3"]
 
     @classmethod
-    def drawn(cls, parameters: AirParameters, step_s: float, duration_s: float, rng: np.random.Generator) -> Air:
-        """Wind for a duration; the gusts' process is stationary."""
+    def draw(cls, parameters: AirParameters, step_s: float, duration_s: float, rng: np.random.Generator) -> Air:
+        """Draw stationary gusts for a duration."""
         p = parameters
         kept = np.exp(-step_s / p.correlation_s)
         shocks = rng.standard_normal((int(np.ceil(duration_s / step_s)) + 2, 3))
         shocks[1:] *= np.sqrt(1.0 - kept**2)
-        sizes = np.array([p.gust_m_s, p.gust_m_s, p.vertical_gust_m_s])
-        return cls(
-            np.array([p.east_m_s, p.north_m_s, 0.0]), sizes * scipy.signal.lfilter([1.0], [1.0, -kept], shocks, axis=0)
-        )
+        deviations = np.array([p.gust_m_s, p.gust_m_s, p.vertical_gust_m_s])
+        gusts = deviations * scipy.signal.lfilter([1.0], [1.0, -kept], shocks, axis=0)
+        return cls(np.array([p.east_m_s, p.north_m_s, 0.0]), gusts)
 
     def check_lasts(self, knots: int) -> None:
         """Raises ValueError where there are gusts for fewer knots than a flight may take."""
@@ -63,44 +132,32 @@ class Air:
 
 @dataclass(frozen=True)
 class GroundPatch:
-    """Heights of the ground about a site, bilinear within and held beyond.
+    """Heights of the ground around a site on a grid, bilinear within it and constant beyond its edges.
 
-    Attributes
-    ----------
-    corner_m
-        East and north of the first height.
-    spacing_m
-        Distance between heights.
-    heights_m
-        Row i lies at north + i * spacing, column j at east + j * spacing.
+    - corner_m: east and north of the first height; row i lies at north + i * spacing, column j at east + j * spacing
     """
 
     corner_m: Float64[np.ndarray, "2"]
     spacing_m: float
     heights_m: Float64[np.ndarray, "rows columns"]
 
-    def height_m(self, place_m: Float64[np.ndarray, "2"]) -> float:
-        """Height at a place (east, north)."""
-        return float(kernels.ground_height(self.as_kernel(), float(place_m[0]), float(place_m[1])))
+    def height_m(self, position_m: Float64[np.ndarray, "2"]) -> float:
+        """Height at a position (east, north)."""
+        return float(kernels.ground_height(self.as_kernel(), float(position_m[0]), float(position_m[1])))
 
     def as_kernel(self) -> kernels.Ground:
-        """As the kernels take it."""
+        """The same as a struct of the kernels."""
         east, north = self.corner_m.tolist()
         return kernels.Ground(east, north, self.spacing_m, self.heights_m)
 
 
 @dataclass(frozen=True)
 class LandingLaser:
-    """The altimeter as the landing uses it.
+    """Laser altimeter of the landing.
 
-    Attributes
-    ----------
-    scale
-        Readings over true ranges.
-    noise_m
-        Of the reading at each knot from the flight's start on.
-    stuck_m
-        What it reads always, if it does.
+    - scale: readings over true ranges
+    - noise_m: noise of the reading at each knot from the flight's start on
+    - stuck_m: the constant reading of a failed altimeter
     """
 
     scale: float
@@ -109,7 +166,7 @@ class LandingLaser:
 
 
 class Phase(Enum):
-    """What a flight is about; the values are those of the kernels."""
+    """Phases of a flight; the values are those of the kernels."""
 
     TRANSIT = kernels.FOLLOW
     WAIT = kernels.WAIT
@@ -121,32 +178,23 @@ class Phase(Enum):
 
 @dataclass(frozen=True)
 class RotorcraftFlight:
-    """A flight, and what it takes to fly on.
+    """A simulated flight, and the autopilot's state, from which the simulation can be continued.
 
-    Attributes
-    ----------
-    path
-        The motion.
-    phases
-        What it was about at each knot: values of `Phase`.
-    carried
-        Thrust and trim at the last knot.
-    heading_rad
-        Yaw that is held.
-    craft
-        The helicopter.
+    - phases: value of `Phase` at each knot
+    - autopilot: thrust and trim at the last knot
+    - heading_rad: commanded yaw
     """
 
     path: FlownPath
     phases: Int64[np.ndarray, "knots"]
-    carried: Float64[np.ndarray, "4"]
+    autopilot: Float64[np.ndarray, "4"]
     heading_rad: float
     craft: RotorcraftParameters
 
     def first(self, phase: Phase) -> float | None:
-        """Time at which a phase began; None if it did not."""
-        found = np.flatnonzero(self.phases == phase.value)
-        return float(self.path.knots_s[found[0]]) if found.size else None
+        """Time at which a phase began; None if it did not occur."""
+        knots = np.flatnonzero(self.phases == phase.value)
+        return float(self.path.knots_s[knots[0]]) if knots.size else None
 
 
 def transit_flight(
@@ -159,21 +207,10 @@ def transit_flight(
     air: Air,
     rng: np.random.Generator,
 ) -> RotorcraftFlight:
-    """The flight up to a moment after the last picture.
+    """Simulate the flight until `TAIL_S` after the last picture.
 
-    Parameters
-    ----------
-    over_m
-        Where it is commanded to be at the first picture.
-    course_rad, heading_rad
-        Directions of flight and nose, counterclockwise from east.
-    rng
-        Phases of the vibration.
-
-    Raises
-    ------
-    ValueError
-        If the air is known for less than the flight takes, `TAIL_S` after the last picture included.
+    `over_m` is the commanded position at the first picture; course and heading are the directions of flight and nose,
+    counterclockwise from east. `rng` draws the vibration. Raises ValueError where the gusts end before the flight.
     """
     p, step = transit, craft.step_s
     count = int(np.ceil((p.lead_s + p.pictures_s + TAIL_S) / step - 1e-9)) + 1
@@ -183,12 +220,13 @@ def transit_flight(
     reference = np.concatenate([np.multiply.outer(one, along) for one in _run_up(p, times)], axis=1)
     reference[:, :3] += over_m
     constants = craft.craft(gravity_m_s2)
-    rows = np.zeros((count, SIZE))
-    rows[0, PLACE : PLACE + 3] = reference[0, :3]
-    rows[0, kernels.ANGLE :][:3], carried = _trimmed(constants, heading_rad, air.mean_m_s)
-    kernels.follow(kernels.Flight(rows, carried, heading_rad, air.mean_m_s, air.gusts_m_s, step), reference, constants)
-    path = FlownPath(-p.lead_s, step, rows, Vibration.drawn(craft.vibration, rng), gravity_m_s2)
-    return RotorcraftFlight(path, np.full(count, Phase.TRANSIT.value), carried, heading_rad, craft)
+    rows = np.zeros((count, kernels.SIZE))
+    rows[0, kernels.POSITION :][:3] = reference[0, :3]
+    rows[0, kernels.ANGLE :][:3], autopilot = _trim_hover(constants, heading_rad, air.mean_m_s)
+    flight = kernels.Flight(rows, autopilot, heading_rad, air.mean_m_s, air.gusts_m_s, step)
+    kernels.follow(flight, reference, constants)
+    path = FlownPath(-p.lead_s, step, rows, Vibration.draw(craft.vibration, rng), gravity_m_s2)
+    return RotorcraftFlight(path, np.full(count, Phase.TRANSIT.value), autopilot, heading_rad, craft)
 
 
 def landing_flight(
@@ -201,61 +239,25 @@ def landing_flight(
     laser: LandingLaser,
     end_s: float | None = None,
 ) -> RotorcraftFlight:
-    """The flight on to a site and down, until `end_s`, or else `rest_s` after the touchdown or when the time is up.
+    """Continue a flight to a site and down, until `end_s`, or else `rest_s` after the touchdown or at the time limit.
 
-    Parameters
-    ----------
-    flown
-        The flight for pictures.
-    site_m
-        East and north of the site in the coordinates that are believed.
-    errors
-        Believed less true position, velocity and angles (yaw, pitch, roll) at the knots from the flight's start on; the
-        last row is held after them.
-
-    Raises
-    ------
-    ValueError
-        If the air or the laser's noise is known for less than the flight may take.
+    `site_m` is the site's east and north in navigation's coordinates. `errors` are navigation's minus true position,
+    velocity and angles (yaw, pitch, roll) at the knots from the flight's start on; the last row remains afterwards.
+    Raises ValueError where the gusts or the laser's noise end before the longest possible flight.
     """
     step, before = flown.craft.step_s, len(flown.path.rows)
     count = before + int(np.ceil((guidance.wait_s + guidance.longest_s) / step))
     air.check_lasts(count)
     if len(laser.noise_m) < count:
         raise ValueError(f"the laser's noise is known for {len(laser.noise_m)} knots; the flight may take {count}")
-    rows = np.concatenate([flown.path.rows, np.zeros((count - before, SIZE))])
+    rows = np.concatenate([flown.path.rows, np.zeros((count - before, kernels.SIZE))])
     phases = np.concatenate([flown.phases, np.full(count - before, Phase.WAIT.value)])
     held = np.concatenate([errors, np.repeat(errors[-1:], max(count - len(errors), 0), axis=0)])
-    hover_m = float(rows[before - 1, 2] + held[before - 1, 2])
-    wait_until = before - 1 + round((guidance.wait_s - TAIL_S) / step)
-    flight = kernels.Flight(rows, flown.carried.copy(), flown.heading_rad, air.mean_m_s, air.gusts_m_s, step)
-    kernels.land(
-        flight,
-        phases,
-        before - 1,
-        held,
-        laser.noise_m,
-        ground.as_kernel(),
-        _landing_commands(guidance, site_m, hover_m, wait_until, laser),
-        flown.craft.craft(flown.path.gravity_m_s2),
-    )
-    landed = np.flatnonzero(phases == Phase.ON_GROUND.value)
-    if end_s is not None:
-        count = min(count, round((end_s - flown.path.start_s) / step) + 1)
-    elif landed.size:
-        count = min(count, int(landed[0]) + int(np.ceil(guidance.rest_s / step)))
-    path = replace(flown.path, rows=rows[:count])
-    return replace(flown, path=path, phases=phases[:count], carried=flight.carried)
-
-
-def _landing_commands(
-    guidance: LandingGuidance, site_m: Float64[np.ndarray, "2"], hover_m: float, wait_until: int, laser: LandingLaser
-) -> kernels.Landing:
-    return kernels.Landing(
+    commands = kernels.Landing(
         site_east_m=float(site_m[0]),
         site_north_m=float(site_m[1]),
-        hover_m=hover_m,
-        wait_until=wait_until,
+        hover_m=float(rows[before - 1, 2] + held[before - 1, 2]),
+        wait_until=before - 1 + round((guidance.wait_s - TAIL_S) / step),
         approach_m_s=guidance.approach_m_s,
         near_m=guidance.near_m,
         descent_m_s=guidance.descent_m_s,
@@ -264,12 +266,22 @@ def _landing_commands(
         laser_scale=laser.scale,
         laser_stuck_m=np.nan if laser.stuck_m is None else laser.stuck_m,
     )
+    flight = kernels.Flight(rows, flown.autopilot.copy(), flown.heading_rad, air.mean_m_s, air.gusts_m_s, step)
+    craft = flown.craft.craft(flown.path.gravity_m_s2)
+    kernels.land(flight, phases, before - 1, held, laser.noise_m, ground.as_kernel(), commands, craft)
+    landed = np.flatnonzero(phases == Phase.ON_GROUND.value)
+    if end_s is not None:
+        count = min(count, round((end_s - flown.path.start_s) / step) + 1)
+    elif landed.size:
+        count = min(count, int(landed[0]) + int(np.ceil(guidance.rest_s / step)))
+    path = replace(flown.path, rows=rows[:count])
+    return replace(flown, path=path, phases=phases[:count], autopilot=flight.autopilot)
 
 
 def _run_up(
     p: TransitParameters, times_s: Float64[np.ndarray, "n"]
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
-    """Distance along the course from where the first picture is due, speed and acceleration of the commanded point."""
+    """Distance along the course from the first picture's position, speed and acceleration of the commanded point."""
     ramp = p.speed_m_s / p.acceleration_m_s2
     since = times_s + p.settle_s + ramp
     gaining = np.clip(since, 0.0, ramp)
@@ -278,17 +290,17 @@ def _run_up(
     return distance, p.acceleration_m_s2 * gaining, np.where((since > 0.0) & (since < ramp), p.acceleration_m_s2, 0.0)
 
 
-def _trimmed(
+def _trim_hover(
     c: kernels.Craft, heading_rad: float, wind_m_s: Float64[np.ndarray, "3"]
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "4"]]:
-    """Angles at which it hovers in this wind, and what is carried then."""
+    """Angles of a hover in this wind, and the autopilot's state."""
     trim = -wind_m_s / c.drag_s
     east, north, _ = trim.tolist()
     forward = np.cos(heading_rad) * east + np.sin(heading_rad) * north
     left = np.cos(heading_rad) * north - np.sin(heading_rad) * east
     pitch = np.arctan2(forward, c.gravity_m_s2)
     roll = -np.arctan2(left * np.cos(pitch), c.gravity_m_s2)
-    carried = np.zeros(CARRIED)
-    carried[THRUST] = np.sqrt(c.gravity_m_s2**2 + trim @ trim)
-    carried[kernels.TRIM :] = trim
-    return np.array([heading_rad, pitch, roll]), carried
+    autopilot = np.zeros(kernels.AUTOPILOT_SIZE)
+    autopilot[kernels.THRUST] = np.sqrt(c.gravity_m_s2**2 + trim @ trim)
+    autopilot[kernels.TRIM :] = trim
+    return np.array([heading_rad, pitch, roll]), autopilot

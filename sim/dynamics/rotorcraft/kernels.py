@@ -1,8 +1,7 @@
-"""Compiled flight of a small helicopter; `marsyard.sim.dynamics.rotorcraft.flight` states what is modelled.
+"""Compiled flight dynamics of a small helicopter; `marsyard.sim.dynamics.rotorcraft.flight` states the model.
 
 A row is the state at a knot: position, velocity and acceleration, then angles (yaw, pitch, roll), their rates and
-accelerations. Between knots accelerations are straight lines, so that rows are exact at every time: the motion is
-defined by them, not approximated.
+accelerations. Accelerations are linear between knots: this defines the motion exactly at every time.
 """
 
 from __future__ import annotations
@@ -16,9 +15,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-PLACE, SPEED, PUSH, ANGLE, RATE, TWIST, SIZE = 0, 3, 6, 9, 12, 15, 18
-#: What flies on beside a row: thrust per mass, then the trim against steady wind (east, north, up).
-THRUST, TRIM, CARRIED = 0, 1, 4
+#: First columns of the vectors in a row.
+POSITION, VELOCITY, ACCELERATION, ANGLE, RATE, ANGULAR_ACCELERATION, SIZE = 0, 3, 6, 9, 12, 15, 18
+#: State of the autopilot: thrust per mass, then the trim against steady wind (east, north, up).
+THRUST, TRIM, AUTOPILOT_SIZE = 0, 1, 4
 #: Phases of a flight.
 FOLLOW, WAIT, APPROACH, DESCEND, FLARE, REST = range(6)
 
@@ -32,10 +32,10 @@ class Craft(NamedTuple):
     attitude_damping: float
     heading_rad_s: float
     thrust_lag_s: float
-    most_tilt_rad: float
+    max_tilt_rad: float
     gust_tilt_s_m: float
     gust_yaw_s_m: float
-    place_gain: float
+    position_gain: float
     speed_gain: float
     trim_gain: float
     delay_steps: int
@@ -44,7 +44,7 @@ class Craft(NamedTuple):
 
 
 class Landing(NamedTuple):
-    """What is commanded after the pictures: see `LandingGuidance`, in SI units."""
+    """Commands of the landing: see `LandingGuidance`, in SI units."""
 
     site_east_m: float
     site_north_m: float
@@ -60,13 +60,10 @@ class Landing(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """A flight in progress: its rows, what is carried along, the yaw that is held, and the air at the knots.
-
-    `rows` and `carried` are written; `gusts` has a row for each of `rows`.
-    """
+    """A simulated flight: rows and the autopilot's state, both updated, commanded yaw, wind, and gusts of each row."""
 
     rows: Array
-    carried: Array
+    autopilot: Array
     heading: float
     wind: Array
     gusts: Array
@@ -74,7 +71,7 @@ class Flight(NamedTuple):
 
 
 class Ground(NamedTuple):
-    """Heights on a grid: bilinear within it, held beyond. Row i lies at north_m + i * spacing_m."""
+    """Heights on a grid: bilinear within it, constant beyond. Row i lies at north_m + i * spacing_m."""
 
     east_m: float
     north_m: float
@@ -84,7 +81,7 @@ class Ground(NamedTuple):
 
 @njit(cache=True)
 def ground_height(ground: Ground, east: float, north: float) -> float:
-    """Height of the ground at a place."""
+    """Height of the ground at a position."""
     rows, columns = ground.heights.shape
     y = min(max((north - ground.north_m) / ground.spacing_m, 0.0), rows - 1.0)
     x = min(max((east - ground.east_m) / ground.spacing_m, 0.0), columns - 1.0)
@@ -99,7 +96,7 @@ def ground_height(ground: Ground, east: float, north: float) -> float:
 
 @njit(cache=True)
 def laser_range(ground: Ground, row: Array) -> float:
-    """Range along body -z to the ground, found in four steps: as exact as a beam near the vertical needs."""
+    """Range along body -z to the ground by four fixed-point iterations, enough for a beam near the vertical."""
     yaw, pitch, roll = row[ANGLE], row[ANGLE + 1], row[ANGLE + 2]
     cp, sp, cr, sr = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
     forward = cr * sp
@@ -115,100 +112,103 @@ def laser_range(ground: Ground, row: Array) -> float:
 
 
 @njit(cache=True)
-def _limited(east: float, north: float, most: float) -> tuple[float, float]:
+def _limit(east: float, north: float, limit: float) -> tuple[float, float]:
     size = math.hypot(east, north)
-    if size <= most:
+    if size <= limit:
         return east, north
-    return most * east / size, most * north / size
+    return limit * east / size, limit * north / size
 
 
 @njit(cache=True)
-def _wanted(
-    believed: Array, carried: Array, wanted_place: Array, wanted_speed: Array, wanted_push: Array, step: float, c: Craft
+def _command_acceleration(
+    state: Array, autopilot: Array, goal: Array, speed: Array, acceleration: Array, step: float, c: Craft
 ) -> tuple[float, float, float]:
-    """Acceleration that the autopilot asks for (east, north, up); winds its trim on."""
-    ask = np.empty(3)
+    """Acceleration commanded by the autopilot (east, north, up); updates its trim."""
+    command = np.empty(3)
     for i in range(3):
-        off = wanted_speed[i] + c.place_gain * (wanted_place[i] - believed[i]) - believed[SPEED + i]
-        carried[TRIM + i] += c.trim_gain * off * step
-        ask[i] = wanted_push[i] + c.speed_gain * off + carried[TRIM + i]
-    most = c.gravity_m_s2 * math.tan(c.most_tilt_rad)
-    east, north = _limited(ask[0], ask[1], most)
-    return east, north, min(max(ask[2], -0.4 * c.gravity_m_s2), 0.4 * c.gravity_m_s2)
+        error = speed[i] + c.position_gain * (goal[i] - state[i]) - state[VELOCITY + i]
+        autopilot[TRIM + i] += c.trim_gain * error * step
+        command[i] = acceleration[i] + c.speed_gain * error + autopilot[TRIM + i]
+    limit = c.gravity_m_s2 * math.tan(c.max_tilt_rad)
+    east, north = _limit(command[0], command[1], limit)
+    return east, north, min(max(command[2], -0.4 * c.gravity_m_s2), 0.4 * c.gravity_m_s2)
 
 
 @njit(cache=True)
 def _advance(row: Array, after: Array, step: float) -> None:
-    """Places and speeds at the next knot from accelerations at both."""
-    for place, speed, push in ((PLACE, SPEED, PUSH), (ANGLE, RATE, TWIST)):
+    """Positions and velocities at the next knot from accelerations at both knots."""
+    for value, rate, acceleration in ((POSITION, VELOCITY, ACCELERATION), (ANGLE, RATE, ANGULAR_ACCELERATION)):
         for i in range(3):
-            first, second = row[push + i], after[push + i]
-            after[place + i] = row[place + i] + step * row[speed + i] + step * step * (2.0 * first + second) / 6.0
-            after[speed + i] = row[speed + i] + 0.5 * step * (first + second)
+            first, second = row[acceleration + i], after[acceleration + i]
+            after[value + i] = row[value + i] + step * row[rate + i] + step * step * (2.0 * first + second) / 6.0
+            after[rate + i] = row[rate + i] + 0.5 * step * (first + second)
 
 
 @njit(cache=True)
-def _fly(flight: Flight, k: int, tilt_error: Array, ask: tuple[float, float, float], c: Craft) -> None:
-    """Write the row after row k: angles under the autopilot's command, then thrust along body z, drag and gravity."""
+def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float, float, float], c: Craft) -> None:
+    """Compute the row after row k: angles from the commands, accelerations from thrust along body z, drag, gravity."""
     row, after, gust = flight.rows[k], flight.rows[k + 1], flight.gusts[k + 1]
-    carried, step, g = flight.carried, flight.step, c.gravity_m_s2
-    believed = row[ANGLE] + tilt_error[0]
-    cy, sy = math.cos(believed), math.sin(believed)
-    pitch_ask = math.atan2(cy * ask[0] + sy * ask[1], g)
-    roll_ask = -math.atan2((cy * ask[1] - sy * ask[0]) * math.cos(pitch_ask), g)
-    thrust_ask = (g + ask[2]) / (math.cos(row[ANGLE + 1]) * math.cos(row[ANGLE + 2]))
-    carried[THRUST] += (thrust_ask - carried[THRUST]) * min(step / c.thrust_lag_s, 1.0)
+    autopilot, step, g = flight.autopilot, flight.step, c.gravity_m_s2
+    yaw_estimate = row[ANGLE] + tilt_error[0]
+    cy, sy = math.cos(yaw_estimate), math.sin(yaw_estimate)
+    pitch_command = math.atan2(cy * command[0] + sy * command[1], g)
+    roll_command = -math.atan2((cy * command[1] - sy * command[0]) * math.cos(pitch_command), g)
+    thrust_command = (g + command[2]) / (math.cos(row[ANGLE + 1]) * math.cos(row[ANGLE + 2]))
+    autopilot[THRUST] += (thrust_command - autopilot[THRUST]) * min(step / c.thrust_lag_s, 1.0)
 
     cy, sy = math.cos(row[ANGLE]), math.sin(row[ANGLE])
     along = cy * gust[0] + sy * gust[1]
     across = cy * gust[1] - sy * gust[0]
-    # the autopilot regulates what it believes; the gust tilts the rotor along itself and turns the nose into it
-    aims = (
+    # the autopilot controls the estimated angles; a gust tilts the rotor along its direction and turns the nose into it
+    targets = (
         flight.heading - tilt_error[0] - c.gust_yaw_s_m * across,
-        pitch_ask - tilt_error[1] + c.gust_tilt_s_m * along,
-        roll_ask - tilt_error[2] - c.gust_tilt_s_m * across,
+        pitch_command - tilt_error[1] + c.gust_tilt_s_m * along,
+        roll_command - tilt_error[2] - c.gust_tilt_s_m * across,
     )
     for i in range(3):
         natural = c.heading_rad_s if i == 0 else c.attitude_rad_s
-        angle = row[ANGLE + i] + step * row[RATE + i] + 0.5 * step * step * row[TWIST + i]
-        rate = row[RATE + i] + step * row[TWIST + i]
-        off = aims[i] - angle
+        angle = row[ANGLE + i] + step * row[RATE + i] + 0.5 * step * step * row[ANGULAR_ACCELERATION + i]
+        rate = row[RATE + i] + step * row[ANGULAR_ACCELERATION + i]
+        error = targets[i] - angle
         if i == 0:
-            off = math.atan2(math.sin(off), math.cos(off))
-        after[TWIST + i] = natural * natural * off - 2.0 * c.attitude_damping * natural * rate
+            error = math.atan2(math.sin(error), math.cos(error))
+        after[ANGULAR_ACCELERATION + i] = natural * natural * error - 2.0 * c.attitude_damping * natural * rate
         after[ANGLE + i] = angle
     yaw, pitch, roll = after[ANGLE], after[ANGLE + 1], after[ANGLE + 2]
     forward = math.cos(roll) * math.sin(pitch)
     left = -math.sin(roll)
-    thrust = carried[THRUST]
-    after[PUSH] = thrust * (math.cos(yaw) * forward - math.sin(yaw) * left)
-    after[PUSH + 1] = thrust * (math.sin(yaw) * forward + math.cos(yaw) * left)
-    after[PUSH + 2] = thrust * math.cos(roll) * math.cos(pitch) - g
+    thrust = autopilot[THRUST]
+    after[ACCELERATION] = thrust * (math.cos(yaw) * forward - math.sin(yaw) * left)
+    after[ACCELERATION + 1] = thrust * (math.sin(yaw) * forward + math.cos(yaw) * left)
+    after[ACCELERATION + 2] = thrust * math.cos(roll) * math.cos(pitch) - g
     for i in range(3):
-        speed = row[SPEED + i] + step * row[PUSH + i]
-        after[PUSH + i] += (flight.wind[i] + gust[i] - speed) / c.drag_s
+        speed = row[VELOCITY + i] + step * row[ACCELERATION + i]
+        after[ACCELERATION + i] += (flight.wind[i] + gust[i] - speed) / c.drag_s
     _advance(row, after, step)
 
 
 @njit(cache=True)
-def _resting(row: Array, after: Array, step: float, c: Craft) -> None:
-    """Writes the next row on the ground: what is left of motion and tilt dies away."""
+def _step_on_ground(row: Array, after: Array, step: float, c: Craft) -> None:
+    """Compute the next row on the ground: the remaining motion and tilt decay."""
     for i in range(3):
-        after[PUSH + i] = -(row[SPEED + i] + step * row[PUSH + i]) / c.contact_s
+        after[ACCELERATION + i] = -(row[VELOCITY + i] + step * row[ACCELERATION + i]) / c.contact_s
         natural = 0.5 / c.contact_s
         angle = 0.0 if i == 0 else row[ANGLE + i] + step * row[RATE + i]
-        after[TWIST + i] = -natural * natural * angle - 2.0 * natural * (row[RATE + i] + step * row[TWIST + i])
+        rate = row[RATE + i] + step * row[ANGULAR_ACCELERATION + i]
+        after[ANGULAR_ACCELERATION + i] = -natural * natural * angle - 2.0 * natural * rate
     _advance(row, after, step)
 
 
 @njit(cache=True)
 def follow(flight: Flight, path: Array, c: Craft) -> None:
-    """Fill rows from the first along a path of rows (position, velocity, acceleration), on true states."""
-    exact = np.zeros(3)
+    """Simulate a flight along a path (position, velocity, acceleration), controlled by true states."""
+    no_error = np.zeros(3)
     for k in range(flight.rows.shape[0] - 1):
-        seen = flight.rows[max(k - c.delay_steps, 0)]
-        ask = _wanted(seen, flight.carried, path[k, 0:3], path[k, 3:6], path[k, 6:9], flight.step, c)
-        _fly(flight, k, exact, ask, c)
+        delayed = flight.rows[max(k - c.delay_steps, 0)]
+        command = _command_acceleration(
+            delayed, flight.autopilot, path[k, 0:3], path[k, 3:6], path[k, 6:9], flight.step, c
+        )
+        _step_flight(flight, k, no_error, command, c)
 
 
 @njit(cache=True)
@@ -222,48 +222,48 @@ def land(
     landing: Landing,
     c: Craft,
 ) -> None:
-    """Fill rows and phases after `start`, guided by the believed state.
+    """Simulate a landing after row `start`, controlled by estimated states; updates rows and phases.
 
-    Rows of `errors` are believed less true position, velocity and angles (yaw, pitch, roll).
+    Rows of `errors` are estimated minus true position, velocity and angles (yaw, pitch, roll).
     """
     rows = flight.rows
     goal = np.empty(3)
     speed = np.zeros(3)
-    none = np.zeros(3)
-    believed = np.empty(PUSH)
+    zero = np.zeros(3)
+    estimate = np.empty(ACCELERATION)
     phase = WAIT
     for k in range(start, rows.shape[0] - 1):
-        seen = max(k - c.delay_steps, 0)
-        for i in range(PUSH):
-            believed[i] = rows[seen, i] + errors[seen, i]
+        delayed = max(k - c.delay_steps, 0)
+        for i in range(ACCELERATION):
+            estimate[i] = rows[delayed, i] + errors[delayed, i]
         if phase == REST:
             phases[k + 1] = REST
-            _resting(rows[k], rows[k + 1], flight.step, c)
+            _step_on_ground(rows[k], rows[k + 1], flight.step, c)
             continue
         if phase == WAIT and k >= landing.wait_until:
             phase = APPROACH
-        off_east, off_north = landing.site_east_m - believed[0], landing.site_north_m - believed[1]
-        if phase == APPROACH and math.hypot(off_east, off_north) < landing.near_m:
+        east_left, north_left = landing.site_east_m - estimate[0], landing.site_north_m - estimate[1]
+        if phase == APPROACH and math.hypot(east_left, north_left) < landing.near_m:
             phase = DESCEND
         if phase == DESCEND:
-            reading = landing.laser_scale * laser_range(ground, rows[seen]) + laser_noise[seen]
+            reading = landing.laser_scale * laser_range(ground, rows[delayed]) + laser_noise[delayed]
             if not math.isnan(landing.laser_stuck_m):
                 reading = landing.laser_stuck_m
             if reading < landing.flare_range_m:
                 phase = FLARE
-        # waiting, and when it lands, it comes to rest where it is; else a place to go to, no faster than commanded
+        # while waiting and landing the goal is the current position; else the site, within the commanded speed
         goal[2] = landing.hover_m
         speed[2] = 0.0
         if phase in (WAIT, FLARE):
-            goal[0], goal[1] = believed[0], believed[1]
+            goal[0], goal[1] = estimate[0], estimate[1]
         else:
-            east, north = _limited(off_east, off_north, landing.approach_m_s / c.place_gain)
-            goal[0], goal[1] = believed[0] + east, believed[1] + north
+            east, north = _limit(east_left, north_left, landing.approach_m_s / c.position_gain)
+            goal[0], goal[1] = estimate[0] + east, estimate[1] + north
         if phase >= DESCEND:
             speed[2] = -landing.descent_m_s if phase == DESCEND else -landing.flare_m_s
-            goal[2] = believed[2]
-        ask = _wanted(believed, flight.carried, goal, speed, none, flight.step, c)
-        _fly(flight, k, errors[k, PUSH:], ask, c)
+            goal[2] = estimate[2]
+        command = _command_acceleration(estimate, flight.autopilot, goal, speed, zero, flight.step, c)
+        _step_flight(flight, k, errors[k, ACCELERATION:], command, c)
         after = rows[k + 1]
         if phase != WAIT and after[2] - c.gear_m <= ground_height(ground, after[0], after[1]):
             phase = REST

@@ -9,7 +9,7 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 
 #: A small world that is built in a moment.
-WORLD = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "place": {"bank": 1}}
+WORLD: dict[str, Any] = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "place": {"bank": 1}}
 FLAT = {"samples": 1024, "spacing_m": 3.0, "rms_slope_deg": 0.0, "craters_per_km2": 0.0}
 DESCENT = {
     "wind_east_m_s": 14.0,
@@ -57,6 +57,6 @@ def parameters(**parts: Any) -> DescentScenarioParameters:
     return DescentScenarioParameters.model_validate(WORLD | {"descent": DESCENT} | parts)
 
 
-def run(case: int = 0, **parts: Any) -> CaseResult:
+def run(case: int = 0, /, **parts: Any) -> CaseResult:
     """One descent over the small world."""
     return DescentScenario().run(parameters(**parts), Streams(1, "test", case))

@@ -6,24 +6,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.exposure import expose
+from marsyard.scenarios.descent.exposure import SHIELD_DIAMETER_M, HeatShield, add_haze, take_exposures
 from marsyard.scenarios.descent.faults import (
     Faults,
-    delivered,
     faulty_altitudes,
     faulty_attitudes,
     faulty_terrain,
     faulty_times,
 )
-from marsyard.scenarios.descent.flight import flown_descent, picture_states
-from marsyard.scenarios.descent.haze import veiled
-from marsyard.scenarios.descent.heat_shield import DIAMETER_M, HeatShield
+from marsyard.scenarios.descent.flight import create_flight, picture_states
 from marsyard.scenarios.descent.optics import calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
 from marsyard.scenarios.descent.world import World
-from marsyard.scenarios.faults import faulty_detector
+from marsyard.scenarios.faults import deliver, faulty_detector
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
@@ -66,7 +64,7 @@ def test_no_fault_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize(("name", "field"), Faults.model_fields.items())
-def test_a_fault_is_named_with_its_size(name, field) -> None:
+def test_a_fault_is_named_with_its_size(name: str, field: FieldInfo) -> None:
     size = 2 if field.annotation is int else 0.25
     assert Faults.model_validate({name: size}).name_and_size == (name, size)
 
@@ -81,7 +79,7 @@ def test_haze_takes_contrast_and_leaves_light() -> None:
     """From straight above contrast falls as exp(-depth); the veil is neither black nor glaring."""
     pattern = np.where(np.indices((256, 256)).sum(axis=0) % 2, 0.12, 0.10)
     frame = _frame(2000.0, pattern)
-    clear, hazy = veiled(frame, 0.0, SUN, Environment()), veiled(frame, 1.0, SUN, Environment())
+    clear, hazy = add_haze(frame, 0.0, SUN, Environment()), add_haze(frame, 1.0, SUN, Environment())
     np.testing.assert_allclose(clear, pattern, rtol=1e-6)
     middle = np.s_[126:130, 126:130]
     assert np.ptp(hazy[middle]) == pytest.approx(np.exp(-1.0) * 0.02, rel=0.03)
@@ -89,28 +87,28 @@ def test_haze_takes_contrast_and_leaves_light() -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [1.0, 4.0])
-def test_the_heat_shield_is_as_large_as_asked_for(angle_deg) -> None:
+def test_the_heat_shield_is_as_large_as_asked_for(angle_deg: float) -> None:
     """Seen face on its disc takes pi / 4 of its angle squared."""
     frame = _frame(2000.0, np.full((256, 256), 0.5))
     first = _state(2000.0)
-    drawn = HeatShield.drawn(first, np.radians(angle_deg), np.random.default_rng(3))
-    towards = drawn.place_m - first.position_m
+    drawn = HeatShield.draw(first, np.radians(angle_deg), np.random.default_rng(3))
+    towards = drawn.centre_m - first.position_m
     faced = replace(drawn, normal=towards / np.linalg.norm(towards), spin_rad_s=np.zeros(3))
-    seen = faced.over(frame.radiance, frame, SUN, 0.0)
+    seen = faced.draw_over(frame.radiance, frame, SUN, 0.0)
     solid = frame.rays.pixel_angles.astype(np.float64) ** 2
     covered = solid[(seen != frame.radiance).reshape(-1)].sum()
     assert covered == pytest.approx(np.pi / 4.0 * np.radians(angle_deg) ** 2, rel=0.1)
     # 20 m/s away for 3.75 s
-    later = faced.over(frame.radiance, frame, SUN, 3.75)
-    distance = DIAMETER_M / np.radians(angle_deg)
+    later = faced.draw_over(frame.radiance, frame, SUN, 3.75)
+    distance = SHIELD_DIAMETER_M / np.radians(angle_deg)
     shrunk = solid[(later != frame.radiance).reshape(-1)].sum() / covered
     assert shrunk == pytest.approx((distance / (distance + 75.0)) ** 2, abs=0.05)
 
 
 def test_pictures_may_come_twice_or_black() -> None:
     pictures = [np.full((4, 4), value, dtype=np.uint16) for value in (1, 2, 3)]
-    assert [int(one[0, 0]) for one in delivered(Faults(repeated_picture=3), pictures)] == [1, 2, 2]
-    assert [int(one[0, 0]) for one in delivered(Faults(black_picture=1), pictures)] == [0, 2, 3]
+    assert [int(one[0, 0]) for one in deliver(pictures, 3, 0)] == [1, 2, 2]
+    assert [int(one[0, 0]) for one in deliver(pictures, 0, 1)] == [0, 2, 3]
     assert [int(one[0, 0]) for one in pictures] == [1, 2, 3]
 
 
@@ -128,10 +126,10 @@ def test_readings_are_wrong_by_what_is_asked_for() -> None:
 def _pictures(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]:
     p = parameters(faults=faults, detector=NOISELESS, **parts)
     world, streams = World.of(p), Streams(1, "faults", 0)
-    states = picture_states(p, flown_descent(p, world.surface, streams))
+    states = picture_states(p, create_flight(p, world.surface, streams))
     optics = camera_optics(p.camera)
     detector = Detector.drawn(optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector"))
-    return expose(p, world, states, optics, detector, streams)
+    return [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
 
 
 def test_faults_show_in_pictures() -> None:
@@ -178,4 +176,4 @@ def test_regular_dunes_confuse_the_second_peak() -> None:
     columns = list(result.products["tracks_columns"])
     ratios = result.products["tracks"][:, columns.index("second_peak_ratio")]
     assert ratios.max() > 0.6
-    assert result.outcome != "VALID" or result.row["velocity_error_m_s"] < 5.0
+    assert result.outcome != "VALID" or float(result.row["velocity_error_m_s"]) < 5.0

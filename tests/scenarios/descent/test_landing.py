@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from marsyard.scenarios.descent.landing import touchdown
 from marsyard.scenarios.descent.parameters import LandingParameters
+from marsyard.scenarios.descent.score import touchdown
 
 EXACT = LandingParameters(steering_error=0.0, burn_error_m_s=0.0)
 DRIFT = np.array([12.0, -9.0])
@@ -36,7 +36,7 @@ def test_a_wrong_answer_does_harm() -> None:
     ("believed", "available_s"),
     [(None, 17.0), (DRIFT, EXACT.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)],
 )
-def test_without_an_answer_in_time_or_of_weight_nothing_is_steered(believed, available_s) -> None:
+def test_without_an_answer_in_time_nothing_is_steered(believed: np.ndarray | None, available_s: float) -> None:
     landed = touchdown(EXACT, DRIFT, believed, available_s, _rng())
     np.testing.assert_array_equal(landed.with_answer, landed.without_answer)
     assert landed.punctual == (available_s >= EXACT.computation_s)

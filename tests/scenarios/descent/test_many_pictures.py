@@ -15,7 +15,7 @@ from tests.scenarios.descent.settings import DESCENT, PERFECT, parameters, run
 
 STREAM = "tests.scenarios.descent.test_many_pictures:Inertial"
 #: The three pictures of a descent as flown, among nine.
-NINE = {"pictures": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
+NINE: dict[str, Any] = {"pictures": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
 
 
 class Inertial:
@@ -57,14 +57,14 @@ def nine() -> CaseResult:
 
 def test_the_truth_is_of_what_the_answer_is_of(nine: CaseResult) -> None:
     """The inertial unit makes no errors here, so that its velocities are true of every span."""
-    row = nine.row
+    row: Any = nine.row
     assert (nine.outcome, row["stream_pictures"], row["answered_after"]) == ("VALID", 9, 2)
     assert np.isnan(row["velocity_error_after_1_m_s"])
     after = [row[f"velocity_error_after_{number}_m_s"] for number in range(2, 10)]
     # 400 Hz samples of a swinging descent, added up by the trapezoidal rule
     assert max(after) < 1e-3
-    assert row["velocity_error_m_s"] < 1e-3
-    assert row["firing_velocity_error_m_s"] < 2e-2
+    assert float(row["velocity_error_m_s"]) < 1e-3
+    assert float(row["firing_velocity_error_m_s"]) < 2e-2
     # of an instant, not of the interval before it: the swinging camera changes its velocity
     means = nine.products["after_true_m_s"][-1]
     assert np.hypot(*(means - nine.products["velocity_true_m_s"])) > 0.05
@@ -81,7 +81,7 @@ def test_an_estimator_of_three_gets_those_of_a_descent_of_three(nine: CaseResult
         three["room_first_pair"],
         three["room_second_pair"],
     )
-    assert nine.row["dimes.velocity_error_m_s"] < 1.0
+    assert float(nine.row["dimes.velocity_error_m_s"]) < 1.0
     assert "dimes.stream_pictures" not in nine.row
 
 
@@ -106,7 +106,7 @@ def test_a_span_between_pictures() -> None:
 
 
 def test_a_case_of_many_pictures_is_a_function_of_its_parameters() -> None:
-    errors = {"pictures": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM}
+    errors: dict[str, Any] = {"pictures": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM}
     first, again = run(**errors), run(**errors)
     assert differing_columns(dict(first.row), dict(again.row)) == ()
 
@@ -147,7 +147,7 @@ def test_numbers_of_pictures_that_cannot_be(parts: dict[str, Any], said: str) ->
 
 @pytest.mark.parametrize(("pictures", "places"), [(3, (0, 1, 2)), (4, (1, 2, 3)), (5, (0, 2, 4)), (10, (1, 5, 9))])
 def test_three_as_far_apart_as_can_be(pictures: int, places: tuple[int, int, int]) -> None:
-    assert parameters(pictures=pictures).triple_places == places
+    assert parameters(pictures=pictures).triple_indices == places
 
 
 def test_no_picture_is_taken_after_the_firing() -> None:

@@ -1,6 +1,7 @@
 """What a descent's parameters take, and what a site makes of them."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ SITES = ("gusev", "ivanpah")
         ({"faults": {"hase": 1.0}}, "hase"),
     ],
 )
-def test_impossible_parameters_are_named(wrong, names) -> None:
+def test_impossible_parameters_are_named(wrong: dict[str, Any], names: str) -> None:
     with pytest.raises(ValidationError, match=names):
         DescentScenarioParameters.model_validate(wrong)
 
@@ -54,7 +55,7 @@ def test_a_site_is_not_dispersed() -> None:
 
 
 @pytest.mark.parametrize("stated", [{}, {"site": "kelso"}, {"dimes": {"subpixel": False}, "faults": {"haze": 2.0}}])
-def test_complete_parameters_are_read_back_as_they_were(stated) -> None:
+def test_complete_parameters_are_read_back_as_they_were(stated: dict[str, Any]) -> None:
     """As a campaign's workers do."""
     p = DescentScenarioParameters.model_validate(stated)
     assert DescentScenarioParameters.model_validate(p.model_dump(mode="json", round_trip=True)) == p

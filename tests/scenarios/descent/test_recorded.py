@@ -11,10 +11,11 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.flight import flown_descent
+from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.descent.world import World
-from marsyard.sim.dynamics.recorded_files import COLUMNS
+from marsyard.sim.dynamics.recorded import COLUMNS
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import parameters, run
 
@@ -43,7 +44,7 @@ def test_a_simulated_flight_from_its_file_is_the_same_case(tmp_path: Path) -> No
     """At 50 Hz, in north, east, down and the camera's axes, times counted from another zero."""
     simulated, p = run(), parameters()
     world = World.of(p)
-    flown = flown_descent(p, world.surface, Streams(1, "test", 0))
+    flown = create_flight(p, world.surface, Streams(1, "test", 0))
     times = np.arange(-5.0, flown.firing_s + 1.0, 0.02)
     truth = flown.motion.motion(times)
     place = np.array([p.place.east_m, p.place.north_m, world.surface.height(p.place.east_m, p.place.north_m)])
@@ -71,7 +72,7 @@ def test_a_simulated_flight_from_its_file_is_the_same_case(tmp_path: Path) -> No
 def test_a_flight_is_turned_and_moved_with_its_place(tmp_path: Path) -> None:
     file = _straight(tmp_path)
     p = DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu", "turn_deg": 90.0}})
-    assert p.flight is not None
+    assert isinstance(p.flight, FlightFile)
     motion = p.flight.motion(np.array([100.0, 200.0, 30.0]), 3.7)
     # to the east becomes to the south
     assert np.allclose(motion.state(0.0).position_m, [100.0, 200.0 - 50.0, 30.0 + 2200.0 - 350.0])
@@ -90,7 +91,7 @@ def test_levers_and_mountings(tmp_path: Path) -> None:
     quaternion = tuple(Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])).as_quat().tolist())
     stated = {"file": file, "axes": "enu", "mounting": quaternion, "lever_m": (0.0, 0.0, -2.0)}
     p = DescentScenarioParameters.model_validate({"flight": stated})
-    assert p.flight is not None
+    assert isinstance(p.flight, FlightFile)
     state = p.flight.motion(np.zeros(3), 3.7).state(0.0)
     assert np.allclose(state.attitude.as_matrix(), np.eye(3))
     assert state.position_m[2] == pytest.approx(2000.0 - 250.0 - 2.0)

@@ -1,6 +1,7 @@
 """Whole descents: truth, measurement and score hang together."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,8 @@ def _timeless(row: Any) -> dict[str, Any]:
     return {name: value for name, value in row.items() if "time" not in name}
 
 
-def test_a_case_is_a_function_of_its_parameters_and_streams(nominal) -> None:
-    other = run(case=1)
+def test_a_case_is_a_function_of_its_parameters_and_streams(nominal: CaseResult) -> None:
+    other = run(1)
     again = run()
     assert _timeless(again.row) == _timeless(nominal.row)
     assert other.row["image_hash"] != nominal.row["image_hash"]
@@ -51,8 +52,8 @@ def test_every_dispersion_of_the_catalogue_is_read_back() -> None:
 
 
 @pytest.mark.parametrize("name", ["velocity", "firing_velocity"])
-def test_the_error_is_the_estimate_less_the_truth(nominal, name) -> None:
-    row = nominal.row
+def test_the_error_is_the_estimate_less_the_truth(nominal: CaseResult, name: str) -> None:
+    row: Any = nominal.row
     assert nominal.answered
     for axis in "xy":
         assert row[f"{name}_error_{axis}_m_s"] == pytest.approx(
@@ -61,10 +62,10 @@ def test_the_error_is_the_estimate_less_the_truth(nominal, name) -> None:
     assert row[f"{name}_error_m_s"] == pytest.approx(math.hypot(row[f"{name}_error_x_m_s"], row[f"{name}_error_y_m_s"]))
 
 
-def test_figures_are_drawn_from_what_was_scored(nominal) -> None:
+def test_figures_are_drawn_from_what_was_scored(nominal: CaseResult) -> None:
     row = nominal.row
     for kind in ("true", "estimated"):
-        stored = [row[f"velocity_{kind}_x_m_s"], row[f"velocity_{kind}_y_m_s"]]
+        stored = [float(row[f"velocity_{kind}_{axis}_m_s"]) for axis in "xy"]
         np.testing.assert_allclose(nominal.products[f"velocity_{kind}_m_s"], stored)
     assert all(nominal.products[f"image_{k}"].shape == (256, 1024) for k in (1, 2, 3))
 
@@ -80,7 +81,7 @@ def test_truth_is_the_mean_velocity_of_the_camera() -> None:
 
 
 @pytest.mark.parametrize("wind", [(25.0, 0.0), (0.0, 25.0), (-18.0, -18.0)])
-def test_with_perfect_instruments_over_flat_ground_the_velocity_is_right(wind) -> None:
+def test_with_perfect_instruments_over_flat_ground_the_velocity_is_right(wind: tuple[float, float]) -> None:
     """Signs and axes of the whole chain: 0.15 m/s is a tenth of a binned pixel over 3.75 s.
 
     Carried to the thrusters' firing by a perfect inertial unit, the velocity is as right as it was.
@@ -90,19 +91,19 @@ def test_with_perfect_instruments_over_flat_ground_the_velocity_is_right(wind) -
     result = run(**PERFECT, terrain=FLAT, descent=descent)
     row = result.row
     assert result.outcome == "VALID"
-    assert row["velocity_error_m_s"] < 0.15
+    assert float(row["velocity_error_m_s"]) < 0.15
     for axis in "xy":
         assert row[f"firing_velocity_error_{axis}_m_s"] == pytest.approx(row[f"velocity_error_{axis}_m_s"], abs=0.01)
 
 
-def test_perfect_instruments_are_told_to_be(nominal) -> None:
+def test_perfect_instruments_are_told_to_be(nominal: CaseResult) -> None:
     """Over flat ground nothing is left but the altitude's way from the radar's last reading to the picture."""
     row = run(**PERFECT, terrain=FLAT).row
     for name in ("attitude_error_common_deg", "attitude_error_own_deg"):
-        assert row[name] < 1e-4 < nominal.row[name]
+        assert float(row[name]) < 1e-4 < float(nominal.row[name])
     # a tenth of a second at 0.3 m/s2 and at half a swing's 2 m/s: 0.1 m of 1400
     assert abs(float(row["altitude_error_common"])) < 1e-4 < abs(float(nominal.row["altitude_error_common"]))
-    assert row["velocity_change_error_m_s"] < 1e-3 < nominal.row["velocity_change_error_m_s"]
+    assert float(row["velocity_change_error_m_s"]) < 1e-3 < float(nominal.row["velocity_change_error_m_s"])
 
 
 def test_errors_of_instruments_are_of_their_class() -> None:
@@ -127,13 +128,13 @@ def test_an_attitude_error_makes_the_velocity_error_it_must() -> None:
     for case in range(4):
         row = run(case, **PERFECT, terrain=FLAT, descent=steady, faults={"attitude_error_deg": 0.8}).row
         fallen = float(row["altitude_2_m"]) - float(row["altitude_3_m"])
-        velocity = [row["velocity_true_x_m_s"], row["velocity_true_y_m_s"], -fallen / 3.75]
-        errors.append([row["velocity_error_x_m_s"], row["velocity_error_y_m_s"]])
+        velocity = [float(row["velocity_true_x_m_s"]), float(row["velocity_true_y_m_s"]), -fallen / 3.75]
+        errors.append([float(row[f"velocity_error_{axis}_m_s"]) for axis in "xy"])
         turn = Streams(1, "test", case).generator("attitude fault").uniform(-np.pi, np.pi)
         tilt = np.radians(0.8) * np.array([np.cos(turn), np.sin(turn), 0.0])
         expected.append(np.cross(tilt, velocity)[:2])
         assert row["attitude_error_common_deg"] == pytest.approx(0.8, abs=1e-3)
-        assert row["attitude_error_own_deg"] < 1e-3
+        assert float(row["attitude_error_own_deg"]) < 1e-3
     np.testing.assert_allclose(errors, expected, atol=0.15, rtol=0.13)
     assert np.abs(expected).max() > 1.0
 
@@ -146,8 +147,8 @@ def test_an_altitude_error_common_to_all_pictures_scales_the_velocity() -> None:
     assert row["altitude_error_common"] == pytest.approx(0.02, abs=1e-4)
 
 
-def test_conditions_are_read_from_the_simulated_objects(nominal) -> None:
-    row = nominal.row
+def test_conditions_are_read_from_the_simulated_objects(nominal: CaseResult) -> None:
+    row: Any = nominal.row
     assert row["altitude_1_m"] == pytest.approx(2000.0, abs=20.0)
     assert row["altitude_1_m"] - row["altitude_3_m"] == pytest.approx(7.5 * row["descent_rate_m_s"], abs=40.0)
     assert row["off_nadir_max_deg"] == max(row[f"off_nadir_{k}_deg"] for k in (1, 2, 3))
@@ -174,7 +175,7 @@ def test_no_room_for_a_template_is_an_outcome_without_velocity() -> None:
         assert math.isfinite(float(result.row[f"{name}_true_x_m_s"]))
 
 
-def test_room_is_judged_by_truth_alone(nominal) -> None:
+def test_room_is_judged_by_truth_alone(nominal: CaseResult) -> None:
     """Altitudes measured at half make DIMES look in the wrong places; the geometry has not changed."""
     wrong = run(faults={"altitude_error": 0.4})
     for name in ("room", "room_first_pair", "room_second_pair"):
@@ -193,10 +194,10 @@ def test_over_a_site_the_velocity_is_right() -> None:
     assert result.outcome == "VALID"
     assert result.row["site"] == "gusev"
     # relief of 2 deg slopes moves a template against the plane below the lander, by 1 m/s at worst here
-    assert result.row["velocity_error_m_s"] < 1.0
+    assert float(result.row["velocity_error_m_s"]) < 1.0
 
 
-def test_real_terrain_can_be_descended_on(tmp_path) -> None:
+def test_real_terrain_can_be_descended_on(tmp_path: Path) -> None:
     """A terrain model from a file in the site's surround; the pictures are of it."""
     heights = 30.0 * np.sin(np.arange(200) / 9.0)[:, None] * np.cos(np.arange(200) / 7.0)
     np.savez(tmp_path / "dtm.npz", dem=heights, dem_gsd=8.0)
@@ -207,7 +208,7 @@ def test_real_terrain_can_be_descended_on(tmp_path) -> None:
     assert result.outcome == "VALID"
     assert result.row["image_hash"] != without.row["image_hash"]
     # crests and hollows of 30 m up to 500 m aside
-    assert result.row["velocity_error_m_s"] < 4.0
+    assert float(result.row["velocity_error_m_s"]) < 4.0
 
 
 def test_another_algorithm_is_given_the_same() -> None:
@@ -221,7 +222,7 @@ def test_a_slow_algorithm_is_late_at_the_firing() -> None:
     """Its measured time decides, by the flight computer's factor: 0.1 s are 60 s there, and 14 to 24 s are left."""
     slow = run(algorithm="tests.scenarios.descent.guesses:SlowInertial").row
     quick = run(algorithm="tests.scenarios.descent.guesses:Inertial").row
-    assert slow["estimation_time_s"] >= 0.1
+    assert float(slow["estimation_time_s"]) >= 0.1
     assert (slow["answer_in_time"], quick["answer_in_time"]) == (False, True)
     unhurried = run(algorithm="tests.scenarios.descent.guesses:SlowInertial", landing={"processor_factor": 1.0}).row
     assert unhurried["answer_in_time"] is True

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.flight import flown_descent
+from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
@@ -97,7 +97,7 @@ def clashing(case: ScoredDescent) -> dict[str, float]:
 
 velocity_error = clashing
 
-OWN = {
+OWN: dict[str, Any] = {
     "flight": {"motion": f"{HERE}Falling", "attitude_of": "body"},
     "altimeter": {"instrument": f"{HERE}Exact", "options": {"off_m": 6.0}},
     "attitude_source": {"instrument": f"{HERE}Turned"},
@@ -135,7 +135,7 @@ def test_a_case_is_flown_measured_and_scored_by_what_the_parts_give() -> None:
 def test_the_motion_of_a_case_is_its_own() -> None:
     p = parameters(terrain=FLAT, **OWN)
     surface = World.of(p).surface
-    first, again, other = (flown_descent(p, surface, Streams(1, "test", case)).row for case in (0, 0, 1))
+    first, again, other = (create_flight(p, surface, Streams(1, "test", case)).row for case in (0, 0, 1))
     assert first == again
     assert first["flight_north_m_s"] != other["flight_north_m_s"]
     assert not any(name.startswith("descent_") for name in first)
@@ -149,32 +149,32 @@ def test_the_motion_of_a_case_is_its_own() -> None:
         ("up", "at picture 1 the camera looks up"),
         ("order", "flies 25.95 to -5 s"),
         ("nan", "gives positions_m that are not finite"),
-        ("column", "tells the column height_m twice, or it is one of its options"),
+        ("column", "reports the column height_m twice, or it is one of its options"),
     ],
 )
 def test_a_motion_that_is_none_is_told(wrong: str, said: str) -> None:
-    flight = {**OWN["flight"], "options": {"wrong": wrong}}  # type: ignore[dict-item]
+    flight = {**OWN["flight"], "options": {"wrong": wrong}}
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=said):
-        flown_descent(p, World.of(p).surface, Streams(1, "test", 0))
+        create_flight(p, World.of(p).surface, Streams(1, "test", 0))
 
 
 @pytest.mark.parametrize("lasts_s", [20.0, 20.05, 27.95, 28.0])
 def test_a_motion_that_ends_early_is_followed_to_its_end(lasts_s: float) -> None:
     """To its last instant, whatever the sum of the times that lead there comes to."""
-    flight = {**OWN["flight"], "options": {"east_m_s": 0.0, "lasts_s": lasts_s, "height_m": 5000.0}}  # type: ignore[dict-item]
+    flight = {**OWN["flight"], "options": {"east_m_s": 0.0, "lasts_s": lasts_s, "height_m": 5000.0}}
     p = parameters(terrain=FLAT, flight=flight)
     world, streams = World.of(p), Streams(1, "test", 0)
-    flown = flown_descent(p, world.surface, streams)
+    flown = create_flight(p, world.surface, streams)
     assert flown.firing_s == pytest.approx(flown.motion.span_s[1] - 0.1)
-    assert Instruments.drawn(p, world, flown, streams).navigation.velocity(np.array([flown.firing_s])).shape == (1, 3)
+    assert Instruments.draw(p, world, flown, streams).navigation.velocity(np.array([flown.firing_s])).shape == (1, 3)
 
 
 def test_a_motion_below_the_ground_is_told() -> None:
-    flight = {**OWN["flight"], "options": {"height_m": 500.0}}  # type: ignore[dict-item]
+    flight = {**OWN["flight"], "options": {"height_m": 500.0}}
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=r"at picture 3 the camera is 62\.5 m below the ground"):
-        flown_descent(p, World.of(p).surface, Streams(1, "test", 0))
+        create_flight(p, World.of(p).surface, Streams(1, "test", 0))
 
 
 def test_a_score_takes_no_column_that_is_there() -> None:

@@ -13,8 +13,15 @@ from marsyard.campaigns.definition.identity import chosen_parts, foreign_sources
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.parts import named
 from marsyard.scenarios.parts.motions import OwnMotion
-from marsyard.scenarios.parts.named import DYNAMICS, SCORE, checked_columns
-from marsyard.scenarios.parts.scores import SCORED, ScoredDescent, ScoredFlight, ScoredLanding, score_of, taken_by
+from marsyard.scenarios.parts.named import DYNAMICS, SCORE, check_columns
+from marsyard.scenarios.parts.scores import (
+    SCORED,
+    ScoredDescent,
+    ScoredFlight,
+    ScoredLanding,
+    accepted_cases,
+    load_score,
+)
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
 
@@ -85,7 +92,7 @@ def test_options_are_filled_in_and_can_be_dispersed() -> None:
     )
     assert isinstance(p.flight, OwnMotion)
     assert p.flight.options == {"height_m": 1800.0, "speed_m_s": 60.0, "glide_ratio": 0.25, "rocking_deg": 8.0}
-    assert p.flight.made().glide_ratio == 0.25
+    assert p.flight.create().glide_ratio == 0.25
     assert DescentScenarioParameters.model_validate(p.model_dump(mode="json")) == p
 
 
@@ -93,11 +100,11 @@ def test_an_entry_point_names_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         named, "installed", lambda group: {"glider": "own_parts:Glider"} if group in DYNAMICS.group else {}
     )
-    assert type(DYNAMICS.made("glider", {})).__name__ == "Glider"
+    assert type(DYNAMICS.create("glider", {})).__name__ == "Glider"
     with pytest.raises(ValueError, match=r"unknown motion 'glidr' \(did you mean 'glider'\?\)"):
-        DYNAMICS.found("glidr")
+        DYNAMICS.load("glidr")
     with pytest.raises(ValueError, match="unknown score 'glider'"):
-        SCORE.found("glider")
+        SCORE.load("glider")
 
 
 def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,16 +120,16 @@ def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypat
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     names = ("any_case", "two", "landing", "flown", "kept")
-    taken = {name: taken_by(score_of(f"scores_here:{name}")) for name in names}
+    taken = {name: accepted_cases(load_score(f"scores_here:{name}")) for name in names}
     assert taken["any_case"] == SCORED
     assert taken["two"] == (ScoredDescent, ScoredLanding)
     assert taken["landing"] == taken["kept"] == (ScoredLanding,)
     # what holds more is taken as well
     assert taken["flown"] == (ScoredFlight, ScoredDescent)
     with pytest.raises(ValueError, match="scores ScoredLanding; allowed here: ScoredDescent"):
-        score_of("scores_here:landing", ScoredDescent)
+        load_score("scores_here:landing", ScoredDescent)
     with pytest.raises(ValueError, match="does not take one argument"):
-        score_of("scores_here:none_at_all")
+        load_score("scores_here:none_at_all")
 
 
 @pytest.mark.parametrize(
@@ -137,7 +144,7 @@ def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypat
 )
 def test_columns_that_cannot_be(told: object, said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        checked_columns("x:y", told, texts=False)
+        check_columns("x:y", told, texts=False)
 
 
 def test_the_identity_covers_the_modules_of_parts() -> None:

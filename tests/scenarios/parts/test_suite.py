@@ -70,13 +70,13 @@ def bad(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
             "deterministic",
             True,
             "return Poses(*poses(place, np.random.normal()))",
-            "asked twice, it gives something else",
+            "asked twice, it answers differently",
         ),
         (
             "deterministic",
             False,
             "self.asked = getattr(self, 'asked', 0) + 1\nreturn Poses(*poses(place, self.asked))",
-            "depends on the cases that it was asked before",
+            "depends on earlier cases",
         ),
         (
             "columns",
@@ -118,7 +118,7 @@ def test_what_a_motion_must_not_do(
             "inputs",
             "altitude",
             "truth.times_s[0] -= 1.0\nreturn InstrumentReadings(truth.times_s, 1.0 * truth.times_s)",
-            "the InstrumentTruth that it was handed is not what it was before",
+            "it changed its input, a InstrumentTruth",
         ),
     ],
 )
@@ -137,12 +137,12 @@ def test_what_an_instrument_must_not_do(
         ("answer", "ScoredDescent", "return {'east': case.answer.velocity_m_s[0]}", "it raised TypeError"),
         ("answer", "ScoredLanding", "return {'site': 'here'}", "gives site as a str; allowed: a number, true or false"),
         ("columns", "ScoredRun", "return {a.state.name: 1.0 for a in case.answers}", "its columns change"),
-        ("inputs", "ScoredDescent", "case.touchdown_m_s[:] = 0.0\nreturn {}", "the ScoredDescent that it was handed"),
+        ("inputs", "ScoredDescent", "case.touchdown_m_s[:] = 0.0\nreturn {}", "it changed its input, a ScoredDescent"),
         (
             "deterministic",
             "ScoredRun",
             "KEPT.append(1)\nreturn {'asked': len(KEPT)}",
-            "asked twice, it gives something",
+            "asked twice, it answers differently",
         ),
     ],
 )

@@ -96,7 +96,7 @@ def test_across_a_slope_the_rover_slides_downhill(azimuth_rad: float) -> None:
     start = settle(MER, ground, 0.0, 0.0, azimuth_rad)
     driven = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=1.0), _rng())
     moved = driven.end.world_from_rover.translation - start.world_from_rover.translation
-    sideways = 0.5 * (STEADY.share(np.radians(10.0)) - STEADY.flat)
+    sideways = 0.5 * (STEADY.slip_fraction(np.radians(10.0)) - STEADY.flat)
     # the ground falls to the west
     assert moved[0] == pytest.approx(-sideways * np.cos(np.radians(10.0)), abs=1e-9)
     assert driven.slip == pytest.approx(STEADY.flat, abs=1e-9)
@@ -111,13 +111,13 @@ def test_turns_fall_short() -> None:
     start = settle(MER, steep, 0.0, 0.0, EAST)
     driven = drive(MER, steep, Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(10.0)), _rng())
     assert 1.0 - driven.turn_left_rad / np.radians(10.0) == pytest.approx(
-        0.03 + 0.5 * (STEADY.share(np.radians(15.0)) - 0.01), rel=1e-6
+        0.03 + 0.5 * (STEADY.slip_fraction(np.radians(15.0)) - 0.01), rel=1e-6
     )
 
 
 def test_soils_and_steps_scatter_as_stated() -> None:
     parameters = SlipParameters(soil_spread=0.3, step_spread=0.0, wander_deg_m=0.0)
-    factors = np.log([Soil.drawn(parameters, np.random.default_rng(n)).factor for n in range(400)])
+    factors = np.log([Soil.draw(parameters, np.random.default_rng(n)).factor for n in range(400)])
     # 0.3 within four standard errors, 0.3 / sqrt(800)
     assert np.std(factors) == pytest.approx(0.3, abs=0.042)
     ground = uphill_east(10.0)

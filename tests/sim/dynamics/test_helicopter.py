@@ -67,5 +67,5 @@ def test_targets_are_passed_over_40_minutes_apart() -> None:
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="do not fit into"):
         HelicopterParameters(passes=20)
-    with pytest.raises(ValueError, match="known from"):
+    with pytest.raises(ValueError, match="outside of the motion"):
         flight().state(3000.0)

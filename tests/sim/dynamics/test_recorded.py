@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
-from marsyard.sim.dynamics.recorded import RecordedMotion
-from marsyard.sim.dynamics.recorded_files import COLUMNS, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.recorded import COLUMNS, RecordedMotion, TrajectoryFileError, read_poses
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
 #: The beginning of freiburg1_xyz of the TUM RGB-D benchmark (Sturm et al. 2012): its two first poses, twice, the
@@ -206,5 +205,5 @@ def test_motions_that_cannot_be_followed() -> None:
     half = Rotation.from_euler("z", np.array([[0.0], [0.0], [120.0], [120.0]]), degrees=True)
     with pytest.raises(ValueError, match=r"turns by 120 deg after 1.000000 s \(pose 2\)"):
         RecordedMotion(times, places, half, 3.7)
-    with pytest.raises(ValueError, match="time 4 s is not recorded; allowed: 0 to 3 s"):
+    with pytest.raises(ValueError, match="time 4 s is outside of the motion; allowed: 0 to 3 s"):
         RecordedMotion(times, places, still, 3.7).state(4.0)

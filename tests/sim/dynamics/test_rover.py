@@ -17,10 +17,10 @@ EAST, NORTH = 0.5 * np.pi, 0.0
 
 
 def test_wheels_rest_at_the_stated_places() -> None:
-    places = dict(zip(WHEELS, MER.wheel_places_m, strict=True))
+    places = dict(zip(WHEELS, MER.wheel_centres_m, strict=True))
     assert places["left front"] == pytest.approx([0.705, 0.53, 0.125])
     assert places["right rear"] == pytest.approx([-0.705, -0.53, 0.125])
-    assert wheel_centres(MER, 0.0, (0.0, 0.0)) == pytest.approx(MER.wheel_places_m)
+    assert wheel_centres(MER, 0.0, (0.0, 0.0)) == pytest.approx(MER.wheel_centres_m)
 
 
 @pytest.mark.parametrize("rover", [MER, ROCKY_8])
@@ -81,7 +81,8 @@ def test_all_wheels_stand_on_rough_ground() -> None:
     assert isinstance(surface, Ground)
     rng = np.random.default_rng(4)
     for _ in range(10):
-        stance = settle(MER, surface, *rng.uniform(0.0, 25.0, 2).tolist(), float(rng.uniform(-3.0, 3.0)))
+        east, north = rng.uniform(0.0, 25.0, 2).tolist()
+        stance = settle(MER, surface, east, north, float(rng.uniform(-3.0, 3.0)))
         assert np.abs(stance.gaps_m).max() < 1e-6
         # no point under the middle of a wheel is deeper than its rim
         centres = stance.world_from_rover.apply(wheel_centres(MER, stance.differential_rad, stance.bogies_rad))
@@ -92,7 +93,7 @@ def test_all_wheels_stand_on_rough_ground() -> None:
 def _block(east: float, north: float, top: float) -> Float64[np.ndarray, "triangles 3 3"]:
     """A block, 0.4 m square, half buried."""
     block = trimesh.creation.box(extents=(0.4, 0.4, 2.0 * top))
-    return np.asarray(block.triangles) + np.array([east, north, 0.0])
+    return np.asarray(np.asarray(block.triangles) + np.array([east, north, 0.0]))
 
 
 def test_bodies_stand_out_of_the_ground_they_lie_on() -> None:

@@ -10,7 +10,7 @@ import pytest
 import spiceypy
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.dynamics.recorded_files import TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.recorded import TrajectoryFileError, read_poses
 
 LANDER, SITE, MARS = -999, 399999, 499
 CAMERA_FRAME, SITE_FRAME = -999001, 1499901

@@ -13,7 +13,7 @@ GROUND_M = -1900.0
 
 
 def _wind(seed: int = 0, **parameters: float) -> Wind:
-    return Wind.drawn(WindParameters(**parameters), GROUND_M, np.random.default_rng(seed))
+    return Wind.draw(WindParameters(**parameters), GROUND_M, np.random.default_rng(seed))
 
 
 def test_mean_wind_is_constant_above_its_layer_and_logarithmic_in_it() -> None:

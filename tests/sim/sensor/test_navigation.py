@@ -32,7 +32,7 @@ RTK, COMPASS = RtkParameters(), TiltCompassParameters()
 @cache
 def _path(seed: int) -> FlownPath:
     rng = np.random.default_rng(seed)
-    air = Air.drawn(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S, rng)
+    air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S, rng)
     over, heading = np.array([100.0, 50.0, 10.0]), rng.uniform(0.0, 2.0 * np.pi)
     return transit_flight(CRAFT, TRANSIT, over, 0.3, heading, GRAVITY, air, rng).path
 

@@ -60,7 +60,7 @@ def test_wheels_do_not_see_slip_and_pictures_do() -> None:
     true = drives[-1].end.world_from_rover
     _, counted = _followed(drives, EXACT, 0)
     _, seen = _followed(drives, EXACT, 0, visual=True)
-    lost = slip.share(np.radians(15.0)) * 3 * STRAIGHT.forward_m
+    lost = slip.slip_fraction(np.radians(15.0)) * 3 * STRAIGHT.forward_m
     uphill = np.array([np.cos(np.radians(15.0)), 0.0, np.sin(np.radians(15.0))])
     assert counted.error_m(true) == pytest.approx(lost * uphill, abs=1e-7)
     assert seen.error_m(true) == pytest.approx(np.zeros(3), abs=1e-7)
