@@ -32,8 +32,8 @@ class _Hash:
 
 
 def _mixed(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    result = np.uint32(_LEFT) * x - np.uint32(_RIGHT) * y
-    return result ^ (result >> np.uint32(_SHIFT))
+    result: np.ndarray = np.uint32(_LEFT) * x - np.uint32(_RIGHT) * y
+    return np.asarray(result ^ (result >> np.uint32(_SHIFT)))
 
 
 def seeds(words: np.ndarray) -> np.ndarray:

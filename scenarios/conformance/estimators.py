@@ -180,4 +180,4 @@ class EstimatorSuite(Suite):
 
 def _first(number: int) -> DescentMeasurements:
     """A descent of which only the first pictures were taken."""
-    return inputs.descent(_PICTURES).chosen(tuple(range(number)))
+    return inputs.descent(_PICTURES).select(tuple(range(number)))

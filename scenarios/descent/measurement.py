@@ -25,7 +25,7 @@ from marsyard.scenarios.parts.instruments import (
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from marsyard.sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter, Readings
-from marsyard.sim.sensor.radar import first_return
+from marsyard.sim.sensor.ranging import first_return
 from marsyard.sim.streams import Streams
 
 
@@ -65,7 +65,7 @@ class Instruments:
         start, end = -flown.lead_s + MARGIN_S, flown.firing_s + MARGIN_S
         approach = Approach(p.approach, start)
         unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
-        imu = approach.calibrated(unit, streams.generator("inertial unit's calibration"))
+        imu = approach.calibrate(unit, streams.generator("inertial unit's calibration"))
         clock = Clock.drawn(p.clock, streams.generator("image clock"))
         own = _own_readings(p, world, flown.motion, _tags(p, clock, streams), streams)
         return cls(
@@ -119,8 +119,8 @@ def _navigated(
     errors = approach.errors(imu, streams.generator("approach"))
     increments = imu.increments(flown.motion, start, end, streams.generator("inertial noise"))
     state = flown.motion.state(start)
-    attitude, velocity = errors.believed(state.attitude, state.velocity_m_s)
-    return InertialSolution.propagated(increments, attitude, velocity, gravity_m_s2(p))
+    attitude, velocity = errors.apply(state.attitude, state.velocity_m_s)
+    return InertialSolution.propagate(increments, attitude, velocity, gravity_m_s2(p))
 
 
 def measure(

@@ -1,4 +1,4 @@
-"""Auto-exposure: exposure times until the picture, or a part of it, is as bright as asked for."""
+"""Auto-exposure: adjustment of the exposure time to a target brightness of the picture or a region of it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class AutoExposureParameters(Parameters):
 
     percentile: Annotated[float, Field(gt=0.0, lt=100.0, description="percentile of the counts that is judged")] = 98.0
     target: Annotated[
-        float, Field(gt=0.0, lt=1.0, description="what that percentile shall be, as a share of full scale")
+        float, Field(gt=0.0, lt=1.0, description="target of that percentile, as a fraction of full scale")
     ] = 0.75
     tolerance: Annotated[float, Field(gt=0.0, le=0.5, description="accepted relative distance from the target")] = 0.05
     pictures: Annotated[int, Field(ge=1, le=20, description="test pictures at most")] = 5
@@ -27,7 +27,7 @@ class AutoExposureParameters(Parameters):
     most_s: Annotated[float, Field(gt=0.0, le=10.0, description="longest exposure, s")] = 1.0
 
     @model_validator(mode="after")
-    def _range_is_not_empty(self) -> AutoExposureParameters:
+    def _check_limits(self) -> AutoExposureParameters:
         if self.least_s > self.most_s:
             raise ValueError(f"the shortest exposure {self.least_s} s is longer than the longest {self.most_s} s")
         return self
@@ -35,16 +35,11 @@ class AutoExposureParameters(Parameters):
 
 @dataclass(frozen=True)
 class AutoExposure:
-    """What auto-exposure found.
+    """Result of auto-exposure.
 
-    Attributes
-    ----------
-    detector
-        The detector set to the exposure time that was found.
-    exposures_s
-        Exposure times of the test pictures.
-    converged
-        Whether the last test picture met the target.
+    - detector: the detector with the adjusted exposure time
+    - exposures_s: exposure times of the test pictures
+    - converged: whether the last test picture reached the target
     """
 
     detector: Detector
@@ -60,23 +55,13 @@ def auto_expose(
     region: tuple[slice, slice] | None = None,
     motion: ImageMotion | None = None,
 ) -> AutoExposure:
-    """Takes test pictures and scales the exposure time until the picture is as bright as asked for.
+    """Take test pictures and scale the exposure time until the picture has the target brightness.
 
-    Parameters
-    ----------
-    detector, radiance, motion
-        The detector, whose exposure time is tried first, and the scene.
-    parameters
-        What is asked for.
-    rng
-        Stream of the test pictures' noise.
-    region
-        Rows and columns of the delivered picture that are judged; all of it if not given.
+    - detector: its exposure time is tried first
+    - rng: random stream of the test pictures' noise
+    - region: rows and columns of the delivered picture whose percentile is used; all by default
 
-    Raises
-    ------
-    ValueError
-        If the region holds no pixel.
+    Raises ValueError if the region has no pixel.
     """
     tried: list[float] = []
     exposure = float(np.clip(detector.parameters.exposure_s, parameters.least_s, parameters.most_s))
@@ -97,13 +82,13 @@ def auto_expose(
 def _correction(
     counts: UInt16[np.ndarray, "rows columns"], detector: Detector, parameters: AutoExposureParameters
 ) -> float:
-    """By what to multiply the exposure time; at most a factor of 8 at once, and a quarter where the counts saturate."""
+    """Factor on the exposure time: 1/8 to 8, and a quarter if the counts saturate."""
     if counts.size == 0:
         raise ValueError("auto-exposure was given a region without pixels")
     p = detector.parameters
-    most = min(float(p.full_scale_dn), p.full_well_e / p.gain_e_dn + p.offset_dn)
+    saturation = min(float(p.full_scale_dn), p.full_well_e / p.gain_e_dn + p.offset_dn)
     level = float(np.percentile(counts, parameters.percentile))
-    if level >= 0.99 * most:
+    if level >= 0.99 * saturation:
         return 0.25
     signal = max(level - p.offset_dn, 1.0)
-    return float(np.clip((parameters.target * most - p.offset_dn) / signal, 0.125, 8.0))
+    return float(np.clip((parameters.target * saturation - p.offset_dn) / signal, 0.125, 8.0))

@@ -1,19 +1,18 @@
-"""Cameras by name: geometry and detector of the papers' cameras.
+"""Camera presets by name: geometry and detector of the papers' cameras.
 
-Frames
-------
 A descent camera is given in the body frame: at its origin, looking along -z, columns along +x. All others are given in
-a frame with x forward, y to the left and z up, whose origin lies between the two cameras of a pair: the mast's, or the
-rover's. ``camera.moved(body_from_mast)`` puts them onto a vehicle.
+a frame with x forward, y left and z up, with its origin between the two cameras of a pair: the mast's or the rover's.
+``camera.moved(body_from_mast)`` mounts them on a vehicle.
 
 Sources: the field-test paper III.B; the target tracking paper section 3 (research rover); the landing paper section 5;
-Maki et al. 2003, "Mars Exploration Rover Engineering Cameras" (MER); what is assumed is called so.
+Maki et al. 2003, "Mars Exploration Rover Engineering Cameras" (MER). Assumed values are marked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any
 
@@ -23,9 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 from marsyard.sim.sensor.datasheet import read_datasheet
-from marsyard.sim.sensor.optics import OpticsParameters
-from marsyard.sim.sensor.parameters import DetectorParameters
-from marsyard.sim.sensor.radiometry import DARK_E_S, NG3_FIELD, NG4_FLIGHT, LightPath, bright_exposure_s
+from marsyard.sim.sensor.detector import DetectorParameters
+from marsyard.sim.sensor.optics import DARK_E_S, NG3_FIELD, NG4_FLIGHT, LightPath, OpticsParameters, bright_exposure_s
 
 #: Distance of Mars from the sun at the MER landings (the paper's "1.5 AU": 44 % of Earth's sunlight), AU.
 MARS_AU = 1.5
@@ -39,20 +37,12 @@ C_MOUNT_RADIAL = (0.0, -0.08, 0.025)
 class CameraDesign:
     """Geometry of a camera or of a stereo pair.
 
-    Attributes
-    ----------
-    focal_length_mm, pixel_pitch_um, size
-        Focal length, distance of the pixels, and (columns, rows).
-    radial
-        R of CAHVOR or CAHVORE.
-    linearity
-        CAHVORE's linearity; None for CAHVOR.
-    baseline_m
-        Distance of the two cameras of a pair; None for a single camera.
-    toe_in_deg
-        By how much each camera of a pair is turned towards the other.
-    down
-        Whether it looks down along -z, rather than forward along +x.
+    - size: (columns, rows)
+    - radial: R of CAHVOR or CAHVORE
+    - linearity: of CAHVORE; None for CAHVOR
+    - baseline_m: distance of the cameras of a pair; None for a single camera
+    - toe_in_deg: rotation of each camera of a pair towards the other
+    - down: whether it looks down along -z instead of forward along +x
     """
 
     focal_length_mm: float
@@ -65,7 +55,7 @@ class CameraDesign:
     down: bool = False
 
     def cameras(self) -> tuple[CameraModel, ...]:
-        """The camera, or the left and the right one of the pair."""
+        """Create the camera, or the left and the right camera of the pair."""
         if self.baseline_m is None:
             return (self._camera(0.0, 0.0),)
         half, toe = 0.5 * self.baseline_m, np.radians(self.toe_in_deg)
@@ -89,25 +79,19 @@ class CameraDesign:
 
 @dataclass(frozen=True)
 class Preset:
-    """A camera of the papers.
-
-    Attributes
-    ----------
-    design, light, detector
-        Geometry, light path and detector.
-    """
+    """A camera of the papers: geometry, light path and detector."""
 
     design: CameraDesign
     light: LightPath
     detector: DetectorParameters
 
     def cameras(self) -> tuple[CameraModel, ...]:
-        """The camera, or the left and the right one of a pair."""
+        """Create the camera, or the left and the right camera of a pair."""
         return self.design.cameras()
 
 
 def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float | int) -> Preset:
-    """A camera with the MER detector, of which the descent camera's parameters are the defaults."""
+    """A camera with the MER detector; the defaults of `DetectorParameters` are the descent camera's."""
     settings = {
         "responsivity_e_s": light.responsivity_e_s(sun_au),
         "sun_au": sun_au,
@@ -129,7 +113,7 @@ def _mer_descent_flown() -> Preset:
 
 
 def _mer_descent_field() -> Preset:
-    """Under Earth's sun; exposed for as many electrons from the same ground as in flight."""
+    """Under Earth's sun, with the exposure time that gives as many electrons from the same ground as in flight."""
     light = LightPath(12.0, 12.0, _DESCENT_BAND, NG3_FIELD)
     flown = _mer_descent_flown().detector.responsivity_e_s
     exposure = _FLIGHT_EXPOSURE_S * flown / light.responsivity_e_s(1.0)
@@ -141,15 +125,6 @@ def _mer_rover_camera(design: CameraDesign, f_number: float) -> Preset:
     light = LightPath(f_number, design.pixel_pitch_um, _ROVER_BAND)
     exposure = bright_exposure_s(170000.0, light.responsivity_e_s(MARS_AU))
     return _mer(design, light, MARS_AU, exposure_s=exposure, temperature_c=-40.0, rows_summed=1)
-
-
-def _mer_navcam() -> Preset:
-    return _mer_rover_camera(CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, baseline_m=0.20), 12.0)
-
-
-def _mer_hazcam() -> Preset:
-    """An equidistant fisheye without distortion, its pupil at rest: both assumed."""
-    return _mer_rover_camera(CameraDesign(5.58, 12.0, (1024, 1024), linearity=0.0, baseline_m=0.10), 15.0)
 
 
 def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
@@ -179,73 +154,62 @@ def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
     return Preset(design, light, detector)
 
 
-def _research_navcam() -> Preset:
-    return _interline(CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10)
-
-
-def _research_pancam() -> Preset:
-    """The toe-in is assumed, that of MER's pancams: parallel cameras would see a point at 2 m 516 px apart."""
-    return _interline(CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10)
-
-
-def _xc55() -> Preset:
-    """The lens is assumed: 6 mm, 43 deg, with some distortion. It looks down."""
-    return _interline(CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8)
-
-
 PRESETS: Mapping[str, Callable[[], Preset]] = MappingProxyType(
     {
         "mer-descent-flown": _mer_descent_flown,
         "mer-descent-field": _mer_descent_field,
-        "mer-navcam": _mer_navcam,
-        "mer-hazcam": _mer_hazcam,
-        "research-navcam": _research_navcam,
-        "research-pancam": _research_pancam,
-        "xc-55": _xc55,
+        "mer-navcam": partial(
+            _mer_rover_camera, CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, baseline_m=0.20), 12.0
+        ),
+        # an equidistant fisheye without distortion, its pupil fixed: both assumed
+        "mer-hazcam": partial(
+            _mer_rover_camera, CameraDesign(5.58, 12.0, (1024, 1024), linearity=0.0, baseline_m=0.10), 15.0
+        ),
+        "research-navcam": partial(_interline, CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10),
+        # the toe-in is assumed, that of MER's pancams: parallel cameras would see a point at 2 m 516 px apart
+        "research-pancam": partial(
+            _interline, CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10
+        ),
+        # the lens is assumed: 6 mm, 43 deg, with some distortion
+        "xc-55": partial(_interline, CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8),
     }
 )
 
 
 def preset(name: str) -> Preset:
-    """The camera of this name.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    """
+    """Create the camera of this name. Raises ValueError if it is unknown."""
     if name not in PRESETS:
         raise ValueError(f"there is no camera preset {name!r}; allowed: {', '.join(PRESETS)}")
     return PRESETS[name]()
 
 
-def _over(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested settings with some of them changed."""
+def _merge(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge changes into nested settings."""
     merged = dict(base)
     for key, value in changes.items():
         below = merged.get(key)
-        merged[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, Mapping) else value
+        merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, Mapping) else value
     return merged
 
 
-def _chosen(settings: object) -> object:
-    """Settings with those of a preset or a datasheet put below them, where they name one."""
+def _resolve_detector(settings: object) -> object:
+    """Merge settings into those of a preset or a datasheet, if they name one."""
     if isinstance(settings, str):
         settings = {"file": settings} if settings.endswith(".toml") else {"preset": settings}
     if not isinstance(settings, Mapping) or all(settings.get(key) is None for key in ("preset", "file")):
         return settings
-    if set(DetectorParameters.model_fields) <= set(settings):  # read before, and kept with the campaign
+    if set(DetectorParameters.model_fields) <= set(settings):  # already resolved, and stored with the campaign
         return settings
     if {"preset", "file"} <= set(settings):
         raise ValueError("a detector is a preset or a datasheet's file, not both")
     changes = {key: value for key, value in settings.items() if key not in ("preset", "file")}
     if "file" in settings:
         file = str(settings["file"])
-        return _over({**read_datasheet(file).parameters().model_dump(), "file": file}, changes)
-    return _over(preset(str(settings["preset"])).detector.model_dump(), changes)
+        return _merge({**read_datasheet(file).parameters().model_dump(), "file": file}, changes)
+    return _merge(preset(str(settings["preset"])).detector.model_dump(), changes)
 
 
-#: Detector parameters that a campaign may also state by a preset's name or a datasheet's file, with what differs:
+#: Detector parameters of a campaign, stated by values or by changes to a preset or a datasheet:
 #: ``[parameters.detector]`` with ``preset = "mer-descent-field"`` and, say, ``temperature_c = 23.0``; or
 #: ``file = "sensor.toml"`` (`marsyard.sim.sensor.datasheet`).
-DetectorChoice = Annotated[DetectorParameters, BeforeValidator(_chosen)]
+DetectorChoice = Annotated[DetectorParameters, BeforeValidator(_resolve_detector)]

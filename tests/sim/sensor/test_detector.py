@@ -4,8 +4,7 @@ from scipy.ndimage import gaussian_filter
 
 from marsyard.algorithms.image.frame_transfer import without_frame_transfer
 from marsyard.sim.sensor import Detector, DetectorParameters, ImageMotion
-from marsyard.sim.sensor.defects import BurstParameters, DefectParameters
-from marsyard.sim.sensor.detector import dark_seconds
+from marsyard.sim.sensor.detector import BurstParameters, DefectParameters, dark_seconds
 from marsyard.sim.sensor.optics import OpticsParameters
 
 EVEN = np.ones((64, 48), dtype=np.float32)
@@ -88,7 +87,7 @@ def test_smear_is_undone_by_dimes() -> None:
     p = detector.parameters
 
     def delivered(charge: np.ndarray) -> np.ndarray:
-        return charge.reshape(256, 4, 32).sum(axis=1) / p.gain_e_dn
+        return np.asarray(charge.reshape(256, 4, 32).sum(axis=1) / p.gain_e_dn)
 
     smeared = delivered(detector.charge(scene))
     exposed = delivered(scene * np.float32(p.responsivity_e_s * p.exposure_s))

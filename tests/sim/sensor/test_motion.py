@@ -29,7 +29,7 @@ def _brute_force(
     total = sum((seen(((n + 0.5) / 24 - 0.5) * EXPOSURE_S) for n in range(24)), np.zeros(shape)) * EXPOSURE_S / 24
     for first in range(1, shape[0], rows):
         lags = range(first, min(first + rows, shape[0]))
-        middle = np.mean(lags) - 0.5
+        middle = float(np.mean(lags)) - 0.5
         after = seen(0.5 * EXPOSURE_S + middle * transfer_row_s) * transfer_row_s
         before = seen(-0.5 * EXPOSURE_S - middle * clear_row_s) * clear_row_s
         for lag in lags:
@@ -58,11 +58,11 @@ def test_the_picture_of_a_turning_camera_is_that_of_many_renderings() -> None:
 
     def seen(time_s: float) -> Picture:
         turned = Rotation.from_rotvec(rate * time_s) * attitude
-        return renderer.render(scene, rays, rigid(turned, place + velocity * time_s)).radiance * response
+        return np.asarray(renderer.render(scene, rays, rigid(turned, place + velocity * time_s)).radiance * response)
 
     frame = renderer.render(scene, rays, rigid(attitude, place))
-    motion = ImageMotion.seen(camera, frame.range_m, frame.world_from_body, velocity, rate)
-    assert motion.greatest_px_s == pytest.approx(np.radians(60.0) * 14.67e-3 / 12e-6, rel=0.1)
+    motion = ImageMotion.of_camera(camera, frame.range_m, frame.world_from_body, velocity, rate)
+    assert motion.max_px_s == pytest.approx(np.radians(60.0) * 14.67e-3 / 12e-6, rel=0.1)
     found = moving_exposure(frame.radiance, response, motion, EXPOSURE_S, transfer_row_s, clear_row_s)
     expected = _brute_force(seen, (size, size), transfer_row_s, clear_row_s, rows=6)
     # beyond the border nothing was rendered: as far as the picture moves, it is not compared
@@ -139,7 +139,7 @@ def test_image_velocity_by_finite_differences() -> None:
     distance = 1000.0 + 100.0 * rng.random((512, 512))
     pose = rigid(Rotation.from_euler("xyz", [0.2, 0.1, 1.0]), np.array([3.0, 5.0, 900.0]))
     velocity, rate = np.array([10.0, -20.0, -60.0]), np.array([0.3, -0.4, 0.2])
-    motion = ImageMotion.seen(camera, distance, pose, velocity, rate)
+    motion = ImageMotion.of_camera(camera, distance, pose, velocity, rate)
     pixels = 32.0 * np.stack(np.meshgrid(np.arange(16), np.arange(16)), axis=-1).astype(np.float64)
     origins, directions = camera.rays(pixels)
     world = pose.apply((origins + distance[::32, ::32, None] * directions).reshape(-1, 3))
@@ -158,8 +158,8 @@ def test_what_has_no_range_moves_with_the_rotation_alone() -> None:
     )
     pose = rigid(Rotation.identity(), np.zeros(3))
     sky = np.full((96, 128), np.inf)
-    assert ImageMotion.seen(camera, sky, pose, np.array([50.0, 20.0, 0.0]), np.zeros(3)).greatest_px_s < 1e-3
-    turning = ImageMotion.seen(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
+    assert ImageMotion.of_camera(camera, sky, pose, np.array([50.0, 20.0, 0.0]), np.zeros(3)).max_px_s < 1e-3
+    turning = ImageMotion.of_camera(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
     # a turn to the left moves the picture to the right by 500 px/rad
     assert turning.velocity_px_s[1, 2, 1] == pytest.approx(50.0, rel=0.01)
 
@@ -194,7 +194,7 @@ def test_the_border_of_a_moving_picture_is_nearly_what_a_wider_one_shows(velocit
     true = moving_exposure(wide, response, motion, EXPOSURE_S, 5e-6, 1e-6)[inside]
     error = (held - true) / true.mean()
     rows, columns = np.indices(frame.shape)
-    depth = np.minimum.reduce([rows, columns, rows[::-1], columns[:, ::-1]])
+    depth: np.ndarray = np.minimum.reduce([rows, columns, rows[::-1], columns[:, ::-1]])
     rms = [float(np.sqrt(np.mean(error[depth == ring] ** 2))) for ring in range(20)]
     # noise is 1 %
     assert 1e-4 < rms[0] < 0.03

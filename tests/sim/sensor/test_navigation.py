@@ -21,7 +21,7 @@ from marsyard.sim.dynamics.rotorcraft.flight import TAIL_S
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from marsyard.sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
 from marsyard.sim.sensor.navigation.kernels import POSITION_FIX, VELOCITY_FIX
-from marsyard.sim.sensor.rtk import Outage, RtkParameters, RtkReceiver
+from marsyard.sim.sensor.satellite_navigation import Outage, RtkParameters, RtkReceiver
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
 
 GRAVITY, FLIGHTS = 9.8, 50
@@ -53,7 +53,7 @@ def _flown(
     solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
     readings = compass.measure(path, compass.sampling.within(*span), rng)
     navigation = NavigationFilter(parameters, SMALL_UNIT, rtk_class, compass_class, GRAVITY)
-    start = navigation.started(solutions, readings)
+    start = navigation.initialize(solutions, readings)
     return path, imu, navigation.run(start, increments, solutions, readings, np.array(keep_s))
 
 
@@ -160,7 +160,7 @@ def test_it_starts_anew_where_it_was_led_astray() -> None:
     solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
     readings = compass.measure(path, compass.sampling.within(*span), rng)
     navigation = NavigationFilter(FilterParameters(), SMALL_UNIT, receiver.parameters, COMPASS, GRAVITY)
-    start = navigation.started(solutions, readings)
+    start = navigation.initialize(solutions, readings)
     astray = replace(start, state=start.state + np.eye(16)[0] * 20.0, covariance=0.01 * start.covariance)
     solution = navigation.run(astray, imu.increments(path, *span, rng), solutions, readings)
     said = solution.innovations
