@@ -177,11 +177,7 @@ class CameraModel(ABC):
         )
 
     def scaled(self: M, factor: Real) -> M:
-        """The camera of the image resized by `factor`: u becomes (u + 0.5) * factor - 0.5.
-
-        The size is rounded to integers, the scale is not.
-        Raises ValueError if `factor` is not positive and finite, or leaves no pixel.
-        """
+        """The camera of the resized image: u becomes (u + 0.5) * factor - 0.5. ValueError unless factor is positive."""
         if not (np.isfinite(factor) and factor > 0):
             raise ValueError(f"an image is scaled by a positive, finite factor, not {factor}")
         scale = float(factor)
@@ -190,10 +186,7 @@ class CameraModel(ABC):
         return self._with_image_map((scale, scale), (shift, shift), size)
 
     def cropped(self: M, column: int, row: int, size: tuple[int, int]) -> M:
-        """The camera of a part of the image, given its upper left pixel (column, row) and its size (columns, rows).
-
-        Raises ValueError if the part is empty or leaves the frame.
-        """
+        """The camera of a part of the image, by upper left pixel and size. Raises ValueError outside the frame."""
         if column < 0 or row < 0 or column + size[0] > self.size[0] or row + size[1] > self.size[1]:
             raise ValueError(
                 f"a crop of {size[0]} x {size[1]} pixels at ({column}, {row}) leaves the frame of "
@@ -322,10 +315,7 @@ class CameraModel(ABC):
 
 
 def looking_down(camera: CameraModel) -> CameraModel:
-    """Mount a camera at the origin so that A is -z and the columns grow along +x.
-
-    Raises ValueError if the picture is a mirror image: no rotation corrects that.
-    """
+    """Mount a camera at the origin, A along -z, columns along +x; raises ValueError for mirrored pictures."""
     if not camera.theta < 0:
         raise ValueError("the camera's picture is mirrored: u right, v down and A forward must be right-handed")
     axis = _unit(camera.a)

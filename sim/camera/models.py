@@ -122,10 +122,7 @@ class Cahv(CameraModel):
         vertical_rad: Real | None = None,
         centre: Triple = _ORIGIN,
     ) -> Cahv:
-        """Create a camera from its full field of view between the frame's outer edges; see `from_axes`.
-
-        Pixels are square unless `vertical_rad` is given. Raises ValueError also if an angle is not between 0 and pi.
-        """
+        """Create a camera from its full field of view (outer edges); square pixels by default; see `from_axes`."""
         for angle in (horizontal_rad, vertical_rad):
             if angle is not None and not 0 < angle < np.pi:
                 raise ValueError(f"a field of view must lie between 0 and pi radians, not {angle}")

@@ -55,10 +55,7 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
 
 
 def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "", *, frame: str = "") -> None:
-    """Write a JPL text file that `read_cahvor` reads back as an equal camera.
-
-    `comment` becomes lines with '#' at the start, `frame` a line ``# Frame: ...`` for the frame of the vectors.
-    """
+    """Write a JPL text file, equal when read back; `comment` and `frame` become lines with '#' at the start."""
     if isinstance(camera, Cahvore):
         model = _TYPE_NAMES.get(camera.linearity, f"CAHVORE3,{camera.linearity!r} = general")
     else:

@@ -1,8 +1,6 @@
 """Instruments: measurements of the true state, with errors."""
 
-from marsyard.sim.sensor.datasheet import read_datasheet
-from marsyard.sim.sensor.detector import Detector, DetectorParameters
-from marsyard.sim.sensor.exposure import AutoExposure, AutoExposureParameters, auto_expose
+from marsyard.sim.sensor.detector import AutoExposure, AutoExposureParameters, Detector, DetectorParameters, auto_expose
 from marsyard.sim.sensor.imu import Imu, ImuIncrements, ImuParameters, WarmUp
 from marsyard.sim.sensor.inertial import Approach, ApproachParameters, InertialSolution, NavigationErrors
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling
@@ -20,9 +18,8 @@ from marsyard.sim.sensor.motion import ImageMotion
 from marsyard.sim.sensor.odometry import OdometryParameters
 from marsyard.sim.sensor.optics import natural_fall_off
 from marsyard.sim.sensor.own_camera import NamedOrOwnCamera, OwnCamera, OwnCameraChoice
-from marsyard.sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, preset
+from marsyard.sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, preset, read_datasheet
 from marsyard.sim.sensor.ranging import (
-    LaserAltimeter,
     LaserParameters,
     RadarAltimeter,
     RadarParameters,
@@ -50,7 +47,6 @@ __all__ = [
     "ImuIncrements",
     "ImuParameters",
     "InertialSolution",
-    "LaserAltimeter",
     "LaserParameters",
     "Mast",
     "MastState",

@@ -1,4 +1,4 @@
-"""Frame-transfer CCD: radiance to counts, with noise, smear, defective pixels, noise bursts and 8-bit companding.
+"""Frame-transfer CCD: radiance to counts, with noise, smear, defects, bursts and 8-bit companding; auto-exposure.
 
 Companding: a step of the square-root table grows with the square root of the count, as shot noise does. The table is
 
@@ -16,7 +16,7 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt16
-from pydantic import Field
+from pydantic import Field, model_validator
 from scipy.ndimage import uniform_filter
 from scipy.optimize import brentq
 
@@ -33,13 +33,9 @@ class DefectParameters(Parameters):
     """Defective pixels; none by default."""
 
     hot_share: Annotated[Fraction, Field(description="fraction of hot pixels")] = 0.0
-    hot_e_s: Annotated[
-        NonNegative, Field(description="mean dark current of hot pixels at 0 deg C, electrons per second")
-    ] = 20000.0
+    hot_e_s: Annotated[NonNegative, Field(description="mean dark current of a hot pixel at 0 deg C, e/s")] = 20000.0
     dead_share: Annotated[Fraction, Field(description="fraction of pixels without response")] = 0.0
-    listed: Annotated[bool, Field(description="whether the camera fills them all from their neighbours, by a list")] = (
-        False
-    )
+    listed: Annotated[bool, Field(description="whether the camera fills them from neighbours by a list")] = False
 
 
 class BurstParameters(Parameters):
@@ -58,9 +54,7 @@ class DetectorParameters(Parameters):
     """
 
     exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="exposure time, s")] = 0.004
-    responsivity_e_s: Annotated[Positive, Field(description="electrons per second on axis at radiance factor 1")] = (
-        1.019e7
-    )
+    responsivity_e_s: Annotated[Positive, Field(description="electrons/s on axis at radiance factor 1")] = 1.019e7
     sun_au: Annotated[float, Field(gt=0.1, le=100.0, description="distance of the sun for this responsivity, AU")] = 1.5
     rows_summed: Annotated[int, Field(ge=1, le=16, description="rows summed on the chip")] = 4
     transfer_row_s: Annotated[NonNegative, Field(description="time under each row during the transfer, s")] = 5.0e-6
@@ -73,9 +67,7 @@ class DetectorParameters(Parameters):
     bits: Annotated[int, Field(ge=8, le=16, description="bits of a count")] = 12
     temperature_c: Annotated[float, Field(ge=-150.0, le=80.0, description="temperature of the detector, deg C")] = -34.0
     dark_e_s: Annotated[NonNegative, Field(description="dark current of a pixel at 0 deg C, electrons/s")] = 159.0
-    dark_doubling_c: Annotated[
-        float, Field(gt=0.0, le=50.0, description="temperature rise that doubles the dark current, deg C")
-    ] = 6.0
+    dark_doubling_c: Annotated[float, Field(gt=0.0, le=50.0, description="temperature rise for doubling, deg C")] = 6.0
     response_spread: Annotated[_RelativeError, Field(description="RMS of the pixels' relative response")] = 0.01
     calibration_error: Annotated[_RelativeError, Field(description="RMS error of the calibrated response")] = 0.002
     companded: Annotated[bool, Field(description="send counts as 8-bit square roots and expand them again")] = False
@@ -102,6 +94,23 @@ class DetectorParameters(Parameters):
     def dark_growth(self) -> float:
         """Dark current relative to 0 deg C."""
         return float(2.0 ** (self.temperature_c / self.dark_doubling_c))
+
+
+class AutoExposureParameters(Parameters):
+    """Auto-exposure by a percentile of the counts, as on the MER rovers (Maki et al. 2003); the numbers are assumed."""
+
+    percentile: Annotated[float, Field(gt=0.0, lt=100.0, description="controlled percentile of the counts")] = 98.0
+    target: Annotated[float, Field(gt=0.0, lt=1.0, description="target of the percentile over full scale")] = 0.75
+    tolerance: Annotated[float, Field(gt=0.0, le=0.5, description="accepted relative distance from the target")] = 0.05
+    pictures: Annotated[int, Field(ge=1, le=20, description="test pictures at most")] = 5
+    least_s: Annotated[float, Field(gt=0.0, le=10.0, description="shortest exposure, s")] = 1e-4
+    most_s: Annotated[float, Field(gt=0.0, le=10.0, description="longest exposure, s")] = 1.0
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> AutoExposureParameters:
+        if self.least_s > self.most_s:
+            raise ValueError(f"the shortest exposure {self.least_s} s is longer than the longest {self.most_s} s")
+        return self
 
 
 @dataclass(frozen=True)
@@ -198,10 +207,7 @@ class Detector:
         rng: np.random.Generator,
         motion: ImageMotion | None = None,
     ) -> UInt16[np.ndarray, "delivered_rows columns"]:
-        """Simulate the counts of one exposure from the scene's radiance factor at mid exposure.
-
-        `rng` is the random stream of the noise; `motion` is None for a still picture.
-        """
+        """Simulate the counts of one exposure from the scene's radiance factor at mid exposure."""
         p = self.parameters
         mean = _sum_rows(self.charge(radiance, motion), p.rows_summed) + self.dark_charge()
         # the point spread's kernel has negative weights: next to a bright edge the mean may be negative
@@ -331,3 +337,64 @@ def compand(counts: UInt16[np.ndarray, "rows columns"], full_scale_dn: int) -> U
 def expand(codes: UInt8[np.ndarray, "rows columns"], full_scale_dn: int) -> UInt16[np.ndarray, "rows columns"]:
     """Expand 8-bit codes to counts."""
     return np.asarray(expansion_table(full_scale_dn)[codes])
+
+
+@dataclass(frozen=True)
+class AutoExposure:
+    """Result of auto-exposure.
+
+    - detector: the detector with the adjusted exposure time
+    - exposures_s: exposure times of the test pictures
+    - converged: whether the last test picture reached the target
+    """
+
+    detector: Detector
+    exposures_s: tuple[float, ...]
+    converged: bool
+
+
+def auto_expose(
+    detector: Detector,
+    radiance: Float32[np.ndarray, "rows columns"],
+    parameters: AutoExposureParameters,
+    rng: np.random.Generator,
+    region: tuple[slice, slice] | None = None,
+    motion: ImageMotion | None = None,
+) -> AutoExposure:
+    """Take test pictures and scale the exposure time until the picture has the target brightness.
+
+    - detector: its exposure time is tried first
+    - rng: random stream of the test pictures' noise
+    - region: rows and columns of the delivered picture whose percentile is used; all by default
+
+    Raises ValueError if the region has no pixel.
+    """
+    tried: list[float] = []
+    exposure = float(np.clip(detector.parameters.exposure_s, parameters.least_s, parameters.most_s))
+    while True:
+        current = detector.with_exposure(exposure)
+        tried.append(exposure)
+        counts = current.expose(radiance, rng, motion)
+        factor = _correction(counts if region is None else counts[region], current, parameters)
+        converged = abs(factor - 1.0) <= parameters.tolerance
+        following = float(np.clip(exposure * factor, parameters.least_s, parameters.most_s))
+        if converged or following == exposure:
+            return AutoExposure(current, tuple(tried), converged)
+        if len(tried) == parameters.pictures:
+            return AutoExposure(detector.with_exposure(following), tuple(tried), False)
+        exposure = following
+
+
+def _correction(
+    counts: UInt16[np.ndarray, "rows columns"], detector: Detector, parameters: AutoExposureParameters
+) -> float:
+    """Factor on the exposure time: 1/8 to 8, and a quarter if the counts saturate."""
+    if counts.size == 0:
+        raise ValueError("auto-exposure was given a region without pixels")
+    p = detector.parameters
+    saturation = min(float(p.full_scale_dn), p.full_well_e / p.gain_e_dn + p.offset_dn)
+    level = float(np.percentile(counts, parameters.percentile))
+    if level >= 0.99 * saturation:
+        return 0.25
+    signal = max(level - p.offset_dn, 1.0)
+    return float(np.clip((parameters.target * saturation - p.offset_dn) / signal, 0.125, 8.0))

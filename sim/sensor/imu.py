@@ -62,17 +62,11 @@ class ImuParameters(Parameters):
     accelerometer_bias_mg: Annotated[NonNegative, Field(description="constant accelerometer bias, mg")] = 0.3
     accelerometer_wander_mg: Annotated[NonNegative, Field(description="time-correlated accelerometer bias, mg")] = 0.05
     accelerometer_wander_s: Annotated[Positive, Field(description="correlation time of that bias, s")] = 60.0
-    accelerometer_bias_mg_k: Annotated[NonNegative, Field(description="accelerometer bias with temperature, mg/K")] = (
-        0.02
-    )
-    velocity_random_walk_ug_sqrt_hz: Annotated[NonNegative, Field(description="velocity random walk, ug/sqrt(Hz)")] = (
-        50.0
-    )
+    accelerometer_bias_mg_k: Annotated[NonNegative, Field(description="its change with temperature, mg/K")] = 0.02
+    velocity_random_walk_ug_sqrt_hz: Annotated[NonNegative, Field(description="velocity noise, ug/sqrt(Hz)")] = 50.0
     accelerometer_scale_ppm: Annotated[NonNegative, Field(description="error of the scale factors, ppm")] = 300.0
     accelerometer_misalignment_mrad: Annotated[NonNegative, Field(description="input from another axis, mrad")] = 0.1
-    accelerometer_count_m_s: Annotated[NonNegative, Field(description="velocity of a count, m/s; 0: not rounded")] = (
-        2.0**-14
-    )
+    accelerometer_count_m_s: Annotated[NonNegative, Field(description="velocity of a count, m/s; 0: exact")] = 2.0**-14
     warm_up: WarmUp = WarmUp()
     clock: ClockParameters = ClockParameters(offset_sd_s=0.0002, jitter_sd_s=0.00002)
 

@@ -70,10 +70,7 @@ class InertialSolution:
         velocity_m_s: Float64[np.ndarray, "3"],
         gravity_m_s2: float,
     ) -> InertialSolution:
-        """Propagate from estimated attitude and velocity at the first boundary, with gravity along world -z.
-
-        Velocity increments are rotated by the estimated attitude: its error tilts the specific force.
-        """
+        """Propagate from an estimated attitude and velocity at the first boundary, with gravity along world -z."""
         turns = Rotation.from_rotvec(increments.delta_angles_rad).as_quat()
         attitudes = Rotation.from_quat(running_products(np.concatenate([attitude.as_quat()[None], turns])))
         gravity = np.array([0.0, 0.0, -gravity_m_s2])
@@ -130,9 +127,7 @@ class ApproachParameters(Parameters):
 
     attitude_sd_deg: Annotated[NonNegative, Field(description="error of the star reference per axis, deg")] = 0.05
     velocity_sd_m_s: Annotated[NonNegative, Field(description="error of the velocity at that time, per axis")] = 1.0
-    spin_scale_ppm: Annotated[NonNegative, Field(description="residual scale error of the spin axis's gyro, ppm")] = (
-        20.0
-    )
+    spin_scale_ppm: Annotated[NonNegative, Field(description="residual scale error of the spin gyro, ppm")] = 20.0
     cruise_s: Annotated[NonNegative, Field(le=20000.0, description="from the star reference to entry, s")] = 900.0
     entry_s: Annotated[Positive, Field(le=2000.0, description="from entry to the parachute's opening, s")] = 240.0
     parachute_s: Annotated[Positive, Field(le=2000.0, description="from there to the descent's start, s")] = 80.0

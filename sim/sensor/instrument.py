@@ -81,10 +81,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class GaussMarkov:
-    """A realisation of a stationary first-order Gauss-Markov process with zero mean; linear between its knots.
-
-    `values` has one column per independent channel.
-    """
+    """A stationary first-order Gauss-Markov process of zero mean, a column per channel; linear between its knots."""
 
     knots_s: Float64[np.ndarray, "knots"]
     values: Float64[np.ndarray, "knots channels"]
@@ -97,10 +94,7 @@ class GaussMarkov:
         span_s: tuple[float, float],
         rng: np.random.Generator,
     ) -> GaussMarkov:
-        """Draw a realisation over a time span from each channel's standard deviation and the correlation time.
-
-        Raises ValueError if the span is not finite or its end is before its start.
-        """
+        """Draw a realisation by standard deviations and correlation time. Raises ValueError for an invalid span."""
         first, last = span_s
         if not (np.isfinite(first) and np.isfinite(last) and first <= last):
             raise ValueError(f"a process cannot be drawn from {first} s to {last} s; a finite span is needed")

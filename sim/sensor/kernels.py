@@ -85,9 +85,9 @@ def path_kernel(row_path: float, column_path: float, reach: int, kernel: Array) 
     down = np.empty(4)
     right = np.empty(4)
     for n in range(count):
-        share = (n + 0.5) / count - 0.5
-        y = share * row_path
-        x = share * column_path
+        fraction = (n + 0.5) / count - 0.5
+        y = fraction * row_path
+        x = fraction * column_path
         i = math.floor(y)
         j = math.floor(x)
         _cubic(y - i, down)
@@ -204,10 +204,10 @@ def block_means(picture: Array32, edges: NDArray[np.int64]) -> Array32:
     """Compute means over blocks of rows, shape (blocks, columns)."""
     means = np.zeros((len(edges) - 1, picture.shape[1]), dtype=np.float32)
     for block in range(len(edges) - 1):
-        share = np.float32(1.0 / (edges[block + 1] - edges[block]))
+        weight = np.float32(1.0 / (edges[block + 1] - edges[block]))
         for r in range(edges[block], edges[block + 1]):
             for c in range(picture.shape[1]):
-                means[block, c] += share * picture[r, c]
+                means[block, c] += weight * picture[r, c]
     return means
 
 
@@ -282,9 +282,9 @@ def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
                     line[k] *= weights[start + np.uint64(k)]
                     change[k] -= line[k]
             for r in range(first, last):
-                share = np.float32((r - first) / (last - first))
+                fraction = np.float32((r - first) / (last - first))
                 line = moved[r - first]
                 start = np.uint64(r * columns + left)
                 for k in range(width):
-                    total[start + np.uint64(k)] += seconds * (before[k] + share * change[k] + own[k])
+                    total[start + np.uint64(k)] += seconds * (before[k] + fraction * change[k] + own[k])
                     own[k] += line[k]

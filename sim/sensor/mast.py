@@ -66,9 +66,7 @@ class PointingParameters(Parameters):
 class StereoCalibrationParameters(Parameters):
     """Calibration errors of a stereo pair; spreads are one standard deviation."""
 
-    disparity_error_px: Annotated[
-        Pixels, Field(description="limit of the uniform disparity error in the frames' middle, px")
-    ] = 0.5
+    disparity_error_px: Annotated[Pixels, Field(description="limit of the uniform disparity error mid-frame, px")] = 0.5
     epipolar_error_px: Annotated[Pixels, Field(description="across the epipolar lines in the frames' middle, px")] = 0.2
     alignment_deg: Annotated[Degrees, Field(description="of the pair on its head, each axis, deg")] = 0.05
     roll_deg: Annotated[Degrees, Field(description="of each camera about its axis, deg")] = 0.01
@@ -112,10 +110,7 @@ class Mast:
         return self._state(np.zeros(2), np.zeros(2))
 
     def point(self, state: MastState, azimuth_rad: float, elevation_rad: float, rng: np.random.Generator) -> MastState:
-        """Move the mast to commanded angles (see `MastGeometry`); it stops at its limits, as its readings show.
-
-        `rng` is the random stream of the motors' stops.
-        """
+        """Move the mast to commanded angles (see `MastGeometry`) within its limits; `rng` draws the motors' stops."""
         p, g = self.parameters, self.geometry
         lower, upper = np.array([g.azimuth_limits_rad, g.elevation_limits_rad]).T
         stopped = np.radians(p.settling_deg) * rng.standard_normal(2)
@@ -167,10 +162,7 @@ class StereoHead:
         return cls(design, replace(design, left=left, right=right))
 
     def disparity_error_px(self, range_m: float) -> float:
-        """Calibrated less true disparity of a point at this range straight ahead of each pair, as applied.
-
-        The common rotation of the calibrated pair has no effect on it.
-        """
+        """Calibrated less true disparity of a point at this range straight ahead of each pair."""
         pairs = [(mast.left, mast.right) for mast in (self.calibrated, self.true)]
         calibrated, true = (_disparity_px(left, right, range_m) for left, right in pairs)
         return calibrated - true
@@ -183,10 +175,7 @@ _HEAD_FROM_DOWN = Rotation.from_matrix(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0
 def on_head(
     left: CameraModel, right: CameraModel, baseline_m: float, toe_in_deg: float
 ) -> tuple[CameraModel, CameraModel]:
-    """Mount two cameras of a body frame (see `marsyard.sim.camera.looking_down`) on a head as a stereo pair.
-
-    Both look forwards, half the baseline to either side of the head's origin, turned inwards by the toe-in.
-    """
+    """Mount two cameras that look down on a head as a stereo pair that looks forwards, turned inwards by the toe-in."""
 
     def mount(camera: CameraModel, side: float) -> CameraModel:
         turn = Rotation.from_rotvec([0.0, 0.0, -side * np.radians(toe_in_deg)])

@@ -46,9 +46,7 @@ class VisualOdometryParameters(Parameters):
     error of a run and random errors is assumed), and 3 % on 2 m.
     """
 
-    scale_error: Annotated[Fraction, Field(description="of the distance, constant in a run (stereo calibration)")] = (
-        0.015
-    )
+    scale_error: Annotated[Fraction, Field(description="of the distance, constant in a run (stereo)")] = 0.015
     walk_m: Annotated[float, Field(ge=0.0, le=1.0, description="error per axis per root metre, m")] = 0.02
     floor_m: Annotated[float, Field(ge=0.0, le=1.0, description="error per axis new with every drive, m")] = 0.002
     failure_share: Annotated[Fraction, Field(description="fraction of drives without convergence")] = 0.0
@@ -64,9 +62,9 @@ class OdometryParameters(Parameters):
     scale_error: Annotated[Fraction, Field(description="of the path, constant in a run (wheel radius)")] = 0.01
     walk_m: Annotated[float, Field(ge=0.0, le=1.0, description="error along and across per root metre, m")] = 0.01
     heading_scale_error: Annotated[Fraction, Field(description="of the turn, constant in a run")] = 0.002
-    heading_drift_deg_m: Annotated[Degrees, Field(description="drift along the path, common to a run, deg/m")] = 0.03
+    heading_drift_deg_m: Annotated[Degrees, Field(description="drift along the path, constant in a run, deg/m")] = 0.03
     heading_walk_deg: Annotated[Degrees, Field(description="heading error per root metre of path, deg")] = 0.05
-    misalignment_deg: Annotated[Degrees, Field(description="of the accelerometers, per axis, common to a run")] = 0.1
+    misalignment_deg: Annotated[Degrees, Field(description="of the accelerometers, per axis, constant in a run")] = 0.1
     tilt_noise_deg: Annotated[Degrees, Field(description="of pitch and roll, new at every stop")] = 0.03
     visual: VisualOdometryParameters = VisualOdometryParameters()
 

@@ -107,14 +107,11 @@ class LightPath:
         flux = float(np.trapezoid(passed, wavelength_nm)) / sun_distance_au**2
         return area * self.transmission * flux / (4.0 * self.f_number**2)
 
-    def mean_wavelength_nm(self) -> float:
-        """Compute the mean wavelength of the detected photons."""
-        wavelength_nm, electrons = self._electrons_per_m2()
-        return float(np.average(wavelength_nm, weights=electrons * self._filter(wavelength_nm, electrons)))
-
     def diffraction_px(self) -> float:
-        """Compute the mean wavelength times f-number over the pixel pitch."""
-        return 1e-3 * self.mean_wavelength_nm() * self.f_number / self.pixel_pitch_um
+        """Compute the mean wavelength of the detected photons times f-number over the pixel pitch."""
+        wavelength_nm, electrons = self._electrons_per_m2()
+        mean_nm = float(np.average(wavelength_nm, weights=electrons * self._filter(wavelength_nm, electrons)))
+        return 1e-3 * mean_nm * self.f_number / self.pixel_pitch_um
 
     def _electrons_per_m2(self) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
         """Wavelengths, and electrons per second, m2 and nm at 1 AU without lens and filter."""
@@ -146,23 +143,13 @@ def solar_photons(wavelength_nm: Float64[np.ndarray, "n"]) -> Float64[np.ndarray
 class OpticsParameters(Parameters):
     """Point spread and dust. Defaults: an f/12 lens at 700 nm on 12 um pixels, without dust."""
 
-    diffraction_px: Annotated[
-        NonNegative, Field(le=5.0, description="wavelength times f-number over pixel pitch; 0: none")
-    ] = 0.70
-    diffusion_px: Annotated[
-        NonNegative, Field(le=5.0, description="RMS charge diffusion, pixels; the default is assumed")
-    ] = 0.25
-    pixel_aperture: Annotated[
-        bool, Field(description="average over the pixel's area; not for area-sampled renderings")
-    ] = False
+    diffraction_px: Annotated[NonNegative, Field(le=5.0, description="wavelength x f-number / pitch; 0: none")] = 0.70
+    diffusion_px: Annotated[NonNegative, Field(le=5.0, description="RMS charge diffusion, pixels (assumed)")] = 0.25
+    pixel_aperture: Annotated[bool, Field(description="average over pixels; not for area-sampled renderings")] = False
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
     dust_depth: Annotated[float, Field(ge=0.0, le=1.0, description="fraction of the light absorbed by a speck")] = 0.3
-    dust_radius_px: Annotated[
-        float, Field(gt=0.0, le=1000.0, description="mean radius of a speck's shadow, px; +- a third")
-    ] = 25.0
-    dust_softness: Annotated[
-        float, Field(gt=0.0, le=1.0, description="half width of a shadow's edge over its radius")
-    ] = 0.5
+    dust_radius_px: Annotated[float, Field(gt=0.0, le=1000.0, description="mean shadow radius, px; +- a third")] = 25.0
+    dust_softness: Annotated[float, Field(gt=0.0, le=1.0, description="half width of its edge over the radius")] = 0.5
 
 
 @lru_cache(maxsize=32)

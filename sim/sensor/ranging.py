@@ -1,13 +1,12 @@
-"""Ranging instruments: common errors, the laser altimeter and the radar altimeter, and the true height above ground.
+"""Ranging instruments: common errors, laser ranges along a ray, the radar altimeter, and the true height above ground.
 
-The laser reads the slant range to the ground along an axis of the body. The radar reads the range to the nearest ground
-within a cone fixed to the body: over a slope the foot of the perpendicular, over relief the nearest crest, and at tilts
-beyond the beam's half width the beam's edge. The ground's reflectivity and the antenna pattern are not modelled.
+The radar reads the range to the nearest ground within a cone fixed to the body: over a slope the foot of the
+perpendicular, over relief the nearest crest, and at tilts beyond the beam's half width the beam's edge. The ground's
+reflectivity and the antenna pattern are not modelled.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -115,83 +114,10 @@ class RangingUnit:
         return Readings(tags, np.where(valid, values, np.nan))
 
 
-class _Altimeter(ABC):
-    """Common part of the altimeters over a terrain."""
-
-    unit: RangingUnit
-
-    @property
-    def sampling(self) -> Sampling:
-        """Sampling times."""
-        return self.unit.sampling
-
-    @abstractmethod
-    def true_ranges(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
-        """Compute the true ranges at true times; infinite beyond the maximum range."""
-
-    def measure(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator) -> Readings:
-        """Read one range per true time."""
-        return self.unit.readings(times_s, self.true_ranges(trajectory, times_s), rng)
-
-
-@dataclass(frozen=True)
-class LaserAltimeter(_Altimeter):
-    """A laser altimeter over a terrain, its beam along a body axis.
-
-    A beam of some width reads the mean range of seven rays that divide it evenly.
-    """
-
-    parameters: LaserParameters
-    surface: Surface
-    unit: RangingUnit
-    axis_body: Float64[np.ndarray, "3"]
-
-    @classmethod
-    def drawn(
-        cls,
-        parameters: LaserParameters,
-        surface: Surface,
-        rng: np.random.Generator,
-        axis_body: Float64[np.ndarray, "3"] = DOWN,
-    ) -> LaserAltimeter:
-        """Draw the constant errors of an altimeter along a unit vector in body axes."""
-        return cls(parameters, surface, RangingUnit.drawn(parameters, rng), axis_body)
-
-    def true_ranges(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
-        """Compute the range along the axis to the ground; infinite if it is beyond the maximum range."""
-        motion = trajectory.motion(times_s)
-        width = 1e-3 * self.parameters.beam_mrad
-        rays = np.array(self.axis_body)[None] if width == 0.0 else _beam_rays(self.axis_body, width)
-        axes = np.stack([motion.attitudes.apply(ray) for ray in rays], axis=1)
-        ranges = [
-            np.mean([range_along(self.surface, position, axis, self.parameters.max_range_m) for axis in beam])
-            for position, beam in zip(motion.positions_m, axes, strict=True)
-        ]
-        return np.array(ranges, dtype=np.float64)
-
-
-def _beam_rays(axis: Float64[np.ndarray, "3"], width_rad: float) -> Float64[np.ndarray, "7 3"]:
-    """Unit vectors through seven equal parts of a round beam's area: its centre and a ring.
-
-    The ring has the root mean square radius of the area outside the central part.
-    """
-    sideways = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    sideways /= np.linalg.norm(sideways)
-    # outside a seventh of the area r^2 is uniform from 1/7 to 1 of the beam's radius squared
-    ring = 0.5 * width_rad * np.sqrt(4.0 / 7.0)
-    turns = np.arange(6) * np.pi / 3.0
-    around = np.outer(np.cos(turns), sideways) + np.outer(np.sin(turns), np.cross(axis, sideways))
-    rays = np.concatenate([axis[None], axis + np.tan(ring) * around])
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-
-
 def range_along(
     surface: Surface, position_m: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], max_range_m: float
 ) -> float:
-    """Intersect a ray (unit vector, world axes) with the terrain; return the range, infinite without intersection.
-
-    The ray is compared with the ground at least once per terrain sample. A crest between two comparisons is missed.
-    """
+    """Intersect a ray with the terrain, compared at least once per sample; return the range, or infinity."""
     horizontal_m = float(np.hypot(axis[0], axis[1])) * max_range_m
     count = MIN_POINTS + int(np.ceil(horizontal_m / surface.spacing_m))
 
@@ -209,7 +135,7 @@ def range_along(
 
 
 @dataclass(frozen=True)
-class RadarAltimeter(_Altimeter):
+class RadarAltimeter:
     """A radar altimeter over a terrain; flight software uses its range as the altitude."""
 
     parameters: RadarParameters
@@ -221,16 +147,21 @@ class RadarAltimeter(_Altimeter):
         """Draw the constant errors."""
         return cls(parameters, surface, RangingUnit.drawn(parameters, rng))
 
-    def true_ranges(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
-        """Compute the range to the nearest ground within the beam; infinite if it is beyond the maximum range."""
-        motion = trajectory.motion(times_s)
+    @property
+    def sampling(self) -> Sampling:
+        """Sampling times."""
+        return self.unit.sampling
+
+    def measure(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator) -> Readings:
+        """Read one range to the nearest ground within the beam per true time."""
+        motion, p = trajectory.motion(times_s), self.parameters
         axes = motion.attitudes.apply(DOWN.copy())
-        half_angle = np.radians(0.5 * self.parameters.beam_deg)
+        half_angle = np.radians(0.5 * p.beam_deg)
         ranges = [
-            first_return(self.surface, position, axis, half_angle, self.parameters.max_range_m)
+            first_return(self.surface, position, axis, half_angle, p.max_range_m)
             for position, axis in zip(motion.positions_m, axes, strict=True)
         ]
-        return np.array(ranges, dtype=np.float64)
+        return self.unit.readings(times_s, np.array(ranges, dtype=np.float64), rng)
 
 
 def first_return(
@@ -294,9 +225,9 @@ def _search(
         offsets = offsets[ranges <= nearest + (RELIEF_PER_STEP + slopes) * step_m]
         # each node with its neighbours of a finer grid
         step_m /= REFINEMENT
-        line = (np.arange(REFINEMENT) - 0.5 * (REFINEMENT - 1)) * step_m
-        neighbours = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        offsets = np.asarray((offsets[:, None, :] + neighbours).reshape(-1, 2), dtype=np.float64)
+        fine = (np.arange(REFINEMENT) - 0.5 * (REFINEMENT - 1)) * step_m
+        neighbours = np.stack(np.meshgrid(fine, fine), axis=-1).reshape(-1, 2)
+        offsets = np.asarray((offsets[:, None, :] + neighbours).reshape(-1, 2))
         if not offsets.size:
             return nearest
     return nearest

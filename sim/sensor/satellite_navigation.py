@@ -107,15 +107,9 @@ class RtkParameters(Parameters):
     float_share: Annotated[Fraction, Field(description="fraction of the time with a floating solution")] = 0.1
     float_s: Annotated[Positive, Field(description="mean duration of a floating solution, s")] = 60.0
     velocity_noise_m_s: Annotated[PerAxis, Field(description="of velocity, new in every solution")] = (0.03, 0.03, 0.05)
-    velocity_wander_m_s: Annotated[PerAxis, Field(description="time-correlated velocity error, m/s")] = (
-        0.01,
-        0.01,
-        0.02,
-    )
+    velocity_wander_m_s: Annotated[PerAxis, Field(description="velocity wander, m/s")] = (0.01, 0.01, 0.02)
     velocity_correlation_s: Annotated[Positive, Field(description="correlation time of the velocity error, s")] = 10.0
-    reported_spread: Annotated[Fraction, Field(description="spread of log(reported / true deviation), per flight")] = (
-        0.1
-    )
+    reported_spread: Annotated[Fraction, Field(description="spread of log(reported / true deviation) per flight")] = 0.1
     outages: Annotated[tuple[Outage, ...], Field(description="times without solutions")] = ()
     clock: ClockParameters = ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0002)
 

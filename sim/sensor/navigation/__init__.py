@@ -96,10 +96,7 @@ class NavigationSolution:
     end: FilterState
 
     def pose(self, time_s: float) -> RigidTransform:
-        """Extrapolate the pose to a time tag from the last boundary before it.
-
-        Raises ValueError if the tag is before the first boundary or after the last.
-        """
+        """Extrapolate the pose to a time tag from the boundary before it. Raises ValueError outside the boundaries."""
         tags = self.increments.times_s
         if not tags[0] <= time_s <= tags[-1]:
             raise ValueError(f"navigation is known from {tags[0]:.4f} s to {tags[-1]:.4f} s, not at {time_s:.4f} s")
@@ -122,10 +119,7 @@ class NavigationFilter:
     gravity_m_s2: float
 
     def initialize(self, solutions: RtkSolutions, readings: TiltCompassReadings) -> FilterState:
-        """Create the initial state at the first readings, with deviations far larger than theirs.
-
-        Raises ValueError if there is no solution or no compass reading.
-        """
+        """Create the initial state at the first readings. Raises ValueError without solution or compass reading."""
         valid = np.flatnonzero(np.isfinite(solutions.positions_m[:, 0]))
         if valid.size == 0 or readings.times_s.size == 0:
             raise ValueError("the filter needs a solution of the receiver and a reading of the compass to start at")

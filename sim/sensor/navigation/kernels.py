@@ -219,8 +219,8 @@ def _interpolate(times: Array, values: Array, last: int, time: float) -> Array:
         k -= 1
     after = min(k + 1, last)
     span = times[after] - times[k]
-    share = 0.0 if span <= 0.0 else min(max((time - times[k]) / span, 0.0), 1.0)
-    out: Array = values[k] + share * (values[after] - values[k])
+    fraction = 0.0 if span <= 0.0 else min(max((time - times[k]) / span, 0.0), 1.0)
+    out: Array = values[k] + fraction * (values[after] - values[k])
     return out
 
 

@@ -193,7 +193,7 @@ def test_the_border_of_a_moving_picture_is_nearly_what_a_wider_one_shows(velocit
     held = moving_exposure(frame, np.ones_like(frame), motion, EXPOSURE_S, 5e-6, 1e-6)
     true = moving_exposure(wide, response, motion, EXPOSURE_S, 5e-6, 1e-6)[inside]
     error = (held - true) / true.mean()
-    rows, columns = np.indices(frame.shape)
+    rows, columns = (np.asarray(one) for one in np.indices(frame.shape))
     depth: np.ndarray = np.minimum.reduce([rows, columns, rows[::-1], columns[:, ::-1]])
     rms = [float(np.sqrt(np.mean(error[depth == ring] ** 2))) for ring in range(20)]
     # noise is 1 %

@@ -83,7 +83,7 @@ def test_errors_are_what_the_covariance_says() -> None:
         errors = _errors(path, imu, solution, solution.kept_at)
         covariances = solution.covariances
         squares.append([float(e @ np.linalg.solve(p, e)) for e, p in zip(errors, covariances, strict=True)])
-    low, high = chi2.ppf([0.001, 0.999], 15 * FLIGHTS) / FLIGHTS
+    low, high = (float(chi2.ppf(p, 15 * FLIGHTS)) / FLIGHTS for p in (0.001, 0.999))
     means = np.mean(squares, axis=0)
     assert np.all((means > low) & (means < high)), means
 
@@ -130,7 +130,7 @@ def test_through_an_outage_it_coasts_as_its_covariance_says() -> None:
         sizes.append(np.hypot(*error[:2]))
     assert 0.2 < np.sqrt(np.mean(np.square(sizes))) < 3.0
     # what the instruments are off by in an outage is less than the filter allows for: inclinometers count little
-    low, high = chi2.ppf([0.001, 0.999], 9 * FLIGHTS) / FLIGHTS
+    low, high = (float(chi2.ppf(p, 9 * FLIGHTS)) / FLIGHTS for p in (0.001, 0.999))
     assert low < np.mean(squares) < high
 
 

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -6,7 +8,7 @@ from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
 from marsyard.sim.sensor.optics import OpticsParameters, apply_point_spread, dust_transmission, line_spread
 
 MER = OpticsParameters()
-FORWARD = {"axis": np.array([0.0, 0.0, -1.0]), "right": np.array([1.0, 0.0, 0.0])}
+FORWARD: dict[str, Any] = {"axis": np.array([0.0, 0.0, -1.0]), "right": np.array([1.0, 0.0, 0.0])}
 
 
 @pytest.mark.parametrize("parameters", [MER, OpticsParameters(pixel_aperture=True), OpticsParameters(diffusion_px=1.0)])
