@@ -74,8 +74,6 @@ class CameraModel(ABC):
     def _pupil_axis(self) -> Vector:
         return self.a
 
-    # ----- projection -----
-
     def project(
         self, points: Float[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
@@ -147,8 +145,6 @@ class CameraModel(ABC):
         columns, rows = self.size
         return np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)), axis=-1)
 
-    # ----- motion and changes of the image -----
-
     def moved(self: M, new_from_old: RigidTransform) -> M:
         """The camera after a rigid motion: ``moved(T).project(T.apply(points))`` equals ``project(points)``.
 
@@ -211,8 +207,6 @@ class CameraModel(ABC):
     def _with(self: M, **changes: Any) -> M:
         return cast(M, replace(cast(Any, self), **changes))
 
-    # ----- derived quantities -----
-
     @property
     def image_centre(self) -> tuple[float, float]:
         """(hc, vc): the pixel of the direction A before distortion."""
@@ -259,8 +253,6 @@ class CameraModel(ABC):
         along = np.arange(steps)[:, np.newaxis] / steps
         return np.concatenate([start + along * (end - start) for start, end in pairwise(corners)])
 
-    # ----- construction, comparison, storage -----
-
     def __post_init__(self) -> None:
         for field in fields(cast(Any, self)):
             if field.name not in ("size", "linearity"):
@@ -291,8 +283,6 @@ class CameraModel(ABC):
 
     def __reduce__(self) -> tuple[Callable[..., CameraModel], tuple[()]]:
         return partial(type(self), **self._fields()), ()
-
-    # ----- linear algebra shared by the models -----
 
     @cached_property
     def _determinant(self) -> float:

@@ -333,8 +333,6 @@ class Cahvore(RadialModel):
         radial, pupil = np.asarray(r, dtype=np.float64), np.asarray(e, dtype=np.float64)
         return cls(cahv.c, cahv.a, cahv.h, cahv.v, axis, radial, pupil, linearity=linearity, size=cahv.size)
 
-    # ----- the lens: angle theta, "distance" chi, shift of the pupil -----
-
     @cached_property
     def _theta_limit(self) -> float:
         """Angle from the axis up to which the lens is one-to-one, radians."""
@@ -382,8 +380,6 @@ class Cahvore(RadialModel):
                 break
         solved = (np.abs(step) <= 1e-9) & (upsilon > 0) & (theta >= 0) & (theta < self._theta_limit)
         return np.where(solved, theta, np.nan), upsilon
-
-    # ----- the model -----
 
     def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
         along, off = self._off_axis(x, y, z)

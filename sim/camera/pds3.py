@@ -169,9 +169,8 @@ def _refuse_subframes(label: Any, source: Source) -> None:
     for field, stated in fields.items():
         value = getattr(stated, "value", stated)  # a quantity with its unit, as 2 <pixel>
         if isinstance(value, int) and value != 1:
-            raise source.error(
-                field, f"{value}: of a part of the detector or of averaged pixels", "1, or subframe_folded_in=True"
-            )
+            fault = f"{value}: of a part of the detector or of averaged pixels"
+            raise source.error(field, fault, "1, or subframe_folded_in=True")
 
 
 def _camera(group: Any, size: tuple[int, int], source: Source) -> CameraModel:
@@ -200,10 +199,8 @@ def _components(group: Any, source: Source) -> dict[str, tuple[str, Any]]:
     for letter, unit in zip(letters, units, strict=False):
         if letter in ("C", "E") and str(unit).upper() not in _METRES:
             raise source.error(f"{_GROUP}.MODEL_COMPONENT_UNIT", f"{unit!r} for {letter}", "METER")
-    keywords = (f"MODEL_COMPONENT_{number}" for number in range(1, len(letters) + 1))
-    return {
-        letter: (f"{_GROUP}.{keyword}", group.get(keyword)) for letter, keyword in zip(letters, keywords, strict=True)
-    }
+    keywords = {letter: f"MODEL_COMPONENT_{number}" for number, letter in enumerate(letters, start=1)}
+    return {letter: (f"{_GROUP}.{keyword}", group.get(keyword)) for letter, keyword in keywords.items()}
 
 
 def _vector(letter: str, components: Mapping[str, tuple[str, Any]], source: Source) -> list[float]:

@@ -53,16 +53,16 @@ class ImuParameters(Parameters):
     rate_hz: Annotated[Positive, Field(le=10000.0, description="samples per second")] = 400.0
     gyro_bias_deg_h: Annotated[NonNegative, Field(description="constant gyro bias, deg/h")] = 1.0
     gyro_wander_deg_h: Annotated[NonNegative, Field(description="time-correlated gyro bias, deg/h")] = 0.35
-    gyro_wander_s: Annotated[Positive, Field(description="correlation time of that bias, s")] = 100.0
-    gyro_bias_deg_h_k: Annotated[NonNegative, Field(description="change of gyro bias with temperature, deg/h/K")] = 0.1
+    gyro_wander_s: Annotated[Positive, Field(description="correlation time of the bias, s")] = 100.0
+    gyro_bias_deg_h_k: Annotated[NonNegative, Field(description="bias change with temperature, deg/h/K")] = 0.1
     angular_random_walk_deg_sqrt_h: Annotated[NonNegative, Field(description="angular random walk, deg/sqrt(h)")] = 0.07
     gyro_scale_ppm: Annotated[NonNegative, Field(description="error of the gyros' scale factors, ppm")] = 100.0
     gyro_misalignment_mrad: Annotated[NonNegative, Field(description="each gyro's input from another axis, mrad")] = 0.1
     gyro_count_rad: Annotated[NonNegative, Field(description="angle of a count, rad; 0: no rounding")] = 2.0**-19
     accelerometer_bias_mg: Annotated[NonNegative, Field(description="constant accelerometer bias, mg")] = 0.3
     accelerometer_wander_mg: Annotated[NonNegative, Field(description="time-correlated accelerometer bias, mg")] = 0.05
-    accelerometer_wander_s: Annotated[Positive, Field(description="correlation time of that bias, s")] = 60.0
-    accelerometer_bias_mg_k: Annotated[NonNegative, Field(description="its change with temperature, mg/K")] = 0.02
+    accelerometer_wander_s: Annotated[Positive, Field(description="correlation time of the bias, s")] = 60.0
+    accelerometer_bias_mg_k: Annotated[NonNegative, Field(description="bias change with temperature, mg/K")] = 0.02
     velocity_random_walk_ug_sqrt_hz: Annotated[NonNegative, Field(description="velocity noise, ug/sqrt(Hz)")] = 50.0
     accelerometer_scale_ppm: Annotated[NonNegative, Field(description="error of the scale factors, ppm")] = 300.0
     accelerometer_misalignment_mrad: Annotated[NonNegative, Field(description="input from another axis, mrad")] = 0.1

@@ -192,7 +192,10 @@ class Approach:
     def body_rates(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
         """Nominal angular velocities, body axes, rad/s."""
         # the turn of the flight direction leaves its axis fixed: only the spin moves the axis in the body
-        turning, spun, (first, second, _) = self._off_nadir_rate(times_s), self._spun(times_s), self._turn_axis()
+        times, angles = self._knots()
+        knot_rates = np.concatenate([[0.0], np.diff(angles) / np.diff(times), [0.0]])
+        turning = knot_rates[np.searchsorted(times, times_s, side="right")]
+        spun, (first, second, _) = self._spun(times_s), self._turn_axis()
         rates: Float64[np.ndarray, "n 3"] = np.empty((times_s.size, 3))
         rates[:, 0] = turning * (np.cos(spun) * first + np.sin(spun) * second)
         rates[:, 1] = turning * (np.cos(spun) * second - np.sin(spun) * first)
@@ -235,8 +238,3 @@ class Approach:
     def _off_nadir(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         times, angles = self._knots()
         return np.asarray(np.interp(times_s, times, angles))
-
-    def _off_nadir_rate(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
-        times, angles = self._knots()
-        rates = np.concatenate([[0.0], np.diff(angles) / np.diff(times), [0.0]])
-        return np.asarray(rates[np.searchsorted(times, times_s, side="right")])

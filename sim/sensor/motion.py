@@ -46,11 +46,6 @@ class ImageMotion:
     velocity_px_s: Float64[np.ndarray, "n m 2"]
 
     @classmethod
-    def uniform(cls, rows_s: float, columns_s: float) -> ImageMotion:
-        """Create a uniform motion, pixels per second."""
-        return cls(np.tile(np.array([rows_s, columns_s], dtype=np.float64), (2, 2, 1)))
-
-    @classmethod
     def of_camera(
         cls,
         camera: CameraModel,

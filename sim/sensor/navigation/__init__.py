@@ -185,27 +185,19 @@ class NavigationFilter:
 
     def _gps_rows(self, s: RtkSolutions) -> Float64[np.ndarray, "n 15"]:
         """Solutions in the kernels' columns; reported deviations are split as in the receiver's parameters."""
-        rows = np.empty((s.times_s.size, kernels.GPS_COLUMNS))
-        rows[:, kernels.TAG] = s.times_s
-        rows[:, kernels.ARRIVAL] = s.times_s + self.rtk.latency_s
-        rows[:, kernels.GPS_POSITION : kernels.GPS_POSITION + 3] = s.positions_m
-        rows[:, kernels.GPS_VELOCITY : kernels.GPS_VELOCITY + 3] = s.velocities_m_s
         fixed, floating = self.rtk.fixed, self.rtk.floating
         wanders, noises = (
             np.where(s.fixed[:, None], _fraction(fixed, part), _fraction(floating, part)) * s.reported_m
             for part in ("wander_m", "noise_m")
         )
-        rows[:, kernels.GPS_WANDER : kernels.GPS_WANDER + 3] = wanders
-        rows[:, kernels.GPS_NOISE : kernels.GPS_NOISE + 3] = noises
-        rows[:, kernels.FIXED] = s.fixed
+        arrivals = s.times_s + self.rtk.latency_s
+        rows = np.column_stack([s.times_s, arrivals, s.positions_m, s.velocities_m_s, wanders, noises, s.fixed])
         rows[_stuck(s.positions_m, self.parameters.most_repeats), kernels.GPS_POSITION] = np.nan
         return rows
 
     def _tilt_rows(self, r: TiltCompassReadings) -> Float64[np.ndarray, "n 5"]:
-        rows = np.empty((r.times_s.size, kernels.TILT_COLUMNS))
-        rows[:, kernels.TAG] = r.times_s
-        rows[:, kernels.UP : kernels.UP + 3] = r.up_body
-        rows[:, kernels.YAW] = 0.5 * np.pi - r.headings_rad
+        """Readings in the kernels' columns."""
+        rows = np.column_stack([r.times_s, r.up_body, 0.5 * np.pi - r.headings_rad])
         max_repeats = self.parameters.most_repeats
         rows[_stuck(r.up_body, max_repeats), kernels.UP] = np.nan
         rows[_stuck(r.headings_rad[:, None], max_repeats), kernels.YAW] = np.nan
@@ -217,12 +209,8 @@ class NavigationFilter:
     def _accelerometer_bias_m_s2(self) -> float:
         """Including scale and misalignment errors under gravity: 1 ppm is 1e-3 mg, 1 mrad is 1 mg."""
         p = self.imu
-        parts = [
-            p.accelerometer_bias_mg,
-            p.accelerometer_wander_mg,
-            1e-3 * p.accelerometer_scale_ppm,
-            p.accelerometer_misalignment_mrad,
-        ]
+        biases = [p.accelerometer_bias_mg, p.accelerometer_wander_mg]
+        parts = [*biases, 1e-3 * p.accelerometer_scale_ppm, p.accelerometer_misalignment_mrad]
         return float(np.linalg.norm(np.array(parts))) * 1e-3 * STANDARD_GRAVITY_M_S2
 
     def _heading_bias_rad(self) -> float:

@@ -25,9 +25,9 @@ ERRORS = 24
 #: Blocks of the state, after position and velocity.
 QUATERNION, STATE_GYRO_BIAS, STATE_ACCELEROMETER_BIAS, STATE = 6, 10, 13, 16
 #: Columns of a receiver's row: time tag, time of delivery, solution, deviations of wander and noise, whether fixed.
-TAG, ARRIVAL, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED, GPS_COLUMNS = 0, 1, 2, 5, 8, 11, 14, 15
+TAG, ARRIVAL, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED = 0, 1, 2, 5, 8, 11, 14
 #: Columns of a compass's row after its time tag; yaw is counterclockwise from east.
-UP, YAW, TILT_COLUMNS = 1, 4, 5
+UP, YAW = 1, 4
 #: Types of innovations.
 POSITION_FIX, VELOCITY_FIX, COMPASS, INCLINOMETER = range(4)
 #: Memory between runs: whether the receiver's last solution was fixed (-1: none yet), the filtered acceleration in
