@@ -29,7 +29,7 @@ def render_state(
     pose = state.world_from_body if mounting is None else state.world_from_body * mounting
     frame = process_renderer(backend).render(scene, optics.rays, pose, state.time_s)
     rate = state.attitude.apply(state.body_rate_rad_s)
-    return frame, ImageMotion.seen(optics.camera, frame.range_m, frame.world_from_body, state.velocity_m_s, rate)
+    return frame, ImageMotion.of_camera(optics.camera, frame.range_m, frame.world_from_body, state.velocity_m_s, rate)
 
 
 def sunlight_ratio(air: Environment, elevation_rad: float, detector: DetectorParameters) -> float:

@@ -56,7 +56,7 @@ def asked(
 def _three_of(measurements: DescentMeasurements, triple: Triple | None) -> DescentMeasurements:
     if triple is None:
         raise ValueError(f"it takes three pictures, and {len(measurements.images)} are taken")
-    return measurements if len(measurements.images) == len(triple) else measurements.chosen(triple)
+    return measurements if len(measurements.images) == len(triple) else measurements.select(triple)
 
 
 def checked_last_interval(answer: object, measurements: DescentMeasurements) -> VelocityEstimate:

@@ -1,4 +1,4 @@
-"""Where things built once are kept on disk, how much room they may take, and how they are written and verified."""
+"""Cached arrays on disk: location, size limit, eviction, atomic writing and checksums."""
 
 from __future__ import annotations
 
@@ -14,40 +14,34 @@ from pathlib import Path
 
 import numpy as np
 
-#: Room that cached terrains may take where ``MARSYARD_CACHE_GB`` does not say: a share of what the disk could give, and
-#: a bound on it. Gigabytes are of 10**9 bytes.
+#: Default limit where ``MARSYARD_CACHE_GB`` is not set: a fraction of the free space, and a bound on it.
 FREE_SHARE, LIMIT_GB = 0.4, 10.0
 GIGA = 10**9
-#: Ending of files that are being written, and the age from which one is what an interrupted process left behind.
+#: Suffix of files that are being written, and the age from which such a file is left over from an interrupted process.
 UNFINISHED, ABANDONED_S = ".part", 86400.0
-
-
-#: Bytes of the checksum behind an array.
+#: Bytes of the checksum after an array.
 _CHECKSUM_BYTES = 4
-#: Files that this process has verified, and their state at that time: device, inode, time of change and size.
+#: Files that this process has verified, with their state at that time: device, inode, modification time and size.
 _VERIFIED: dict[Path, tuple[int, int, int, int]] = {}
 
 
 class CacheWarning(UserWarning):
-    """A cached file is damaged and built again, or cannot be written; results do not depend on it."""
+    """A cached file is damaged and built again, or cannot be written. Results do not depend on it."""
 
 
 def cache_directory(kind: str) -> Path:
-    """The folder for cached things of this kind: under ``MARSYARD_CACHE``, else the user's cache folder. Created."""
-    configured = os.environ.get("MARSYARD_CACHE")
-    root = (
-        Path(configured) if configured else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "marsyard"
-    )
-    directory = root / kind
+    """Return the cache folder for files of this kind and create it; below ``MARSYARD_CACHE`` or the user's cache."""
+    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "marsyard"
+    directory = Path(os.environ.get("MARSYARD_CACHE") or default) / kind
     directory.mkdir(parents=True, exist_ok=True)
     return directory
 
 
 def limit_bytes(folder: Path, kept_bytes: int) -> int:
-    """Most that the files in a folder may take together, where they take `kept_bytes` now.
+    """Return the size limit of a cache folder whose files take `kept_bytes` now.
 
-    ``MARSYARD_CACHE_GB`` where it is set, else 40 % of what would be free without them, at most 10 GB. Raises
-    ValueError where the variable is not a positive number.
+    ``MARSYARD_CACHE_GB`` where it is set; otherwise 40 % of the space that is free without the cached files, at most
+    10 GB. Raises ValueError if the variable is not a positive number.
     """
     configured = os.environ.get("MARSYARD_CACHE_GB")
     if not configured:
@@ -62,7 +56,7 @@ def limit_bytes(folder: Path, kept_bytes: int) -> int:
 
 
 def kept_bytes(folder: Path) -> int:
-    """Bytes that the files in a folder take together, those being written left out."""
+    """Return the total size of the finished files in a folder."""
     total = 0
     for path in folder.iterdir():
         with contextlib.suppress(FileNotFoundError):
@@ -71,11 +65,10 @@ def kept_bytes(folder: Path) -> int:
 
 
 def make_room(folder: Path, wanted_bytes: int, in_use: Collection[Path] = ()) -> None:
-    """Removes the files of a folder that were used least recently, until one of `wanted_bytes` fits under the limit.
+    """Delete the least recently used files of a folder until a file of `wanted_bytes` fits under the limit.
 
-    Files `in_use` stay, whatever the limit. So do those being written, but for what an interrupted process left a day
-    ago. Other processes may remove files at the same time, and may hold a removed one open: it goes when they let go.
-    Raises ValueError as `limit_bytes` does.
+    Files `in_use` are never deleted. Unfinished files are deleted once they are a day old. Other processes may delete
+    files at the same time, or hold a deleted file open. Raises ValueError as `limit_bytes` does.
     """
     kept, kept_bytes = [], 0
     for path in folder.iterdir():
@@ -96,19 +89,16 @@ def make_room(folder: Path, wanted_bytes: int, in_use: Collection[Path] = ()) ->
 
 
 def touch(path: Path) -> None:
-    """Marks a file as used now; in a folder that cannot be written to nothing is ever removed either.
-
-    Only the time of access changes: the time of change says whether the file is the one that was verified.
-    """
+    """Set a file's access time to now, if the folder is writable; the modification time identifies verified files."""
     with contextlib.suppress(OSError):
         os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
 
 
 def save_array(path: Path, array: np.ndarray) -> np.ndarray:
-    """Write an array with its checksum, whole or not at all, and return it memory-mapped and read-only.
+    """Write an array with its checksum atomically; return it memory-mapped and read-only.
 
-    File and folder are synced, so that a loss of power leaves the whole file or none. The file is mapped before it gets
-    its name: another process may remove it at once. Raises OSError where it cannot be written.
+    File and folder are synced, so that a power loss leaves the whole file or none. The file is mapped before it is
+    renamed, because another process may delete it at once. Raises OSError if it cannot be written.
     """
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=UNFINISHED, delete=False) as part:
         try:
@@ -117,27 +107,36 @@ def save_array(path: Path, array: np.ndarray) -> np.ndarray:
             part.flush()
             os.fsync(part.fileno())
             mapped: np.ndarray = np.load(part.name, mmap_mode="r").view(np.ndarray)
-            state = _state(Path(part.name))
+            state = _file_state(Path(part.name))
             Path(part.name).replace(path)
         except BaseException:
             Path(part.name).unlink(missing_ok=True)
             raise
-    _sync_folder(path.parent)
+    with contextlib.suppress(OSError):  # not every file system can sync a folder
+        descriptor = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
     _VERIFIED[path] = state
     return mapped
 
 
 def load_array(path: Path) -> np.ndarray | None:
-    """Map an array that `save_array` wrote, read-only; None where there is none, or where it is damaged.
+    """Map an array written by `save_array`, read-only; return None if the file is missing or damaged.
 
-    The first use of a file by a process verifies its checksum (about 0.3 s per GB of cached pages), later uses only
-    compare the file's state. Warns with `CacheWarning` of a damaged file.
+    The first use of a file in a process verifies its checksum (about 0.3 s per GB of cached pages). Later uses compare
+    the file's state only. Issues a `CacheWarning` for a damaged file.
     """
     try:
-        state = _state(path)
+        state = _file_state(path)
         mapped: np.ndarray = np.load(path, mmap_mode="r").view(np.ndarray)
-        if _VERIFIED.get(path) != state and _stored_checksum(path) != _checksum(mapped):
-            raise ValueError("its checksum does not match its content")
+        if _VERIFIED.get(path) != state:
+            with path.open("rb") as file:
+                file.seek(-_CHECKSUM_BYTES, os.SEEK_END)
+                stored = file.read()
+            if stored != _checksum(mapped):
+                raise ValueError("its checksum does not match its content")
     except FileNotFoundError:
         return None
     except (OSError, ValueError, EOFError) as error:
@@ -147,27 +146,10 @@ def load_array(path: Path) -> np.ndarray | None:
     return mapped
 
 
-def _state(path: Path) -> tuple[int, int, int, int]:
-    """What changes when a file is written to or replaced."""
+def _file_state(path: Path) -> tuple[int, int, int, int]:
     status = path.stat()
     return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def _checksum(array: np.ndarray) -> bytes:
     return zlib.crc32(np.ascontiguousarray(array).data).to_bytes(_CHECKSUM_BYTES, "little")
-
-
-def _stored_checksum(path: Path) -> bytes:
-    with path.open("rb") as file:
-        file.seek(-_CHECKSUM_BYTES, os.SEEK_END)
-        return file.read()
-
-
-def _sync_folder(folder: Path) -> None:
-    """Syncs the names in a folder; not every file system can."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -1,4 +1,4 @@
-"""Safe reading of a user's files: regular files only, and archives by what they expand to, checked before they do."""
+"""Safe reading of user files: regular files only; the expanded size of archives is checked before they are read."""
 
 from __future__ import annotations
 
@@ -11,64 +11,54 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-#: Kinds of files that are not regular, for messages.
-_KINDS = (
-    (stat.S_ISFIFO, "a named pipe"),
-    (stat.S_ISSOCK, "a socket"),
-    (stat.S_ISCHR, "a character device"),
-    (stat.S_ISBLK, "a block device"),
-)
-#: What numpy and zipfile raise for damaged archives and headers; NotImplementedError is an unknown compression.
+#: Types of special files, for messages.
+_SPECIAL_FILES = {
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a character device",
+    stat.S_IFBLK: "a block device",
+}
+#: Errors of numpy and zipfile for damaged archives and headers; NotImplementedError is an unknown compression.
 ARCHIVE_ERRORS = (OSError, ValueError, EOFError, TypeError, KeyError, NotImplementedError, zipfile.BadZipFile)
-
-#: Shape and type of an array, by its header.
+#: Shape and type of an array.
 ArrayHeader = tuple[tuple[int, ...], np.dtype[Any]]
 
 
 def check_regular(path: str | Path) -> os.stat_result:
-    """Return the status of a regular file, or of what a link leads to.
+    """Return the status of a regular file or of the target of a link.
 
-    Raises
-    ------
-    OSError
-        Where the file is missing, a folder, a named pipe or a device. Opening a pipe may wait for ever, and a device
-        may have no end.
+    Raises OSError if the file is missing, a folder, a named pipe or a device: opening a pipe may block for ever, and a
+    device may have no end.
     """
-    about = Path(path).stat()
-    if stat.S_ISDIR(about.st_mode):
+    status = Path(path).stat()
+    if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    if not stat.S_ISREG(about.st_mode):
-        kind = next((name for matches, name in _KINDS if matches(about.st_mode)), "a special file")
+    if not stat.S_ISREG(status.st_mode):
+        kind = _SPECIAL_FILES.get(stat.S_IFMT(status.st_mode), "a special file")
         raise OSError(errno.EINVAL, f"is {kind}; a regular file is needed", str(path))
-    return about
+    return status
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """Open a regular file for reading. Raises OSError, as `check_regular`."""
+    """Open a regular file for reading. Raises OSError as `check_regular` does."""
     check_regular(path)
     return Path(path).open("rb")
 
 
 def npz_headers(path: str | Path) -> dict[str, ArrayHeader]:
-    """Shape and type of each array of an .npz archive, without expanding any.
-
-    Raises
-    ------
-    OSError, ValueError, EOFError, zipfile.BadZipFile
-        Where the file is no archive of arrays (`ARCHIVE_ERRORS`).
-    """
+    """Read shape and type of each array of an .npz archive without expanding it; raises one of `ARCHIVE_ERRORS`."""
     check_regular(path)
     headers: dict[str, ArrayHeader] = {}
     with zipfile.ZipFile(path) as archive:
-        for about in archive.infolist():
-            if about.filename.endswith(".npy"):
-                with archive.open(about) as member:
-                    headers[about.filename.removesuffix(".npy")] = npy_header(member)
+        for entry in archive.infolist():
+            if entry.filename.endswith(".npy"):
+                with archive.open(entry) as member:
+                    headers[entry.filename.removesuffix(".npy")] = npy_header(member)
     return headers
 
 
 def npy_header(file: Any) -> ArrayHeader:
-    """Shape and type that the header of an .npy file states. Raises ValueError where it is none."""
+    """Read shape and type from the header of an open .npy file. Raises ValueError if it has no valid header."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"version {version} of .npy files is not read")
@@ -78,10 +68,7 @@ def npy_header(file: Any) -> ArrayHeader:
 
 
 def expanded_bytes(path: str | Path) -> int:
-    """Bytes that the members of a zip archive expand to, by its directory, beyond which zipfile reads nothing.
-
-    Raises OSError or zipfile.BadZipFile where the file is no zip archive.
-    """
+    """Return the expanded size of a zip archive by its directory. Raises OSError or zipfile.BadZipFile."""
     check_regular(path)
     with zipfile.ZipFile(path) as archive:
-        return sum(about.file_size for about in archive.infolist())
+        return sum(entry.file_size for entry in archive.infolist())

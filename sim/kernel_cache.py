@@ -1,8 +1,7 @@
-"""Where compiled kernels are kept: one folder for each state of their sources.
+"""Cache folder of compiled kernels: one folder per state of the kernels' sources.
 
-numba keeps a compiled function until its own file changes; it does not see that a function which it calls, in another
-file, has changed. A kernel that was compiled against old code would then go on giving the old results. Here every
-change of any kernel's source is another folder.
+numba recompiles a function when its own file changes, not when a function that it calls from another file changes. A
+stale kernel would return old results. Any change of any kernel source therefore selects a new folder.
 """
 
 from __future__ import annotations
@@ -16,38 +15,35 @@ from pathlib import Path
 from marsyard.sim.cache import cache_directory
 from marsyard.sim.processor import processor_features
 
-#: The folders that hold kernels, side by side in the tree and where they are installed.
+#: The folders that hold kernels, in the source tree and in an installation.
 _FOLDERS = ("sim", "algorithms", "scenarios")
 
 
 def use_own_folder() -> None:
-    """Points numba, without importing it, at the folder of the kernels as they are, unless the user has chosen one."""
+    """Set numba's cache folder by the kernels' sources, without importing numba; the user's own setting is kept."""
     if "NUMBA_CACHE_DIR" in os.environ:
         return
-    digest = hashlib.sha256(sys.version.encode())
-    for source in _kernel_sources():
+    root, digest = Path(__file__).parents[1], hashlib.sha256(sys.version.encode())
+    sources = (path for folder in _FOLDERS for path in (root / folder).rglob("*.py"))
+    for source in sorted(path for path in sources if "kernels" in (path.stem, path.parent.name)):
         digest.update(source.read_bytes())
     try:
         folder = cache_directory("kernels") / digest.hexdigest()[:16]
     except OSError:
-        # Nowhere to keep them: numba falls back to its own places, or compiles in every process.
-        return
+        return  # without a writable folder numba uses its own, or compiles in every process
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(folder)
 
 
 def kernels_are_ready(user: str) -> bool:
-    """Whether a user of the kernels (a scenario) has run to its end with those that are there, on this processor.
-
-    False where nothing can be kept: then each process compiles them anew.
-    """
+    """Whether a user of the kernels (a scenario) has completed a run with the cached kernels on this processor."""
     mark = _mark(user)
     return mark is not None and mark.exists()
 
 
 def note_ready(user: str) -> None:
-    """Notes that this user's kernels are compiled."""
+    """Record that the kernels of this user are compiled."""
     mark = _mark(user)
     if mark is not None:
         with suppress(OSError):
@@ -56,22 +52,13 @@ def note_ready(user: str) -> None:
 
 
 def compiled_functions() -> int:
-    """Number of compiled functions that are kept so far; 0 where none can be kept."""
+    """Count the cached compiled functions; 0 if there is no cache."""
     folder = os.environ.get("NUMBA_CACHE_DIR")
     return 0 if folder is None else sum(1 for _ in Path(folder).rglob("*.nbc"))
 
 
 def _mark(user: str) -> Path | None:
-    # numba keeps one compiled form for each kind of processor, as compiled code runs on its own kind only
+    # compiled code runs on its own type of processor only: numba keeps one compiled form per type
     folder = os.environ.get("NUMBA_CACHE_DIR")
     digest = hashlib.sha256(f"{user} {processor_features()}".encode())
     return None if folder is None else Path(folder) / f"{digest.hexdigest()[:16]}.ready"
-
-
-def _kernel_sources() -> list[Path]:
-    root = Path(__file__).parents[1]
-    return sorted(path for folder in _FOLDERS for path in (root / folder).rglob("*.py") if _is_kernel(path))
-
-
-def _is_kernel(path: Path) -> bool:
-    return path.name == "kernels.py" or path.parent.name == "kernels"

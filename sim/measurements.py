@@ -1,6 +1,6 @@
-"""What instruments deliver to flight software: the only thing that an algorithm is given; and what it asks of wheels.
+"""Measurements: the only input of an algorithm; and commands to the wheels.
 
-Nothing here holds truth. Cameras are as calibrated, times are as tagged, attitudes and altitudes are as measured.
+Nothing here is ground truth. Cameras are as calibrated, times as tagged, attitudes and altitudes as measured.
 """
 
 from __future__ import annotations
@@ -19,24 +19,15 @@ from marsyard.sim.frames import rigid_from_axes
 
 @dataclass(frozen=True)
 class DetectorCalibration:
-    """What the ground knows of an image detector before flight.
+    """Calibration of an image detector before flight.
 
-    Attributes
-    ----------
-    flat_field
-        Relative response of each delivered pixel (1 at the brightest), shape (rows, columns) of the delivered image.
-    exposure_s
-        Exposure time, seconds.
-    transfer_row_s
-        Time a charge packet spends under each physical row while the picture is shifted out, seconds.
-    clear_row_s
-        Time a charge packet spends under each physical row while the detector is cleared before the exposure, seconds.
-    rows_summed
-        Physical rows summed on the chip into one delivered row.
-    offset_dn
-        Counts delivered for no light.
-    full_scale_dn
-        The largest count (4095 for 12 bits).
+    - flat_field: relative response of each delivered pixel (1 at the brightest)
+    - exposure_s: exposure time
+    - transfer_row_s: time of a charge packet under each physical row during the transfer to the storage area
+    - clear_row_s: time of a charge packet under each physical row during the clearing before the exposure
+    - rows_summed: physical rows summed on the chip into one delivered row
+    - offset_dn: counts without light
+    - full_scale_dn: the largest count (4095 for 12 bits)
     """
 
     flat_field: Float[np.ndarray, "rows columns"]
@@ -50,21 +41,13 @@ class DetectorCalibration:
 
 @dataclass(frozen=True)
 class DetectorImage:
-    """One picture as delivered by a camera.
+    """A picture as delivered by a camera.
 
-    Row 0 is the row nearest to the storage area: it is shifted out first, and a packet of row r passes under the rows
-    r-1, r-2, ... 0 on its way out.
+    Row 0 is nearest to the storage area and is shifted out first. A packet of row r passes the rows r-1, r-2, ... 0.
 
-    Attributes
-    ----------
-    counts
-        Detector counts, shape (rows, columns) as delivered, after summing on the chip.
-    time_s
-        Time tag of the middle of the exposure, seconds.
-    camera
-        The calibrated camera model of the delivered picture (its size is that of `counts`), in the body frame.
-    calibration
-        The detector's calibration.
+    - counts: detector counts, after summing on the chip
+    - time_s: time tag of the middle of the exposure
+    - camera: the calibrated camera model of the delivered picture, in the body frame
     """
 
     counts: UInt16[np.ndarray, "rows columns"]
@@ -75,11 +58,7 @@ class DetectorImage:
 
 @dataclass(frozen=True)
 class AttitudeMeasurement:
-    """Attitude as propagated on board.
-
-    `world_from_body` rotates body axes into the local level world frame (see `marsyard.sim.frames`); `time_s` is its
-    time tag.
-    """
+    """Attitude as propagated on board: rotation from body axes to the world frame, with its time tag."""
 
     world_from_body: Rotation
     time_s: float
@@ -87,7 +66,7 @@ class AttitudeMeasurement:
 
 @dataclass(frozen=True)
 class AltitudeMeasurement:
-    """Altitude above the ground, metres, and its time tag, seconds."""
+    """Altitude above the ground, with its time tag."""
 
     altitude_m: float
     time_s: float
@@ -95,22 +74,13 @@ class AltitudeMeasurement:
 
 @dataclass(frozen=True)
 class DescentFrame:
-    """What the lander's computer gets with one descent picture, and with nothing that comes after it.
+    """Measurements available to the lander's computer at one descent picture; without later ones.
 
-    The inertial unit's increments come as its navigation has added them up: attitude and velocity at the picture, mean
-    velocity since the one before. Both velocities carry the same unknown error of the navigation's initial velocity.
+    Both velocities contain the same unknown error of the navigation's initial velocity.
 
-    Attributes
-    ----------
-    image, attitude, altitude
-        The picture, with its camera in the body frame, and what was measured with it.
-    sun_direction
-        Unit vector to the sun, world axes.
-    inertial_velocity_m_s
-        Velocity of the camera at the picture's tag, world axes (east, north, up), m/s, shape (3,); None where it was
-        not recorded.
-    interval_velocity_m_s
-        Mean velocity of the camera since the picture before, likewise; None with the first picture.
+    - sun_direction: unit vector to the sun, world axes
+    - inertial_velocity_m_s: inertial velocity of the camera at the picture, world axes; None if not recorded
+    - interval_velocity_m_s: mean inertial velocity since the previous picture, world axes; None at the first picture
     """
 
     image: DetectorImage
@@ -123,21 +93,14 @@ class DescentFrame:
 
 @dataclass(frozen=True)
 class DescentMeasurements:
-    """What the lander's computer holds when the last descent picture has arrived: the third, for DIMES.
+    """Measurements available to the lander's computer at the last descent picture: the third, for DIMES.
 
-    Attributes
-    ----------
-    images, attitudes, altitudes
-        As many of each, in the order of exposure.
-    interval_velocities_m_s
-        Mean velocity of the camera over the intervals between pictures as the inertial navigation has it, world
-        axes (east, north, up), m/s, one fewer than pictures, shape (n - 1, 3). All carry the same unknown error of the
-        navigation's initial velocity; only their differences are accurate (the paper's "biased IMU horizontal
-        velocities").
-    sun_direction
-        Unit vector to the sun, world axes.
-    inertial_velocities_m_s
-        Velocity at the pictures' tags, with the same error, shape (n, 3); None where it was not recorded.
+    - images, attitudes, altitudes: as many of each, in the order of exposure
+    - interval_velocities_m_s: mean inertial velocities of the camera between successive pictures, world axes. All
+      contain the same unknown error of the navigation's initial velocity; only their differences are accurate (the
+      paper's "biased IMU horizontal velocities")
+    - sun_direction: unit vector to the sun, world axes
+    - inertial_velocities_m_s: inertial velocities at the pictures, with the same error; None if not recorded
     """
 
     images: tuple[DetectorImage, ...]
@@ -158,7 +121,7 @@ class DescentMeasurements:
         return self.images[-2].time_s, self.images[-1].time_s
 
     def frames(self) -> tuple[DescentFrame, ...]:
-        """The same picture by picture, as it came."""
+        """The same measurements, picture by picture."""
         at = self.inertial_velocities_m_s
         return tuple(
             DescentFrame(
@@ -172,17 +135,17 @@ class DescentMeasurements:
             for number, image in enumerate(self.images)
         )
 
-    def chosen(self, places: tuple[int, ...]) -> DescentMeasurements:
-        """Some of the pictures, by their places from 0 in ascending order, with the mean velocities between them."""
+    def select(self, indices: tuple[int, ...]) -> DescentMeasurements:
+        """Select pictures by ascending indices, with the mean velocities between them."""
         at = self.inertial_velocities_m_s
-        intervals = [self._mean_velocity(first, second) for first, second in pairwise(places)]
+        intervals = [self._mean_velocity(first, second) for first, second in pairwise(indices)]
         return DescentMeasurements(
-            images=tuple(self.images[place] for place in places),
-            attitudes=tuple(self.attitudes[place] for place in places),
-            altitudes=tuple(self.altitudes[place] for place in places),
+            images=tuple(self.images[index] for index in indices),
+            attitudes=tuple(self.attitudes[index] for index in indices),
+            altitudes=tuple(self.altitudes[index] for index in indices),
             interval_velocities_m_s=np.array(intervals, dtype=np.float64).reshape(-1, 3),
             sun_direction=self.sun_direction,
-            inertial_velocities_m_s=None if at is None else at[list(places)],
+            inertial_velocities_m_s=None if at is None else at[list(indices)],
         )
 
     def _mean_velocity(self, first: int, second: int) -> Float[np.ndarray, "3"]:
@@ -195,23 +158,16 @@ class DescentMeasurements:
 
 @dataclass(frozen=True)
 class MastGeometry:
-    """Where a mast of two axes carries its head, as surveyed before flight.
+    """Geometry of a pan-tilt mast, as surveyed before flight.
 
-    The mast turns about the rover's z axis and, above that, about the head's y axis; roll it cannot. With both angles
-    zero the head's axes are the rover's: x forward, y to the left, z up.
+    The azimuth axis is parallel to the rover's z axis; the elevation axis, above it, is the head's y axis. With both
+    angles zero the head's axes are parallel to the rover's: x forward, y left, z up.
 
-    Attributes
-    ----------
-    base_m
-        A point of the azimuth axis in the rover (body) frame, metres, shape (3,).
-    elbow_m
-        From there to the elevation axis, in axes that turn with the azimuth, metres, shape (3,).
-    head_m
-        From there to the head frame's origin, in the head's own axes, metres, shape (3,).
-    azimuth_limits_rad
-        Least and largest azimuth, positive to the right (clockwise seen from above), radians.
-    elevation_limits_rad
-        Least and largest elevation, positive upwards, radians.
+    - base_m: a point of the azimuth axis in the rover (body) frame
+    - elbow_m: vector from the base to the elevation axis, in axes that turn with the azimuth
+    - head_m: vector from the elevation axis to the head frame's origin, in the head's axes
+    - azimuth_limits_rad: minimum and maximum azimuth, positive to the right (clockwise seen from above)
+    - elevation_limits_rad: minimum and maximum elevation, positive upwards
     """
 
     base_m: Float[np.ndarray, "3"]
@@ -221,7 +177,7 @@ class MastGeometry:
     elevation_limits_rad: tuple[float, float] = (-0.5 * np.pi, 0.5 * np.pi)
 
     def rover_from_head(self, azimuth_rad: float, elevation_rad: float) -> RigidTransform:
-        """The head's pose in the rover frame at these angles, within the limits or not."""
+        """Pose of the head in the rover frame at these angles; the limits are not checked."""
         (sa, ca), (se, ce) = ((math.sin(angle), math.cos(angle)) for angle in (azimuth_rad, elevation_rad))
         pan = np.array([[ca, sa, 0.0], [-sa, ca, 0.0], [0.0, 0.0, 1.0]])
         turn = pan @ np.array([[ce, 0.0, -se], [0.0, 1.0, 0.0], [se, 0.0, ce]])
@@ -230,15 +186,7 @@ class MastGeometry:
 
 @dataclass(frozen=True)
 class MastCalibration:
-    """A mast and the stereo pair on its head, as calibrated.
-
-    Attributes
-    ----------
-    geometry
-        The mast.
-    left, right
-        Camera models of the full frames, in the head frame.
-    """
+    """A mast and the calibrated stereo pair on its head; camera models of the full frames, in the head frame."""
 
     geometry: MastGeometry
     left: CameraModel
@@ -247,15 +195,7 @@ class MastCalibration:
 
 @dataclass(frozen=True)
 class MastImage:
-    """A picture, or the part of it that was read out, of one camera on the mast.
-
-    Attributes
-    ----------
-    counts
-        Detector counts, shape (rows, columns).
-    corner
-        Column and row in the full frame of the upper left pixel.
-    """
+    """A full frame or subframe of a camera on the mast; `corner` is column and row of its upper left pixel."""
 
     counts: UInt16[np.ndarray, "rows columns"]
     corner: tuple[int, int] = (0, 0)
@@ -263,19 +203,12 @@ class MastImage:
 
 @dataclass(frozen=True)
 class RoverMeasurements:
-    """What the rover's computer holds when it has stopped, pointed its mast and taken a stereo pair.
+    """Measurements available to the rover's computer at a stop: a stereo pair taken from the pointed mast.
 
-    Attributes
-    ----------
-    left, right
-        The pictures, taken together.
-    mast
-        The mast and its cameras as calibrated.
-    azimuth_rad, elevation_rad
-        The mast's angles as its encoders read them.
-    world_from_rover
-        Pose of the rover as estimated on board, in the local level world frame: right at the start by definition,
-        wrong by slip and drift later.
+    - left, right: the pictures, taken at the same time
+    - azimuth_rad, elevation_rad: the mast's angles as read by its encoders
+    - world_from_rover: pose of the rover as estimated on board: exact at the start by definition, later with errors by
+      slip and drift
     """
 
     left: MastImage
@@ -288,17 +221,13 @@ class RoverMeasurements:
 
 @dataclass(frozen=True)
 class DriveCommand:
-    """A motion asked of a rover's wheels: a constant velocity and rate of turn, held until the motion is done.
+    """A motion command to a rover's wheels: constant velocity and turn rate until the path is driven.
 
     Straight ahead is ``(d, 0, 0)``, backward ``(-d, 0, 0)``, crabbing ``(0, d, 0)``, a turn in place ``(0, 0, t)``, an
     arc of radius d / t ``(d, 0, t)``; ``(0, -r * t, t)`` moves sideways around a point that stays r ahead.
 
-    Attributes
-    ----------
-    forward_m, left_m
-        Path along the rover's x and y axes, metres; both axes turn with the rover.
-    turn_left_rad
-        Turn about the rover's z axis, counterclockwise seen from above, radians.
+    - forward_m, left_m: path along the rover's x and y axes; both axes turn with the rover
+    - turn_left_rad: turn about the rover's z axis, counterclockwise seen from above
     """
 
     forward_m: float = 0.0
@@ -307,12 +236,12 @@ class DriveCommand:
 
     @property
     def length_m(self) -> float:
-        """Length of the rover's path, metres."""
+        """Length of the rover's path."""
         return float(np.hypot(self.forward_m, self.left_m))
 
     @property
     def displacement_m(self) -> Float[np.ndarray, "2"]:
-        """Where the motion ends, in the axes of its start (forward, left), metres, if the wheels do not slip."""
+        """End position without slip, in the rover's axes at the start (forward, left)."""
         # chord of an arc: the path, shortened by sin(t/2) / (t/2) and turned by t/2
         half = 0.5 * self.turn_left_rad
         shortened = float(np.sinc(half / np.pi))
@@ -320,21 +249,16 @@ class DriveCommand:
         path = np.array([[cosine, -sine], [sine, cosine]]) @ np.array([self.forward_m, self.left_m])
         return np.asarray(shortened * path)
 
-    def part(self, share: float) -> DriveCommand:
-        """The motion over a share of its time."""
-        return DriveCommand(share * self.forward_m, share * self.left_m, share * self.turn_left_rad)
+    def part(self, fraction: float) -> DriveCommand:
+        """The motion over a fraction of its duration."""
+        return DriveCommand(fraction * self.forward_m, fraction * self.left_m, fraction * self.turn_left_rad)
 
 
 @dataclass(frozen=True)
 class PixelTarget:
-    """A target picked in a picture of the left camera from where the rover still stands.
+    """A target designated by a full-frame pixel (u, v) of the left camera, from the rover's current position.
 
-    Attributes
-    ----------
-    pixel
-        (u, v) in the full frame, shape (2,).
-    azimuth_rad, elevation_rad
-        The mast's angles when the picture was taken.
+    The angles are those of the mast when the picture was taken.
     """
 
     pixel: Float[np.ndarray, "2"]
@@ -344,33 +268,25 @@ class PixelTarget:
 
 @dataclass(frozen=True)
 class RoverTarget:
-    """A target given in the rover frame (as it lies when the target is designated), metres, shape (3,)."""
+    """A target designated by its position in the rover frame at the time of designation, metres."""
 
     position_rover: Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
 class SiteTarget:
-    """A target given in the site frame (north, east, down from the world's origin), metres, shape (3,)."""
+    """A target designated by its position in the site frame (north, east, down from the world's origin), metres."""
 
     position_site: Float[np.ndarray, "3"]
 
 
-#: The three ways in which the ground may name a target (tracking paper, section 3).
+#: The three forms of target designation by ground operators (tracking paper, section 3).
 TargetDesignation = PixelTarget | RoverTarget | SiteTarget
 
 
 @dataclass(frozen=True)
 class PoseMeasurement:
-    """Position and attitude as the on-board filter has them.
-
-    Attributes
-    ----------
-    world_from_body
-        The body's pose in the local level world frame, metres.
-    time_s
-        Its time tag, seconds.
-    """
+    """Pose of the body in the world frame as estimated by the on-board filter, with its time tag."""
 
     world_from_body: RigidTransform
     time_s: float
@@ -378,21 +294,14 @@ class PoseMeasurement:
 
 @dataclass(frozen=True)
 class LandingMeasurements:
-    """What the helicopter's computer holds when it looks for a place to land.
+    """Measurements available to the helicopter's computer for the selection of a landing site.
 
-    Attributes
-    ----------
-    images
-        Two pictures of overlapping ground, the first and the second, each with its camera in the body frame.
-    poses
-        The on-board filter's pose at each picture.
-    slant_range_m
-        The laser altimeter's range at the first picture, metres: from its camera's centre along the camera's optical
-        axis to the ground. NaN where nothing was returned.
-    up_body
-        Upwards at the first picture as the inclinometers have it, unit vector in body axes.
-    apriori_site_world
-        Where to land if no better place is known: a point in the world frame, metres.
+    - images: two pictures of overlapping ground, in order, each with its camera in the body frame
+    - poses: the on-board filter's pose at each picture
+    - slant_range_m: laser altimeter range at the first picture, from its camera's centre along the optical axis to the
+      ground; NaN without a return
+    - up_body: unit vector upwards at the first picture as measured by the inclinometers, body axes
+    - apriori_site_world: landing site used if no better one is detected: a point in the world frame, metres
     """
 
     images: tuple[DetectorImage, DetectorImage]

@@ -1,4 +1,4 @@
-"""The base class of all parameters, and the types that many of their fields have."""
+"""Base class and common field types of all parameters."""
 
 from __future__ import annotations
 
@@ -17,6 +17,6 @@ def bounded(low: float, high: float, description: str) -> Any:
 
 
 class Parameters(BaseModel):
-    """Values that a user may state: an unknown key is an error, and a validated object does not change."""
+    """User parameters: unknown keys are errors, validated objects are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

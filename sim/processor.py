@@ -1,4 +1,4 @@
-"""What the last bits of a result depend on besides the program: the processor."""
+"""Identification of the processor type, on which the last bits of results depend."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 @cache
 def processor_features() -> str:
-    """Machine type and a hash of the processor's instruction set extensions, which compiled code is made for."""
+    """Return the machine type and a hash of the instruction set extensions that compiled code is made for."""
     flags = ""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():

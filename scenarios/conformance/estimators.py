@@ -143,4 +143,4 @@ class EstimatorSuite(Suite):
 
 
 def _first_pictures(number: int) -> DescentMeasurements:
-    return inputs.descent(_PICTURES).chosen(tuple(range(number)))
+    return inputs.descent(_PICTURES).select(tuple(range(number)))

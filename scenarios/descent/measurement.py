@@ -19,7 +19,7 @@ from marsyard.scenarios.parts.instruments import InstrumentReadings, InstrumentT
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from marsyard.sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter, Readings
-from marsyard.sim.sensor.radar import first_return
+from marsyard.sim.sensor.ranging import first_return
 from marsyard.sim.streams import Streams
 
 
@@ -49,7 +49,7 @@ class Instruments:
         start, end = -flight.lead_s + MARGIN_S, flight.firing_s + MARGIN_S
         approach = Approach(p.approach, start)
         unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
-        imu = approach.calibrated(unit, streams.generator("inertial unit's calibration"))
+        imu = approach.calibrate(unit, streams.generator("inertial unit's calibration"))
         clock = Clock.drawn(p.clock, streams.generator("image clock"))
         own = _read_own_instruments(p, world, flight.motion, _time_tags(p, clock, streams), streams)
         return cls(
@@ -101,8 +101,8 @@ def _propagate_navigation(
     errors = approach.errors(imu, streams.generator("approach"))
     increments = imu.increments(flight.motion, start, end, streams.generator("inertial noise"))
     state = flight.motion.state(start)
-    attitude, velocity = errors.believed(state.attitude, state.velocity_m_s)
-    return InertialSolution.propagated(increments, attitude, velocity, gravity_m_s2(p))
+    attitude, velocity = errors.apply(state.attitude, state.velocity_m_s)
+    return InertialSolution.propagate(increments, attitude, velocity, gravity_m_s2(p))
 
 
 def measure(

@@ -121,7 +121,7 @@ def quest(sightings: Sightings, carried: InertialSolution) -> Rotation:
 def _turned(increments: ImuIncrements, bias_rad_s: Float64[np.ndarray, "3"]) -> InertialSolution:
     """Attitudes relative to the first, by the gyros less a bias."""
     corrected = replace(increments, delta_angles_rad=increments.delta_angles_rad - bias_rad_s * increments.period_s)
-    return InertialSolution.propagated(corrected, Rotation.identity(), np.zeros(3), 0.0)
+    return InertialSolution.propagate(corrected, Rotation.identity(), np.zeros(3), 0.0)
 
 
 def _bias_integral(carried: InertialSolution, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3 3"]:

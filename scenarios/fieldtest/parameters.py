@@ -15,9 +15,9 @@ from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.render import CloudParameters
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import DetectorChoice, preset
-from marsyard.sim.sensor.clock import ClockParameters
-from marsyard.sim.sensor.gps import POST_PROCESSED, GpsParameters
 from marsyard.sim.sensor.imu import ImuParameters
+from marsyard.sim.sensor.instrument import ClockParameters
+from marsyard.sim.sensor.satellite_navigation import POST_PROCESSED, GpsParameters
 from marsyard.sim.terrain import TerrainParameters, site, sites
 
 Count = Annotated[int, Field(ge=0, le=100000)]

@@ -24,9 +24,9 @@ from marsyard.sim.dynamics import Motion
 from marsyard.sim.dynamics.helicopter import HelicopterFlight, helicopter_flight
 from marsyard.sim.render import CloudLayer
 from marsyard.sim.sensor import preset
-from marsyard.sim.sensor.clock import Clock
-from marsyard.sim.sensor.gps import Gps
 from marsyard.sim.sensor.imu import DEG_H, Imu
+from marsyard.sim.sensor.instrument import Clock
+from marsyard.sim.sensor.satellite_navigation import Gps
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface, TerrainBank, site
 

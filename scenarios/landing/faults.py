@@ -12,7 +12,7 @@ from pydantic import Field
 from marsyard.scenarios.faults import Pictures, SizedFaults, deliver
 from marsyard.scenarios.landing.helicopter import HelicopterParameters
 from marsyard.sim.parameters import NonNegative
-from marsyard.sim.sensor.rtk import Outage
+from marsyard.sim.sensor.satellite_navigation import Outage
 
 
 class Faults(SizedFaults):

@@ -18,8 +18,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
-from marsyard.sim.sensor.laser import range_along
-from marsyard.sim.sensor.ranging import DOWN, RangingUnit
+from marsyard.sim.sensor.ranging import DOWN, RangingUnit, range_along
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 

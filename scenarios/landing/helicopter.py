@@ -33,11 +33,11 @@ from marsyard.sim.dynamics.rotorcraft import (
 )
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.parameters import Parameters
-from marsyard.sim.sensor.clock import Clock, ClockParameters
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
+from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from marsyard.sim.sensor.navigation import FilterParameters, FilterState, NavigationFilter, NavigationSolution
 from marsyard.sim.sensor.ranging import RangingUnit
-from marsyard.sim.sensor.rtk import RtkParameters, RtkReceiver, RtkSolutions
+from marsyard.sim.sensor.satellite_navigation import RtkParameters, RtkReceiver, RtkSolutions
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from marsyard.sim.streams import Streams
 
@@ -143,7 +143,7 @@ class Navigated:
             instruments.compass.sampling.within(start_s, end_s),
             streams.generator(f"compass' noise, {part}"),
         )
-        start = instruments.navigation.started(solutions, readings) if before is None else before
+        start = instruments.navigation.initialize(solutions, readings) if before is None else before
         solution = instruments.navigation.run(start, increments, solutions, readings)
         return cls(solution, instruments.imu.boundaries(start_s, end_s), solutions, readings, fixes)
 

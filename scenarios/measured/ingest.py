@@ -46,7 +46,7 @@ from marsyard.sim.camera import (
     read_cameras,
     read_pds3_product,
 )
-from marsyard.sim.camera.pds_labels import is_pds3
+from marsyard.sim.camera.pds3 import is_pds3
 from marsyard.sim.files import npy_header
 from marsyard.sim.frames import SITE_FROM_WORLD
 

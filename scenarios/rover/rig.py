@@ -74,7 +74,7 @@ class Rig:
     def point(self, azimuth_rad: float, elevation_rad: float) -> None:
         """Points the mast; where it reads these angles already, it stays."""
         if self.state.readings_rad != (azimuth_rad, elevation_rad):
-            self.state = self.mast.pointed(self.state, azimuth_rad, elevation_rad, self.motors)
+            self.state = self.mast.point(self.state, azimuth_rad, elevation_rad, self.motors)
 
     @property
     def rover_from_head(self) -> RigidTransform:

@@ -1,4 +1,4 @@
-"""What the readers of camera files share: their error, and putting a camera together from what was read."""
+"""Common parts of the camera file readers: error messages, bounded reading, construction of the camera."""
 
 from __future__ import annotations
 
@@ -7,46 +7,39 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.cahv import Cahv
-from marsyard.sim.camera.cahvor import Cahvor
-from marsyard.sim.camera.cahvore import Cahvore
-from marsyard.sim.camera.vectors import Real
+from marsyard.sim.camera.base import CameraModel, Real
+from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
 from marsyard.sim.files import open_regular
 
-#: Labels of several megabytes are there; camera files are small.
-_MOST_BYTES = 1 << 23
+#: Maximum size of a camera file; some labels have several megabytes.
+MAX_BYTES = 1 << 23
+#: Names of the models; their letters are the names of their vectors.
+MODELS = ("CAHV", "CAHVOR", "CAHVORE")
 
 
 class CameraFileError(ValueError):
-    """A camera file that cannot be used. The message names the file, the field and what is allowed."""
+    """A camera file that cannot be used. The message names the file, the field and the allowed values."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """The file that is being read, for messages."""
+    """Path of the file that is read, for its content and for error messages."""
 
     path: str
 
     def error(self, field: str, fault: str, allowed: str) -> CameraFileError:
-        """The error to raise for a field."""
+        """Create the error for a field."""
         return CameraFileError(f"{self.path}: {field}: {fault}; allowed: {allowed}")
 
     def text(self) -> str:
-        """The whole file.
-
-        Raises
-        ------
-        CameraFileError
-            If it cannot be read, or is larger than any camera file is.
-        """
-        contents = self.head(_MOST_BYTES + 1)
-        if len(contents) > _MOST_BYTES:
-            raise self.error("file", f"is larger than {_MOST_BYTES >> 20} MiB", "a camera file or label, not a picture")
+        """Read the whole file. Raises CameraFileError if it is unreadable, empty or larger than `MAX_BYTES`."""
+        contents = self.head(MAX_BYTES + 1)
+        if len(contents) > MAX_BYTES:
+            raise self.error("file", f"is larger than {MAX_BYTES >> 20} MiB", "a camera file or label, not a picture")
         return contents.decode("latin-1")
 
     def head(self, count: int) -> bytes:
-        """The file's first bytes, of which there must be some."""
+        """Read at most `count` bytes. Raises CameraFileError if the file is unreadable or empty."""
         try:
             with open_regular(self.path) as file:
                 read = file.read(count)
@@ -57,16 +50,10 @@ class Source:
         return read
 
 
-#: The models by their names, whose letters are the names of their vectors.
-MODELS = ("CAHV", "CAHVOR", "CAHVORE")
-
-
 def linearity_of_type(kind: Real | None, parameter: float | None, field: str, source: Source) -> float:
-    """CAHVORE's linearity from its type (1 perspective, 2 fish-eye, 3 general) and, for type 3, its parameter."""
-    if kind == 1:
-        return 1.0
-    if kind == 2:
-        return 0.0
+    """Return CAHVORE's linearity for its type (1 perspective, 2 fish-eye, 3 general) and the parameter of type 3."""
+    if kind in (1, 2):
+        return 1.0 if kind == 1 else 0.0
     if kind != 3:
         raise source.error(field, f"CAHVORE's type is {'missing' if kind is None else kind}", "type 1, 2 or 3")
     if parameter is None:
@@ -74,20 +61,10 @@ def linearity_of_type(kind: Real | None, parameter: float | None, field: str, so
     return parameter
 
 
-def assembled(
-    name: str,
-    vectors: Mapping[str, Sequence[float]],
-    size: tuple[int, int],
-    linearity: float | None,
-    source: Source,
+def create_camera(
+    name: str, vectors: Mapping[str, Sequence[float]], size: tuple[int, int], linearity: float | None, source: Source
 ) -> CameraModel:
-    """The camera from what a file holds: the name of its model, and its vectors by their letters.
-
-    Raises
-    ------
-    CameraFileError
-        If the camera refuses it.
-    """
+    """Create the camera of a model name and its vectors by letter. Raises CameraFileError for impossible values."""
     c, a, h, v, *lens = (np.array(vectors[letter], dtype=np.float64) for letter in name)
     try:
         if name == "CAHV":
@@ -98,7 +75,5 @@ def assembled(
             raise ValueError("linearity is missing")
         return Cahvore(c, a, h, v, lens[0], lens[1], lens[2], linearity=linearity, size=size)
     except ValueError as fault:
-        field, _, _ = str(fault).partition(" ")
-        raise source.error(
-            field.upper(), str(fault), "a camera model of unit A and O and independent H, V, A"
-        ) from fault
+        field, allowed = str(fault).partition(" ")[0].upper(), "a camera model of unit A and O and independent H, V, A"
+        raise source.error(field, str(fault), allowed) from fault

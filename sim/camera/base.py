@@ -1,18 +1,15 @@
-"""What every camera model of the CAHV family shares: image plane, rigid motion, changes of the image.
+"""Base class of the CAHV camera models: image plane, rigid motion, binning, scaling and cropping.
 
-Vectors and pixels
-------------------
-A camera holds its vectors in one frame of reference (the world's, a body's, a label's rover frame); points given to it
-and rays got from it are in that same frame, metres. Pixels are (u, v): column to the right, row down, the centre of the
-upper left pixel at (0, 0).
+The vectors of a camera, points to project and rays are in one frame of reference (the world's, a body's, a label's
+rover frame), metres. Pixels are (u, v): column to the right, row down, the centre of the upper left pixel at (0, 0).
 
 The image plane is that of Yakimovsky & Cunningham 1978: a point P' (after distortion, if any) falls on
 
     u = (P' - C).H / (P' - C).A        v = (P' - C).V / (P' - C).A
 
 so that H = hs H' + hc A and V = vs V' + vc A, with H' and V' the unit vectors of the image's columns and rows, hs and
-vs the focal lengths in pixels and (hc, vc) the image centre. Nothing assumes that H' and V' are perpendicular, or that
-the three are right-handed.
+vs the focal lengths in pixels and (hc, vc) the image centre. H' and V' need not be perpendicular, nor the three
+right-handed.
 """
 
 from __future__ import annotations
@@ -20,37 +17,37 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from jaxtyping import Bool, Float
-from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform
+from jaxtyping import Bool, Float, Num
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.camera.vectors import Gradient, Real, Vector, blocks, checked_size, cross, frozen_vector, unit
+Vector = NDArray[np.float64]
+#: A number that may be written as an integer (the run-time checks do not accept an integer for a float).
+Real = float | int
+#: Three components, as an array or written out.
+Triple = Num[np.ndarray, "3"] | tuple[Real, Real, Real]
+Gradient = tuple[Vector, Vector, Vector]
 
-#: Labels round A and O to six digits or fewer.
+#: Tolerance on the length of A and O: labels round them to six digits or fewer.
 UNIT_TOLERANCE = 1e-4
+#: Points per block: few enough for the processor's cache, enough to hide NumPy's cost per call.
+_BLOCK = 16384
 
-
-M = TypeVar("M", bound="CameraModel")  # beartype does not know typing.Self
+M = TypeVar("M", bound="CameraModel")  # beartype does not support typing.Self
 
 
 class CameraModel(ABC):
-    """A camera of the CAHV family. `Cahv`, `Cahvor` and `Cahvore` are its final forms; all are immutable.
+    """A camera of the CAHV family: `Cahv`, `Cahvor` or `Cahvore`; all are immutable.
 
-    Attributes
-    ----------
-    c
-        Centre of projection C, metres, shape (3,).
-    a
-        Unit vector A, perpendicular to the image plane and pointing into the scene, shape (3,).
-    h, v
-        Horizontal and vertical image vectors H and V, pixels, shape (3,).
-    size
-        (columns, rows) of the image.
+    - c: centre of projection C, metres
+    - a: unit vector A, perpendicular to the image plane and pointing into the scene
+    - h, v: horizontal and vertical image vectors H and V, pixels
+    - size: (columns, rows) of the image
     """
 
     c: Float[np.ndarray, "3"]
@@ -59,7 +56,7 @@ class CameraModel(ABC):
     v: Float[np.ndarray, "3"]
     size: tuple[int, int]
 
-    # ----- what a model defines: x, y, z are the coordinates of P - C, all arguments and results of shape (n,) -----
+    # ----- defined by each model: x, y, z are the coordinates of P - C; all arrays have the shape (n,) -----
 
     @abstractmethod
     def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
@@ -77,32 +74,20 @@ class CameraModel(ABC):
     def _pupil_axis(self) -> Vector:
         return self.a
 
-    # ----- projection -----
-
     def project(
         self, points: Float[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
-        """Pixels of points.
+        """Project points (metres) to pixels (u, v) and report whether they are visible.
 
-        Parameters
-        ----------
-        points
-            Points in the camera's frame of reference, metres, shape (..., 3).
-
-        Returns
-        -------
-        pixels
-            (u, v), shape (..., 2); NaN where not visible.
-        visible
-            Whether the optics image the point, shape (...): it lies before the image plane, within the range in which
-            the distortion is one-to-one, and its coordinates are finite. It says nothing of the frame's border:
-            ``visible & camera.in_frame(pixels)`` does.
+        Pixels are NaN where not visible. A point is visible if it lies before the image plane, the distortion is
+        one-to-one there, and its coordinates are finite. The frame's border is not tested:
+        ``visible & camera.in_frame(pixels)`` does that.
         """
         flat = points.reshape(-1, 3)
         pixels = np.empty((len(flat), 2))
         visible = np.empty(len(flat), dtype=np.bool_)
         with np.errstate(all="ignore"):
-            for block in blocks(len(flat)):
+            for block in _blocks(len(flat)):
                 u, v, seen = self._image(*self._from_centre(flat[block]))
                 pixels[block, 0] = u
                 pixels[block, 1] = v
@@ -111,14 +96,11 @@ class CameraModel(ABC):
         return pixels.reshape(*points.shape[:-1], 2), visible.reshape(points.shape[:-1])
 
     def projection_jacobian(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 3"]:
-        """Derivative of `project`'s pixels with respect to the points, pixels per metre, shape (..., 2, 3).
-
-        NaN where the point is not visible.
-        """
+        """Derivative of the pixels of `project` with respect to the points, pixels per metre; NaN where not visible."""
         flat = points.reshape(-1, 3)
         jacobian = np.empty((len(flat), 2, 3))
         with np.errstate(all="ignore"):
-            for block in blocks(len(flat)):
+            for block in _blocks(len(flat)):
                 coordinates = self._from_centre(flat[block])
                 for row, gradient in enumerate(self._image_gradient(*coordinates)):
                     for column, derivative in enumerate(gradient):
@@ -129,26 +111,16 @@ class CameraModel(ABC):
     def rays(
         self, pixels: Float[np.ndarray, "*batch 2"]
     ) -> tuple[Float[np.ndarray, "*batch 3"], Float[np.ndarray, "*batch 3"]]:
-        """Lines of sight of pixels, which may lie between pixel centres and outside the frame.
+        """Origins (metres) and unit directions of the lines of sight of pixels, also between and outside the frame's.
 
-        Parameters
-        ----------
-        pixels
-            (u, v), shape (..., 2).
-
-        Returns
-        -------
-        origins
-            Where each ray starts, metres, shape (..., 3): C, moved along the optical axis by `Cahvore`.
-            May be read-only.
-        directions
-            Unit vectors, shape (..., 3); NaN where no ray reaches the pixel (the distortion's range ends before it).
+        Origins are C, which `Cahvore` moves along the optical axis; they may be read-only. Directions are NaN where no
+        ray reaches the pixel, because the range of the distortion ends before it.
         """
         flat = pixels.reshape(-1, 2)
         directions = np.empty((len(flat), 3))
         origins: NDArray[np.float64] | None = None
         with np.errstate(all="ignore"):
-            for block in blocks(len(flat)):
+            for block in _blocks(len(flat)):
                 u, v = np.array(flat[block].T, dtype=np.float64, order="C")
                 sight, shift = self._sight(u, v)
                 length = np.sqrt(sight[0] * sight[0] + sight[1] * sight[1] + sight[2] * sight[2])
@@ -169,24 +141,18 @@ class CameraModel(ABC):
         return np.asarray(inside)
 
     def pixel_grid(self) -> Float[np.ndarray, "rows columns 2"]:
-        """(u, v) of every pixel's centre, shape (rows, columns, 2)."""
+        """(u, v) of every pixel's centre."""
         columns, rows = self.size
         return np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)), axis=-1)
-
-    # ----- motion and changes of the image -----
 
     def moved(self: M, new_from_old: RigidTransform) -> M:
         """The camera after a rigid motion: ``moved(T).project(T.apply(points))`` equals ``project(points)``.
 
-        With the camera in the body frame, ``moved(world_from_body)`` is the camera in the world.
-
-        Raises
-        ------
-        ValueError
-            If `new_from_old` holds more than one transform.
+        With the camera in the body frame, ``moved(world_from_body)`` is the camera in the world frame. Raises
+        ValueError if `new_from_old` holds more than one transform.
         """
         if not new_from_old.single:
-            raise ValueError("a camera moves by a single transform, not by an array of them")
+            raise ValueError("a camera moves by a single transform, not by an array of transforms")
         matrix = new_from_old.as_matrix()
         turned = {name: matrix[:3, :3] @ getattr(self, name) for name in ("a", "h", "v", "o") if hasattr(self, name)}
         return self._with(c=matrix[:3, :3] @ self.c + matrix[:3, 3], **turned)
@@ -194,12 +160,8 @@ class CameraModel(ABC):
     def binned(self: M, columns: int, rows: int) -> M:
         """The camera of an image in which blocks of `columns` x `rows` pixels are summed or averaged into one.
 
-        Column u becomes (u - (columns - 1) / 2) / columns, and rows likewise.
-
-        Raises
-        ------
-        ValueError
-            If a factor is not positive, or does not divide the image's size (crop first).
+        Column u becomes (u - (columns - 1) / 2) / columns, and rows likewise. Raises ValueError if a factor is not
+        positive or does not divide the image's size (crop first).
         """
         for factor, extent, name in ((columns, self.size[0], "columns"), (rows, self.size[1], "rows")):
             if factor < 1 or extent % factor:
@@ -211,15 +173,7 @@ class CameraModel(ABC):
         )
 
     def scaled(self: M, factor: Real) -> M:
-        """The camera of the image resized by `factor`: u becomes (u + 0.5) * factor - 0.5.
-
-        The new size is the old one times `factor`, rounded to the nearest integer; the scale is `factor` all the same.
-
-        Raises
-        ------
-        ValueError
-            If `factor` is not positive and finite, or leaves no pixel.
-        """
+        """The camera of the resized image: u becomes (u + 0.5) * factor - 0.5. ValueError unless factor is positive."""
         if not (np.isfinite(factor) and factor > 0):
             raise ValueError(f"an image is scaled by a positive, finite factor, not {factor}")
         scale = float(factor)
@@ -228,13 +182,7 @@ class CameraModel(ABC):
         return self._with_image_map((scale, scale), (shift, shift), size)
 
     def cropped(self: M, column: int, row: int, size: tuple[int, int]) -> M:
-        """The camera of a part of the image, given its upper left pixel (column, row) and its size (columns, rows).
-
-        Raises
-        ------
-        ValueError
-            If the part is empty or leaves the frame.
-        """
+        """The camera of a part of the image, by upper left pixel and size. Raises ValueError outside the frame."""
         if column < 0 or row < 0 or column + size[0] > self.size[0] or row + size[1] > self.size[1]:
             raise ValueError(
                 f"a crop of {size[0]} x {size[1]} pixels at ({column}, {row}) leaves the frame of "
@@ -249,7 +197,7 @@ class CameraModel(ABC):
         return self._with(h=h, v=self.v + (factor - 1.0) * (self.v - row * self.a))
 
     def recentred(self: M, columns: Real, rows: Real) -> M:
-        """The camera whose pictures are moved by so much to the right and down."""
+        """The camera whose pictures are shifted to the right and down by a number of pixels."""
         return self._with(h=self.h + columns * self.a, v=self.v + rows * self.a)
 
     def _with_image_map(self: M, scale: tuple[float, float], shift: tuple[float, float], size: tuple[int, int]) -> M:
@@ -259,11 +207,9 @@ class CameraModel(ABC):
     def _with(self: M, **changes: Any) -> M:
         return cast(M, replace(cast(Any, self), **changes))
 
-    # ----- derived quantities -----
-
     @property
     def image_centre(self) -> tuple[float, float]:
-        """(hc, vc): the pixel in which the direction A falls before distortion."""
+        """(hc, vc): the pixel of the direction A before distortion."""
         scale = self.a @ self.a
         return float(self.a @ self.h / scale), float(self.a @ self.v / scale)
 
@@ -279,39 +225,26 @@ class CameraModel(ABC):
     @property
     def right(self) -> Float[np.ndarray, "3"]:
         """Unit vector H', perpendicular to A, along which u grows."""
-        return unit(self.h - self.image_centre[0] * self.a)
+        return _unit(self.h - self.image_centre[0] * self.a)
 
     @property
     def down(self) -> Float[np.ndarray, "3"]:
         """Unit vector V', perpendicular to A, along which v grows."""
-        return unit(self.v - self.image_centre[1] * self.a)
+        return _unit(self.v - self.image_centre[1] * self.a)
 
     @property
     def theta(self) -> float:
-        """Angle from V' to H' about A, radians: -pi/2 for square axes, +pi/2 if they are mirrored."""
+        """Angle from V' to H' about A, radians: -pi/2 for square axes; positive in mirrored pictures."""
         right, down = self.right, self.down
         return float(np.arctan2(self.a @ np.cross(down, right), down @ right))
 
-    @property
-    def right_handed(self) -> bool:
-        """Whether u right, v down and A forward are right-handed, as in any picture that is not mirrored."""
-        return self.theta < 0
-
     def corner_rays(self) -> tuple[Float[np.ndarray, "4 3"], Float[np.ndarray, "4 3"]]:
         """`rays` of the frame's outer corners (half a pixel beyond the centres), clockwise from the upper left."""
-        right, bottom = self.size[0] - 0.5, self.size[1] - 0.5
-        return self.rays(np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]]))
+        return self.rays(self.border(1))
 
     def boresight(self) -> Float[np.ndarray, "3"]:
-        """Unit direction in which the middle of the frame looks."""
+        """Unit direction of the middle of the frame."""
         return self.rays(np.array([(self.size[0] - 1) / 2, (self.size[1] - 1) / 2]))[1]
-
-    def half_angle(self) -> float:
-        """Half angle of the cone about `boresight` that holds the whole frame, radians; NaN if any of it is blind."""
-        directions = self.rays(self.border(64))[1]
-        axis = self.boresight()
-        across = np.linalg.norm(np.cross(directions, axis), axis=-1)
-        return float(np.max(np.arctan2(across, directions @ axis)))
 
     def border(self, steps: int) -> Float[np.ndarray, "pixels 2"]:
         """Pixels along the frame's outer edge, clockwise from the upper left, `steps` on each side."""
@@ -320,13 +253,11 @@ class CameraModel(ABC):
         along = np.arange(steps)[:, np.newaxis] / steps
         return np.concatenate([start + along * (end - start) for start, end in pairwise(corners)])
 
-    # ----- construction, comparison, storage -----
-
     def __post_init__(self) -> None:
         for field in fields(cast(Any, self)):
             if field.name not in ("size", "linearity"):
-                object.__setattr__(self, field.name, frozen_vector(field.name, getattr(self, field.name)))
-        object.__setattr__(self, "size", checked_size(self.size))
+                object.__setattr__(self, field.name, _frozen_vector(field.name, getattr(self, field.name)))
+        object.__setattr__(self, "size", _checked_size(self.size))
         length = float(np.linalg.norm(self.a))
         if abs(length - 1) > UNIT_TOLERANCE:
             raise ValueError(f"a must be a unit vector (to {UNIT_TOLERANCE:g}); its length is {length!r}")
@@ -350,19 +281,17 @@ class CameraModel(ABC):
         values = (value.tobytes() if isinstance(value, np.ndarray) else value for value in self._fields().values())
         return hash((type(self), *values))
 
-    def __reduce__(self) -> tuple[Callable[..., CameraModel], tuple[type[CameraModel], Mapping[str, Any]]]:
-        return _rebuilt, (type(self), self._fields())
-
-    # ----- linear algebra shared by the models -----
+    def __reduce__(self) -> tuple[Callable[..., CameraModel], tuple[()]]:
+        return partial(type(self), **self._fields()), ()
 
     @cached_property
     def _determinant(self) -> float:
-        return float(self.a @ cross(self.h, self.v))
+        return float(self.a @ _cross(self.h, self.v))
 
     @cached_property
     def _direction_from_pixel(self) -> NDArray[np.float64]:
         """Matrix that takes (u, v, 1) to the vector d with d.A = 1, d.H = u, d.V = v."""
-        columns = (cross(self.v, self.a), cross(self.a, self.h), cross(self.h, self.v))
+        columns = (_cross(self.v, self.a), _cross(self.a, self.h), _cross(self.h, self.v))
         return np.stack(columns, axis=1) / self._determinant
 
     def _from_centre(self, points: NDArray[Any]) -> Gradient:
@@ -375,5 +304,49 @@ class CameraModel(ABC):
         return x, y, z
 
 
-def _rebuilt(model: type[M], values: Mapping[str, Any]) -> M:
-    return model(**values)
+def looking_down(camera: CameraModel) -> CameraModel:
+    """Mount a camera at the origin, A along -z, columns along +x; raises ValueError for mirrored pictures."""
+    if not camera.theta < 0:
+        raise ValueError("the camera's picture is mirrored: u right, v down and A forward must be right-handed")
+    axis = _unit(camera.a)
+    right = _unit(camera.right - (camera.right @ axis) * axis)
+    turn = Rotation.from_matrix(np.stack([right, np.cross(right, axis), -axis]))
+    return camera.moved(RigidTransform.from_components(-turn.apply(camera.c.copy()), turn))
+
+
+def dot(vector: Vector, x: Vector, y: Vector, z: Vector) -> Vector:
+    """Scalar products of one vector with n vectors, independent of n (unlike a BLAS product)."""
+    return np.asarray(vector[0] * x + vector[1] * y + vector[2] * z)
+
+
+def _cross(first: Vector, second: Vector) -> Vector:
+    """Vector product of two vectors, five times faster than NumPy's."""
+    a, b, c = first.tolist()
+    x, y, z = second.tolist()
+    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])
+
+
+def _unit(vector: Vector) -> Vector:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _blocks(count: int) -> list[slice]:
+    return [slice(start, min(start + _BLOCK, count)) for start in range(0, count, _BLOCK)]
+
+
+def _frozen_vector(name: str, value: ArrayLike) -> Vector:
+    """Return a read-only copy of three finite components; raise a ValueError that names the field."""
+    vector = np.asarray(value, dtype=np.float64) + 0.0  # a copy; turns -0.0 into 0.0, so that equal cameras hash alike
+    if vector.shape != (3,):
+        raise ValueError(f"{name} must have three components, not shape {vector.shape}")
+    if not np.all(np.isfinite(vector)):
+        raise ValueError(f"{name} must be finite, not {vector.tolist()}")
+    vector.flags.writeable = False
+    return vector
+
+
+def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
+    columns, rows = size
+    if int(columns) != columns or int(rows) != rows or columns < 1 or rows < 1:
+        raise ValueError(f"size must be two positive integers (columns, rows), not {size}")
+    return int(columns), int(rows)

@@ -1,4 +1,4 @@
-"""Compiled projection through a lens with radial distortion, and back: where NumPy's calls cost most."""
+"""Compiled projection through a lens with radial distortion, and its inverse."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
-#: Most steps of Newton's method, and the last step's share of the solution: the error is of its square.
+#: Maximum number of Newton steps, and the relative size of the last step: the error is of its square.
 NEWTON_STEPS, CONVERGED = 12, 1e-9
-#: Halvings of what Newton's method leaves: more than a float has digits.
+#: Steps of the bisection if Newton's method fails: more than a float has bits.
 BISECTIONS = 70
 
 
@@ -32,19 +32,12 @@ def radial_image(
     r: Array,
     tau_limit: float,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Columns and rows of points, and whether the optics can image them: `marsyard.sim.camera.Cahvor` says by what
-    model.
+    """Project points to columns and rows, and test whether the optics image them; model: `Cahvor`.
 
-    Parameters
-    ----------
-    points
-        x, y and z of P - C, shape (n,) each.
-    axis
-        O, to full length.
-    image_plane, axis_image
-        H, V and A, and the products of O with each.
-    r, tau_limit
-        (rho0, rho1, rho2), and the tau at which the distance from the axis stops growing.
+    - points: x, y and z of P - C, shape (n,) each
+    - axis: O, normalised
+    - image_plane, axis_image: H, V and A, and their scalar products with O
+    - r, tau_limit: (rho0, rho1, rho2), and the tau at which the distance from the axis stops growing
     """
     along_x, along_y, along_z = points
     h, v, a = image_plane
@@ -67,14 +60,14 @@ def radial_image(
 
 @njit(cache=True, inline="always")
 def _excess(polynomial: Triple, tau: float, ratio: float) -> float:
-    """What the ratio chi / f(chi) satisfies as zero: it grows with the ratio as far as f grows."""
+    """Residual of the ratio chi / f(chi); it grows with the ratio as far as f grows."""
     s = tau * ratio * ratio
     return ratio * (polynomial[0] + s * (polynomial[1] + s * polynomial[2])) - 1.0
 
 
 @njit(cache=True, error_model="numpy")
-def _bisected(polynomial: Triple, tau: float, upper: float) -> float:
-    """The solution of `_undistortion` below a bound, which may be infinite."""
+def _bisect(polynomial: Triple, tau: float, upper: float) -> float:
+    """Solve `_undistortion` by bisection below a bound, which may be infinite."""
     low, high = 0.0, upper
     if upper == math.inf:
         high = 1.0
@@ -91,7 +84,10 @@ def _bisected(polynomial: Triple, tau: float, upper: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _undistortion(polynomial: Triple, limits: tuple[float, float], tau: float) -> float:
-    """As `undistortion`, of one."""
+    """Solve g (k1 + s (k3 + s k5)) = 1 with s = tau g^2 for the ratio g = chi / f(chi), which is finite on the axis.
+
+    Newton's method from g = 1 / k1, then bisection if it fails.
+    """
     if not tau < limits[1]:
         return math.nan
     k1, k3, k5 = polynomial
@@ -105,22 +101,16 @@ def _undistortion(polynomial: Triple, limits: tuple[float, float], tau: float) -
     upper = math.sqrt(limits[0] / tau)
     if abs(step) <= CONVERGED * ratio and 0.0 < ratio <= upper:
         return ratio
-    found: float = _bisected(polynomial, tau, upper)
-    return found
+    solution: float = _bisect(polynomial, tau, upper)
+    return solution
 
 
 @njit(cache=True, error_model="numpy")
 def undistortion(polynomial: Triple, limits: tuple[float, float], distorted_tau: Array) -> Array:
-    """The ratio chi / f(chi) of each f(chi)^2: `marsyard.sim.camera.radial` says how it is solved for.
+    """Compute the ratio chi / f(chi) for each f(chi)^2; NaN beyond the range of f.
 
-    Parameters
-    ----------
-    polynomial
-        k1, k3 and k5 of f.
-    limits
-        chi^2 and f(chi)^2 where f stops growing.
-    distorted_tau
-        Shape (n,); NaN comes out where f does not reach it.
+    - polynomial: k1, k3 and k5 of f
+    - limits: chi^2 and f(chi)^2 where f stops growing
     """
     ratio = np.empty(distorted_tau.size)
     for n in range(distorted_tau.size):
@@ -137,19 +127,11 @@ def radial_sight(
     polynomial: Triple,
     limits: tuple[float, float],
 ) -> tuple[Array, Array, Array]:
-    """Directions of pixels, of any length; NaN where no ray reaches one: `marsyard.sim.camera.Cahvor` says by what
-    model.
+    """Compute directions of pixels, of any length; NaN without a ray; model: `Cahvor`.
 
-    Parameters
-    ----------
-    u, v
-        Pixels, shape (n,) each.
-    direction_from_pixel
-        Matrix that takes (u, v, 1) to a direction before distortion.
-    axis
-        O, to full length.
-    polynomial, limits
-        As for `undistortion`.
+    - direction_from_pixel: matrix that maps (u, v, 1) to a direction before distortion
+    - axis: O, normalised
+    - polynomial, limits: as in `undistortion`
     """
     m = direction_from_pixel
     along_x, along_y, along_z = np.empty(u.size), np.empty(u.size), np.empty(u.size)

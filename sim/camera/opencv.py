@@ -1,22 +1,24 @@
-"""Conversion from OpenCV's cameras, with a stated residual.
+"""Conversion of OpenCV's camera models to CAHVOR and CAHVORE, with the residual.
 
-OpenCV's camera looks along z with x right and y down, and its pixels count as ours do. Its pinhole camera distorts
-about the direction z with k1, k2, k3 (radial) and p1, p2 (tangential):
+OpenCV's camera looks along z with x right and y down; its pixels count as ours. Its pinhole model distorts about the
+direction z with k1, k2, k3 (radial) and p1, p2 (tangential):
 
     r^2 = x^2 + y^2        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
                            y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-(its rational model divides the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6), and its fisheye moves a ray at the angle
-theta from z to the distance theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala & Brandt 2006).
+Its rational model divides the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6. Its fisheye model moves a ray at the
+angle theta from z to the distance theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala & Brandt
+2006).
 
-CAHVOR about O = A is the pinhole camera with k3 = p1 = p2 = 0; others are fitted by tilting O. The fisheye with
-k3 = k4 = 0 is CAHVORE about O = A with the linearity 0 and a resting pupil.
+CAHVOR about O = A equals the pinhole model with k3 = p1 = p2 = 0; others are fitted by tilting O. CAHVORE about O = A
+with linearity 0 and a fixed pupil equals the fisheye model with k3 = k4 = 0.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -25,23 +27,22 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.cahv import Cahv
-from marsyard.sim.camera.cahvor import Cahvor
-from marsyard.sim.camera.cahvore import Cahvore
+from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
 
 Array = NDArray[np.float64]
+C = TypeVar("C", bound=CameraModel)
 
-#: Samples of the frame along each side, its outer edge included.
+#: Samples along each side of the frame, including its outer edge.
 _SAMPLES = 33
-#: A closed form that reproduces the frame to this is not fitted, pixels.
+#: A closed form with a smaller residual is exact and is not fitted.
 _EXACT_PX = 1e-9
-#: What a pixel counts that a camera under trial does not see.
-_BLIND_PX = 1e3
+#: Residual of a pixel that is not visible in a camera during the fit.
+_INVISIBLE_PX = 1e3
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Distance between two cameras' pixels over the frame, pixels: its root mean square, and the largest."""
+    """Root mean square and maximum of the distance between two cameras' pixels over the frame."""
 
     rms_px: float
     max_px: float
@@ -53,25 +54,16 @@ def from_opencv(
     size: tuple[int, int],
     camera_from_world: RigidTransform | None = None,
 ) -> tuple[Cahvor, Residual]:
-    """The CAHVOR camera nearest to OpenCV's pinhole camera, and how near it is over the frame.
+    """Fit the CAHVOR camera nearest to OpenCV's pinhole camera; return it with its residual over the frame.
 
-    Exact where all coefficients but k1 and k2 vanish; otherwise fitted by least squares.
+    Exact if all coefficients but k1 and k2 are zero; otherwise fitted by least squares.
 
-    Parameters
-    ----------
-    matrix
-        Camera matrix, pixels, shape (3, 3); may have a skew.
-    distortion
-        None, (k1, k2, p1, p2), (k1, k2, p1, p2, k3) or (k1, k2, p1, p2, k3, k4, k5, k6).
-    size
-        (columns, rows).
-    camera_from_world
-        Takes points of the new camera's frame of reference to OpenCV's axes; the identity if not given.
+    - matrix: camera matrix, pixels; may have a skew
+    - distortion: none, (k1, k2, p1, p2), (k1, k2, p1, p2, k3) or (k1, k2, p1, p2, k3, k4, k5, k6)
+    - camera_from_world: transform from the new camera's frame of reference to OpenCV's axes; identity by default
 
-    Raises
-    ------
-    ValueError
-        If the matrix is no camera matrix, there are other coefficients, or the distortion folds over within the frame.
+    Raises ValueError if the matrix is no camera matrix, the number of coefficients differs, or the distortion is not
+    one-to-one within the frame.
     """
     coefficients = _eight_coefficients(distortion)
     linear = _linear(matrix, size, RigidTransform.identity() if camera_from_world is None else camera_from_world)
@@ -80,17 +72,8 @@ def from_opencv(
     points = _undistorted(_normalised(pixels, matrix), coefficients)
     directions = _in_world(np.concatenate([points, np.ones((len(points), 1))], axis=1), camera_from_world)
     start = Cahvor.from_cahv(linear, r=(0.0, coefficients[0], coefficients[1]))
-    camera, residual = start, _residual(_far_pixels(start, directions) - pixels)
-    if not residual.max_px <= _EXACT_PX:
-        scales = np.array([1e-3, 1e-3, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1.0, 1.0])
-
-        def differences(change: Array) -> Array:
-            there = _far_pixels(_varied(start, axes, change), directions)
-            return np.nan_to_num(there - pixels, nan=_BLIND_PX).ravel()
-
-        camera = _varied(start, axes, _fitted(differences, scales))
-        residual = _residual(_far_pixels(camera, directions) - pixels)
-    return camera, residual
+    scales = np.array([1e-3, 1e-3, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1.0, 1.0])
+    return _fit(start, lambda change: _vary_pinhole(start, axes, change), (directions, pixels), scales, method="lm")
 
 
 def from_opencv_fisheye(
@@ -99,23 +82,10 @@ def from_opencv_fisheye(
     size: tuple[int, int],
     camera_from_world: RigidTransform | None = None,
 ) -> tuple[Cahvore, Residual]:
-    """The CAHVORE camera nearest to OpenCV's fisheye (Kannala & Brandt), and how near it is over the frame.
+    """Fit the CAHVORE camera nearest to OpenCV's fisheye (Kannala & Brandt); return it with its residual.
 
-    Exact when k3 and k4 vanish; otherwise scale, radial terms and linearity are fitted by least squares.
-
-    Parameters
-    ----------
-    matrix
-        Camera matrix, pixels, shape (3, 3); may have a skew.
-    distortion
-        (k1, k2, k3, k4).
-    size, camera_from_world
-        As in `from_opencv`.
-
-    Raises
-    ------
-    ValueError
-        If the matrix is no camera matrix, there are other coefficients, or the distortion folds over within the frame.
+    Exact if k3 and k4 are zero; otherwise scale, radial terms and linearity are fitted by least squares. `distortion`
+    is (k1, k2, k3, k4); the other parameters and the errors are those of `from_opencv`.
     """
     if len(distortion) != 4 or not np.all(np.isfinite(distortion)):
         raise ValueError(f"distortion of a fisheye must be (k1, k2, k3, k4), finite, not {distortion}")
@@ -123,20 +93,27 @@ def from_opencv_fisheye(
     pixels = _frame_samples(size)
     directions = _in_world(_fisheye_directions(_normalised(pixels, matrix), distortion), camera_from_world)
     start = Cahvore.from_cahv(linear, r=(0.0, distortion[0], distortion[1]), linearity=0.0)
-    camera, residual = start, _residual(_far_pixels(start, directions) - pixels)
-    if not residual.max_px <= _EXACT_PX:
+    limits, scales = np.array([0.5, 10.0, 10.0, 1.0]), np.array([1e-3, 1e-3, 1e-3, 1e-1])
+    bounds = (-limits, limits)
+    return _fit(start, lambda change: _vary_fisheye(start, change), (directions, pixels), scales, bounds=bounds)
 
-        def differences(change: Array) -> Array:
-            there = _far_pixels(_relensed(start, change), directions)
-            return np.nan_to_num(there - pixels, nan=_BLIND_PX).ravel()
 
-        limits = np.array([0.5, 10.0, 10.0, 1.0])
-        fit = least_squares(
-            differences, np.zeros(4), bounds=(-limits, limits), x_scale=[1e-3, 1e-3, 1e-3, 1e-1], xtol=1e-14, ftol=1e-14
-        )
-        camera = _relensed(start, np.asarray(fit.x))
-        residual = _residual(_far_pixels(camera, directions) - pixels)
-    return camera, residual
+def _fit(
+    start: C, vary: Callable[[Array], C], samples: tuple[Array, Array], scales: Array, **options: Any
+) -> tuple[C, Residual]:
+    """Fit a camera to samples (directions, pixels) from `start`; `scales` are typical sizes of the parameters."""
+    directions, pixels = samples
+    residual = _residual(_far_pixels(start, directions) - pixels)
+    if residual.max_px <= _EXACT_PX:
+        return start, residual
+
+    def differences(change: Array) -> Array:
+        projected = _far_pixels(vary(change), directions)
+        return np.nan_to_num(projected - pixels, nan=_INVISIBLE_PX).ravel()
+
+    fit = least_squares(differences, np.zeros(len(scales)), x_scale=scales, xtol=1e-14, ftol=1e-14, **options)
+    camera = vary(np.asarray(fit.x))
+    return camera, _residual(_far_pixels(camera, directions) - pixels)
 
 
 def _eight_coefficients(distortion: Array) -> Array:
@@ -157,7 +134,7 @@ def _linear(matrix: Array, size: tuple[int, int], camera_from_world: RigidTransf
     return Cahv(world_from_camera[:3, 3], rotation[:, 2], rotation @ matrix[0], rotation @ matrix[1], size)
 
 
-def _varied(start: Cahvor, axes: Array, change: Array) -> Cahvor:
+def _vary_pinhole(start: Cahvor, axes: Array, change: Array) -> Cahvor:
     """A camera near `start`: image plane turned, H and V rescaled and shifted, O tilted, rho1 and rho2 changed."""
     (tilt_x, tilt_y, *rho), turn, (scale_u, scale_v, shift_u, shift_v) = change[:4], change[4:7], change[7:11]
     rotation = Rotation.from_rotvec(turn).as_matrix()
@@ -173,7 +150,7 @@ def _varied(start: Cahvor, axes: Array, change: Array) -> Cahvor:
     )
 
 
-def _relensed(start: Cahvore, change: Array) -> Cahvore:
+def _vary_fisheye(start: Cahvore, change: Array) -> Cahvore:
     """A fisheye near `start`: its scale, rho1, rho2 and linearity changed."""
     scale, rho1, rho2, linearity = (float(one) for one in change)
     (hc, vc), a = start.image_centre, start.a
@@ -183,7 +160,7 @@ def _relensed(start: Cahvore, change: Array) -> Cahvore:
 
 
 def _fisheye_directions(points: Array, coefficients: Array) -> Array:
-    """Directions (z along the axis) that OpenCV's fisheye takes to (x, y), shape (n, 2); by Newton's method."""
+    """Invert OpenCV's fisheye: directions (z along the axis) of its points (x, y), shape (n, 2); Newton's method."""
     distance = np.hypot(points[:, 0], points[:, 1])
     theta = np.minimum(distance, np.pi)
     for _ in range(50):
@@ -193,15 +170,15 @@ def _fisheye_directions(points: Array, coefficients: Array) -> Array:
         if np.max(np.abs(step)) < 1e-14:
             break
     angles = np.linspace(0.0, float(theta.max()), 1000)
-    there = theta * _fisheye_gain(theta, coefficients)[0]
-    if not (np.max(np.abs(there - distance)) < 1e-9 and np.all(_fisheye_gain(angles, coefficients)[1] > 0)):
+    reached = theta * _fisheye_gain(theta, coefficients)[0]
+    if not (np.max(np.abs(reached - distance)) < 1e-9 and np.all(_fisheye_gain(angles, coefficients)[1] > 0)):
         raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
     across = np.divide(np.sin(theta), distance, out=np.ones_like(theta), where=distance > 0)
     return np.stack([points[:, 0] * across, points[:, 1] * across, np.cos(theta)], axis=-1)
 
 
 def _in_world(directions: Array, camera_from_world: RigidTransform | None) -> Array:
-    """Directions in OpenCV's axes, in those of the frame that the camera is put into."""
+    """Rotate directions from OpenCV's axes to the camera's frame of reference."""
     return directions if camera_from_world is None else directions @ camera_from_world.as_matrix()[:3, :3]
 
 
@@ -215,29 +192,23 @@ def _normalised(pixels: Array, matrix: Array) -> Array:
 
 
 def _undistorted(distorted: Array, coefficients: Array) -> Array:
-    """Newton in two dimensions."""
+    """Invert the pinhole distortion by Newton's method in two dimensions."""
     points = distorted.copy()
     for _ in range(50):
-        there, slope = _distorted(points, coefficients)
-        step = np.linalg.solve(slope, (there - distorted)[..., np.newaxis])[..., 0]
+        image, slope = _distorted(points, coefficients)
+        step = np.linalg.solve(slope, (image - distorted)[..., np.newaxis])[..., 0]
         points -= step
         if np.max(np.abs(step)) < 1e-14:
             break
-    there, slope = _distorted(points, coefficients)
-    if not (np.max(np.abs(there - distorted)) < 1e-9 and np.all(np.linalg.det(slope) > 0)):
+    image, slope = _distorted(points, coefficients)
+    if not (np.max(np.abs(image - distorted)) < 1e-9 and np.all(np.linalg.det(slope) > 0)):
         raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
     return points
 
 
-def _fitted(differences: Callable[[Array], Array], scales: Array) -> Array:
-    """The change from zero that makes the differences least; `scales` are changes that matter alike."""
-    fit = least_squares(differences, np.zeros(len(scales)), method="lm", x_scale=scales, xtol=1e-14, ftol=1e-14)
-    return np.asarray(fit.x)
-
-
 def _distorted(points: Array, coefficients: Array) -> tuple[Array, Array]:
     """OpenCV's pinhole distortion of (x, y), shape (n, 2), and its derivative, shape (n, 2, 2)."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = np.concatenate([coefficients, np.zeros(8 - len(coefficients))])
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     x, y = points.T
     square = x * x + y * y
     over = 1 + square * (k1 + square * (k2 + square * k3))
@@ -249,18 +220,13 @@ def _distorted(points: Array, coefficients: Array) -> tuple[Array, Array]:
         [x * gain + 2 * p1 * x * y + p2 * (square + 2 * x * x), y * gain + p1 * (square + 2 * y * y) + 2 * p2 * x * y],
         axis=-1,
     )
-    derivative = np.stack(
-        [
-            np.stack([gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, across], axis=-1),
-            np.stack([across, gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1),
-        ],
-        axis=-2,
-    )
-    return distorted, derivative
+    by_x = np.stack([gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, across], axis=-1)
+    by_y = np.stack([across, gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1)
+    return distorted, np.stack([by_x, by_y], axis=-2)
 
 
 def _fisheye_gain(theta: Array, coefficients: Array) -> tuple[Array, Array]:
-    """OpenCV's fisheye: distance over angle, and the derivative of the distance."""
+    """Distance over angle of OpenCV's fisheye, and the derivative of the distance."""
     k1, k2, k3, k4 = coefficients
     square = theta * theta
     gain = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
@@ -279,7 +245,5 @@ def _residual(differences: Array) -> Residual:
 
 def _perpendicular(axis: Array) -> Array:
     """A unit vector perpendicular to a unit vector."""
-    smallest = np.zeros(3)
-    smallest[np.argmin(np.abs(axis))] = 1.0
-    vector = np.cross(axis, smallest)
+    vector = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     return np.asarray(vector / np.linalg.norm(vector))

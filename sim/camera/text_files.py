@@ -1,26 +1,26 @@
-"""JPL's text files of camera models (.cahv, .cahvor, .cahvore), as written by the calibration program CCALADJ and cmod.
+"""JPL's text files of camera models (.cahv, .cahvor, .cahvore), as written by the programs CCALADJ and cmod.
 
     Model = CAHVOR = perspective, distortion
     Dimensions = 1024 1024
     C =  0.442604 -0.0611635 -1.25106
     A = ...
 
-and likewise H, V, O, R, E, as far as the model has them. CAHVORE carries its type (1 perspective, 2 fish-eye,
-3 general) and for type 3 the linearity: ``Model = CAHVORE3,0.37 = general``. The derived lines Hs, Hc, Vs, Vc and
-Theta, the covariance matrices ``S`` and ``S internal`` and unknown lines are not read: the vectors say everything.
+and the model's other vectors H, V, O, R, E. CAHVORE states its type (1 perspective, 2 fish-eye, 3 general) and for
+type 3 the linearity: ``Model = CAHVORE3,0.37 = general``. The derived lines Hs, Hc, Vs, Vc and Theta, the covariance
+matrices ``S`` and ``S internal`` and unknown lines are not read.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-from marsyard.sim.camera.assembly import Source, assembled, linearity_of_type
+from marsyard.sim.camera.assembly import Source, create_camera, linearity_of_type
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.cahvore import Cahvore
+from marsyard.sim.camera.models import Cahvore
 
-#: Frames of the cameras that Marsyard writes, as their files state them.
+#: Frames of written cameras, as stated in their files.
 BODY_FRAME = "body (metres); the body's pose in the world, where it is known, is stated next to this file"
 HEAD_FRAME = "head of the mast (metres: x forward, y left, z up at azimuth and elevation zero)"
 
@@ -34,49 +34,28 @@ _ASSIGNMENT = re.compile(r"\s*(?P<name>[A-Za-z][A-Za-z_ ]*?)\s*=\s*(?P<value>.*?
 _MODEL = re.compile(r"(?P<name>CAHV|CAHVOR|CAHVORE(?P<type>\d+)?)(?:\s*,\s*(?P<parameter>[^\s=]+))?\s*(?:=.*)?$")
 
 
-@dataclass(frozen=True)
-class _Line:
+class _Line(NamedTuple):
     number: int
     value: str
 
 
 def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> CameraModel:
-    """Read a JPL text file; whichever of the three models it holds.
+    """Read the camera model of a JPL text file.
 
-    Parameters
-    ----------
-    path
-        The file.
-    size
-        (columns, rows) of the pictures, for files without the line Dimensions; a file that has one must agree.
-
-    Raises
-    ------
-    CameraFileError
-        If the file cannot be read, or a line is missing, repeated or wrong; it names file, field and what is allowed.
+    `size` is (columns, rows) of the pictures, for files without the line Dimensions; otherwise it must agree. Raises
+    CameraFileError if the file cannot be read, or a line is missing, repeated or wrong; it names file, field and
+    allowed values.
     """
     source = Source(str(path))
     lines = _assignments(source.text(), source)
     name, linearity = _model(_required(lines, "Model", source), source)
     size = _size(lines, size, source)
     vectors = {letter: _vector(letter, _required(lines, letter, source), source) for letter in name}
-    return assembled(name, vectors, size, linearity, source)
+    return create_camera(name, vectors, size, linearity, source)
 
 
 def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "", *, frame: str = "") -> None:
-    """Write a JPL text file that `read_cahvor` reads back as an equal camera.
-
-    Parameters
-    ----------
-    camera
-        A `Cahv`, `Cahvor` or `Cahvore`.
-    path
-        The file, which is overwritten.
-    comment
-        Text for the first lines, which begin with '#'.
-    frame
-        The frame that the camera's vectors are in, for a line ``# Frame: ...``; empty where it is not known.
-    """
+    """Write a JPL text file, equal when read back; `comment` and `frame` become lines with '#' at the start."""
     if isinstance(camera, Cahvore):
         model = _TYPE_NAMES.get(camera.linearity, f"CAHVORE3,{camera.linearity!r} = general")
     else:
@@ -123,24 +102,20 @@ def _model(line: _Line, source: Source) -> tuple[str, float | None]:
 
 
 def _size(lines: dict[str, _Line], given: tuple[int, int] | None, source: Source) -> tuple[int, int]:
-    """(columns, rows) by the file, or as given where the file does not state them."""
-    if "Dimensions" not in lines and given is not None:
-        return given
+    """(columns, rows) by the file, or as given if the file does not state them."""
     if "Dimensions" not in lines:
-        raise source.error("Dimensions", "missing", "a line 'Dimensions = columns rows', or size = [columns, rows]")
-    stated = _dimensions(lines["Dimensions"], source)
+        if given is None:
+            raise source.error("Dimensions", "missing", "a line 'Dimensions = columns rows', or size = [columns, rows]")
+        return given
+    line = lines["Dimensions"]
+    words = line.value.split()
+    if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
+        fault = f"{line.value!r} in line {line.number}"
+        raise source.error("Dimensions", fault, "two positive integers, columns and rows")
+    stated = int(words[0]), int(words[1])
     if given is not None and given != stated:
         raise source.error("Dimensions", f"{stated[0]} {stated[1]}", f"the given size, {given[0]} {given[1]}")
     return stated
-
-
-def _dimensions(line: _Line, source: Source) -> tuple[int, int]:
-    words = line.value.split()
-    if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
-        raise source.error(
-            "Dimensions", f"{line.value!r} in line {line.number}", "two positive integers, columns and rows"
-        )
-    return int(words[0]), int(words[1])
 
 
 def _vector(name: str, line: _Line, source: Source) -> list[float]:

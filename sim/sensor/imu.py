@@ -1,11 +1,11 @@
-"""An inertial measurement unit: angle and velocity increments of a motion, with the errors of its class.
+"""Inertial measurement unit: angle and velocity increments of a motion, with the errors of the unit's class.
 
-The world frame is taken as inertial: the planet's rotation, which flight software knows and takes off, is left out of
-motion and measurement alike. The unit sits at the body's origin, its axes along the body's.
+The world frame is inertial here: the planet's rotation, which flight software knows and removes, is left out of motion
+and measurement. The unit is at the body's origin, its axes parallel to the body's.
 
-Increments are those of a unit that samples its sensors much faster than it delivers: the angle increment is the exact
-rotation vector between two samples (coning included), the velocity increment the integral of specific force in the
-body axes of the interval's start (sculling included).
+The sensors are sampled much faster than the increments are delivered: an angle increment is the exact rotation vector
+between two boundaries (coning included), a velocity increment the integral of specific force in the body axes at the
+interval's start (sculling included).
 """
 
 from __future__ import annotations
@@ -21,25 +21,23 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
-from marsyard.sim.sensor.clock import Clock, ClockParameters
-from marsyard.sim.sensor.quaternions import products
-from marsyard.sim.sensor.stochastic import GaussMarkov
+from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov
 
-#: Standard gravity, in which accelerometers are specified.
+#: Standard gravity, the unit of accelerometer specifications.
 STANDARD_GRAVITY_M_S2 = 9.80665
 DEG_H = np.radians(1.0) / 3600.0
 DEG_SQRT_H = np.radians(1.0) / 60.0
 
 
 class WarmUp(Parameters):
-    """Temperature of the unit less that at which it was calibrated: none, then an exponential approach to a change."""
+    """Temperature of the unit less the calibration temperature: zero, then an exponential approach to a change."""
 
     start_s: Annotated[float, Field(description="time at which the change begins, s")] = 0.0
-    change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="change in the end, K")] = 0.0
+    change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="final change, K")] = 0.0
     time_constant_s: Annotated[Positive, Field(description="time constant of the approach, s")] = 600.0
 
     def temperature_k(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
-        """Temperature less that of the calibration, K."""
+        """Compute the temperature less the calibration temperature, K."""
         since = np.maximum(times_s - self.start_s, 0.0)
         return np.asarray(-self.change_k * np.expm1(-since / self.time_constant_s))
 
@@ -54,80 +52,47 @@ class ImuParameters(Parameters):
 
     rate_hz: Annotated[Positive, Field(le=10000.0, description="samples per second")] = 400.0
     gyro_bias_deg_h: Annotated[NonNegative, Field(description="constant gyro bias, deg/h")] = 1.0
-    gyro_wander_deg_h: Annotated[NonNegative, Field(description="gyro bias that wanders, deg/h")] = 0.35
-    gyro_wander_s: Annotated[Positive, Field(description="correlation time of the wandering gyro bias, s")] = 100.0
-    gyro_bias_deg_h_k: Annotated[NonNegative, Field(description="change of gyro bias with temperature, deg/h/K")] = 0.1
+    gyro_wander_deg_h: Annotated[NonNegative, Field(description="time-correlated gyro bias, deg/h")] = 0.35
+    gyro_wander_s: Annotated[Positive, Field(description="correlation time of the bias, s")] = 100.0
+    gyro_bias_deg_h_k: Annotated[NonNegative, Field(description="bias change with temperature, deg/h/K")] = 0.1
     angular_random_walk_deg_sqrt_h: Annotated[NonNegative, Field(description="angular random walk, deg/sqrt(h)")] = 0.07
     gyro_scale_ppm: Annotated[NonNegative, Field(description="error of the gyros' scale factors, ppm")] = 100.0
     gyro_misalignment_mrad: Annotated[NonNegative, Field(description="each gyro's input from another axis, mrad")] = 0.1
     gyro_count_rad: Annotated[NonNegative, Field(description="angle of a count, rad; 0: no rounding")] = 2.0**-19
     accelerometer_bias_mg: Annotated[NonNegative, Field(description="constant accelerometer bias, mg")] = 0.3
-    accelerometer_wander_mg: Annotated[NonNegative, Field(description="accelerometer bias that wanders, mg")] = 0.05
-    accelerometer_wander_s: Annotated[
-        Positive, Field(description="correlation time of the wandering accelerometer bias, s")
-    ] = 60.0
-    accelerometer_bias_mg_k: Annotated[
-        NonNegative, Field(description="change of accelerometer bias with temperature, mg/K")
-    ] = 0.02
-    velocity_random_walk_ug_sqrt_hz: Annotated[NonNegative, Field(description="velocity random walk, ug/sqrt(Hz)")] = (
-        50.0
-    )
-    accelerometer_scale_ppm: Annotated[
-        NonNegative, Field(description="error of the accelerometers' scale factors, ppm")
-    ] = 300.0
-    accelerometer_misalignment_mrad: Annotated[
-        NonNegative, Field(description="each accelerometer's input from another axis, mrad")
-    ] = 0.1
-    accelerometer_count_m_s: Annotated[NonNegative, Field(description="velocity of a count, m/s; 0: no rounding")] = (
-        2.0**-14
-    )
+    accelerometer_wander_mg: Annotated[NonNegative, Field(description="time-correlated accelerometer bias, mg")] = 0.05
+    accelerometer_wander_s: Annotated[Positive, Field(description="correlation time of the bias, s")] = 60.0
+    accelerometer_bias_mg_k: Annotated[NonNegative, Field(description="bias change with temperature, mg/K")] = 0.02
+    velocity_random_walk_ug_sqrt_hz: Annotated[NonNegative, Field(description="velocity noise, ug/sqrt(Hz)")] = 50.0
+    accelerometer_scale_ppm: Annotated[NonNegative, Field(description="error of the scale factors, ppm")] = 300.0
+    accelerometer_misalignment_mrad: Annotated[NonNegative, Field(description="input from another axis, mrad")] = 0.1
+    accelerometer_count_m_s: Annotated[NonNegative, Field(description="velocity of a count, m/s; 0: exact")] = 2.0**-14
     warm_up: WarmUp = WarmUp()
     clock: ClockParameters = ClockParameters(offset_sd_s=0.0002, jitter_sd_s=0.00002)
 
 
-#: A small unit of quartz or silicon, as a helicopter of 2 m carries; assumed (the landing paper names an
-#: ISIS of Inertial Science, without figures). The gyros' bias is what zeroing them on the ground has left.
+#: A small quartz or silicon unit of a 2 m helicopter; assumed (the landing paper names Inertial Science's ISIS, without
+#: figures). The gyro bias is the residual after zeroing on the ground.
 SMALL_UNIT = ImuParameters(
-    rate_hz=100.0,
-    gyro_bias_deg_h=60.0,
-    gyro_wander_deg_h=20.0,
-    gyro_bias_deg_h_k=0.0,
-    angular_random_walk_deg_sqrt_h=2.0,
-    gyro_scale_ppm=1000.0,
-    gyro_misalignment_mrad=1.0,
-    gyro_count_rad=2.0**-19,
-    accelerometer_bias_mg=3.0,
-    accelerometer_wander_mg=0.3,
-    accelerometer_bias_mg_k=0.0,
-    velocity_random_walk_ug_sqrt_hz=200.0,
-    accelerometer_scale_ppm=1000.0,
-    accelerometer_misalignment_mrad=1.0,
+    rate_hz=100.0, gyro_bias_deg_h=60.0, gyro_wander_deg_h=20.0, gyro_bias_deg_h_k=0.0,
+    angular_random_walk_deg_sqrt_h=2.0, gyro_scale_ppm=1000.0, gyro_misalignment_mrad=1.0, gyro_count_rad=2.0**-19,
+    accelerometer_bias_mg=3.0, accelerometer_wander_mg=0.3, accelerometer_bias_mg_k=0.0,
+    velocity_random_walk_ug_sqrt_hz=200.0, accelerometer_scale_ppm=1000.0, accelerometer_misalignment_mrad=1.0,
     clock=ClockParameters(),
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Triad:
-    """Three gyros or accelerometers: the errors of one unit. Below, "unit" is rad for gyros and m/s for accelerometers.
+    """The errors of three gyros (unit: rad) or accelerometers (unit: m/s).
 
-    Attributes
-    ----------
-    bias
-        Constant bias, unit/s.
-    bias_per_k
-        Change of bias with temperature, unit/s/K.
-    wander
-        Bias that wanders, unit/s.
-    warm_up
-        Temperature over time.
-    scale
-        Errors of the scale factors, shares.
-    misalignment
-        Input of each sensor (row) from the other axes (columns), radians; its diagonal is 0.
-    random_walk
-        White noise of rate, unit/sqrt(s).
-    count
-        Unit of a count; 0 for no rounding.
+    - bias, bias_per_k: constant bias, unit/s, and its change with temperature, unit/s/K
+    - wander: time-correlated bias, unit/s
+    - warm_up: temperature over time
+    - scale: relative errors of the scale factors
+    - misalignment: input of each sensor (row) from the other axes (columns), radians; its diagonal is 0
+    - random_walk: white noise of rate, unit/sqrt(s)
+    - count: resolution, unit; 0 for no rounding
     """
 
     bias: Float64[np.ndarray, "3"]
@@ -141,18 +106,18 @@ class Triad:
 
     @property
     def sensitivity_error(self) -> Float64[np.ndarray, "3 3"]:
-        """What the triad measures of a true input, less that input: this matrix times the input."""
+        """Matrix of scale and misalignment errors: measured less true input is this matrix times the input."""
         return np.asarray(np.diag(self.scale) + self.misalignment)
 
     def bias_at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
-        """Bias at these times: constant, wandering and with temperature; unit/s."""
+        """Compute the total bias: constant, thermal and time-correlated; unit/s."""
         thermal = self.warm_up.temperature_k(times_s)[:, None] * self.bias_per_k
         return np.asarray(self.bias + thermal + self.wander.at(times_s))
 
-    def measured(
+    def measure(
         self, true: Float64[np.ndarray, "n 3"], boundaries_s: Float64[np.ndarray, "m"], rng: np.random.Generator
     ) -> Float64[np.ndarray, "n 3"]:
-        """Measured increments of these true ones between m = n + 1 boundaries; what rounding leaves is carried over."""
+        """Measure true increments between m = n + 1 boundaries; rounding residuals are carried over."""
         steps = np.diff(boundaries_s)[:, None]
         noise = self.random_walk * np.sqrt(steps) * rng.standard_normal(true.shape)
         bias = self.bias_at(0.5 * (boundaries_s[1:] + boundaries_s[:-1])) * steps
@@ -165,18 +130,12 @@ class Triad:
 
 @dataclass(frozen=True)
 class ImuIncrements:
-    """What the unit delivers.
+    """Increments measured by an inertial unit.
 
-    Attributes
-    ----------
-    times_s
-        Time tags of the boundaries between samples, seconds, never decreasing; one more than samples.
-    period_s
-        Time between samples as flight software has it.
-    delta_angles_rad
-        Rotation vectors from the body axes at each interval's start to those at its end.
-    delta_velocities_m_s
-        Integrals of specific force over each interval, in the body axes of its start.
+    - times_s: time tags of the sample boundaries, never decreasing; one more than samples
+    - period_s: nominal time between boundaries
+    - delta_angles_rad: rotation vectors from the body axes at each interval's start to those at its end
+    - delta_velocities_m_s: integrals of specific force over each interval, in the body axes at its start
     """
 
     times_s: Float64[np.ndarray, "m"]
@@ -187,17 +146,7 @@ class ImuIncrements:
 
 @dataclass(frozen=True)
 class Imu:
-    """One unit: its errors over a span of time are drawn once, its noise with the increments.
-
-    Attributes
-    ----------
-    parameters
-        Its class.
-    gyro, accelerometer
-        Its errors, in rad and m/s.
-    clock
-        Of its time tags.
-    """
+    """An inertial unit with its errors over a time span drawn; noise is drawn with the increments."""
 
     parameters: ImuParameters
     gyro: Triad
@@ -206,15 +155,19 @@ class Imu:
 
     @classmethod
     def drawn(cls, parameters: ImuParameters, span_s: tuple[float, float], rng: np.random.Generator) -> Imu:
-        """A unit with its errors drawn for use within a span of time."""
+        """Draw the errors for use within a time span."""
         p = parameters
         milli_g = 1e-3 * STANDARD_GRAVITY_M_S2
+        gyro_wander, force_wander = (
+            np.full(3, p.gyro_wander_deg_h * DEG_H),
+            np.full(3, p.accelerometer_wander_mg * milli_g),
+        )
         return cls(
             parameters,
             gyro=Triad(
                 bias=p.gyro_bias_deg_h * DEG_H * rng.standard_normal(3),
                 bias_per_k=p.gyro_bias_deg_h_k * DEG_H * rng.standard_normal(3),
-                wander=GaussMarkov.drawn(np.full(3, p.gyro_wander_deg_h * DEG_H), p.gyro_wander_s, span_s, rng),
+                wander=GaussMarkov.drawn(gyro_wander, p.gyro_wander_s, span_s, rng),
                 warm_up=p.warm_up,
                 scale=1e-6 * p.gyro_scale_ppm * rng.standard_normal(3),
                 misalignment=1e-3 * p.gyro_misalignment_mrad * _off_diagonal(rng),
@@ -224,9 +177,7 @@ class Imu:
             accelerometer=Triad(
                 bias=p.accelerometer_bias_mg * milli_g * rng.standard_normal(3),
                 bias_per_k=p.accelerometer_bias_mg_k * milli_g * rng.standard_normal(3),
-                wander=GaussMarkov.drawn(
-                    np.full(3, p.accelerometer_wander_mg * milli_g), p.accelerometer_wander_s, span_s, rng
-                ),
+                wander=GaussMarkov.drawn(force_wander, p.accelerometer_wander_s, span_s, rng),
                 warm_up=p.warm_up,
                 scale=1e-6 * p.accelerometer_scale_ppm * rng.standard_normal(3),
                 misalignment=1e-3 * p.accelerometer_misalignment_mrad * _off_diagonal(rng),
@@ -237,7 +188,7 @@ class Imu:
         )
 
     def boundaries(self, start_s: float, end_s: float) -> Float64[np.ndarray, "m"]:
-        """True times of the boundaries between samples from a start to the last that is not after an end, seconds."""
+        """Compute the true times of the sample boundaries from start to the last one not after the end."""
         count = int(np.floor((end_s - start_s) * self.parameters.rate_hz + 1e-9))
         if count < 1:
             raise ValueError(f"there is no sample from {start_s} s to {end_s} s at {self.parameters.rate_hz} Hz")
@@ -246,24 +197,24 @@ class Imu:
     def increments(
         self, trajectory: Trajectory, start_s: float, end_s: float, rng: np.random.Generator
     ) -> ImuIncrements:
-        """What the unit delivers of a motion from a start to an end, both true times within the span drawn."""
+        """Measure a motion from a start to an end, both true times within the span."""
         boundaries = self.boundaries(start_s, end_s)
         angles, velocities = true_increments(trajectory, boundaries)
         return ImuIncrements(
             times_s=np.maximum.accumulate(self.clock.tags(boundaries, rng)),
             period_s=1.0 / self.parameters.rate_hz,
-            delta_angles_rad=self.gyro.measured(angles, boundaries, rng),
-            delta_velocities_m_s=self.accelerometer.measured(velocities, boundaries, rng),
+            delta_angles_rad=self.gyro.measure(angles, boundaries, rng),
+            delta_velocities_m_s=self.accelerometer.measure(velocities, boundaries, rng),
         )
 
 
 def true_increments(
     trajectory: Trajectory, boundaries_s: Float64[np.ndarray, "m"]
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Rotation vectors between boundaries, and integrals of specific force in the body axes of each interval's start.
+    """Compute rotation vectors between boundaries and integrals of specific force in the body axes at each start.
 
-    Specific force is integrated in world axes as a cubic spline through the boundaries: for a frequency f its error is
-    of the order of (2 pi f step)^4 / 720 of its amplitude, 1e-9 for a nodding of 1 Hz at 400 samples per second.
+    Specific force is integrated in world axes as a cubic spline through the boundaries. For a frequency f the relative
+    error is of the order of (2 pi f step)^4 / 720: 1e-9 for a nodding of 1 Hz at 400 samples per second.
     """
     motion = trajectory.motion(boundaries_s)
     attitudes = motion.attitudes
@@ -276,3 +227,31 @@ def true_increments(
 
 def _off_diagonal(rng: np.random.Generator) -> Float64[np.ndarray, "3 3"]:
     return np.asarray(rng.standard_normal((3, 3)) * (1.0 - np.eye(3)))
+
+
+def products(left: Float64[np.ndarray, "n 4"], right: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
+    """Multiply quaternions (x, y, z, w) pairwise, several times faster than `Rotation`; the right one acts first."""
+    ax, ay, az, aw = left.T
+    bx, by, bz, bw = right.T
+    product: Float64[np.ndarray, "n 4"] = np.empty(left.shape)
+    product[:, 0] = aw * bx + ax * bw + ay * bz - az * by
+    product[:, 1] = aw * by + ay * bw + az * bx - ax * bz
+    product[:, 2] = aw * bz + az * bw + ax * by - ay * bx
+    product[:, 3] = aw * bw - ax * bx - ay * by - az * bz
+    return product
+
+
+def running_products(steps: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
+    """Compute the products of the first 1, 2, ... n quaternions, each step to the right of those before it.
+
+    Recursion: the products of pairs give every second running product; the others follow from these.
+    """
+    count = len(steps)
+    if count == 1:
+        return steps
+    through_pairs = running_products(products(steps[: count - 1 : 2], steps[1::2]))
+    running = np.empty((count, 4))
+    running[0] = steps[0]
+    running[1::2] = through_pairs
+    running[2::2] = products(through_pairs[: (count - 1) // 2], steps[2::2])
+    return running

@@ -1,54 +1,60 @@
-"""Strapdown navigation on board: attitude and velocity from an inertial unit's increments.
+"""Inertial navigation on board: strapdown propagation, and its initial errors at the start of the descent.
 
-Position is integrated only for the mean velocity over an interval; it starts at 0.
+`InertialSolution` propagates attitude and velocity from an inertial unit's increments. `Approach` propagates the errors
+from the last star reference through spinning cruise, entry, braking and the parachute to the descent. Only the errors
+are propagated, along a nominal profile, in steps that resolve the spin:
+
+    d(attitude)/dt = R (bias + sensitivity error x body rate) + noise
+    d(velocity)/dt = attitude x (R f) + R (bias + sensitivity error x f) + noise
+
+with R the nominal attitude, f the nominal specific force, both errors in world axes, to first order (Titterton and
+Weston, Strapdown Inertial Navigation Technology, ch. 12, over minutes and without the errors' effect on gravity). The
+unit and its errors are those of the descent.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.sensor.imu import ImuIncrements
-from marsyard.sim.sensor.quaternions import running_products
+from marsyard.sim.parameters import NonNegative, Parameters, Positive
+from marsyard.sim.sensor.imu import Imu, ImuIncrements, products, running_products
+
+#: Steps of the propagation per second: at 2 rpm the midpoint rule's error is 5e-5 of the effect that the spin averages.
+STEPS_PER_S = 5.0
+#: Mean of sin^4, the shape of the deceleration over the entry.
+_MEAN_SIN4 = 3.0 / 8.0
 
 
 @dataclass(frozen=True)
 class NavigationErrors:
-    """Errors of navigation at an instant.
+    """Errors of an inertial navigation at one time.
 
-    Attributes
-    ----------
-    attitude_rad
-        Small rotation about the world axes from the true attitude to the one that is believed.
-    velocity_m_s
-        Believed less true velocity, world axes.
+    - attitude_rad: small rotation about the world axes from the true to the estimated attitude
+    - velocity_m_s: estimated less true velocity, world axes
     """
 
     attitude_rad: Float64[np.ndarray, "3"]
     velocity_m_s: Float64[np.ndarray, "3"]
 
-    def believed(
+    def apply(
         self, attitude: Rotation, velocity_m_s: Float64[np.ndarray, "3"]
     ) -> tuple[Rotation, Float64[np.ndarray, "3"]]:
-        """Attitude and velocity that are believed, given the true ones."""
+        """Add the errors to a true attitude and velocity."""
         return Rotation.from_rotvec(self.attitude_rad) * attitude, velocity_m_s + self.velocity_m_s
 
 
 @dataclass(frozen=True)
 class InertialSolution:
-    """Attitude, velocity and displacement as propagated on board; times are the unit's time tags.
+    """Attitude, velocity and displacement propagated on board from inertial increments; times are the unit's tags.
 
-    Attributes
-    ----------
-    increments
-        What it was propagated from.
-    attitudes
-        Rotations from body to world axes at the boundaries of the samples.
-    velocities_m_s, displacements_m
-        At the boundaries of the samples, world axes; displacement from the first.
+    - attitudes: rotations from body to world axes at the sample boundaries
+    - velocities_m_s, displacements_m: at the sample boundaries, world axes; displacement from the first boundary
     """
 
     increments: ImuIncrements
@@ -57,17 +63,14 @@ class InertialSolution:
     displacements_m: Float64[np.ndarray, "m 3"]
 
     @classmethod
-    def propagated(
+    def propagate(
         cls,
         increments: ImuIncrements,
         attitude: Rotation,
         velocity_m_s: Float64[np.ndarray, "3"],
         gravity_m_s2: float,
     ) -> InertialSolution:
-        """The solution from believed attitude and velocity at the first boundary and gravity along world -z.
-
-        Velocity increments are turned by the believed attitude, so that its error tilts the specific force.
-        """
+        """Propagate from an estimated attitude and velocity at the first boundary, with gravity along world -z."""
         turns = Rotation.from_rotvec(increments.delta_angles_rad).as_quat()
         attitudes = Rotation.from_quat(running_products(np.concatenate([attitude.as_quat()[None], turns])))
         gravity = np.array([0.0, 0.0, -gravity_m_s2])
@@ -77,37 +80,28 @@ class InertialSolution:
         return cls(increments, attitudes, velocities, _running_sums(moved))
 
     def attitude(self, times_s: Float64[np.ndarray, "n"]) -> Rotation:
-        """Attitudes at time tags; between samples the rate is constant."""
-        interval, share = self._placed(times_s)
+        """Interpolate attitudes at time tags with a constant rate between samples."""
+        interval, fraction = self._locate(times_s)
         return self.attitudes[interval] * Rotation.from_rotvec(
-            share[:, None] * self.increments.delta_angles_rad[interval]
+            fraction[:, None] * self.increments.delta_angles_rad[interval]
         )
 
     def velocity(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
-        """Velocities at time tags, world axes; between samples the acceleration is constant."""
-        interval, share = self._placed(times_s)
+        """Interpolate velocities at time tags linearly between samples, world axes."""
+        interval, fraction = self._locate(times_s)
         before, after = self.velocities_m_s[interval], self.velocities_m_s[interval + 1]
-        return np.asarray(before + share[:, None] * (after - before))
-
-    def displacement(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
-        """Displacements from the first boundary to time tags, world axes; between samples acceleration is constant."""
-        interval, share = self._placed(times_s)
-        before, after = self.velocities_m_s[interval], self.velocities_m_s[interval + 1]
-        passed = share[:, None] * self.increments.period_s
-        return np.asarray(self.displacements_m[interval] + passed * (before + 0.5 * share[:, None] * (after - before)))
+        return np.asarray(before + fraction[:, None] * (after - before))
 
     def mean_velocities(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "intervals 3"]:
-        """Mean velocities over the intervals between successive time tags, world axes, one fewer than tags."""
-        return np.asarray(np.diff(self.displacement(times_s), axis=0) / np.diff(times_s)[:, None])
+        """Compute mean velocities between successive time tags, world axes; acceleration is constant in a sample."""
+        interval, fraction = self._locate(times_s)
+        before, after = self.velocities_m_s[interval], self.velocities_m_s[interval + 1]
+        elapsed = fraction[:, None] * self.increments.period_s
+        displacements = self.displacements_m[interval] + elapsed * (before + 0.5 * fraction[:, None] * (after - before))
+        return np.asarray(np.diff(displacements, axis=0) / np.diff(times_s)[:, None])
 
-    def _placed(self, times_s: Float64[np.ndarray, "n"]) -> tuple[np.ndarray, Float64[np.ndarray, "n"]]:
-        """Number of the interval in which each time falls, and the share of it that has passed.
-
-        Raises
-        ------
-        ValueError
-            If a time is tagged before the first sample or after the last.
-        """
+    def _locate(self, times_s: Float64[np.ndarray, "n"]) -> tuple[np.ndarray, Float64[np.ndarray, "n"]]:
+        """Interval of each time, and its elapsed fraction. Raises ValueError before the first or after the last tag."""
         tags = self.increments.times_s
         if times_s.size and (times_s.min() < tags[0] or times_s.max() > tags[-1]):
             raise ValueError(
@@ -121,5 +115,126 @@ class InertialSolution:
 
 
 def _running_sums(steps: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "m 3"]:
-    """Sums of the first 0, 1, 2, ... n steps."""
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+class ApproachParameters(Parameters):
+    """From the last star reference to the descent. Defaults: nominal times and speeds of the MER landings.
+
+    Times and speeds: Desai and Knocke (2007), rounded. Assumed: the errors of the star reference, and the spin axis's
+    scale factor error after calibration against the stars in cruise.
+    """
+
+    attitude_sd_deg: Annotated[NonNegative, Field(description="error of the star reference per axis, deg")] = 0.05
+    velocity_sd_m_s: Annotated[NonNegative, Field(description="error of the velocity at that time, per axis")] = 1.0
+    spin_scale_ppm: Annotated[NonNegative, Field(description="residual scale error of the spin gyro, ppm")] = 20.0
+    cruise_s: Annotated[NonNegative, Field(le=20000.0, description="from the star reference to entry, s")] = 900.0
+    entry_s: Annotated[Positive, Field(le=2000.0, description="from entry to the parachute's opening, s")] = 240.0
+    parachute_s: Annotated[Positive, Field(le=2000.0, description="from there to the descent's start, s")] = 80.0
+    spin_rpm: Annotated[float, Field(ge=-10.0, le=10.0, description="spin until the parachute opens, rpm")] = 2.0
+    heading_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="azimuth of the flight at entry")] = 80.0
+    entry_off_nadir_deg: Annotated[float, Field(ge=0.0, le=180.0, description="flight's direction at entry")] = 78.0
+    deploy_off_nadir_deg: Annotated[float, Field(ge=0.0, le=180.0, description="flight's direction at opening")] = 62.0
+    upright_s: Annotated[Positive, Field(description="from the parachute's opening to hanging straight, s")] = 30.0
+    entry_speed_m_s: Annotated[Positive, Field(description="lost from entry to opening, m/s")] = 5000.0
+    parachute_speed_m_s: Annotated[NonNegative, Field(description="lost under the parachute, m/s")] = 340.0
+    inflation_s: Annotated[Positive, Field(description="time constant of that loss, s")] = 8.0
+    gravity_m_s2: Annotated[NonNegative, Field(description="carried by the parachute, m/s2")] = 3.71
+
+    @property
+    def duration_s(self) -> float:
+        """From the star reference to the descent's start."""
+        return self.cruise_s + self.entry_s + self.parachute_s
+
+
+@dataclass(frozen=True)
+class Approach:
+    """Nominal profile from the last star reference to the start of the descent at `end_s`."""
+
+    parameters: ApproachParameters
+    end_s: float
+
+    @property
+    def start_s(self) -> float:
+        """Time of the star reference."""
+        return self.end_s - self.parameters.duration_s
+
+    def calibrate(self, imu: Imu, rng: np.random.Generator) -> Imu:
+        """Replace the scale factor error of the z gyro (the spin axis) by its residual after calibration."""
+        scale = imu.gyro.scale.copy()
+        scale[2] = 1e-6 * self.parameters.spin_scale_ppm * float(rng.standard_normal())
+        return replace(imu, gyro=replace(imu.gyro, scale=scale))
+
+    def errors(self, imu: Imu, rng: np.random.Generator) -> NavigationErrors:
+        """Propagate the navigation errors to the descent's start; the unit's time span must include the approach."""
+        p = self.parameters
+        count = int(np.ceil(p.duration_s * STEPS_PER_S))
+        step = p.duration_s / count
+        times = self.start_s + step * (np.arange(count) + 0.5)
+        attitudes, rates, forces = self.attitudes(times), self.body_rates(times), self.specific_forces(times)
+        turned = attitudes.apply(imu.gyro.bias_at(times) + rates @ imu.gyro.sensitivity_error.T) * step
+        turned += imu.gyro.random_walk * np.sqrt(step) * rng.standard_normal(turned.shape)
+        reference = np.radians(p.attitude_sd_deg) * rng.standard_normal(3)
+        attitude = reference + np.cumsum(turned, axis=0)
+        sensed = imu.accelerometer.bias_at(times) + forces @ imu.accelerometer.sensitivity_error.T
+        # attitude error at the middle of each step
+        gained = (np.cross(attitude - 0.5 * turned, attitudes.apply(forces)) + attitudes.apply(sensed)) * step
+        gained += imu.accelerometer.random_walk * np.sqrt(step) * rng.standard_normal(gained.shape)
+        velocity = p.velocity_sd_m_s * rng.standard_normal(3) + gained.sum(axis=0)
+        return NavigationErrors(attitude_rad=attitude[-1], velocity_m_s=velocity)
+
+    def attitudes(self, times_s: Float64[np.ndarray, "n"]) -> Rotation:
+        """Nominal rotations from body to world axes: body -z along the flight direction, spinning about it."""
+        flight = Rotation.from_rotvec(self._off_nadir(times_s)[:, None] * self._turn_axis())
+        spun = Rotation.from_rotvec(self._spun(times_s)[:, None] * np.array([0.0, 0.0, 1.0]))
+        return Rotation.from_quat(products(flight.as_quat(), spun.as_quat()))
+
+    def body_rates(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+        """Nominal angular velocities, body axes, rad/s."""
+        # the turn of the flight direction leaves its axis fixed: only the spin moves the axis in the body
+        times, angles = self._knots()
+        knot_rates = np.concatenate([[0.0], np.diff(angles) / np.diff(times), [0.0]])
+        turning = knot_rates[np.searchsorted(times, times_s, side="right")]
+        spun, (first, second, _) = self._spun(times_s), self._turn_axis()
+        rates: Float64[np.ndarray, "n 3"] = np.empty((times_s.size, 3))
+        rates[:, 0] = turning * (np.cos(spun) * first + np.sin(spun) * second)
+        rates[:, 1] = turning * (np.cos(spun) * second - np.sin(spun) * first)
+        rates[:, 2] = np.where(times_s < self._deploy_s(), self._spin_rate(), 0.0)
+        return rates
+
+    def specific_forces(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+        """Nominal acceleration less gravity, body axes, m/s2: drag along the spin axis."""
+        p = self.parameters
+        entering = np.clip((times_s - self._entry_s()) / p.entry_s, 0.0, 1.0)
+        drag = p.entry_speed_m_s / (p.entry_s * _MEAN_SIN4) * np.sin(np.pi * entering) ** 4
+        hanging = np.maximum(times_s - self._deploy_s(), 0.0)
+        braking = p.parachute_speed_m_s / p.inflation_s * np.exp(-hanging / p.inflation_s) + p.gravity_m_s2
+        drag += np.where(times_s >= self._deploy_s(), braking, 0.0)
+        return np.asarray(drag[:, None] * np.array([0.0, 0.0, 1.0]))
+
+    def _deploy_s(self) -> float:
+        return self.end_s - self.parameters.parachute_s
+
+    def _entry_s(self) -> float:
+        return self._deploy_s() - self.parameters.entry_s
+
+    def _spin_rate(self) -> float:
+        return float(2.0 * np.pi * self.parameters.spin_rpm / 60.0)
+
+    def _spun(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        return np.asarray(self._spin_rate() * (np.minimum(times_s, self._deploy_s()) - self.start_s))
+
+    def _turn_axis(self) -> Float64[np.ndarray, "3"]:
+        # tilts nadir towards the heading: (0, 0, -1) x (sin a, cos a, 0)
+        heading = np.radians(self.parameters.heading_deg)
+        return np.asarray(np.array([np.cos(heading), -np.sin(heading), 0.0]))
+
+    def _knots(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """Times at which the turn rate of the flight direction changes, and its angle from nadir there."""
+        p = self.parameters
+        times = np.array([self._entry_s(), self._deploy_s(), self._deploy_s() + p.upright_s])
+        return times, np.radians([p.entry_off_nadir_deg, p.deploy_off_nadir_deg, 0.0])
+
+    def _off_nadir(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        times, angles = self._knots()
+        return np.asarray(np.interp(times_s, times, angles))

@@ -1,73 +1,118 @@
-"""What altimeters and position receivers have in common: readings at a rate and with time tags of their own."""
+"""Common parts of instruments: sampling times, time tags, readings and time-correlated errors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Annotated
 
 import numpy as np
+import scipy  # scipy.signal is slow to import: it is loaded at its first use
 from jaxtyping import Float64
+from pydantic import Field
+from scipy.interpolate import make_interp_spline
 
-from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.parameters import Parameters
+
+#: Knots per correlation time. Linear interpolation between them loses at most 1 % of the variance.
+KNOTS_PER_CORRELATION = 50
+_Deviation = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
 @dataclass(frozen=True)
 class Readings:
-    """What an instrument delivers.
+    """Readings of an instrument, with their time tags.
 
-    Attributes
-    ----------
-    times_s
-        Time tags, seconds.
-    values
-        One row for each reading: a range (altimeters, metres) or a position (receivers, metres, world axes, three
-        columns). Not a number where the instrument had nothing to deliver.
+    `values` has one row per reading: a range (altimeters, metres) or a position (receivers, metres, world axes). NaN
+    marks a missing reading.
     """
 
     times_s: Float64[np.ndarray, "n"]
     values: Float64[np.ndarray, "n *quantity"]
 
 
-@runtime_checkable
-class Instrument(Protocol):
-    """An instrument with its constant errors drawn, that reads a motion at given true times."""
-
-    @property
-    def sampling(self) -> Sampling:
-        """When it reads."""
-        ...
-
-    def measure(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator) -> Readings:
-        """One reading at each true time; `rng` gives its noise."""
-        ...
-
-
 @dataclass(frozen=True)
 class Sampling:
-    """When an instrument reads: every 1 / rate seconds, at a phase of its own.
-
-    Attributes
-    ----------
-    rate_hz
-        Readings per second.
-    phase_s
-        True time of a reading, seconds.
-    """
+    """Periodic sampling at a rate; `phase_s` is the true time of one sample."""
 
     rate_hz: float
     phase_s: float
 
     @classmethod
     def drawn(cls, rate_hz: float, rng: np.random.Generator) -> Sampling:
-        """Readings at a rate, their phase drawn evenly."""
+        """Draw a uniformly distributed phase."""
         return cls(rate_hz, float(rng.random()) / rate_hz)
 
     def within(self, start_s: float, end_s: float) -> Float64[np.ndarray, "n"]:
-        """True times of all readings from a start to an end, seconds."""
+        """Return the true times of all samples from start to end."""
         first = np.ceil((start_s - self.phase_s) * self.rate_hz)
         last = np.floor((end_s - self.phase_s) * self.rate_hz)
         return np.asarray(self.phase_s + np.arange(first, last + 1.0) / self.rate_hz)
 
     def latest(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
-        """True time of the last reading at or before each time, seconds."""
+        """Return the true time of the last sample at or before each time."""
         return np.asarray(self.phase_s + np.floor((times_s - self.phase_s) * self.rate_hz) / self.rate_hz)
+
+
+class ClockParameters(Parameters):
+    """Errors of time tags: tagged less true time."""
+
+    offset_s: Annotated[float, Field(ge=-10.0, le=10.0, description="mean of the constant offset, s")] = 0.0
+    offset_sd_s: Annotated[_Deviation, Field(description="spread of the constant offset between units, s")] = 0.0
+    jitter_sd_s: Annotated[_Deviation, Field(description="spread of the tags about the offset, new in each, s")] = 0.0
+
+
+@dataclass(frozen=True)
+class Clock:
+    """An instrument's clock; `offset_s` is the constant part of tagged less true time."""
+
+    parameters: ClockParameters
+    offset_s: float
+
+    @classmethod
+    def drawn(cls, parameters: ClockParameters, rng: np.random.Generator) -> Clock:
+        """Draw the constant offset."""
+        return cls(parameters, parameters.offset_s + parameters.offset_sd_s * float(rng.standard_normal()))
+
+    def tags(self, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator) -> Float64[np.ndarray, "n"]:
+        """Return the time tags of events at true times."""
+        jitter = self.parameters.jitter_sd_s * rng.standard_normal(times_s.size)
+        return np.asarray(times_s + self.offset_s + jitter)
+
+
+@dataclass(frozen=True)
+class GaussMarkov:
+    """A stationary first-order Gauss-Markov process of zero mean, a column per channel; linear between its knots."""
+
+    knots_s: Float64[np.ndarray, "knots"]
+    values: Float64[np.ndarray, "knots channels"]
+
+    @classmethod
+    def drawn(
+        cls,
+        sd: Float64[np.ndarray, "channels"],
+        correlation_s: float,
+        span_s: tuple[float, float],
+        rng: np.random.Generator,
+    ) -> GaussMarkov:
+        """Draw a realisation by standard deviations and correlation time. Raises ValueError for an invalid span."""
+        first, last = span_s
+        if not (np.isfinite(first) and np.isfinite(last) and first <= last):
+            raise ValueError(f"a process cannot be drawn from {first} s to {last} s; a finite span is needed")
+        step = correlation_s / KNOTS_PER_CORRELATION
+        count = int(np.ceil((last - first) / step)) + 2
+        decay = np.exp(-step / correlation_s)
+        innovations = rng.standard_normal((count, sd.size))
+        innovations[1:] *= np.sqrt(1.0 - decay**2)
+        values: Float64[np.ndarray, "knots channels"] = sd * scipy.signal.lfilter(
+            [1.0], [1.0, -decay], innovations, axis=0
+        )
+        return cls(first + step * np.arange(count), values)
+
+    def at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n channels"]:
+        """Interpolate the process. Raises ValueError if a time is outside the span."""
+        if times_s.size and (times_s.min() < self.knots_s[0] or times_s.max() > self.knots_s[-1]):
+            raise ValueError(
+                f"errors are asked for from {times_s.min():.3f} s to {times_s.max():.3f} s; they were drawn from "
+                f"{self.knots_s[0]:.3f} s to {self.knots_s[-1]:.3f} s"
+            )
+        return np.asarray(make_interp_spline(self.knots_s, self.values, k=1)(times_s))

@@ -1,8 +1,8 @@
-"""Compiled kernels of exposure over time: motion blur, and the smear of a moving scene during charge transfer.
+"""Compiled kernels of a moving exposure: motion blur, and smear during the charge transfer.
 
-Both take the scene as it stands at mid exposure, with `pad` rows and columns repeated beyond each border, and its image
-velocity (rows and columns per second) on a coarse grid. What stands at x at time t stood at x - velocity * t at mid
-exposure. Velocity is constant within tiles of `TILE` x `TILE` pixels.
+The scene is given at mid exposure, with `pad` rows and columns repeated beyond each border, and its image velocity
+(rows and columns per second) on a coarse grid. A point at x at time t was at x - velocity * t at mid exposure. Velocity
+is constant within tiles of `TILE` x `TILE` pixels.
 """
 
 from __future__ import annotations
@@ -26,20 +26,12 @@ MIN_TAP = 1e-6
 
 
 class Transfer(NamedTuple):
-    """A moving scene while it is shifted out.
+    """A moving scene during the charge transfer.
 
-    Attributes
-    ----------
-    padded, pad
-        The scene, and its border in rows and columns.
-    response
-        Response of every pixel.
-    edges
-        First row of each block of rows, and the number of rows, shape (blocks + 1,).
-    field, step
-        Image velocity, as for `blur`.
-    start_s, row_s
-        Time at which the transfer starts, from mid exposure, and time per row.
+    - padded, pad: the scene, and its border in rows and columns
+    - edges: first row of each block of rows, and the number of rows, shape (blocks + 1,)
+    - field, step: image velocity, as in `blur`
+    - start_s, row_s: start of the transfer after mid exposure, and time per row
     """
 
     padded: Array32
@@ -54,7 +46,7 @@ class Transfer(NamedTuple):
 
 @njit(cache=True)
 def velocity_at(field: Array, step: float, row: float, column: float) -> tuple[float, float]:
-    """Rows and columns per second at a pixel, bilinear between the nodes of the grid, held beyond them."""
+    """Interpolate the velocity bilinearly at a pixel, rows and columns per second; constant beyond the grid."""
     y = min(max(row / step, 0.0), field.shape[0] - 1.0)
     x = min(max(column / step, 0.0), field.shape[1] - 1.0)
     i = min(int(y), field.shape[0] - 2)
@@ -82,25 +74,20 @@ def _cubic(f: float, weights: Array) -> None:
 
 @njit(cache=True)
 def path_kernel(row_path: float, column_path: float, reach: int, kernel: Array) -> None:
-    """Mean over a straight path, centred on the pixel, as a convolution of whole pixels.
+    """Write the convolution kernel of the mean over a straight path centred on the pixel.
 
-    Parameters
-    ----------
-    row_path, column_path
-        Length of the path in rows and columns.
-    reach
-        Half size of the kernel.
-    kernel
-        Output, shape (2 reach + 1, at least 2 reach + 1); its sum is 1.
+    - row_path, column_path: length of the path in rows and columns
+    - reach: half size of the kernel
+    - kernel: output, shape (2 reach + 1, at least 2 reach + 1); its sum is 1
     """
     kernel[:] = 0.0
     count = max(1, math.ceil(STEPS_PER_PX * math.sqrt(row_path * row_path + column_path * column_path)))
     down = np.empty(4)
     right = np.empty(4)
     for n in range(count):
-        share = (n + 0.5) / count - 0.5
-        y = share * row_path
-        x = share * column_path
+        fraction = (n + 0.5) / count - 0.5
+        y = fraction * row_path
+        x = fraction * column_path
         i = math.floor(y)
         j = math.floor(x)
         _cubic(y - i, down)
@@ -112,7 +99,7 @@ def path_kernel(row_path: float, column_path: float, reach: int, kernel: Array) 
 
 @njit(cache=True)
 def _tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
-    """First row and column of each run of four neighbouring taps that matter, and how many there are."""
+    """Write first row and column of each group of four neighbouring non-zero taps; return the number of groups."""
     count = 0
     for p in range(kernel.shape[0]):
         q = 0
@@ -129,18 +116,11 @@ def _tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
 
 @njit(cache=True)
 def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float, out: Array32) -> None:
-    """Mean of the moving scene over an exposure centred on the time of `padded`, for each pixel.
+    """Average the moving scene over an exposure centred on the time of `padded`.
 
-    Parameters
-    ----------
-    padded, pad
-        The scene, and its border, with three columns more on the right.
-    field, step
-        Image velocity at grid nodes (rows and columns per second), shape (n, m, 2), and their distance in pixels.
-    exposure_s
-        Exposure time.
-    out
-        Output, the shape of the scene without its border.
+    - padded, pad: the scene, and its border, with three more columns on the right
+    - field, step: image velocity at grid nodes (rows and columns per second), and the grid spacing in pixels
+    - out: output, shape of the scene without its border
     """
     rows, columns = out.shape
     # three columns more, always 0: taps are added four at a time
@@ -171,7 +151,7 @@ def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float
 
 @njit(cache=True)
 def _split(position: float, size: int) -> tuple[int, np.float32]:
-    """Whole and fractional part of a position, held so that the next sample exists."""
+    """Integer and fractional part of a position, clipped so that the next sample exists."""
     i = math.floor(position)
     if i < 0:
         return 0, np.float32(0.0)
@@ -184,9 +164,9 @@ def _split(position: float, size: int) -> tuple[int, np.float32]:
 def _add_moved(
     source: Array32, shape: tuple[int, int], y: float, x: float, factor: np.float32, line: Array32, width: int
 ) -> None:
-    """Adds factor times a picture at row y and columns x, x + 1, ... to a line, bilinear between samples.
+    """Add factor times a picture at row y and columns x, x + 1, ... to a line, with bilinear interpolation.
 
-    The picture is given as one row of numbers and its shape: to cut rows out of it would take longer than to add them.
+    The picture is flat with its shape: slicing rows would take longer than adding them.
     """
     i, fy = _split(y, shape[0])
     j, fx = _split(x, shape[1] - width)
@@ -209,7 +189,7 @@ def _add_moved(
 
 @njit(cache=True)
 def sums_before(scene: Array32) -> Array32:
-    """Sums over the rows before each row, shape (rows + 1, columns)."""
+    """Compute sums over the rows before each row, shape (rows + 1, columns)."""
     rows, columns = scene.shape
     sums = np.empty((rows + 1, columns), dtype=np.float32)
     sums[0] = 0.0
@@ -221,35 +201,27 @@ def sums_before(scene: Array32) -> Array32:
 
 @njit(cache=True)
 def block_means(picture: Array32, edges: NDArray[np.int64]) -> Array32:
-    """Means over blocks of rows, shape (blocks, columns)."""
+    """Compute means over blocks of rows, shape (blocks, columns)."""
     means = np.zeros((len(edges) - 1, picture.shape[1]), dtype=np.float32)
     for block in range(len(edges) - 1):
-        share = np.float32(1.0 / (edges[block + 1] - edges[block]))
+        weight = np.float32(1.0 / (edges[block + 1] - edges[block]))
         for r in range(edges[block], edges[block + 1]):
             for c in range(picture.shape[1]):
-                means[block, c] += share * picture[r, c]
+                means[block, c] += weight * picture[r, c]
     return means
 
 
 @njit(cache=True)
 def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Array32:
-    """Charge that a packet gathers on its way out from the upper edge of each block of rows, in radiance x rows.
+    """Compute the charge that a packet gathers on its way out from each block edge, radiance x rows.
 
-    A packet that starts at the upper edge of block R passes the middle of block K < R when the picture has moved on
-    for (R - K - 1/2) blocks. Each block of the scene is seen at that one time.
+    A packet that starts at the upper edge of block R passes the middle of block K < R after the time of (R - K - 1/2)
+    blocks. Each block of the scene is sampled at that time.
 
-    Parameters
-    ----------
-    transfer
-        The moving scene.
-    prefix
-        Sums over the padded scene's rows before each row, shape (padded rows + 1, padded columns).
-    response
-        Mean response of each block, shape (blocks, columns).
+    - prefix: sums over the padded scene's rows before each row, shape (padded rows + 1, padded columns)
+    - response: mean response of each block, shape (blocks, columns)
 
-    Returns
-    -------
-    The sum at each edge, shape (blocks + 1, columns).
+    Returns the sum at each edge, shape (blocks + 1, columns).
     """
     pad, edges = transfer.pad, transfer.edges
     blocks, columns = response.shape
@@ -275,10 +247,10 @@ def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Arr
 
 @njit(cache=True)
 def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
-    """Add to `charge` (radiance x seconds, changed in place) what every row's packet gathers on its way out.
+    """Add the charge that every row's packet gathers on its way out to `charge` (radiance x seconds, in place).
 
-    Between the edges of a block the sums over earlier blocks (`gather_blocks`) change linearly, as their times do; the
-    block's own rows are added one by one, seen half a block's time after the start.
+    Between the edges of a block the sums over earlier blocks (`gather_blocks`) are interpolated linearly; the block's
+    own rows are added one by one, sampled half a block's time after the start.
     """
     padded, pad, response, edges = transfer.padded, transfer.pad, transfer.response, transfer.edges
     columns = response.shape[1]
@@ -310,9 +282,9 @@ def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
                     line[k] *= weights[start + np.uint64(k)]
                     change[k] -= line[k]
             for r in range(first, last):
-                share = np.float32((r - first) / (last - first))
+                fraction = np.float32((r - first) / (last - first))
                 line = moved[r - first]
                 start = np.uint64(r * columns + left)
                 for k in range(width):
-                    total[start + np.uint64(k)] += seconds * (before[k] + share * change[k] + own[k])
+                    total[start + np.uint64(k)] += seconds * (before[k] + fraction * change[k] + own[k])
                     own[k] += line[k]

@@ -1,7 +1,24 @@
-"""Between the scene and the pixels: point spread, fall-off and dust on the lens."""
+"""Optics and radiometry of a camera: sunlight to electrons, point spread, natural fall-off and dust on the lens.
+
+A surface of radiance factor I/F under the solar photon irradiance E shows the radiance (I/F) E / pi. Behind a lens of
+f-number N and transmission T a pixel of area A gathers on axis
+
+    rate = (I/F) A T / (4 N^2)  integral of E(wavelength) T_filter(wavelength) QE(wavelength)      electrons per second
+
+The sun is a black body of 5772 K and of its true size (IAU 2015 Resolution B3): 1361 W/m2 at 1 AU. Between 400 and
+1100 nm that is within a few per cent of the measured spectrum, less than the uncertainty of quantum efficiency and lens
+transmission. The calibrated transmission of the lens absorbs the difference.
+
+Calibration: the field-test paper (section III.B) gives the dark current's part of the noise and the signal-to-noise
+ratio on the darkest terrain at -34, 0 and +23 deg C. Two constants fit them together: `LENS_TRANSMISSION` (signal) and
+`DARK_E_S` (dark current). The part is 1 - SNR / SNR without dark current; the ratio is the mean over the picture's
+rows, which wait for their readout for different times. From 0 to 23 deg C a dark current that doubles every 6 deg C
+grows by a factor of 14.3, and the paper's parts by 9.1. The constant lies between: both parts have the same error.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated
 
@@ -13,44 +30,136 @@ from pydantic import Field
 from marsyard.sim.camera import Cahvore, CameraModel
 from marsyard.sim.parameters import NonNegative, Parameters
 
+_PLANCK, _LIGHT, _BOLTZMANN = 6.62607015e-34, 2.99792458e8, 1.380649e-23
+_SUN_K, _SUN_RADIUS_M, _AU_M = 5772.0, 6.957e8, 1.495978707e11
+
+#: Calibrated: signal for an SNR of 103 without dark current at `DARKEST_RADIANCE_FACTOR`; window and losses included.
+LENS_TRANSMISSION = 0.519
+#: Calibrated: dark current of a 12 um pixel at 0 deg C, electrons per second (0.018 nA/cm2).
+DARK_E_S = 159.0
+#: Radiance factor of the darkest terrain: albedo 0.1 under an afternoon sun.
+DARKEST_RADIANCE_FACTOR = 0.07
+#: Optical density of reflection at the two surfaces of a plate of index 1.51.
+REFLECTION_DENSITY = -2.0 * float(np.log10(1.0 - (0.51 / 2.51) ** 2))
+#: Assumed: relative change of a neutral glass' density per 100 nm. Filters of the paper's densities then transmit the
+#: paper's 22 % and 11 % (a flat density would give 21.4 % and 10.7 %).
+DENSITY_SLOPE_PER_100_NM = -0.085
+
+#: Assumed: quantum efficiency of a front-illuminated silicon CCD.
+_QE_NM = np.arange(400.0, 1101.0, 50.0)
+_QE = np.array([15.0, 22.0, 28.0, 33.0, 38.0, 42.0, 43.0, 40.0, 34.0, 27.0, 19.0, 11.0, 5.0, 2.0, 0.0]) / 100.0
+#: Default exposure: a radiance factor of 0.3 fills 60 % of the full well.
+BRIGHT_RADIANCE_FACTOR, BRIGHT_FILL = 0.3, 0.6
 #: Half size of the point spread's kernel, pixels.
 REACH_PX = 6
-#: Share of the field angle by which a fisheye's pupil is foreshortened: a MER front hazcam's, measured on the sky of
+#: Fraction of the field angle by which a fisheye's pupil is foreshortened: a MER front hazcam's, measured on the sky of
 #: Opportunity's picture 1F483288473EFFCMUFP1214L0M1 from 60 to 85 deg off axis (not flat-fielded; to 10 %).
-PUPIL_SHARE = 0.95
+PUPIL_FRACTION = 0.95
+
+
+def bright_exposure_s(full_well_e: float, responsivity_e_s: float) -> float:
+    """Compute the default exposure time."""
+    return BRIGHT_FILL * full_well_e / (BRIGHT_RADIANCE_FACTOR * responsivity_e_s)
+
+
+@dataclass(frozen=True)
+class NeutralDensity:
+    """A neutral-density filter of a glass; the density per millimetre is weighted by the detector's solar response."""
+
+    glass: str
+    thickness_mm: float
+    density_per_mm: float
+
+    @property
+    def optical_density(self) -> float:
+        """Spectrally weighted optical density, including the reflection at both surfaces."""
+        return REFLECTION_DENSITY + self.density_per_mm * self.thickness_mm
+
+
+#: The paper's filters (III.B.2); densities per millimetre are calibrated to its optical densities 0.67 and 0.97.
+NG4_FLIGHT = NeutralDensity("NG4", 1.44, (0.67 - REFLECTION_DENSITY) / 1.44)
+NG3_FIELD = NeutralDensity("NG3", 1.35, (0.97 - REFLECTION_DENSITY) / 1.35)
+
+
+@dataclass(frozen=True)
+class LightPath:
+    """The light path from the sun to a pixel's electrons.
+
+    - band_nm: first and last wavelength of the passband
+    - neutral_density: filter before the lens, or None
+    - transmission: of the lens
+    - quantum_efficiency: wavelengths, nm, and electrons per photon at these, linear between and zero outside; None for
+      a front-illuminated silicon CCD
+    """
+
+    f_number: float
+    pixel_pitch_um: float
+    band_nm: tuple[float, float]
+    neutral_density: NeutralDensity | None = None
+    transmission: float = LENS_TRANSMISSION
+    quantum_efficiency: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+
+    def responsivity_e_s(self, sun_distance_au: float) -> float:
+        """Compute the electrons per second in a pixel on axis at radiance factor 1."""
+        wavelength_nm, electrons = self._electrons_per_m2()
+        passed = electrons * self._filter(wavelength_nm, electrons)
+        area = (self.pixel_pitch_um * 1e-6) ** 2
+        flux = float(np.trapezoid(passed, wavelength_nm)) / sun_distance_au**2
+        return area * self.transmission * flux / (4.0 * self.f_number**2)
+
+    def diffraction_px(self) -> float:
+        """Compute the mean wavelength of the detected photons times f-number over the pixel pitch."""
+        wavelength_nm, electrons = self._electrons_per_m2()
+        mean_nm = float(np.average(wavelength_nm, weights=electrons * self._filter(wavelength_nm, electrons)))
+        return 1e-3 * mean_nm * self.f_number / self.pixel_pitch_um
+
+    def _electrons_per_m2(self) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
+        """Wavelengths, and electrons per second, m2 and nm at 1 AU without lens and filter."""
+        wavelength_nm = np.linspace(*self.band_nm, 281)
+        if self.quantum_efficiency is None:
+            efficiency = np.interp(wavelength_nm, _QE_NM, _QE)
+        else:
+            efficiency = np.interp(wavelength_nm, *self.quantum_efficiency, left=0.0, right=0.0)
+        return wavelength_nm, solar_photons(wavelength_nm) * efficiency
+
+    def _filter(
+        self, wavelength_nm: Float64[np.ndarray, "n"], weights: Float64[np.ndarray, "n"]
+    ) -> Float64[np.ndarray, "n"]:
+        if self.neutral_density is None:
+            return np.ones_like(wavelength_nm)
+        middle = np.average(wavelength_nm, weights=weights)
+        tilt = 1.0 + DENSITY_SLOPE_PER_100_NM * (wavelength_nm - middle) / 100.0
+        return np.asarray(10.0 ** (-self.neutral_density.optical_density * tilt))
+
+
+def solar_photons(wavelength_nm: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+    """Compute the photons of sunlight per second, m2 and nm at 1 AU."""
+    wavelength = wavelength_nm * 1e-9
+    occupation = 1.0 / np.expm1(_PLANCK * _LIGHT / (wavelength * _BOLTZMANN * _SUN_K))
+    photons: Float64[np.ndarray, "n"] = 2.0 * np.pi * _LIGHT / wavelength**4 * occupation
+    return photons * (_SUN_RADIUS_M / _AU_M) ** 2 * 1e-9
 
 
 class OpticsParameters(Parameters):
-    """Point spread and dust. The defaults are an f/12 lens at 700 nm on 12 um pixels, without dust."""
+    """Point spread and dust. Defaults: an f/12 lens at 700 nm on 12 um pixels, without dust."""
 
-    diffraction_px: Annotated[
-        NonNegative, Field(le=5.0, description="wavelength times f-number over pixel pitch; 0 for no diffraction")
-    ] = 0.70
-    diffusion_px: Annotated[
-        NonNegative, Field(le=5.0, description="RMS spread of charge by diffusion, pixels; the default is assumed")
-    ] = 0.25
-    pixel_aperture: Annotated[
-        bool, Field(description="average over the pixel's area; not for pictures rendered at a pixel's footprint")
-    ] = False
+    diffraction_px: Annotated[NonNegative, Field(le=5.0, description="wavelength x f-number / pitch; 0: none")] = 0.70
+    diffusion_px: Annotated[NonNegative, Field(le=5.0, description="RMS charge diffusion, pixels (assumed)")] = 0.25
+    pixel_aperture: Annotated[bool, Field(description="average over pixels; not for area-sampled renderings")] = False
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
-    dust_depth: Annotated[float, Field(ge=0.0, le=1.0, description="share of the light that a speck absorbs")] = 0.3
-    dust_radius_px: Annotated[
-        float, Field(gt=0.0, le=1000.0, description="mean radius of a speck's shadow, pixels; each differs by a third")
-    ] = 25.0
-    dust_softness: Annotated[
-        float, Field(gt=0.0, le=1.0, description="half width of a shadow's edge over its radius: it is out of focus")
-    ] = 0.5
+    dust_depth: Annotated[float, Field(ge=0.0, le=1.0, description="fraction of the light absorbed by a speck")] = 0.3
+    dust_radius_px: Annotated[float, Field(gt=0.0, le=1000.0, description="mean shadow radius, px; +- a third")] = 25.0
+    dust_softness: Annotated[float, Field(gt=0.0, le=1.0, description="half width of its edge over the radius")] = 0.5
 
 
 @lru_cache(maxsize=32)
 def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
-    """Weights of a pixel's neighbours along a row or column; their sum is 1.
+    """Compute the line spread function: weights of a pixel's neighbours along a row or column, with the sum 1.
 
-    The weights are those whose Fourier series is the modulation transfer up to the Nyquist frequency: that of a
-    diffraction-limited circular pupil, 2/pi (acos s - s sqrt(1 - s^2)) with s = frequency x wavelength x f-number
-    (Goodman, Introduction to Fourier Optics, 6.4), times that of diffusion, exp(-2 (pi sigma f)^2), and of the pixel's
-    aperture, sinc(f), where asked for. Rows and columns are treated apart, which replaces the round pupil by one
-    whose transfer is the product of both sections.
+    Their Fourier series is the modulation transfer function up to the Nyquist frequency: that of a diffraction-limited
+    circular pupil, 2/pi (acos s - s sqrt(1 - s^2)) with s = frequency x wavelength x f-number (Goodman, Introduction to
+    Fourier Optics, 6.4), times that of diffusion, exp(-2 (pi sigma f)^2), and optionally the pixel aperture's, sinc(f).
+    Rows and columns are separable: the transfer function of the round pupil is replaced by the product of its sections.
     """
     frequency = np.linspace(0.0, 0.5, 513)
     transfer = np.exp(-2.0 * (np.pi * parameters.diffusion_px * frequency) ** 2)
@@ -66,13 +175,10 @@ def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
     return weights
 
 
-def spread(
+def apply_point_spread(
     radiance: Float32[np.ndarray, "rows columns"], parameters: OpticsParameters
 ) -> Float32[np.ndarray, "rows columns"]:
-    """The picture that the lens and the diffusion of charge make of a scene; light is neither lost nor shifted.
-
-    At the frame's border the scene is taken to continue as its mirror image.
-    """
+    """Blur a scene by the lens and charge diffusion, without loss or shift; the scene is mirrored at the border."""
     if parameters.diffraction_px == 0.0 and parameters.diffusion_px == 0.0 and not parameters.pixel_aperture:
         return radiance
     taps = line_spread(parameters)
@@ -80,21 +186,21 @@ def spread(
 
 
 def natural_fall_off(camera: CameraModel) -> Float32[np.ndarray, "rows columns"]:
-    """Brightness of each pixel behind an unvignetted lens, 1 at the brightest.
+    """Compute the relative brightness of each pixel behind an unvignetted lens, 1 at the brightest.
 
-    A pixel gathers light in proportion to the solid angle it sees and to the area of the entrance pupil as seen along
-    its ray: ``dOmega cos(q theta)``, theta the angle from the lens's axis. Where the pupil stands still, q is 1: for a
-    perspective lens the product is the fourth power of the cosine. A fisheye's pupil, whose motion CAHVORE describes,
-    turns a little towards the ray (Kumler & Bauer 2000, Proc. SPIE 4093), and its picture keeps light at 90 deg. For it
-    q is `PUPIL_SHARE`.
+    It is proportional to the pixel's solid angle and to the projected area of the entrance pupil:
+    ``dOmega cos(q theta)``, theta being the angle from the optical axis. For a fixed pupil q is 1: for a perspective
+    lens the product is the fourth power of the cosine. A fisheye's pupil, whose motion CAHVORE describes, turns a
+    little towards the ray (Kumler & Bauer 2000, Proc. SPIE 4093), and its picture has light at 90 deg: q is
+    `PUPIL_FRACTION`.
     """
     _origins, directions = camera.rays(camera.pixel_grid())
     down = np.gradient(directions, axis=0, edge_order=2)
     right = np.gradient(directions, axis=1, edge_order=2)
     solid_angle = np.linalg.norm(np.cross(down, right), axis=-1)
-    axis, share = (camera.o, PUPIL_SHARE) if isinstance(camera, Cahvore) else (camera.a, 1.0)
+    axis, fraction = (camera.o, PUPIL_FRACTION) if isinstance(camera, Cahvore) else (camera.a, 1.0)
     off_axis = np.arccos(np.clip(directions @ (axis / np.linalg.norm(axis)), -1.0, 1.0))
-    pupil = np.clip(np.cos(share * off_axis), 0.0, None)
+    pupil = np.clip(np.cos(fraction * off_axis), 0.0, None)
     brightness: Float64[np.ndarray, "rows columns"] = solid_angle * pupil
     # pixels that no ray reaches are dark
     fall_off = np.nan_to_num(brightness / np.nanmax(brightness)).astype(np.float32)
@@ -104,7 +210,7 @@ def natural_fall_off(camera: CameraModel) -> Float32[np.ndarray, "rows columns"]
 def dust_transmission(
     shape: tuple[int, int], parameters: OpticsParameters, rng: np.random.Generator
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Share of the light that passes the dust: soft absorbing discs at random places."""
+    """Draw the transmission of dust on the lens: soft absorbing discs at random positions."""
     rows, columns = shape
     transmission = np.ones(shape, dtype=np.float32)
     row, column = np.arange(rows)[:, None], np.arange(columns)[None, :]

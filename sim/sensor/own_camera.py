@@ -1,8 +1,8 @@
-"""A user's own camera: its geometry from a camera file, its detector from a datasheet.
+"""User cameras in campaigns: geometry from a camera file.
 
-A campaign names a camera's file once; what it says is put into the campaign's parameters when it is read, so that a
-campaign's folder holds the camera itself, and a file that changes afterwards changes no case (`resume` and `append`
-report it).
+A campaign names the camera file once. Its content is copied into the campaign's parameters when it is read: the
+campaign's folder contains the camera itself, and later changes of the file have no effect (`resume` and `append` report
+them).
 """
 
 from __future__ import annotations
@@ -24,15 +24,13 @@ _FILES = ("file", "number", "subframe_folded_in", "size")
 class OwnCamera(Parameters):
     """A camera of the CAHV family in the body frame: at its origin, looking along -z, columns along +x.
 
-    Stated as ``{ file = "camera.yaml" }`` (any file that `marsyard.sim.camera.read_cameras` reads), or the path alone;
-    all else is then filled in. Where a file puts a camera does not matter: it is mounted so that A looks down.
+    Stated as ``{ file = "camera.yaml" }`` (any format of `marsyard.sim.camera.read_cameras`) or the path alone; the
+    other fields are then filled in. The camera is mounted so that A looks down, independent of its pose in the file.
     """
 
     file: Annotated[str | None, Field(description="camera file that the model was read from")] = None
     number: Annotated[int, Field(ge=0, description="which of the file's cameras, from 0")] = 0
-    subframe_folded_in: Annotated[
-        bool, Field(description="PDS labels: a subframe's model describes the stored picture")
-    ] = False
+    subframe_folded_in: Annotated[bool, Field(description="PDS: a subframe's model is the stored picture's")] = False
     model: Annotated[Literal["CAHV", "CAHVOR", "CAHVORE"], Field(description="filled in from the file")]
     columns: Annotated[int, Field(ge=16, le=16384)]
     rows: Annotated[int, Field(ge=16, le=16384)]
@@ -44,12 +42,12 @@ class OwnCamera(Parameters):
     linearity: Annotated[float | None, Field(description="of CAHVORE")] = None
 
     @model_validator(mode="after")
-    def _is_a_camera(self) -> OwnCamera:
+    def _check_camera(self) -> OwnCamera:
         self.camera()
         return self
 
     def camera(self) -> CameraModel:
-        """The camera in the body frame. Raises ValueError where the model lacks a vector."""
+        """Create the camera in the body frame. Raises ValueError if the model lacks a vector."""
         pinhole = Cahv(np.zeros(3), np.array([0.0, 0.0, -1.0]), np.array(self.h), np.array(self.v), self.size)
         if self.model == "CAHV":
             return pinhole
@@ -74,7 +72,7 @@ class OwnCamera(Parameters):
 
     @classmethod
     def of(cls, camera: CameraModel, **origin: Any) -> OwnCamera:
-        """A camera of any place and pointing, mounted to look down."""
+        """Create the parameters of a camera of any pose, mounted to look down."""
         mounted = looking_down(camera)
         length = float(np.linalg.norm(mounted.a))  # labels round A
         vectors: dict[str, Any] = {
@@ -93,7 +91,7 @@ class OwnCamera(Parameters):
 
 
 def _read(stated: object) -> object:
-    """What stands in a campaign's file, with the camera's file read where it is named and nothing else is."""
+    """Read the camera file if a campaign names one; return other statements unchanged."""
     if isinstance(stated, str | Path):
         stated = {"file": str(stated)}
     if not isinstance(stated, Mapping) or "model" in stated or not isinstance(stated.get("file"), str | Path):
@@ -114,10 +112,10 @@ def _read(stated: object) -> object:
 
 
 def _named_or_read(stated: object) -> object:
-    """A camera's name as it stands; what has an ending or a folder is a file's."""
+    """Return a preset's name unchanged; read a path, which has a suffix or a folder."""
     return stated if isinstance(stated, str) and not Path(stated).suffix and "/" not in stated else _read(stated)
 
 
-#: An own camera as campaigns state it; and where a preset's name may stand instead.
+#: A user camera in a campaign; and a user camera or a preset's name.
 OwnCameraChoice = Annotated[OwnCamera, BeforeValidator(_read)]
 NamedOrOwnCamera = Annotated[str | OwnCamera, BeforeValidator(_named_or_read)]

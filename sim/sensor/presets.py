@@ -1,31 +1,61 @@
-"""Cameras by name: geometry and detector of the papers' cameras.
+"""Cameras and detectors by name or datasheet: geometry and detector of the papers' cameras, detectors of users.
 
-Frames
-------
 A descent camera is given in the body frame: at its origin, looking along -z, columns along +x. All others are given in
-a frame with x forward, y to the left and z up, whose origin lies between the two cameras of a pair: the mast's, or the
-rover's. ``camera.moved(body_from_mast)`` puts them onto a vehicle.
+a frame with x forward, y left and z up, with its origin between the two cameras of a pair: the mast's or the rover's.
+``camera.moved(body_from_mast)`` mounts them on a vehicle.
 
 Sources: the field-test paper III.B; the target tracking paper section 3 (research rover); the landing paper section 5;
-Maki et al. 2003, "Mars Exploration Rover Engineering Cameras" (MER); what is assumed is called so.
+Maki et al. 2003, "Mars Exploration Rover Engineering Cameras" (MER). Assumed values are marked.
+
+Datasheets are TOML files with the manufacturer's values and the lens before the detector:
+
+    name = "Sony IMX265, 16 mm f/4"
+    pixel_pitch_um = 3.45
+    full_well_e = 10500
+    read_noise_e = 2.4
+    bits = 12
+    quantum_efficiency = 0.65           # mean over the band; or a table of wavelength_nm and efficiency
+    dark_current_e_s = 1.0              # of a pixel at dark_temperature_c
+    dark_temperature_c = 20.0
+    prnu = 0.005
+    rows = 1536
+    readout_s = 0.05                    # of a whole frame
+
+    [lens]
+    f_number = 4.0
+    band_nm = [420.0, 680.0]
+
+The values are those of EMVA 1288: saturation capacity, temporal dark noise, quantum efficiency, dark current, photo
+response non-uniformity.
 """
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
-from marsyard.sim.sensor.datasheet import read_datasheet
-from marsyard.sim.sensor.optics import OpticsParameters
-from marsyard.sim.sensor.parameters import DetectorParameters
-from marsyard.sim.sensor.radiometry import DARK_E_S, NG3_FIELD, NG4_FLIGHT, LightPath, bright_exposure_s
+from marsyard.sim.files import open_regular
+from marsyard.sim.parameters import NonNegative, Parameters, Positive
+from marsyard.sim.sensor.detector import DetectorParameters
+from marsyard.sim.sensor.optics import (
+    DARK_E_S,
+    LENS_TRANSMISSION,
+    NG3_FIELD,
+    NG4_FLIGHT,
+    LightPath,
+    OpticsParameters,
+    bright_exposure_s,
+)
 
 #: Distance of Mars from the sun at the MER landings (the paper's "1.5 AU": 44 % of Earth's sunlight), AU.
 MARS_AU = 1.5
@@ -33,26 +63,20 @@ MARS_AU = 1.5
 NAVCAM_RADIAL = (0.00096, -0.002183, 0.018547)
 #: Barrel distortion of a small C-mount lens, R of CAHVOR: 1.8 % in the corner of the XC-55's picture; assumed.
 C_MOUNT_RADIAL = (0.0, -0.08, 0.025)
+#: Maximum size of a datasheet.
+_MAX_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
 class CameraDesign:
     """Geometry of a camera or of a stereo pair.
 
-    Attributes
-    ----------
-    focal_length_mm, pixel_pitch_um, size
-        Focal length, distance of the pixels, and (columns, rows).
-    radial
-        R of CAHVOR or CAHVORE.
-    linearity
-        CAHVORE's linearity; None for CAHVOR.
-    baseline_m
-        Distance of the two cameras of a pair; None for a single camera.
-    toe_in_deg
-        By how much each camera of a pair is turned towards the other.
-    down
-        Whether it looks down along -z, rather than forward along +x.
+    - size: (columns, rows)
+    - radial: R of CAHVOR or CAHVORE
+    - linearity: of CAHVORE; None for CAHVOR
+    - baseline_m: distance of the cameras of a pair; None for a single camera
+    - toe_in_deg: rotation of each camera of a pair towards the other
+    - down: whether it looks down along -z instead of forward along +x
     """
 
     focal_length_mm: float
@@ -65,7 +89,7 @@ class CameraDesign:
     down: bool = False
 
     def cameras(self) -> tuple[CameraModel, ...]:
-        """The camera, or the left and the right one of the pair."""
+        """Create the camera, or the left and the right camera of the pair."""
         if self.baseline_m is None:
             return (self._camera(0.0, 0.0),)
         half, toe = 0.5 * self.baseline_m, np.radians(self.toe_in_deg)
@@ -89,25 +113,19 @@ class CameraDesign:
 
 @dataclass(frozen=True)
 class Preset:
-    """A camera of the papers.
-
-    Attributes
-    ----------
-    design, light, detector
-        Geometry, light path and detector.
-    """
+    """A camera of the papers: geometry, light path and detector."""
 
     design: CameraDesign
     light: LightPath
     detector: DetectorParameters
 
     def cameras(self) -> tuple[CameraModel, ...]:
-        """The camera, or the left and the right one of a pair."""
+        """Create the camera, or the left and the right camera of a pair."""
         return self.design.cameras()
 
 
 def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float | int) -> Preset:
-    """A camera with the MER detector, of which the descent camera's parameters are the defaults."""
+    """A camera with the MER detector; the defaults of `DetectorParameters` are the descent camera's."""
     settings = {
         "responsivity_e_s": light.responsivity_e_s(sun_au),
         "sun_au": sun_au,
@@ -129,7 +147,7 @@ def _mer_descent_flown() -> Preset:
 
 
 def _mer_descent_field() -> Preset:
-    """Under Earth's sun; exposed for as many electrons from the same ground as in flight."""
+    """Under Earth's sun, with the exposure time that gives as many electrons from the same ground as in flight."""
     light = LightPath(12.0, 12.0, _DESCENT_BAND, NG3_FIELD)
     flown = _mer_descent_flown().detector.responsivity_e_s
     exposure = _FLIGHT_EXPOSURE_S * flown / light.responsivity_e_s(1.0)
@@ -143,20 +161,8 @@ def _mer_rover_camera(design: CameraDesign, f_number: float) -> Preset:
     return _mer(design, light, MARS_AU, exposure_s=exposure, temperature_c=-40.0, rows_summed=1)
 
 
-def _mer_navcam() -> Preset:
-    return _mer_rover_camera(CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, baseline_m=0.20), 12.0)
-
-
-def _mer_hazcam() -> Preset:
-    """An equidistant fisheye without distortion, its pupil at rest: both assumed."""
-    return _mer_rover_camera(CameraDesign(5.58, 12.0, (1024, 1024), linearity=0.0, baseline_m=0.10), 15.0)
-
-
 def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
-    """A camera with an interline CCD, which has no smear, on Earth at +20 deg C.
-
-    Assumed: lens of f/4, passband to 700 nm, full well, read noise, dark current in proportion to the pixel's area.
-    """
+    """An interline CCD without smear on Earth at +20 deg C; f/4, 700 nm, full well, noise, dark current: assumed."""
     light = LightPath(4.0, design.pixel_pitch_um, (400.0, 700.0))
     responsivity = light.responsivity_e_s(1.0)
     detector = DetectorParameters(
@@ -179,73 +185,184 @@ def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
     return Preset(design, light, detector)
 
 
-def _research_navcam() -> Preset:
-    return _interline(CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10)
-
-
-def _research_pancam() -> Preset:
-    """The toe-in is assumed, that of MER's pancams: parallel cameras would see a point at 2 m 516 px apart."""
-    return _interline(CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10)
-
-
-def _xc55() -> Preset:
-    """The lens is assumed: 6 mm, 43 deg, with some distortion. It looks down."""
-    return _interline(CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8)
-
-
 PRESETS: Mapping[str, Callable[[], Preset]] = MappingProxyType(
     {
         "mer-descent-flown": _mer_descent_flown,
         "mer-descent-field": _mer_descent_field,
-        "mer-navcam": _mer_navcam,
-        "mer-hazcam": _mer_hazcam,
-        "research-navcam": _research_navcam,
-        "research-pancam": _research_pancam,
-        "xc-55": _xc55,
+        "mer-navcam": partial(
+            _mer_rover_camera, CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, baseline_m=0.20), 12.0
+        ),
+        # an equidistant fisheye without distortion, its pupil fixed: both assumed
+        "mer-hazcam": partial(
+            _mer_rover_camera, CameraDesign(5.58, 12.0, (1024, 1024), linearity=0.0, baseline_m=0.10), 15.0
+        ),
+        "research-navcam": partial(_interline, CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10),
+        # the toe-in is assumed, that of MER's pancams: parallel cameras would see a point at 2 m 516 px apart
+        "research-pancam": partial(
+            _interline, CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10
+        ),
+        # the lens is assumed: 6 mm, 43 deg, with some distortion
+        "xc-55": partial(_interline, CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8),
     }
 )
 
 
 def preset(name: str) -> Preset:
-    """The camera of this name.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    """
+    """Create the camera of this name. Raises ValueError if it is unknown."""
     if name not in PRESETS:
         raise ValueError(f"there is no camera preset {name!r}; allowed: {', '.join(PRESETS)}")
     return PRESETS[name]()
 
 
-def _over(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested settings with some of them changed."""
+class QuantumEfficiency(Parameters):
+    """Electrons per photon by wavelength, linear between the points and zero outside."""
+
+    wavelength_nm: Annotated[tuple[float, ...], Field(min_length=2)]
+    efficiency: Annotated[tuple[Annotated[float, Field(ge=0.0, le=1.0)], ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _check_curve(self) -> QuantumEfficiency:
+        if len(self.wavelength_nm) != len(self.efficiency):
+            raise ValueError(
+                f"{len(self.wavelength_nm)} wavelengths and {len(self.efficiency)} efficiencies; as many of each"
+            )
+        if any(later <= sooner for sooner, later in zip(self.wavelength_nm, self.wavelength_nm[1:], strict=False)):
+            raise ValueError("wavelength_nm must increase")
+        return self
+
+
+class Lens(Parameters):
+    """The lens before the detector."""
+
+    f_number: Annotated[float, Field(gt=0.0, le=100.0)]
+    band_nm: Annotated[tuple[Positive, Positive], Field(description="first and last wavelength of the passband")]
+    transmission: Annotated[float, Field(gt=0.0, le=1.0, description="of the lens and its filters")] = LENS_TRANSMISSION
+
+    @model_validator(mode="after")
+    def _check_band(self) -> Lens:
+        if not 200.0 <= self.band_nm[0] < self.band_nm[1] <= 2500.0:
+            raise ValueError(f"band_nm is {list(self.band_nm)}; allowed: two increasing wavelengths, 200 to 2500 nm")
+        return self
+
+
+class Datasheet(Parameters):
+    """The values of a detector's datasheet."""
+
+    name: str = ""
+    pixel_pitch_um: Annotated[float, Field(gt=0.1, le=100.0)]
+    full_well_e: Annotated[Positive, Field(description="saturation capacity, electrons")]
+    read_noise_e: Annotated[NonNegative, Field(description="temporal dark noise, electrons")]
+    bits: Annotated[int, Field(ge=8, le=16)]
+    gain_e_dn: Annotated[
+        Positive | None, Field(description="electrons per count; default: the full well over all counts")
+    ] = None
+    black_level_dn: NonNegative = 0.0
+    quantum_efficiency: Annotated[float, Field(gt=0.0, le=1.0)] | QuantumEfficiency
+    dark_current_e_s: Annotated[NonNegative, Field(description="of a pixel at dark_temperature_c, electrons per s")]
+    dark_temperature_c: Annotated[float, Field(ge=-150.0, le=100.0)]
+    dark_doubling_c: Annotated[float, Field(gt=0.0, le=50.0)] = 6.0
+    temperature_c: Annotated[float | None, Field(ge=-150.0, le=80.0, description="default: dark_temperature_c")] = None
+    prnu: Annotated[float, Field(ge=0.0, le=0.1, description="RMS of the pixels' relative response")] = 0.01
+    shutter: Annotated[Literal["global", "frame-transfer"], Field(description="no rolling shutter")] = "global"
+    transfer_row_s: Annotated[NonNegative, Field(description="frame transfer: time under each row")] = 0.0
+    rows: Annotated[int, Field(ge=16, le=16384, description="rows of a frame")]
+    readout_s: Annotated[NonNegative, Field(description="to read out a frame, s")]
+    exposure_s: Annotated[
+        float | None, Field(gt=0.0, le=10.0, description="default: 60 % of the full well at radiance factor 0.3")
+    ] = None
+    sun_au: Annotated[float, Field(gt=0.1, le=100.0, description="distance of the sun in use; sets exposure_s")] = 1.5
+    lens: Lens
+
+    @model_validator(mode="after")
+    def _check_shutter(self) -> Datasheet:
+        if (self.shutter == "frame-transfer") != (self.transfer_row_s > 0.0):
+            raise ValueError("transfer_row_s belongs to the shutter 'frame-transfer', which needs it above 0")
+        return self
+
+    def light(self) -> LightPath:
+        """Create the light path from the sun to electrons."""
+        efficiency, band = self.quantum_efficiency, self.lens.band_nm
+        curve = (
+            (band, (efficiency, efficiency))
+            if isinstance(efficiency, float)
+            else (efficiency.wavelength_nm, efficiency.efficiency)
+        )
+        f_number, transmission = self.lens.f_number, self.lens.transmission
+        return LightPath(f_number, self.pixel_pitch_um, band, transmission=transmission, quantum_efficiency=curve)
+
+    def parameters(self) -> DetectorParameters:
+        """Create the parameters of the simulated detector, which reads every pixel."""
+        light = self.light()
+        responsivity = light.responsivity_e_s(self.sun_au)
+        return DetectorParameters(
+            exposure_s=self.exposure_s or bright_exposure_s(self.full_well_e, responsivity),
+            responsivity_e_s=responsivity,
+            sun_au=self.sun_au,
+            rows_summed=1,
+            transfer_row_s=self.transfer_row_s,
+            clear_row_s=0.0,
+            readout_row_s=self.readout_s / self.rows,
+            full_well_e=self.full_well_e,
+            gain_e_dn=self.full_well_e / 2**self.bits if self.gain_e_dn is None else self.gain_e_dn,
+            read_noise_e=self.read_noise_e,
+            offset_dn=self.black_level_dn,
+            bits=self.bits,
+            temperature_c=self.dark_temperature_c if self.temperature_c is None else self.temperature_c,
+            dark_e_s=self.dark_current_e_s * 2.0 ** (-self.dark_temperature_c / self.dark_doubling_c),
+            dark_doubling_c=self.dark_doubling_c,
+            response_spread=self.prnu,
+            optics=OpticsParameters(diffraction_px=light.diffraction_px()),
+        )
+
+
+def read_datasheet(path: str | Path) -> Datasheet:
+    """Read a datasheet from a TOML file; raises ValueError with file and field if it is unreadable or wrong."""
+    try:
+        with open_regular(path) as file:
+            contents = file.read(_MAX_BYTES + 1)
+    except OSError as fault:
+        raise ValueError(f"{path}: cannot be read ({fault.strerror})") from fault
+    if len(contents) > _MAX_BYTES:
+        raise ValueError(f"{path}: larger than {_MAX_BYTES >> 20} MiB; a datasheet in TOML is needed")
+    try:
+        stated: dict[str, Any] = tomllib.loads(contents.decode("utf-8"))
+    except ValueError as fault:
+        raise ValueError(f"{path}: not valid TOML ({fault})") from fault
+    try:
+        return Datasheet.model_validate(stated)
+    except ValidationError as fault:
+        first = fault.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "datasheet"
+        raise ValueError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}") from fault
+
+
+def _merge(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge changes into nested settings."""
     merged = dict(base)
     for key, value in changes.items():
         below = merged.get(key)
-        merged[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, Mapping) else value
+        merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, Mapping) else value
     return merged
 
 
-def _chosen(settings: object) -> object:
-    """Settings with those of a preset or a datasheet put below them, where they name one."""
+def _resolve_detector(settings: object) -> object:
+    """Merge settings into those of a preset or a datasheet, if they name one."""
     if isinstance(settings, str):
         settings = {"file": settings} if settings.endswith(".toml") else {"preset": settings}
     if not isinstance(settings, Mapping) or all(settings.get(key) is None for key in ("preset", "file")):
         return settings
-    if set(DetectorParameters.model_fields) <= set(settings):  # read before, and kept with the campaign
+    if set(DetectorParameters.model_fields) <= set(settings):  # already resolved, and stored with the campaign
         return settings
     if {"preset", "file"} <= set(settings):
         raise ValueError("a detector is a preset or a datasheet's file, not both")
     changes = {key: value for key, value in settings.items() if key not in ("preset", "file")}
     if "file" in settings:
         file = str(settings["file"])
-        return _over({**read_datasheet(file).parameters().model_dump(), "file": file}, changes)
-    return _over(preset(str(settings["preset"])).detector.model_dump(), changes)
+        return _merge({**read_datasheet(file).parameters().model_dump(), "file": file}, changes)
+    return _merge(preset(str(settings["preset"])).detector.model_dump(), changes)
 
 
-#: Detector parameters that a campaign may also state by a preset's name or a datasheet's file, with what differs:
+#: Detector parameters of a campaign, stated by values or by changes to a preset or a datasheet:
 #: ``[parameters.detector]`` with ``preset = "mer-descent-field"`` and, say, ``temperature_c = 23.0``; or
-#: ``file = "sensor.toml"`` (`marsyard.sim.sensor.datasheet`).
-DetectorChoice = Annotated[DetectorParameters, BeforeValidator(_chosen)]
+#: ``file = "sensor.toml"``.
+DetectorChoice = Annotated[DetectorParameters, BeforeValidator(_resolve_detector)]

@@ -1,4 +1,9 @@
-"""What ranging instruments share: their errors, and the true altitude to which readings are compared."""
+"""Ranging instruments: common errors, laser ranges along a ray, the radar altimeter, and the true height above ground.
+
+The radar reads the range to the nearest ground within a cone fixed to the body: over a slope the foot of the
+perpendicular, over relief the nearest crest, and at tilts beyond the beam's half width the beam's edge. The ground's
+reflectivity and the antenna pattern are not modelled.
+"""
 
 from __future__ import annotations
 
@@ -8,32 +13,42 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float64
 from pydantic import Field, model_validator
+from scipy.optimize import brentq
 
+from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.parameters import Parameters
-from marsyard.sim.sensor.clock import Clock, ClockParameters
-from marsyard.sim.sensor.instrument import Readings, Sampling
+from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling
 from marsyard.sim.terrain import Surface
 
-#: Where an altimeter points in body axes, down at the identity attitude, as the descent camera does.
+#: Pointing of an altimeter in body axes: down at the identity attitude, as the descent camera.
 DOWN = np.array([0.0, 0.0, -1.0])
+#: Minimum number of points along a laser ray at which it is compared with the ground.
+MIN_POINTS = 64
+#: Radar: step of the coarsest grid over the height, refinement of each further grid, and number of grids.
+COARSEST_STEP, REFINEMENT, PASSES = 1.0 / 64.0, 5, 3
+#: Ground around a node may be nearer than the node by this plus the node's slope, times the step.
+RELIEF_PER_STEP = 0.2
+#: Maximum slope of the ground in the radar's search.
+MAX_SLOPE = 3.0
+
+_Fraction = Annotated[float, Field(ge=0.0, le=0.2)]
+_Metres = Annotated[float, Field(ge=0.0, le=100.0)]
 
 
 class RangingParameters(Parameters):
-    """Errors of a ranging instrument. Shares of the range are one standard deviation."""
+    """Errors of a ranging instrument; fractions of the range are one standard deviation."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 10.0
-    scale_error: Annotated[
-        float, Field(ge=0.0, le=0.2, description="share of the range, common to all of a unit's readings")
-    ] = 0.0
-    noise: Annotated[float, Field(ge=0.0, le=0.2, description="share of the range, new in every reading")] = 0.0
-    noise_m: Annotated[float, Field(ge=0.0, le=100.0, description="at any range, new in every reading, m")] = 0.0
-    count_m: Annotated[float, Field(ge=0.0, le=100.0, description="range of a count, m; 0: no rounding")] = 0.0
+    scale_error: Annotated[_Fraction, Field(description="fraction of the range, constant for a unit")] = 0.0
+    noise: Annotated[_Fraction, Field(description="fraction of the range, new in every reading")] = 0.0
+    noise_m: Annotated[_Metres, Field(description="at any range, new in every reading, m")] = 0.0
+    count_m: Annotated[_Metres, Field(description="range of a count, m; 0: no rounding")] = 0.0
     min_range_m: Annotated[float, Field(ge=0.0, description="shortest range that is read, m")] = 0.0
     max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="longest range that is read, m")] = 5000.0
     clock: ClockParameters = ClockParameters()
 
     @model_validator(mode="after")
-    def _ranges_in_order(self) -> RangingParameters:
+    def _check_range_limits(self) -> RangingParameters:
         if self.min_range_m >= self.max_range_m:
             raise ValueError(
                 f"min_range_m is {self.min_range_m}; allowed: less than max_range_m, which is {self.max_range_m}"
@@ -41,19 +56,34 @@ class RangingParameters(Parameters):
         return self
 
 
+class LaserParameters(RangingParameters):
+    """A laser altimeter. Defaults: a surveying laser on a small helicopter, assumed."""
+
+    rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 50.0
+    noise_m: Annotated[_Metres, Field(description="at any range, new in every reading, m")] = 0.05
+    count_m: Annotated[_Metres, Field(description="range of a count, m; 0: no rounding")] = 0.01
+    max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="longest range that is read, m")] = 300.0
+    beam_mrad: Annotated[float, Field(ge=0.0, le=50.0, description="full width of the beam, mrad")] = 0.0
+    clock: ClockParameters = ClockParameters(offset_sd_s=0.002, jitter_sd_s=0.0005)
+
+
+class RadarParameters(RangingParameters):
+    """A radar altimeter. Defaults: the MER descent, where 1 % of altitude is three standard deviations.
+
+    Assumed: the split of the 1 % into a constant error and noise, beam, rate, rounding and time tags.
+    """
+
+    beam_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width of the beam, deg")] = 60.0
+    scale_error: Annotated[_Fraction, Field(description="fraction of the range, constant for a unit")] = 0.003
+    noise: Annotated[_Fraction, Field(description="fraction of the range, new in every reading")] = 0.0015
+    count_m: Annotated[_Metres, Field(description="range of a count, m; 0: no rounding")] = 0.3
+    min_range_m: Annotated[float, Field(ge=0.0, description="shortest range that is read, m")] = 5.0
+    clock: ClockParameters = ClockParameters(offset_sd_s=0.002, jitter_sd_s=0.001)
+
+
 @dataclass(frozen=True)
 class RangingUnit:
-    """The errors of one unit, drawn once.
-
-    Attributes
-    ----------
-    parameters
-        Its class.
-    sampling, clock
-        When it reads, and what its clock makes of that.
-    scale
-        What its readings are to true ranges, noise apart.
-    """
+    """A ranging instrument with its constant errors drawn; `scale` is the noise-free ratio of read to true range."""
 
     parameters: RangingParameters
     sampling: Sampling
@@ -62,7 +92,7 @@ class RangingUnit:
 
     @classmethod
     def drawn(cls, parameters: RangingParameters, rng: np.random.Generator) -> RangingUnit:
-        """A unit with its constant errors drawn."""
+        """Draw the constant errors."""
         return cls(
             parameters,
             Sampling.drawn(parameters.rate_hz, rng),
@@ -73,17 +103,158 @@ class RangingUnit:
     def readings(
         self, times_s: Float64[np.ndarray, "n"], ranges_m: Float64[np.ndarray, "n"], rng: np.random.Generator
     ) -> Readings:
-        """What the unit delivers of true ranges (infinite where nothing returns) at true times."""
+        """Simulate readings of true ranges (infinite without a return) at true times."""
         p = self.parameters
         tags = self.clock.tags(times_s, rng)
         relative = self.scale + p.noise * rng.standard_normal(times_s.size)
         values = ranges_m * relative + p.noise_m * rng.standard_normal(times_s.size)
         if p.count_m > 0.0:
             values = p.count_m * np.rint(values / p.count_m)
-        heard = (ranges_m >= p.min_range_m) & (ranges_m <= p.max_range_m)
-        return Readings(tags, np.where(heard, values, np.nan))
+        valid = (ranges_m >= p.min_range_m) & (ranges_m <= p.max_range_m)
+        return Readings(tags, np.where(valid, values, np.nan))
+
+
+def range_along(
+    surface: Surface, position_m: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], max_range_m: float
+) -> float:
+    """Intersect a ray with the terrain, compared at least once per sample; return the range, or infinity."""
+    horizontal_m = float(np.hypot(axis[0], axis[1])) * max_range_m
+    count = MIN_POINTS + int(np.ceil(horizontal_m / surface.spacing_m))
+
+    def clearance(distances_m: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        points = position_m + distances_m[:, None] * axis
+        return np.asarray(points[:, 2] - surface.height(points[:, 0], points[:, 1]))
+
+    distances = np.linspace(0.0, max_range_m, count)
+    below = np.flatnonzero(clearance(distances) <= 0.0)
+    if below.size == 0:
+        return np.inf
+    if below[0] == 0:
+        return 0.0
+    return float(brentq(lambda d: float(clearance(np.array([d]))[0]), distances[below[0] - 1], distances[below[0]]))
+
+
+@dataclass(frozen=True)
+class RadarAltimeter:
+    """A radar altimeter over a terrain; flight software uses its range as the altitude."""
+
+    parameters: RadarParameters
+    surface: Surface
+    unit: RangingUnit
+
+    @classmethod
+    def drawn(cls, parameters: RadarParameters, surface: Surface, rng: np.random.Generator) -> RadarAltimeter:
+        """Draw the constant errors."""
+        return cls(parameters, surface, RangingUnit.drawn(parameters, rng))
+
+    @property
+    def sampling(self) -> Sampling:
+        """Sampling times."""
+        return self.unit.sampling
+
+    def measure(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator) -> Readings:
+        """Read one range to the nearest ground within the beam per true time."""
+        motion, p = trajectory.motion(times_s), self.parameters
+        axes = motion.attitudes.apply(DOWN.copy())
+        half_angle = np.radians(0.5 * p.beam_deg)
+        ranges = [
+            first_return(self.surface, position, axis, half_angle, p.max_range_m)
+            for position, axis in zip(motion.positions_m, axes, strict=True)
+        ]
+        return self.unit.readings(times_s, np.array(ranges, dtype=np.float64), rng)
+
+
+def first_return(
+    surface: Surface,
+    position_m: Float64[np.ndarray, "3"],
+    axis: Float64[np.ndarray, "3"],
+    half_angle_rad: float,
+    max_range_m: float,
+) -> float:
+    """Compute the range to the nearest ground within a cone; infinite if it is beyond the maximum range.
+
+    - position_m, axis: apex of the cone and unit vector along it, world axes
+    - half_angle_rad: angle between the cone's axis and its edge
+
+    Ground within a distance r lies, in plan view, within r sin(a) of the apex, a being the cone's maximum angle from
+    nadir. A grid over that square gives the nearest ground to a few metres; finer grids around the candidate nodes give
+    it to 0.05 % of the height. The square grows until it contains all ground nearer than the range.
+    """
+    clearance = position_m[2] - float(surface.height(float(position_m[0]), float(position_m[1])))
+    if clearance <= 0.0:
+        return 0.0
+    tilt = float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))
+    widest = np.sin(min(tilt + half_angle_rad, 0.5 * np.pi))
+    nearest_angle = max(tilt - half_angle_rad, 0.0)
+    reach = min(1.2 * clearance / max(np.cos(nearest_angle), 0.05), max_range_m)
+    while True:
+        # the step grows with the reach, which bounds the number of nodes
+        step = COARSEST_STEP * max(clearance, 0.5 * reach)
+        nearest = _search(surface, position_m, axis, half_angle_rad, step, reach * widest)
+        if nearest <= reach or reach >= max_range_m:
+            return nearest if nearest <= max_range_m else np.inf
+        reach = min(max(2.0 * reach, nearest if np.isfinite(nearest) else 0.0), max_range_m)
+
+
+def _search(
+    surface: Surface,
+    position_m: Float64[np.ndarray, "3"],
+    axis: Float64[np.ndarray, "3"],
+    half_angle_rad: float,
+    step_m: float,
+    half_side_m: float,
+) -> float:
+    """Range to the nearest ground within a cone and, in plan view, within a square; infinite if there is none."""
+    line = np.arange(-np.ceil(half_side_m / step_m), np.ceil(half_side_m / step_m) + 1.0) * step_m
+    offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    nearest = np.inf
+    for number in range(PASSES):
+        ranges, angles = _ranges_and_angles(surface, position_m, axis, offsets, step_m)
+        inside = angles <= half_angle_rad
+        if inside.any():
+            nearest = float(ranges[inside].min())
+        if number == PASSES - 1:
+            return nearest
+        # candidates: nodes within half a step of the cone whose surroundings may hold nearer ground
+        candidates = (angles <= half_angle_rad + step_m / ranges) & (
+            ranges <= nearest + (RELIEF_PER_STEP + MAX_SLOPE) * step_m
+        )
+        offsets, ranges = offsets[candidates], ranges[candidates]
+        x, y = position_m[0] + offsets[:, 0], position_m[1] + offsets[:, 1]
+        slopes = np.linalg.norm(surface.gradient(x, y, _level(surface, step_m)), axis=-1)
+        offsets = offsets[ranges <= nearest + (RELIEF_PER_STEP + slopes) * step_m]
+        # each node with its neighbours of a finer grid
+        step_m /= REFINEMENT
+        fine = (np.arange(REFINEMENT) - 0.5 * (REFINEMENT - 1)) * step_m
+        neighbours = np.stack(np.meshgrid(fine, fine), axis=-1).reshape(-1, 2)
+        offsets = np.asarray((offsets[:, None, :] + neighbours).reshape(-1, 2))
+        if not offsets.size:
+            return nearest
+    return nearest
+
+
+def _ranges_and_angles(
+    surface: Surface,
+    position_m: Float64[np.ndarray, "3"],
+    axis: Float64[np.ndarray, "3"],
+    offsets_m: Float64[np.ndarray, "n 2"],
+    step_m: float,
+) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
+    """Range to the ground at horizontal offsets, and its angle from an axis; the ground is smoothed to the step."""
+    level = _level(surface, step_m)
+    x, y = position_m[0] + offsets_m[:, 0], position_m[1] + offsets_m[:, 1]
+    down = position_m[2] - surface.height(x, y, level)
+    ranges = np.sqrt(offsets_m[:, 0] ** 2 + offsets_m[:, 1] ** 2 + down**2)
+    along = offsets_m[:, 0] * axis[0] + offsets_m[:, 1] * axis[1] - down * axis[2]
+    return ranges, np.arccos(np.clip(along / ranges, -1.0, 1.0))
+
+
+def _level(surface: Surface, step_m: float) -> int:
+    """Pyramid level with a sample spacing of about a step, or less."""
+    level = np.floor(np.log2(max(step_m / surface.spacing_m, 1.0)))
+    return int(min(level, len(surface.levels) - 1))
 
 
 def height_above_ground(surface: Surface, positions_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-    """True altitude: height above the ground straight below, metres."""
+    """Compute the true altitude: height above the ground straight below."""
     return np.asarray(positions_m[:, 2] - surface.height(positions_m[:, 0], positions_m[:, 1]))

@@ -81,14 +81,14 @@ def test_three_of_many_pictures_keep_the_motion_between_them() -> None:
     given = inputs.descent(5)
     velocities = np.arange(12.0).reshape(4, 3)
     images = tuple(replace(one, time_s=tag) for one, tag in zip(given.images, (0.0, 1.0, 4.0, 6.0, 7.0), strict=True))
-    chosen = replace(given, images=images, interval_velocities_m_s=velocities).chosen((0, 2, 3))
+    chosen = replace(given, images=images, interval_velocities_m_s=velocities).select((0, 2, 3))
     assert chosen.tags_s == (0.0, 4.0, 6.0)
     # a second at the first interval's velocity and three at the second's; the third's alone, to the bit
     np.testing.assert_allclose(chosen.interval_velocities_m_s[0], (velocities[0] + 3.0 * velocities[1]) / 4.0)
     np.testing.assert_array_equal(chosen.interval_velocities_m_s[1], velocities[2])
     assert chosen.attitudes == (given.attitudes[0], given.attitudes[2], given.attitudes[3])
     np.testing.assert_array_equal(chosen.inertial_velocities_m_s, given.inertial_velocities_m_s[[0, 2, 3]])  # type: ignore[index]
-    assert len(given.chosen(()).frames()) == 0
+    assert len(given.select(()).frames()) == 0
 
 
 def test_an_estimator_of_three_takes_no_more() -> None:
@@ -158,7 +158,7 @@ def test_a_frame_comes_back_as_it_was(tmp_path: Path, altitude_m: float) -> None
 
 @pytest.mark.parametrize("number", [1, 5])
 def test_a_case_of_any_number_of_pictures_comes_back(tmp_path: Path, number: int) -> None:
-    given = inputs.descent(5).chosen(tuple(range(number)))
+    given = inputs.descent(5).select(tuple(range(number)))
     write_case(tmp_path, given)
     back = read_case(tmp_path)
     assert isinstance(back, DescentMeasurements)

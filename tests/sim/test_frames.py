@@ -9,7 +9,7 @@ from marsyard.sim.frames import SITE_FROM_WORLD, composed, direction, rigid, rig
     ("azimuth_deg", "elevation_deg", "expected"),
     [(0, 0, [0, 1, 0]), (90, 0, [1, 0, 0]), (180, 0, [0, -1, 0]), (123, 90, [0, 0, 1]), (0, -90, [0, 0, -1])],
 )
-def test_directions_are_clockwise_from_north(azimuth_deg, elevation_deg, expected) -> None:
+def test_directions_are_clockwise_from_north(azimuth_deg: float, elevation_deg: float, expected: list[float]) -> None:
     np.testing.assert_allclose(direction(np.radians(azimuth_deg), np.radians(elevation_deg)), expected, atol=1e-15)
 
 

@@ -25,7 +25,9 @@ def test_a_stream_depends_on_its_key_alone() -> None:
     cases=st.sets(st.integers(0, 2**31), min_size=2, max_size=2),
     names=st.sets(st.text(max_size=5), min_size=2, max_size=2),
 )
-def test_every_part_of_the_key_tells_streams_apart(seeds, campaigns, cases, names) -> None:
+def test_every_part_of_the_key_selects_another_stream(
+    seeds: set[int], campaigns: set[str], cases: set[int], names: set[str]
+) -> None:
     firsts = {
         _first(Streams(seed, campaign, case), name)
         for seed in seeds
@@ -52,7 +54,7 @@ def test_streams_of_neighbouring_cases_are_uncorrelated() -> None:
 @given(
     seed=st.integers(0, 2**63 - 1), campaign=st.text(max_size=5), case=st.integers(0, 2**31), name=st.text(max_size=5)
 )
-def test_seeds_are_worked_out_as_numpy_does(seed, campaign, case, name) -> None:
+def test_seeds_are_worked_out_as_numpy_does(seed: int, campaign: str, case: int, name: str) -> None:
     ours = seeds(stream_words(seed, campaign, np.array([case]), name))[0]
     numpys = np.random.SeedSequence(seed, spawn_key=stream_key(campaign, case, name)).pool
     assert ours.tolist() == numpys.view(np.uint64).tolist()

@@ -1,9 +1,9 @@
-"""Compiled error-state Kalman filter; `marsyard.sim.sensor.navigation.filter` states what is estimated and from what.
+"""Compiled error-state Kalman filter of `marsyard.sim.sensor.navigation`.
 
 A state is a row of 16: position, velocity, quaternion (x, y, z, w; world from body), gyro bias, accelerometer bias. An
-error is true less estimated; for the attitude it is the small rotation about world axes that the estimate lacks. The
-covariance has 15 errors that are estimated, then nine that are only considered: the wander of the receiver's positions
-(in units of its standard deviation) and velocities, the bias of the compass and those of the two inclinometers.
+error is true less estimated; the attitude error is a small rotation about world axes. The covariance has 15 estimated
+errors, then nine considered ones: the wander of the receiver's positions (in units of its standard deviation) and
+velocities, the bias of the compass and those of the two inclinometers.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ ERRORS = 24
 #: Blocks of the state, after position and velocity.
 QUATERNION, STATE_GYRO_BIAS, STATE_ACCELEROMETER_BIAS, STATE = 6, 10, 13, 16
 #: Columns of a receiver's row: time tag, time of delivery, solution, deviations of wander and noise, whether fixed.
-TAG, ARRIVAL, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED, GPS_COLUMNS = 0, 1, 2, 5, 8, 11, 14, 15
+TAG, ARRIVAL, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED = 0, 1, 2, 5, 8, 11, 14
 #: Columns of a compass's row after its time tag; yaw is counterclockwise from east.
-UP, YAW, TILT_COLUMNS = 1, 4, 5
-#: What an innovation is of.
+UP, YAW = 1, 4
+#: Types of innovations.
 POSITION_FIX, VELOCITY_FIX, COMPASS, INCLINOMETER = range(4)
 #: Memory between runs: whether the receiver's last solution was fixed (-1: none yet), the filtered acceleration in
 #: world axes, and how many solutions in a row were rejected.
 LAST_FIX, FILTERED_ACCELERATION, REJECTED, MEMORY = 0, 1, 4, 5
-#: Columns of an innovation: time, what of, axis, normalised by its standard deviation, whether it was used.
+#: Columns of an innovation: time, type, axis, normalised by its standard deviation, whether it was used.
 INNOVATION = 5
 
 
@@ -64,9 +64,9 @@ class Tuning(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What a run gets: boundaries of the inertial samples, their increments, rows of receiver and compass.
+    """Inputs of a run: boundaries and increments of the inertial samples, rows of receiver and compass.
 
-    `kept_at` are the boundaries at which whole covariances are kept, in ascending order.
+    `kept_at` are the boundaries with stored covariances, ascending.
     """
 
     times: Array
@@ -87,7 +87,7 @@ class Estimate(NamedTuple):
 
 @njit(cache=True)
 def matrix_of(q: Array, matrix: Array) -> None:
-    """Writes the rotation matrix of a quaternion."""
+    """Write the rotation matrix of a quaternion."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     matrix[0, 0] = 1.0 - 2.0 * (y * y + z * z)
     matrix[0, 1] = 2.0 * (x * y - z * w)
@@ -179,7 +179,7 @@ def propagate_covariance(p: Array, matrix: Array, gained: Array, kept: float, t:
 def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, gate: float, log: Array) -> None:
     """Update with one scalar measurement; gains of considered errors are zero (Schmidt 1966).
 
-    Writes the normalised innovation, and whether it passed the gate, into the last columns of `log`.
+    Write the normalised innovation and whether it passed the gate to the last columns of `log`.
     """
     state, p = estimate
     ph = np.zeros(ERRORS)
@@ -194,7 +194,7 @@ def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, g
     log[4] = 1.0 if abs(log[3]) < gate else 0.0
     if log[4] == 0.0:
         return
-    # P - K h'P - P h K' + K s K', with K zero for what is considered
+    # P - K h'P - P h K' + K s K', with K zero for considered errors
     for i in range(ERRORS):
         gain_i = ph[i] / variance if i < ESTIMATED else 0.0
         for j in range(ERRORS):
@@ -213,14 +213,14 @@ def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, g
 
 @njit(cache=True)
 def _interpolate(times: Array, values: Array, last: int, time: float) -> Array:
-    """Values at a time among the rows up to `last`, linear between rows."""
+    """Interpolate linearly between the rows up to `last`."""
     k = last
     while k > 0 and times[k] > time:
         k -= 1
     after = min(k + 1, last)
     span = times[after] - times[k]
-    share = 0.0 if span <= 0.0 else min(max((time - times[k]) / span, 0.0), 1.0)
-    out: Array = values[k] + share * (values[after] - values[k])
+    fraction = 0.0 if span <= 0.0 else min(max((time - times[k]) / span, 0.0), 1.0)
+    out: Array = values[k] + fraction * (values[after] - values[k])
     return out
 
 
@@ -247,7 +247,7 @@ def _restart(estimate: Estimate, row: Array, t: Tuning) -> None:
 
 @njit(cache=True)
 def update_solution(row: Array, estimate: Estimate, since: Array, time: float, t: Tuning, log: Array) -> None:
-    """Update with a receiver's solution, carried to now by path and velocity since its time; six innovations."""
+    """Update with a receiver's solution, propagated by the path and velocity since its time; six innovations."""
     state, _ = estimate
     h = np.empty(ERRORS)
     for i in range(3):
@@ -265,7 +265,7 @@ def update_solution(row: Array, estimate: Estimate, since: Array, time: float, t
 
 
 @njit(cache=True)
-def update_tilt(row: Array, estimate: Estimate, lean: float, time: float, t: Tuning, log: Array) -> None:
+def update_tilt(row: Array, estimate: Estimate, disturbance_rad: float, time: float, t: Tuning, log: Array) -> None:
     """Update with the inclinometers' x and y components of up; two innovations."""
     h, matrix = np.empty(ERRORS), np.empty((3, 3))
     for i in range(2):
@@ -273,12 +273,12 @@ def update_tilt(row: Array, estimate: Estimate, lean: float, time: float, t: Tun
         h[:] = 0.0
         h[ATTITUDE_ERROR], h[ATTITUDE_ERROR + 1], h[TILT_BIAS + i] = matrix[1, i], -matrix[0, i], 1.0
         log[i, 0], log[i, 1], log[i, 2] = time, INCLINOMETER, i
-        noise = math.hypot(t.tilt_noise_rad, lean)
+        noise = math.hypot(t.tilt_noise_rad, disturbance_rad)
         update_scalar(estimate, h, row[UP + i] - matrix[2, i], noise, t.gate, log[i])
 
 
 @njit(cache=True)
-def update_heading(row: Array, estimate: Estimate, lean: float, time: float, t: Tuning, log: Array) -> None:
+def update_heading(row: Array, estimate: Estimate, disturbance_rad: float, time: float, t: Tuning, log: Array) -> None:
     """Update with the compass; one innovation."""
     h, matrix = np.zeros(ERRORS), np.empty((3, 3))
     matrix_of(estimate.state[QUATERNION:], matrix)
@@ -288,7 +288,7 @@ def update_heading(row: Array, estimate: Estimate, lean: float, time: float, t: 
     h[ATTITUDE_ERROR + 2], h[HEADING_BIAS] = 1.0, 1.0
     log[0, 0], log[0, 1], log[0, 2] = time, COMPASS, 0
     off = row[YAW] - math.atan2(matrix[1, 0], matrix[0, 0])
-    noise = math.hypot(t.heading_noise_rad, t.tan_dip * lean)
+    noise = math.hypot(t.heading_noise_rad, t.tan_dip * disturbance_rad)
     update_scalar(estimate, h, math.atan2(math.sin(off), math.cos(off)), noise, t.gate, log[0])
 
 
@@ -308,9 +308,9 @@ def _propagate(inputs: Inputs, k: int, states: Array, p: Array, memory: Array, t
 
 @njit(cache=True)
 def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tuple[Array, Array, Array, Array]:
-    """States at all boundaries, covariances at some, the deviations of all, and innovations.
+    """Run the filter; return states and deviations at all boundaries, stored covariances, and innovations.
 
-    `memory` and `p` are left as they end. Readings tagged before the first boundary are left out.
+    `memory` and `p` are updated in place. Readings tagged before the first boundary are ignored.
     """
     times, gps, tilts, kept_at = inputs.times, inputs.gps, inputs.tilts, inputs.kept_at
     states = np.empty((times.size, STATE))
@@ -347,17 +347,17 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tup
             logged += 6
         east, north = memory[FILTERED_ACCELERATION], memory[FILTERED_ACCELERATION + 1]
         level = math.sqrt(east**2 + north**2 + t.unmodelled_acceleration_m_s2**2)
-        lean = t.disturbance * level / t.gravity_m_s2
+        disturbance_rad = t.disturbance * level / t.gravity_m_s2
         while tilt < tilts.shape[0] and tilts[tilt, TAG] <= times[k]:
             row = tilts[tilt]
             tilt += 1
             if row[TAG] < times[0]:
                 continue
             if not math.isnan(row[UP]):
-                update_tilt(row, estimate, lean, times[k], t, log[logged : logged + 2])
+                update_tilt(row, estimate, disturbance_rad, times[k], t, log[logged : logged + 2])
                 logged += 2
             if not math.isnan(row[YAW]):
-                update_heading(row, estimate, lean, times[k], t, log[logged : logged + 1])
+                update_heading(row, estimate, disturbance_rad, times[k], t, log[logged : logged + 1])
                 logged += 1
         for i in range(ESTIMATED):
             deviations[k, i] = math.sqrt(p[i, i])

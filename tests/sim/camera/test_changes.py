@@ -7,6 +7,7 @@ import dataclasses
 import math
 import pickle
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def transforms(draw: st.DrawFn) -> RigidTransform:
 def points_before(camera: CameraModel) -> np.ndarray:
     """Points all over the frame, 4 m off."""
     origins, directions = camera.rays(camera.pixel_grid()[::100, ::100])
-    return origins + 4 * directions
+    return np.asarray(origins + 4 * directions)
 
 
 def vectors(camera: CameraModel) -> np.ndarray:
@@ -145,7 +146,7 @@ def test_impossible_changes_are_refused(navcam: Cahvor) -> None:
 
 def test_mirrored_camera_keeps_its_handedness(navcam: Cahvor) -> None:
     mirrored = dataclasses.replace(navcam, h=1023 * navcam.a - navcam.h)
-    assert not mirrored.right_handed
+    assert mirrored.theta > 0
     points = points_before(navcam)
     expected = navcam.project(points)[0]
     expected[..., 0] = 1023 - expected[..., 0]
@@ -187,7 +188,6 @@ def test_field_of_view_is_between_the_outer_edges() -> None:
     both = Cahv.from_field_of_view(1.0, (100, 50), vertical_rad=0.8, axis=(0, 0, 1), right=(1, 0, 0))
     upper, lower = both.rays(np.array([[49.5, -0.5], [49.5, 49.5]]))[1]
     assert math.acos(upper @ lower) == pytest.approx(0.8)
-    assert both.half_angle() == pytest.approx(math.atan(math.hypot(math.tan(0.5), math.tan(0.4))))
     assert np.allclose(both.boresight(), (0, 0, 1))
 
 
@@ -223,7 +223,7 @@ def test_impossible_constructions_are_refused() -> None:
         ({"r": np.array([-1.0, 0.0, 0.0])}, "r must begin with a number above -1"),
     ],
 )
-def test_impossible_fields_are_refused(navcam: Cahvor, change: dict[str, object], fault: str) -> None:
+def test_impossible_fields_are_refused(navcam: Cahvor, change: dict[str, Any], fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
         dataclasses.replace(navcam, **change)
 
@@ -253,7 +253,8 @@ def test_cameras_do_not_share_the_callers_arrays(navcam: Cahvor) -> None:
 
 def through_pickle(camera: CameraModel) -> CameraModel:
     """As a worker process gets it."""
-    return pickle.loads(pickle.dumps(camera))  # noqa: S301
+    copied: CameraModel = pickle.loads(pickle.dumps(camera))  # noqa: S301
+    return copied
 
 
 @pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, through_pickle])
@@ -284,9 +285,9 @@ def test_derived_quantities_of_the_navcam(navcam: Cahvor) -> None:
     assert vc == pytest.approx(navcam.a @ navcam.v, rel=3e-6)
     across, along = np.cross(navcam.a, navcam.v), np.cross(navcam.a, navcam.h)
     assert navcam.theta == pytest.approx(math.atan2(np.cross(navcam.v, navcam.h) @ navcam.a, across @ along), abs=1e-8)
-    assert navcam.right_handed
     assert np.allclose(hs * navcam.right + hc * navcam.a, navcam.h, atol=1e-2)
-    assert math.degrees(2 * navcam.half_angle()) == pytest.approx(61.4, abs=0.1)  # 45 x 45 degrees, across the corners
+    half_angles = np.arccos(navcam.corner_rays()[1] @ navcam.boresight())
+    assert np.degrees(2 * half_angles.max()) == pytest.approx(61.4, abs=0.1)  # 45 x 45 degrees, across the corners
 
 
 def test_corner_rays_go_round_clockwise(camera: CameraModel) -> None:

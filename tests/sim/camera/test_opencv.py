@@ -35,7 +35,7 @@ def from_opencv_distances(camera: Cahvor, matrix: np.ndarray, distortion: np.nda
         matrix,
         distortion,
     )
-    return np.linalg.norm(np.asarray(there).reshape(-1, 2) - pixels.reshape(-1, 2), axis=-1)
+    return np.asarray(np.linalg.norm(np.asarray(there).reshape(-1, 2) - pixels.reshape(-1, 2), axis=-1))
 
 
 @pytest.mark.parametrize("distortion", [[], [-0.2, 0.05, 0, 0], [0.1, -0.02, 0, 0, 0]])

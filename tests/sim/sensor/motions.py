@@ -9,8 +9,13 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Motion, State
+from marsyard.sim.sensor import ImageMotion
 
 GRAVITY = 3.71
+
+
+def uniform_motion(rows_s: float, columns_s: float) -> ImageMotion:
+    return ImageMotion(np.tile(np.array([rows_s, columns_s]), (2, 2, 1)))
 
 
 @dataclass(frozen=True)

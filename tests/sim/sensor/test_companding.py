@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from marsyard.sim.sensor.companding import compand, compression_table, expand, expansion_table
+from marsyard.sim.sensor.detector import compand, compression_table, expand, expansion_table
 
 
 @pytest.mark.parametrize("full_scale", [255, 1023, 4095])

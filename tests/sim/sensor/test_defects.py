@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from marsyard.sim.sensor.defects import filled
+from marsyard.sim.sensor.detector import fill_bad_pixels
 
 
 def test_listed_pixels_get_the_mean_of_their_good_neighbours() -> None:
@@ -13,7 +13,7 @@ def test_listed_pixels_get_the_mean_of_their_good_neighbours() -> None:
     bad[2, 3] = bad[2, 4] = bad[0, 0] = True
     spoilt = counts.copy()
     spoilt[bad] = 4000
-    repaired = filled(spoilt, bad)
+    repaired = fill_bad_pixels(spoilt, bad)
     np.testing.assert_array_equal(repaired[~bad], counts[~bad])
     # of (2, 3): the seven others about it, without (2, 4)
     around = [counts[i, j] for i in (1, 2, 3) for j in (2, 3, 4) if (i, j) not in ((2, 3), (2, 4))]
@@ -26,5 +26,5 @@ def test_a_pixel_without_good_neighbours_stays_as_it_is() -> None:
     bad[1:4, 1:4] = True
     counts = np.full((5, 5), 7, dtype=np.uint16)
     counts[2, 2] = 99
-    assert filled(counts, bad)[2, 2] == 99
-    assert filled(counts, bad)[1, 1] == 7
+    assert fill_bad_pixels(counts, bad)[2, 2] == 99
+    assert fill_bad_pixels(counts, bad)[1, 1] == 7

@@ -3,10 +3,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from marsyard.algorithms.image.frame_transfer import without_frame_transfer
-from marsyard.sim.sensor import Detector, DetectorParameters, ImageMotion
-from marsyard.sim.sensor.defects import BurstParameters, DefectParameters
-from marsyard.sim.sensor.detector import dark_seconds
+from marsyard.sim.sensor import Detector, DetectorParameters
+from marsyard.sim.sensor.detector import BurstParameters, DefectParameters, dark_seconds
 from marsyard.sim.sensor.optics import OpticsParameters
+from tests.sim.sensor.motions import uniform_motion
 
 EVEN = np.ones((64, 48), dtype=np.float32)
 SHARP = OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)
@@ -88,7 +88,7 @@ def test_smear_is_undone_by_dimes() -> None:
     p = detector.parameters
 
     def delivered(charge: np.ndarray) -> np.ndarray:
-        return charge.reshape(256, 4, 32).sum(axis=1) / p.gain_e_dn
+        return np.asarray(charge.reshape(256, 4, 32).sum(axis=1) / p.gain_e_dn)
 
     smeared = delivered(detector.charge(scene))
     exposed = delivered(scene * np.float32(p.responsivity_e_s * p.exposure_s))
@@ -166,14 +166,12 @@ def test_companding_costs_less_than_shot_noise() -> None:
 def test_motion_changes_the_picture_and_stays_reproducible() -> None:
     scene = np.random.default_rng(2).random(EVEN.shape, dtype=np.float32) * np.float32(0.2)
     detector = _detector()
-    moving = ImageMotion.uniform(900.0, -700.0)
+    moving = uniform_motion(900.0, -700.0)
     first = detector.expose(scene, np.random.default_rng(1), moving)
     np.testing.assert_array_equal(first, detector.expose(scene, np.random.default_rng(1), moving))
     still = detector.expose(scene, np.random.default_rng(1))
     assert (first != still).mean() > 0.5
-    np.testing.assert_array_equal(
-        still, detector.expose(scene, np.random.default_rng(1), ImageMotion.uniform(0.0, 0.0))
-    )
+    np.testing.assert_array_equal(still, detector.expose(scene, np.random.default_rng(1), uniform_motion(0.0, 0.0)))
 
 
 def test_exposure_can_be_set_and_is_stated() -> None:

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.sensor import Imu, ImuIncrements, ImuParameters, InertialSolution, NavigationErrors
-from marsyard.sim.sensor.clock import Clock, ClockParameters
 from marsyard.sim.sensor.imu import DEG_H
+from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from tests.sim.sensor.motions import GRAVITY, Swaying
 from tests.sim.sensor.test_imu import perfect
 
@@ -30,9 +30,9 @@ def _navigated(
     rng = np.random.default_rng(seed)
     imu = Imu.drawn(parameters, SPAN, rng)
     start = motion.state(SPAN[0])
-    attitude, velocity = errors.believed(start.attitude, start.velocity_m_s)
+    attitude, velocity = errors.apply(start.attitude, start.velocity_m_s)
     increments = imu.increments(motion, *SPAN, rng)
-    return imu, InertialSolution.propagated(increments, attitude, velocity, GRAVITY)
+    return imu, InertialSolution.propagate(increments, attitude, velocity, GRAVITY)
 
 
 def test_without_errors_the_motion_itself_comes_out() -> None:
@@ -98,7 +98,7 @@ def test_ten_milliseconds_are_twenty_one_metres_on_the_ground() -> None:
     # an offset that the unit's clock shares does nothing
     imu = Imu.drawn(perfect(clock=ClockParameters(offset_s=0.01)), SPAN, np.random.default_rng(0))
     increments = imu.increments(turning, *SPAN, np.random.default_rng(0))
-    shared = InertialSolution.propagated(increments, turning.state(SPAN[0]).attitude, np.zeros(3), GRAVITY)
+    shared = InertialSolution.propagate(increments, turning.state(SPAN[0]).attitude, np.zeros(3), GRAVITY)
     assert (shared.attitude(tag)[0] * turning.state(3.75).attitude.inv()).magnitude() < 1e-9
 
 
@@ -107,7 +107,7 @@ def test_jitter_beyond_the_period_never_makes_time_run_back() -> None:
     increments = imu.increments(BUSY, *SPAN, np.random.default_rng(0))
     assert np.all(np.diff(increments.times_s) >= 0.0)
     start = BUSY.state(SPAN[0])
-    solution = InertialSolution.propagated(increments, start.attitude, start.velocity_m_s, GRAVITY)
+    solution = InertialSolution.propagate(increments, start.attitude, start.velocity_m_s, GRAVITY)
     times = np.concatenate([increments.times_s[:1], np.linspace(-1.9, 17.9, 1000), increments.times_s[-1:]])
     error = (solution.attitude(times) * BUSY.motion(times).attitudes.inv()).magnitude()
     # at most 1.35 rad/s, and jitter of up to four spreads
@@ -116,7 +116,7 @@ def test_jitter_beyond_the_period_never_makes_time_run_back() -> None:
 
 def test_navigation_is_known_only_within_its_samples() -> None:
     increments = ImuIncrements(np.array([0.0, 1.0]), 1.0, np.zeros((1, 3)), np.zeros((1, 3)))
-    solution = InertialSolution.propagated(increments, Rotation.identity(), np.zeros(3), GRAVITY)
+    solution = InertialSolution.propagate(increments, Rotation.identity(), np.zeros(3), GRAVITY)
     with pytest.raises(ValueError, match=r"known from 0\.0000 s to 1\.0000 s"):
         solution.velocity(np.array([1.5]))
 

@@ -30,13 +30,13 @@ def _rng(seed: int = 1) -> np.random.Generator:
 def _moved(mast: Mast, azimuths_deg: list[float]) -> list[MastState]:
     states, rng = [mast.rest], _rng()
     for azimuth in azimuths_deg:
-        states.append(mast.pointed(states[-1], float(np.radians(azimuth)), 0.0, rng))
+        states.append(mast.point(states[-1], float(np.radians(azimuth)), 0.0, rng))
     return states[1:]
 
 
 def test_a_mast_without_errors_points_as_told() -> None:
     mast = Mast.drawn(EXACT, MER_MAST, _rng())
-    state = mast.pointed(mast.rest, 0.4, -0.3, _rng())
+    state = mast.point(mast.rest, 0.4, -0.3, _rng())
     assert state.true_rad == state.readings_rad == (0.4, -0.3)
     expected = MER_MAST.rover_from_head(0.4, -0.3)
     assert mast.rover_from_head(state).as_matrix() == pytest.approx(expected.as_matrix())
@@ -77,7 +77,7 @@ def test_encoders_read_whole_counts_and_motors_stop_beside_commands() -> None:
 
 def test_the_mast_stops_at_its_limits_and_says_so() -> None:
     mast = Mast.drawn(EXACT, MER_MAST, _rng())
-    state = mast.pointed(mast.rest, 0.0, -2.0, _rng())
+    state = mast.point(mast.rest, 0.0, -2.0, _rng())
     assert np.degrees(state.readings_rad[1]) == pytest.approx(-87.0)
 
 

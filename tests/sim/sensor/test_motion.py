@@ -17,6 +17,7 @@ from marsyard.sim.sensor import ImageMotion, natural_fall_off
 from marsyard.sim.sensor.kernels import path_kernel
 from marsyard.sim.sensor.motion import moving_exposure
 from marsyard.sim.terrain import TerrainParameters, synthesise
+from tests.sim.sensor.motions import uniform_motion
 
 Picture = NDArray[np.float64]
 EXPOSURE_S = 4e-3
@@ -29,7 +30,7 @@ def _brute_force(
     total = sum((seen(((n + 0.5) / 24 - 0.5) * EXPOSURE_S) for n in range(24)), np.zeros(shape)) * EXPOSURE_S / 24
     for first in range(1, shape[0], rows):
         lags = range(first, min(first + rows, shape[0]))
-        middle = np.mean(lags) - 0.5
+        middle = float(np.mean(lags)) - 0.5
         after = seen(0.5 * EXPOSURE_S + middle * transfer_row_s) * transfer_row_s
         before = seen(-0.5 * EXPOSURE_S - middle * clear_row_s) * clear_row_s
         for lag in lags:
@@ -58,11 +59,11 @@ def test_the_picture_of_a_turning_camera_is_that_of_many_renderings() -> None:
 
     def seen(time_s: float) -> Picture:
         turned = Rotation.from_rotvec(rate * time_s) * attitude
-        return renderer.render(scene, rays, rigid(turned, place + velocity * time_s)).radiance * response
+        return np.asarray(renderer.render(scene, rays, rigid(turned, place + velocity * time_s)).radiance * response)
 
     frame = renderer.render(scene, rays, rigid(attitude, place))
-    motion = ImageMotion.seen(camera, frame.range_m, frame.world_from_body, velocity, rate)
-    assert motion.greatest_px_s == pytest.approx(np.radians(60.0) * 14.67e-3 / 12e-6, rel=0.1)
+    motion = ImageMotion.of_camera(camera, frame.range_m, frame.world_from_body, velocity, rate)
+    assert motion.max_px_s == pytest.approx(np.radians(60.0) * 14.67e-3 / 12e-6, rel=0.1)
     found = moving_exposure(frame.radiance, response, motion, EXPOSURE_S, transfer_row_s, clear_row_s)
     expected = _brute_force(seen, (size, size), transfer_row_s, clear_row_s, rows=6)
     # beyond the border nothing was rendered: as far as the picture moves, it is not compared
@@ -85,7 +86,7 @@ def test_smear_and_blur_of_a_drifting_picture(velocity: tuple[float, float]) -> 
         where = [rows - velocity[0] * time_s, columns - velocity[1] * time_s]
         return map_coordinates(scene.astype(np.float64), where, order=3, mode="nearest") * response
 
-    found = moving_exposure(scene, response, ImageMotion.uniform(*velocity), EXPOSURE_S, 4e-5, 8e-6)
+    found = moving_exposure(scene, response, uniform_motion(*velocity), EXPOSURE_S, 4e-5, 8e-6)
     expected = _brute_force(seen, scene.shape, 4e-5, 8e-6, rows=1)
     assert np.sqrt(((found - expected) ** 2).mean()) < 0.0015 * expected.mean()
 
@@ -94,7 +95,7 @@ def test_smear_and_blur_of_a_drifting_picture(velocity: tuple[float, float]) -> 
 def test_a_moving_dot_stays_where_it_is_at_mid_exposure(velocity: tuple[float, float]) -> None:
     rows, columns = np.indices((64, 64))
     dot = np.exp(-0.5 * ((rows - 31.3) ** 2 + (columns - 30.6) ** 2) / 1.5**2).astype(np.float32)
-    picture = moving_exposure(dot, np.ones_like(dot), ImageMotion.uniform(*velocity), EXPOSURE_S, 0.0, 0.0)
+    picture = moving_exposure(dot, np.ones_like(dot), uniform_motion(*velocity), EXPOSURE_S, 0.0, 0.0)
     total = picture.sum(dtype=np.float64)
     assert total == pytest.approx(dot.sum(dtype=np.float64) * EXPOSURE_S, rel=1e-4)
     assert (picture * rows).sum() / total == pytest.approx(31.3, abs=0.005)
@@ -109,12 +110,12 @@ def test_the_trail_of_a_moving_dot_leans() -> None:
     """While it is shifted out, a packet d rows below the dot passes it d row times after the exposure."""
     rows, columns = np.indices((96, 96))
     dot = np.exp(-0.5 * ((rows - 20.0) ** 2 + (columns - 40.0) ** 2) / 1.5**2).astype(np.float32)
-    picture = moving_exposure(dot, np.ones_like(dot), ImageMotion.uniform(0.0, 1000.0), EXPOSURE_S, 5e-5, 0.0)
+    picture = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 5e-5, 0.0)
     for row in (40, 60, 90):
         centre = (picture[row] * columns[row]).sum() / picture[row].sum()
         assert centre == pytest.approx(40.0 + 1000.0 * (0.5 * EXPOSURE_S + (row - 20 - 0.5) * 5e-5), abs=0.05)
     # before the exposure the packets above passed it, the higher the earlier
-    cleared = moving_exposure(dot, np.ones_like(dot), ImageMotion.uniform(0.0, 1000.0), EXPOSURE_S, 0.0, 5e-5)
+    cleared = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 0.0, 5e-5)
     centre = (cleared[5] * columns[5]).sum() / cleared[5].sum()
     assert centre == pytest.approx(40.0 - 1000.0 * (0.5 * EXPOSURE_S + 14.5 * 5e-5), abs=0.05)
 
@@ -122,7 +123,7 @@ def test_the_trail_of_a_moving_dot_leans() -> None:
 def test_slow_motion_joins_the_still_picture() -> None:
     rng = np.random.default_rng(3)
     scene, response = (1.0 + 0.1 * rng.standard_normal((2, 96, 64))).astype(np.float32)
-    found = moving_exposure(scene, response, ImageMotion.uniform(1e-6, 1e-6), EXPOSURE_S, 5e-6, 1e-6)
+    found = moving_exposure(scene, response, uniform_motion(1e-6, 1e-6), EXPOSURE_S, 5e-6, 1e-6)
     rate = scene * response
     passed = np.cumsum(rate, axis=0)
     still = EXPOSURE_S * rate + 5e-6 * (passed - rate) + 1e-6 * (passed[-1:] - passed)
@@ -139,7 +140,7 @@ def test_image_velocity_by_finite_differences() -> None:
     distance = 1000.0 + 100.0 * rng.random((512, 512))
     pose = rigid(Rotation.from_euler("xyz", [0.2, 0.1, 1.0]), np.array([3.0, 5.0, 900.0]))
     velocity, rate = np.array([10.0, -20.0, -60.0]), np.array([0.3, -0.4, 0.2])
-    motion = ImageMotion.seen(camera, distance, pose, velocity, rate)
+    motion = ImageMotion.of_camera(camera, distance, pose, velocity, rate)
     pixels = 32.0 * np.stack(np.meshgrid(np.arange(16), np.arange(16)), axis=-1).astype(np.float64)
     origins, directions = camera.rays(pixels)
     world = pose.apply((origins + distance[::32, ::32, None] * directions).reshape(-1, 3))
@@ -158,8 +159,8 @@ def test_what_has_no_range_moves_with_the_rotation_alone() -> None:
     )
     pose = rigid(Rotation.identity(), np.zeros(3))
     sky = np.full((96, 128), np.inf)
-    assert ImageMotion.seen(camera, sky, pose, np.array([50.0, 20.0, 0.0]), np.zeros(3)).greatest_px_s < 1e-3
-    turning = ImageMotion.seen(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
+    assert ImageMotion.of_camera(camera, sky, pose, np.array([50.0, 20.0, 0.0]), np.zeros(3)).max_px_s < 1e-3
+    turning = ImageMotion.of_camera(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
     # a turn to the left moves the picture to the right by 500 px/rad
     assert turning.velocity_px_s[1, 2, 1] == pytest.approx(50.0, rel=0.01)
 
@@ -189,12 +190,12 @@ def test_the_border_of_a_moving_picture_is_nearly_what_a_wider_one_shows(velocit
     frame = np.ascontiguousarray(wide[inside])
     response = np.zeros_like(wide)
     response[inside] = 1.0
-    motion = ImageMotion.uniform(*velocity)
+    motion = uniform_motion(*velocity)
     held = moving_exposure(frame, np.ones_like(frame), motion, EXPOSURE_S, 5e-6, 1e-6)
     true = moving_exposure(wide, response, motion, EXPOSURE_S, 5e-6, 1e-6)[inside]
     error = (held - true) / true.mean()
-    rows, columns = np.indices(frame.shape)
-    depth = np.minimum.reduce([rows, columns, rows[::-1], columns[:, ::-1]])
+    rows, columns = (np.asarray(one) for one in np.indices(frame.shape))
+    depth: np.ndarray = np.minimum.reduce([rows, columns, rows[::-1], columns[:, ::-1]])
     rms = [float(np.sqrt(np.mean(error[depth == ring] ** 2))) for ring in range(20)]
     # noise is 1 %
     assert 1e-4 < rms[0] < 0.03

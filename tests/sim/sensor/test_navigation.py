@@ -21,7 +21,7 @@ from marsyard.sim.dynamics.rotorcraft.flight import TAIL_S
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from marsyard.sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
 from marsyard.sim.sensor.navigation.kernels import POSITION_FIX, VELOCITY_FIX
-from marsyard.sim.sensor.rtk import Outage, RtkParameters, RtkReceiver
+from marsyard.sim.sensor.satellite_navigation import Outage, RtkParameters, RtkReceiver
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
 
 GRAVITY, FLIGHTS = 9.8, 50
@@ -53,7 +53,7 @@ def _flown(
     solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
     readings = compass.measure(path, compass.sampling.within(*span), rng)
     navigation = NavigationFilter(parameters, SMALL_UNIT, rtk_class, compass_class, GRAVITY)
-    start = navigation.started(solutions, readings)
+    start = navigation.initialize(solutions, readings)
     return path, imu, navigation.run(start, increments, solutions, readings, np.array(keep_s))
 
 
@@ -83,7 +83,7 @@ def test_errors_are_what_the_covariance_says() -> None:
         errors = _errors(path, imu, solution, solution.kept_at)
         covariances = solution.covariances
         squares.append([float(e @ np.linalg.solve(p, e)) for e, p in zip(errors, covariances, strict=True)])
-    low, high = chi2.ppf([0.001, 0.999], 15 * FLIGHTS) / FLIGHTS
+    low, high = (float(chi2.ppf(p, 15 * FLIGHTS)) / FLIGHTS for p in (0.001, 0.999))
     means = np.mean(squares, axis=0)
     assert np.all((means > low) & (means < high)), means
 
@@ -130,7 +130,7 @@ def test_through_an_outage_it_coasts_as_its_covariance_says() -> None:
         sizes.append(np.hypot(*error[:2]))
     assert 0.2 < np.sqrt(np.mean(np.square(sizes))) < 3.0
     # what the instruments are off by in an outage is less than the filter allows for: inclinometers count little
-    low, high = chi2.ppf([0.001, 0.999], 9 * FLIGHTS) / FLIGHTS
+    low, high = (float(chi2.ppf(p, 9 * FLIGHTS)) / FLIGHTS for p in (0.001, 0.999))
     assert low < np.mean(squares) < high
 
 
@@ -160,7 +160,7 @@ def test_it_starts_anew_where_it_was_led_astray() -> None:
     solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
     readings = compass.measure(path, compass.sampling.within(*span), rng)
     navigation = NavigationFilter(FilterParameters(), SMALL_UNIT, receiver.parameters, COMPASS, GRAVITY)
-    start = navigation.started(solutions, readings)
+    start = navigation.initialize(solutions, readings)
     astray = replace(start, state=start.state + np.eye(16)[0] * 20.0, covariance=0.01 * start.covariance)
     solution = navigation.run(astray, imu.increments(path, *span, rng), solutions, readings)
     said = solution.innovations

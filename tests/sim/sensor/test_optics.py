@@ -1,19 +1,21 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
 from marsyard.sim.camera import Cahv, Cahvore
 from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
-from marsyard.sim.sensor.optics import OpticsParameters, dust_transmission, line_spread, spread
+from marsyard.sim.sensor.optics import OpticsParameters, apply_point_spread, dust_transmission, line_spread
 
 MER = OpticsParameters()
-FORWARD = {"axis": np.array([0.0, 0.0, -1.0]), "right": np.array([1.0, 0.0, 0.0])}
+FORWARD: dict[str, Any] = {"axis": np.array([0.0, 0.0, -1.0]), "right": np.array([1.0, 0.0, 0.0])}
 
 
 @pytest.mark.parametrize("parameters", [MER, OpticsParameters(pixel_aperture=True), OpticsParameters(diffusion_px=1.0)])
 def test_point_spread_keeps_light_and_place(parameters: OpticsParameters) -> None:
     scene = np.zeros((41, 41), dtype=np.float32)
     scene[20, 17] = 1.0
-    picture = spread(scene, parameters).astype(np.float64)
+    picture = apply_point_spread(scene, parameters).astype(np.float64)
     assert picture.sum() == pytest.approx(1.0, abs=1e-6)
     assert picture[20, 17] < 0.8
     rows, columns = np.indices(picture.shape)
@@ -23,7 +25,7 @@ def test_point_spread_keeps_light_and_place(parameters: OpticsParameters) -> Non
 
 def test_light_is_kept_at_the_border_too() -> None:
     scene = np.random.default_rng(0).random((30, 25), dtype=np.float32)
-    assert spread(scene, MER).sum(dtype=np.float64) == pytest.approx(scene.sum(dtype=np.float64), rel=1e-6)
+    assert apply_point_spread(scene, MER).sum(dtype=np.float64) == pytest.approx(scene.sum(dtype=np.float64), rel=1e-6)
 
 
 def test_point_spread_has_the_stated_modulation_transfer() -> None:
@@ -39,7 +41,7 @@ def test_point_spread_has_the_stated_modulation_transfer() -> None:
 
 def test_without_spread_the_scene_is_untouched() -> None:
     scene = np.random.default_rng(0).random((8, 8), dtype=np.float32)
-    assert spread(scene, OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)) is scene
+    assert apply_point_spread(scene, OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)) is scene
 
 
 def test_fall_off_is_the_fourth_power_of_the_cosine_for_a_perspective_lens() -> None:

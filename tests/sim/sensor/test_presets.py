@@ -59,7 +59,7 @@ def test_pairs(name: str, baseline_m: float) -> None:
     left, right = preset(name).cameras()
     np.testing.assert_allclose(left.c - right.c, [0.0, baseline_m, 0.0], atol=1e-12)
     for camera in (left, right):
-        assert camera.right_handed
+        assert camera.theta < 0
         # up is up and forward is forward
         assert camera.a[0] > 0.99
         np.testing.assert_allclose(camera.down, [0.0, 0.0, -1.0], atol=1e-12)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.sensor.quaternions import products, running_products
+from marsyard.sim.sensor.imu import products, running_products
 
 
 def test_products_are_those_of_rotations() -> None:

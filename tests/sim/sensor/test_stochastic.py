@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from marsyard.sim.sensor.stochastic import GaussMarkov
+from marsyard.sim.sensor.instrument import GaussMarkov
 
 
 def test_variance_and_correlation_are_as_stated_from_the_start() -> None:

@@ -1,8 +1,8 @@
-"""A satellite receiver that works on carrier phases against a base station: position, velocity, and how good they are.
+"""Satellite navigation receivers: GPS positions, and an RTK receiver with positions, velocities and their deviations.
 
-Its solution is *fixed* while the phases' ambiguities are known as integers, and *floating* otherwise: each has a
-wandering and a white error of its own size. The receiver changes between them at random times, and delivers nothing
-during an outage. Errors are those of the antenna, which is taken to sit at the body's origin.
+An RTK receiver compares carrier phases with a base station. Its solution is *fixed* while the phase ambiguities are
+known as integers, and *floating* otherwise; each type has its own time-correlated and white errors. The receiver
+changes between them at random times and delivers nothing during an outage. Antennas are at the body's origin.
 """
 
 from __future__ import annotations
@@ -15,41 +15,85 @@ from jaxtyping import Bool, Float64
 from pydantic import Field, model_validator
 
 from marsyard.sim.dynamics import Trajectory
-from marsyard.sim.parameters import Parameters, Positive
-from marsyard.sim.sensor.clock import Clock, ClockParameters
-from marsyard.sim.sensor.instrument import Sampling
-from marsyard.sim.sensor.stochastic import GaussMarkov
+from marsyard.sim.parameters import Fraction, Parameters, Positive
+from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov, Readings, Sampling
 
 NonNegative = Annotated[float, Field(ge=0.0, le=1000.0)]
 #: East, north, up.
 PerAxis = tuple[NonNegative, NonNegative, NonNegative]
 
 
-class SolutionErrors(Parameters):
-    """Errors of one kind of solution, one standard deviation towards east, north and up."""
+class GpsParameters(Parameters):
+    """A GPS receiver. Spreads are one standard deviation per axis."""
 
-    wander_m: Annotated[PerAxis, Field(description="wanders with the correlation time, m")]
+    rate_hz: Annotated[float, Field(gt=0.0, le=1000.0, description="fixes per second")] = 10.0
+    horizontal_noise_m: Annotated[NonNegative, Field(description="new in every fix, m")] = 0.3
+    vertical_noise_m: Annotated[NonNegative, Field(description="new in every fix, m")] = 0.6
+    horizontal_wander_m: Annotated[NonNegative, Field(description="time-correlated error, m")] = 1.5
+    vertical_wander_m: Annotated[NonNegative, Field(description="time-correlated error, m")] = 3.0
+    correlation_s: Annotated[float, Field(gt=0.0, description="correlation time, s")] = 300.0
+    latency_s: Annotated[float, Field(ge=0.0, le=10.0, description="from a fix to its delivery, s")] = 0.1
+    clock: ClockParameters = ClockParameters()
+
+
+#: Carrier phases post-processed with precise orbits, in flight (the class of GIPSY-OASIS II).
+POST_PROCESSED = GpsParameters(
+    rate_hz=1.0, horizontal_noise_m=0.02, vertical_noise_m=0.03, horizontal_wander_m=0.05, vertical_wander_m=0.1,
+    correlation_s=600.0, latency_s=0.0,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Gps:
+    """A GPS receiver with its time-correlated error over a time span drawn."""
+
+    parameters: GpsParameters
+    sampling: Sampling
+    clock: Clock
+    wander: GaussMarkov
+
+    @classmethod
+    def drawn(cls, parameters: GpsParameters, span_s: tuple[float, float], rng: np.random.Generator) -> Gps:
+        """Draw the errors for use within a time span."""
+        p = parameters
+        sd = np.array([p.horizontal_wander_m, p.horizontal_wander_m, p.vertical_wander_m])
+        sampling, clock = Sampling.drawn(p.rate_hz, rng), Clock.drawn(p.clock, rng)
+        return cls(p, sampling, clock, GaussMarkov.drawn(sd, p.correlation_s, span_s, rng))
+
+    def measure(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator) -> Readings:
+        """Measure one position per true time, world axes; it is delivered `latency_s` after that time."""
+        p = self.parameters
+        tags = self.clock.tags(times_s, rng)
+        sd = np.array([p.horizontal_noise_m, p.horizontal_noise_m, p.vertical_noise_m])
+        noise = sd * rng.standard_normal((times_s.size, 3))
+        return Readings(tags, trajectory.motion(times_s).positions_m + self.wander.at(times_s) + noise)
+
+
+class SolutionErrors(Parameters):
+    """Errors of one type of solution, one standard deviation along east, north and up."""
+
+    wander_m: Annotated[PerAxis, Field(description="time-correlated error, m")]
     noise_m: Annotated[PerAxis, Field(description="new in every solution, m")]
-    correlation_s: Annotated[Positive, Field(le=10000.0, description="correlation time of the wandering error, s")]
+    correlation_s: Annotated[Positive, Field(le=10000.0, description="correlation time, s")]
 
     @property
     def total_m(self) -> Float64[np.ndarray, "3"]:
-        """Standard deviation of the position."""
+        """Total standard deviation of the position."""
         return np.hypot(self.wander_m, self.noise_m)
 
 
 class Outage(Parameters):
-    """A time without solutions."""
+    """An interval without solutions."""
 
     start_s: Annotated[float, Field(description="true time at which it begins, s")]
     duration_s: Annotated[Positive, Field(description="how long it lasts, s")]
 
 
 class RtkParameters(Parameters):
-    """A receiver of the class of NovAtel's RT2.
+    """An RTK receiver of the class of NovAtel's RT2.
 
     Fixed: 2 cm, the class's specification. Floating: within the deviations of the landing paper's Table II, 0.35 to
-    0.7 m. All else is assumed.
+    0.7 m. All other values are assumed.
     """
 
     rate_hz: Annotated[Positive, Field(le=100.0, description="solutions per second")] = 10.0
@@ -60,23 +104,17 @@ class RtkParameters(Parameters):
     floating: SolutionErrors = SolutionErrors(
         wander_m=(0.42, 0.55, 0.8), noise_m=(0.03, 0.03, 0.05), correlation_s=120.0
     )
-    float_share: Annotated[float, Field(ge=0.0, le=1.0, description="share of the time with a floating solution")] = 0.1
+    float_share: Annotated[Fraction, Field(description="fraction of the time with a floating solution")] = 0.1
     float_s: Annotated[Positive, Field(description="mean duration of a floating solution, s")] = 60.0
-    velocity_noise_m_s: Annotated[PerAxis, Field(description="of velocity, new in every solution, m/s")] = (
-        0.03,
-        0.03,
-        0.05,
-    )
-    velocity_wander_m_s: Annotated[PerAxis, Field(description="of velocity, wanders, m/s")] = (0.01, 0.01, 0.02)
-    velocity_correlation_s: Annotated[Positive, Field(description="correlation time of that, s")] = 10.0
-    reported_spread: Annotated[
-        float, Field(ge=0.0, le=1.0, description="spread of the logarithm of reported over true deviation, per flight")
-    ] = 0.1
+    velocity_noise_m_s: Annotated[PerAxis, Field(description="of velocity, new in every solution")] = (0.03, 0.03, 0.05)
+    velocity_wander_m_s: Annotated[PerAxis, Field(description="velocity wander, m/s")] = (0.01, 0.01, 0.02)
+    velocity_correlation_s: Annotated[Positive, Field(description="correlation time of the velocity error, s")] = 10.0
+    reported_spread: Annotated[Fraction, Field(description="spread of log(reported / true deviation) per flight")] = 0.1
     outages: Annotated[tuple[Outage, ...], Field(description="times without solutions")] = ()
     clock: ClockParameters = ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0002)
 
     @model_validator(mode="after")
-    def _a_share_can_be_held(self) -> RtkParameters:
+    def _check_fixed_duration(self) -> RtkParameters:
         if 0.0 < self.float_share < 1.0 and self.float_s * (1.0 / self.float_share - 1.0) < 1.0 / self.rate_hz:
             raise ValueError(f"a float_share of {self.float_share} leaves fixed solutions less than one reading")
         return self
@@ -84,18 +122,11 @@ class RtkParameters(Parameters):
 
 @dataclass(frozen=True)
 class RtkSolutions:
-    """What the receiver delivers, `latency_s` after each solution's time.
+    """Solutions of an RTK receiver, delivered `latency_s` after their time.
 
-    Attributes
-    ----------
-    times_s
-        Time tags, seconds.
-    positions_m, velocities_m_s
-        World axes; not a number during an outage.
-    reported_m
-        The receiver's own estimate of its position's standard deviation, east, north and up.
-    fixed
-        Whether the solution was fixed.
+    - positions_m, velocities_m_s: world axes; NaN during an outage
+    - reported_m: the receiver's own estimate of its position's standard deviation, east, north and up
+    - fixed: whether the solution is fixed
     """
 
     times_s: Float64[np.ndarray, "n"]
@@ -107,18 +138,10 @@ class RtkSolutions:
 
 @dataclass(frozen=True)
 class RtkReceiver:
-    """One receiver: what wanders over a span of time is drawn once, its noise with the solutions.
+    """An RTK receiver with its time-correlated errors over a time span drawn.
 
-    Attributes
-    ----------
-    parameters, sampling, clock
-        Its class, when it measures, and what its clock makes of that.
-    fixed_wander, floating_wander, velocity_wander
-        Its wandering errors.
-    first_floating, changes_s
-        Whether the solution floats at first, and the true times at which that changes.
-    reported_factor
-        Reported over true standard deviation.
+    - first_floating, changes_s: whether the first solution floats, and the true times of the changes
+    - reported_factor: ratio of the reported to the true standard deviation
     """
 
     parameters: RtkParameters
@@ -133,7 +156,7 @@ class RtkReceiver:
 
     @classmethod
     def drawn(cls, parameters: RtkParameters, span_s: tuple[float, float], rng: np.random.Generator) -> RtkReceiver:
-        """A receiver with its errors drawn for use within a span of time."""
+        """Draw the errors for use within a time span."""
         p = parameters
         floating = bool(rng.random() < p.float_share)
         wanders = [
@@ -157,14 +180,14 @@ class RtkReceiver:
         )
 
     def floats(self, times_s: Float64[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-        """Whether the solution floats at true times."""
+        """Return whether the solution floats at true times."""
         changed = np.searchsorted(self.changes_s, times_s, side="right") % 2 == 1
         return np.asarray(changed != self.first_floating)
 
     def measure(
         self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator
     ) -> RtkSolutions:
-        """One solution at each true time."""
+        """Compute one solution per true time."""
         p = self.parameters
         motion, floating = trajectory.motion(times_s), self.floats(times_s)[:, None]
         tags = self.clock.tags(times_s, rng)
@@ -173,10 +196,9 @@ class RtkReceiver:
         noise = np.where(floating, p.floating.noise_m, p.fixed.noise_m)
         positions = motion.positions_m + wander + noise * shocks[:, :3]
         velocities = motion.velocities_m_s + self.velocity_wander.at(times_s) + p.velocity_noise_m_s * shocks[:, 3:]
-        silent = np.zeros(times_s.size, dtype=bool)
         for one in p.outages:
-            silent |= (times_s >= one.start_s) & (times_s < one.start_s + one.duration_s)
-        positions[silent], velocities[silent] = np.nan, np.nan
+            missing = (times_s >= one.start_s) & (times_s < one.start_s + one.duration_s)
+            positions[missing], velocities[missing] = np.nan, np.nan
         reported = self.reported_factor * np.where(floating, p.floating.total_m, p.fixed.total_m)
         return RtkSolutions(tags, positions, velocities, reported, ~floating[:, 0])
 
@@ -184,7 +206,7 @@ class RtkReceiver:
 def _changes(
     p: RtkParameters, floating: bool, span_s: tuple[float, float], rng: np.random.Generator
 ) -> Float64[np.ndarray, "changes"]:
-    """Times at which the kind of solution changes: durations are exponential, the process stationary."""
+    """Draw the times at which the type of solution changes: exponential durations, a stationary process."""
     if p.float_share in (0.0, 1.0):
         return np.zeros(0)
     means = {True: p.float_s, False: p.float_s * (1.0 / p.float_share - 1.0)}

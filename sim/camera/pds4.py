@@ -1,7 +1,7 @@
-"""Camera models in PDS4 labels: the `geom:Camera_Model_Parameters` of the geometry dictionary.
+"""Camera models in PDS4 labels: the class `geom:Camera_Model_Parameters` of the geometry dictionary.
 
-Vectors are returned in the frame that the label names (`Coordinate_Space_Reference`), as they are. The picture's size
-is that of the label's image array. Namespaces' prefixes and versions do not matter.
+Vectors are returned in the frame named by the label (`Coordinate_Space_Reference`). The picture's size is that of the
+label's image array. Prefixes and versions of namespaces do not matter.
 """
 
 from __future__ import annotations
@@ -10,18 +10,16 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree
 
-from marsyard.sim.camera.assembly import MODELS, Source, assembled, linearity_of_type
+from marsyard.sim.camera.assembly import MODELS, Source, create_camera, linearity_of_type
 from marsyard.sim.camera.base import CameraModel
 
 _START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|[A-Za-z_][\w:.-]*[\s>])")
 _PARAMETERS = "Camera_Model_Parameters"
-#: Where a model's vectors stand, by letter: the element, and its components.
-_POSITION, _UNIT, _PIXEL, _TERMS = (
-    ("x_position", "y_position", "z_position"),
-    ("x_unit", "y_unit", "z_unit"),
-    ("x_pixel", "y_pixel", "z_pixel"),
-    ("c0", "c1", "c2"),
-)
+_POSITION = ("x_position", "y_position", "z_position")
+_UNIT = ("x_unit", "y_unit", "z_unit")
+_PIXEL = ("x_pixel", "y_pixel", "z_pixel")
+_TERMS = ("c0", "c1", "c2")
+#: Element and components of each vector of a model.
 _VECTORS = {
     "C": ("Vector_Center", _POSITION),
     "A": ("Vector_Axis", _UNIT),
@@ -35,43 +33,32 @@ _METRES = (None, "m", "meter", "metre")
 
 
 def is_xml(head: bytes) -> bool:
-    """Whether a file that begins so is XML."""
+    """Whether the first bytes of a file are XML."""
     return _START.match(head) is not None
 
 
 def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
-    """Read every camera model of a PDS4 label, in the label's order.
+    """Read every camera model of a PDS4 label (.xml or .lblx), in order.
 
-    Parameters
-    ----------
-    path
-        The label (.xml or .lblx).
-    subframe_folded_in
-        The standard does not say whether the model of a subframe, or of a picture with averaged pixels, describes the
-        stored picture or the whole detector. Such labels are refused unless this is set, which takes the vectors to
-        describe the stored picture, as those of Mars 2020 do.
-
-    Raises
-    ------
-    CameraFileError
-        If the label cannot be read, has no camera model, or one is incomplete or wrong; it names file, field and what
-        is allowed.
+    The standard does not define whether the model of a subframe, or of a picture with averaged pixels, describes the
+    stored picture or the whole detector. Such labels are refused unless `subframe_folded_in` is set: the vectors then
+    describe the stored picture, as those of Mars 2020 do. Raises CameraFileError if the label cannot be read, has no
+    camera model, or one is incomplete or wrong; it names file, field and allowed values.
     """
     source = Source(str(path))
-    root = _root(source)
-    found = [element for element in root.iter() if _local(element) == _PARAMETERS]
-    found = [element for element in found if _child(element, "model_type") is not None]
-    if not found:
+    root = _parse(source)
+    models = [one for one in root.iter() if _local(one) == _PARAMETERS and _child(one, "model_type") is not None]
+    if not models:
         raise source.error(_PARAMETERS, "missing", "a PDS4 label with at least one such class that states a model_type")
     size = _size(root, source)
     if not subframe_folded_in:
         _refuse_subframes(root, source)
-    return tuple(_camera(element, size, source) for element in found)
+    return tuple(_camera(element, size, source) for element in models)
 
 
-def _root(source: Source) -> ElementTree.Element:
+def _parse(source: Source) -> ElementTree.Element:
     text = source.text()
-    if "<!ENTITY" in text:  # nothing in a label needs one, and nested ones fill the memory
+    if "<!ENTITY" in text:  # labels need none, and nested entities fill the memory
         raise source.error("label", "declares entities", "a PDS4 label, which has none")
     try:
         return ElementTree.fromstring(text.encode("latin-1"))  # noqa: S314  (entities are refused above)
@@ -107,7 +94,7 @@ def _size(root: ElementTree.Element, source: Source) -> tuple[int, int]:
 
 
 def _refuse_subframes(root: ElementTree.Element, source: Source) -> None:
-    """Raises CameraFileError for what the picture was made from, not for what was commanded."""
+    """Raise CameraFileError for a subframe or averaged pixels in the picture's own processing, not in the command."""
     for imaging in (one for one in root.iter() if _local(one) == "Imaging"):
         for part in imaging:
             if _local(part) not in ("Subframe", "Downsampling"):
@@ -136,7 +123,7 @@ def _camera(element: ElementTree.Element, size: tuple[int, int], source: Source)
         where = f"{name}_Model.cahvore_model_type, cahvore_model_parameter"
         kinds = [_number(model, part, where, source) for part in ("cahvore_model_type", "cahvore_model_parameter")]
         linearity = linearity_of_type(kinds[0], kinds[1], where, source)
-    return assembled(name, vectors, size, linearity, source)
+    return create_camera(name, vectors, size, linearity, source)
 
 
 def _vector(model: ElementTree.Element, letter: str, where: str, source: Source) -> list[float]:
@@ -158,7 +145,7 @@ def _vector(model: ElementTree.Element, letter: str, where: str, source: Source)
 
 
 def _number(element: ElementTree.Element, name: str, where: str, source: Source) -> float | None:
-    """A number of an element; None where it is not there."""
+    """A number of an element; None if missing."""
     child = _child(element, name)
     if child is None:
         return None

@@ -1,0 +1,427 @@
+"""The camera models CAHV (pinhole), CAHVOR (radial distortion) and CAHVORE (wide angle, moving entrance pupil).
+
+CAHV: Yakimovsky & Cunningham 1978. CAHVOR: Gennery 2001; 2006, section 2. CAHVORE: Gennery 2006, "Generalized camera
+calibration including fish-eye lenses", IJCV 68(3), sections 3 to 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from marsyard.sim.camera import kernels
+from marsyard.sim.camera.base import UNIT_TOLERANCE, CameraModel, Gradient, Real, Triple, Vector, dot
+
+_ORIGIN = (0.0, 0.0, 0.0)
+#: A chi^2 beyond this is infinite.
+_UNLIMITED_TAU = 1e30
+_NEWTON_STEPS = 30
+#: A linearity nearer to 0 than this is 0, as in JPL's cmod.
+_ZERO_LINEARITY = 1e-15
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Cahv(CameraModel):
+    """A pinhole camera; attributes as in `CameraModel`.
+
+    Raises ValueError if a vector is not finite, A is not a unit vector, A, H and V are linearly dependent or the size
+    is not positive.
+    """
+
+    c: Float[np.ndarray, "3"]
+    a: Float[np.ndarray, "3"]
+    h: Float[np.ndarray, "3"]
+    v: Float[np.ndarray, "3"]
+    size: tuple[int, int]
+
+    def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
+        depth = dot(self.a, x, y, z)
+        return dot(self.h, x, y, z) / depth, dot(self.v, x, y, z) / depth, depth > 0
+
+    def _image_gradient(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+        depth = dot(self.a, x, y, z)
+        u, v = dot(self.h, x, y, z) / depth, dot(self.v, x, y, z) / depth
+        return _gradient(self.h, self.a, u, depth), _gradient(self.v, self.a, v, depth)
+
+    def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
+        return self._image_plane_direction(u, v), None
+
+    @classmethod
+    def from_axes(
+        cls,
+        focal_lengths: tuple[Real, Real],
+        size: tuple[int, int],
+        *,
+        axis: Triple,
+        right: Triple,
+        centre: Triple = _ORIGIN,
+        image_centre: tuple[Real, Real] | None = None,
+    ) -> Cahv:
+        """Create a camera with square axes from its focal lengths (hs, vs) in pixels.
+
+        - axis: viewing direction, of any length
+        - right: direction in which columns grow; its component along `axis` is dropped. Rows grow along axis x right
+        - centre: C, metres
+        - image_centre: (hc, vc), pixels; the middle of the frame by default
+
+        Raises ValueError if a focal length is not positive, or `axis` and `right` are null or parallel.
+        """
+        if not (np.all(np.isfinite(focal_lengths)) and min(focal_lengths) > 0):
+            raise ValueError(f"focal lengths must be positive and finite, not {focal_lengths}")
+        forward = _unit("axis", np.asarray(axis, dtype=np.float64))
+        across = _unit("right", np.asarray(right, dtype=np.float64))
+        perpendicular = across - (across @ forward) * forward
+        if np.linalg.norm(perpendicular) < 1e-6:
+            raise ValueError("axis and right must not be parallel")
+        perpendicular /= np.linalg.norm(perpendicular)
+        hc, vc = ((size[0] - 1) / 2, (size[1] - 1) / 2) if image_centre is None else image_centre
+        return cls(
+            c=np.asarray(centre, dtype=np.float64),
+            a=forward,
+            h=focal_lengths[0] * perpendicular + hc * forward,
+            v=focal_lengths[1] * np.cross(forward, perpendicular) + vc * forward,
+            size=size,
+        )
+
+    @classmethod
+    def from_focal_length(
+        cls,
+        focal_m: Real,
+        pixel_pitch_m: Real | tuple[Real, Real],
+        size: tuple[int, int],
+        *,
+        axis: Triple,
+        right: Triple,
+        centre: Triple = _ORIGIN,
+        image_centre: tuple[Real, Real] | None = None,
+    ) -> Cahv:
+        """Create a camera from its focal length and pixel pitch (one, or along columns and rows); see `from_axes`."""
+        if isinstance(pixel_pitch_m, tuple):
+            column_pitch_m, row_pitch_m = pixel_pitch_m
+        else:
+            column_pitch_m = row_pitch_m = pixel_pitch_m
+        if not (column_pitch_m > 0 and row_pitch_m > 0):
+            raise ValueError(f"the pixel pitch must be positive, not {pixel_pitch_m} m")
+        focal_lengths = (focal_m / column_pitch_m, focal_m / row_pitch_m)
+        return cls.from_axes(focal_lengths, size, axis=axis, right=right, centre=centre, image_centre=image_centre)
+
+    @classmethod
+    def from_field_of_view(
+        cls,
+        horizontal_rad: Real,
+        size: tuple[int, int],
+        *,
+        axis: Triple,
+        right: Triple,
+        vertical_rad: Real | None = None,
+        centre: Triple = _ORIGIN,
+    ) -> Cahv:
+        """Create a camera from its full field of view (outer edges); square pixels by default; see `from_axes`."""
+        for angle in (horizontal_rad, vertical_rad):
+            if angle is not None and not 0 < angle < np.pi:
+                raise ValueError(f"a field of view must lie between 0 and pi radians, not {angle}")
+        hs = float(size[0] / 2 / np.tan(horizontal_rad / 2))
+        vs = hs if vertical_rad is None else float(size[1] / 2 / np.tan(vertical_rad / 2))
+        return cls.from_axes((hs, vs), size, axis=axis, right=right, centre=centre)
+
+
+def _gradient(image_vector: NDArray[np.float64], axis: NDArray[np.float64], pixel: Vector, depth: Vector) -> Gradient:
+    x, y, z = ((image_vector[i] - pixel * axis[i]) / depth for i in range(3))
+    return x, y, z
+
+
+def _unit(name: str, vector: Vector) -> Vector:
+    length = float(np.linalg.norm(vector))
+    if vector.shape != (3,) or not (np.isfinite(length) and length > 0):
+        raise ValueError(f"{name} must be a finite vector of three components that are not all zero")
+    return np.asarray(vector / length)
+
+
+class RadialModel(CameraModel):
+    """A camera with radial distortion about an optical axis O: base class of CAHVOR and CAHVORE.
+
+    The image of P is that of the direction O + kappa lambda, where lambda is the component of P - C perpendicular to O.
+    The models differ in kappa. Both move a ray from its "distance" chi from the axis (for a perspective lens the
+    tangent of its angle) to
+
+        f(chi) = (1 + rho0) chi + rho1 chi^3 + rho2 chi^5
+
+    (Gennery 2006: mu = rho0 + rho1 tau + rho2 tau^2 with tau = chi^2). The range of f ends at its first maximum: beyond
+    it the picture would fold back.
+    """
+
+    o: Float[np.ndarray, "3"]
+    r: Float[np.ndarray, "3"]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        length = float(np.linalg.norm(self.o))
+        if abs(length - 1) > UNIT_TOLERANCE:
+            raise ValueError(f"o must be a unit vector (to {UNIT_TOLERANCE:g}); its length is {length!r}")
+        if not self._axis @ self.a > 0:
+            raise ValueError("o must point to the same side of the image plane as a")
+        if not self.r[0] > -1:
+            raise ValueError(
+                f"r must begin with a number above -1 (1 + r[0] scales the image), not {float(self.r[0])!r}"
+            )
+
+    @cached_property
+    def _axis(self) -> NDArray[np.float64]:
+        """O normalised: labels round it to six digits."""
+        return np.asarray(self.o / np.linalg.norm(self.o))
+
+    @property
+    def _pupil_axis(self) -> NDArray[np.float64]:
+        return self._axis
+
+    @cached_property
+    def _axis_image(self) -> tuple[float, float, float]:
+        """(O.H, O.V, O.A)."""
+        return float(self._axis @ self.h), float(self._axis @ self.v), float(self._axis @ self.a)
+
+    @cached_property
+    def _polynomial(self) -> tuple[float, float, float]:
+        """Coefficients k1 > 0, k3 and k5 of f."""
+        return 1 + float(self.r[0]), float(self.r[1]), float(self.r[2])
+
+    @cached_property
+    def _limits(self) -> tuple[float, float]:
+        """chi^2 and f(chi)^2 at the first maximum of f; infinite if it has none, or only at 90 deg to rounding."""
+        k1, k3, k5 = self._polynomial
+        tau, discriminant = np.inf, 9 * k3**2 - 20 * k5 * k1
+        if k5 == 0:
+            tau = -k1 / (3 * k3) if k3 < 0 else np.inf
+        elif discriminant >= 0:
+            # the two roots of k1 + 3 k3 tau + 5 k5 tau^2, in the form without cancellation
+            half = -0.5 * (3 * k3 + np.copysign(np.sqrt(discriminant), k3))
+            roots = [half / (5 * k5), k1 / half if half else -np.inf]
+            tau = min((float(root) for root in roots if root > 0), default=np.inf)
+        if not tau < _UNLIMITED_TAU:
+            return np.inf, np.inf
+        return float(tau), float(tau * (k1 + tau * (k3 + tau * k5)) ** 2)
+
+    def _off_axis(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Gradient]:
+        """Component of P - C along O, and the vector lambda perpendicular to O."""
+        along = dot(self._axis, x, y, z)
+        return along, (x - along * self._axis[0], y - along * self._axis[1], z - along * self._axis[2])
+
+    def _radial_gradient(self, off: Gradient, kappa: Vector, kappa_gradient: Gradient) -> tuple[Gradient, Gradient]:
+        """Gradients of the pixel of O + kappa lambda, from kappa's."""
+        across = [dot(vector, *off) for vector in (self.h, self.v, self.a)]
+        onto = self._axis_image
+        depth = onto[2] + kappa * across[2]
+
+        def gradient(k: int, vector: NDArray[np.float64]) -> Gradient:
+            pixel = (onto[k] + kappa * across[k]) / depth
+            slope = (across[k] - pixel * across[2]) / depth
+            x, y, z = (
+                kappa * ((vector[i] - onto[k] * self._axis[i]) - pixel * (self.a[i] - onto[2] * self._axis[i])) / depth
+                + slope * kappa_gradient[i]
+                for i in range(3)
+            )
+            return x, y, z
+
+        return gradient(0, self.h), gradient(1, self.v)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Cahvor(RadialModel):
+    """A camera with radial distortion.
+
+    A point P is moved to P' = P + mu lambda before the linear projection, with omega = (P - C).O,
+    lambda = P - C - omega O, tau = lambda.lambda / omega^2 and mu = rho0 + rho1 tau + rho2 tau^2. Points beyond the tau
+    at which the distance (1 + mu) sqrt(tau) from the axis stops growing are not visible.
+
+    - c, a, h, v, size: as in `CameraModel`
+    - o: unit vector O of the optical axis; only its direction is used
+    - r: (rho0, rho1, rho2)
+
+    Raises ValueError as `Cahv`; or if O is not a unit vector or points away from A, or rho0 <= -1.
+    """
+
+    c: Float[np.ndarray, "3"]
+    a: Float[np.ndarray, "3"]
+    h: Float[np.ndarray, "3"]
+    v: Float[np.ndarray, "3"]
+    o: Float[np.ndarray, "3"]
+    r: Float[np.ndarray, "3"]
+    size: tuple[int, int]
+
+    @classmethod
+    def from_cahv(cls, cahv: Cahv, r: Triple, o: Triple | None = None) -> Cahvor:
+        """Add distortion `r` (rho0, rho1, rho2) about the unit vector `o` (A by default) to a pinhole camera."""
+        axis = cahv.a if o is None else np.asarray(o, dtype=np.float64)
+        return cls(cahv.c, cahv.a, cahv.h, cahv.v, axis, np.asarray(r, dtype=np.float64), cahv.size)
+
+    def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
+        image: tuple[Vector, Vector, NDArray[np.bool_]] = kernels.radial_image(
+            (x, y, z), self._axis, (self.h, self.v, self.a), self._axis_image, self.r, self._limits[0]
+        )
+        return image
+
+    def _image_gradient(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+        omega = dot(self._axis, x, y, z)
+        tau = np.maximum((x * x + y * y + z * z) / (omega * omega) - 1, 0)
+        kappa = (1 + (self.r[0] + tau * (self.r[1] + tau * self.r[2]))) / omega
+        mu_slope = (self.r[1] + 2 * self.r[2] * tau) * 2 / omega**3
+        along, off = self._off_axis(x, y, z)
+        # d tau = 2 (lambda / omega^2 - tau / omega O).dP, because lambda is perpendicular to O
+        kappa_x, kappa_y, kappa_z = (
+            mu_slope * (off[i] - tau * omega * self._axis[i]) - kappa / along * self._axis[i] for i in range(3)
+        )
+        return self._radial_gradient(off, kappa, (kappa_x, kappa_y, kappa_z))
+
+    def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
+        direction: Gradient = kernels.radial_sight(
+            u, v, self._direction_from_pixel, self._axis, self._polynomial, self._limits
+        )
+        return direction, None
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Cahvore(RadialModel):
+    """A wide-angle camera whose entrance pupil moves along the optical axis.
+
+    A ray that makes the angle theta with O starts at C + s O, with
+    s = (theta / sin theta - 1) (e0 + e1 theta^2 + e2 theta^4). Its "distance" from the axis, L being the linearity, is
+
+        chi = tan(L theta) / L   (L > 0; L = 1 is a perspective lens)
+        chi = theta              (L = 0, an equidistant fisheye)
+        chi = sin(L theta) / L   (L < 0; L = -1 is orthographic)
+
+    It is moved to (1 + rho0) chi + rho1 chi^3 + rho2 chi^5 and projected linearly. Points outside the range in which
+    this is one-to-one are not visible, nor are points so near that none or several rays pass through them.
+
+    - c, a, h, v, size: as in `CameraModel`; C is the entrance pupil for rays along the axis
+    - o, r: as in `Cahvor`
+    - e: (e0, e1, e2) of the pupil's motion, metres
+    - linearity: L, from -1 to 1
+
+    Raises ValueError as `Cahvor`; or if the linearity is not from -1 to 1.
+    """
+
+    c: Float[np.ndarray, "3"]
+    a: Float[np.ndarray, "3"]
+    h: Float[np.ndarray, "3"]
+    v: Float[np.ndarray, "3"]
+    o: Float[np.ndarray, "3"]
+    r: Float[np.ndarray, "3"]
+    e: Float[np.ndarray, "3"]
+    linearity: Real = field(kw_only=True)
+    size: tuple[int, int] = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "linearity", float(self.linearity) + 0.0)
+        if not -1 <= self.linearity <= 1:
+            raise ValueError(f"linearity must lie between -1 and 1, not {self.linearity!r}")
+
+    @classmethod
+    def from_cahv(
+        cls, cahv: Cahv, r: Triple, e: Triple = (0.0, 0.0, 0.0), *, linearity: Real, o: Triple | None = None
+    ) -> Cahvore:
+        """Put a wide-angle lens about the unit vector `o` (A by default) before a pinhole camera's image plane."""
+        axis = cahv.a if o is None else np.asarray(o, dtype=np.float64)
+        radial, pupil = np.asarray(r, dtype=np.float64), np.asarray(e, dtype=np.float64)
+        return cls(cahv.c, cahv.a, cahv.h, cahv.v, axis, radial, pupil, linearity=linearity, size=cahv.size)
+
+    @cached_property
+    def _theta_limit(self) -> float:
+        """Angle from the axis up to which the lens is one-to-one, radians."""
+        chi = np.sqrt(self._limits[0])
+        return min(float(self._theta(np.array([chi]))[0]), np.pi)
+
+    def _chi(self, theta: Vector) -> Vector:
+        scale = self.linearity
+        if scale > _ZERO_LINEARITY:
+            return np.tan(scale * theta) / scale
+        return np.sin(scale * theta) / scale if scale < -_ZERO_LINEARITY else theta
+
+    def _chi_slope(self, theta: Vector) -> Vector:
+        cosine = np.cos(self.linearity * theta)
+        return 1 / (cosine * cosine) if self.linearity > _ZERO_LINEARITY else cosine
+
+    def _theta(self, chi: Vector) -> Vector:
+        """Inverse of `_chi`; beyond the end of its range, the angle at the end."""
+        scale = self.linearity
+        if scale > _ZERO_LINEARITY:
+            return np.arctan(scale * chi) / scale
+        return np.arcsin(np.maximum(scale * chi, -1)) / scale if scale < -_ZERO_LINEARITY else chi
+
+    def _pupil(self, theta: Vector) -> tuple[Vector, Vector]:
+        """e0 + e1 theta^2 + e2 theta^4 and its derivative."""
+        square = theta * theta
+        series = self.e[0] + square * (self.e[1] + square * self.e[2])
+        return series, theta * (2 * self.e[1] + 4 * self.e[2] * square)
+
+    def _angle(self, along: Vector, across: Vector) -> tuple[Vector, Vector]:
+        """Angle theta of the ray through a point `along` the axis and `across` from it (NaN if none), and upsilon.
+
+        Newton's method on along sin theta - across cos theta - (theta - sin theta) (e0 + e1 theta^2 + e2 theta^4) = 0.
+        """
+        theta = np.arctan2(across, along)
+        upsilon = step = np.zeros_like(theta)
+        for _ in range(_NEWTON_STEPS):
+            sine, cosine = np.sin(theta), np.cos(theta)
+            series, slope = self._pupil(theta)
+            lag = theta - sine
+            upsilon = along * cosine + across * sine - (1 - cosine) * series - lag * slope
+            step = (along * sine - across * cosine - lag * series) / upsilon
+            theta = theta - step
+            if not np.any(np.abs(step) > 1e-9):  # the error is of the step's square
+                break
+        solved = (np.abs(step) <= 1e-9) & (upsilon > 0) & (theta >= 0) & (theta < self._theta_limit)
+        return np.where(solved, theta, np.nan), upsilon
+
+    def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
+        along, off = self._off_axis(x, y, z)
+        across = np.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+        theta, _ = self._angle(along, across)
+        kappa = self._kappa(self._chi(theta), along, across)
+        onto = self._axis_image
+        depth = onto[2] + kappa * dot(self.a, *off)
+        u = (onto[0] + kappa * dot(self.h, *off)) / depth
+        v = (onto[1] + kappa * dot(self.v, *off)) / depth
+        return u, v, depth > 0
+
+    def _kappa(self, chi: Vector, along: Vector, across: Vector) -> Vector:
+        (k1, k3, k5), tau = self._polynomial, chi * chi
+        gain = k1 + tau * (k3 + tau * k5)
+        return gain * np.where(across > 0, chi / across, 1 / along)
+
+    def _image_gradient(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+        along, off = self._off_axis(x, y, z)
+        across = np.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+        theta, upsilon = self._angle(along, across)
+        chi = self._chi(theta)
+        kappa = self._kappa(chi, along, across)
+        (k1, k3, k5), tau = self._polynomial, chi * chi
+        slope = (k1 + tau * (3 * k3 + tau * 5 * k5)) * self._chi_slope(theta)
+        # kappa = f(chi) / across; on the axis lambda vanishes, and with it the effect of kappa's gradient
+        inverse = np.where(across > 0, 1 / across, 0.0)
+        by_across = (slope * np.cos(theta) / upsilon - kappa) * inverse
+        by_along = -slope * np.sin(theta) / upsilon * inverse
+        kappa_x, kappa_y, kappa_z = (by_across * off[i] * inverse + by_along * self._axis[i] for i in range(3))
+        return self._radial_gradient(off, kappa, (kappa_x, kappa_y, kappa_z))
+
+    def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
+        along, off = self._off_axis(*self._image_plane_direction(u, v))
+        along = np.where(along > 0, along, np.nan)
+        across = np.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+        distorted = across / along
+        ratio = kernels.undistortion(self._polynomial, self._limits, distorted * distorted)
+        theta = self._theta(distorted * ratio)
+        theta = np.where(theta < self._theta_limit, theta, np.nan)
+        sine, cosine = np.sin(theta), np.cos(theta)
+        outward = np.where(across > 0, sine / across, 0.0)
+        x, y, z = (cosine * self._axis[i] + outward * off[i] for i in range(3))
+        shift = np.where(theta > 0, theta / sine - 1, 0.0) * self._pupil(theta)[0]
+        return (x, y, z), shift
