@@ -33,25 +33,17 @@ class VelocityOutcome(Enum):
 class VelocityEstimate:
     """An answer to "how fast does the lander move over the ground".
 
-    Attributes
-    ----------
-    outcome
-        How the estimation ended.
-    velocity_m_s
-        Horizontal velocity (east, north) in m/s: the mean velocity of the camera over `span_s`; None unless the outcome
-        is VALID.
-    details
-        The algorithm's intermediate products for figures and diagnosis; None where it keeps none.
-    covariance_m2_s2
-        Covariance of the velocity's error as the algorithm has it, (east, north), m2/s2; None where it states none.
-        Errors are then held against it as well.
-    span_s
-        Begin and end of what the velocity is the mean of, as time tags, from the first picture's to the last one's that
-        the algorithm has; equal ones mean the velocity at that instant. None: the last interval, which is from the
-        second to the third picture where there are three.
-    after_pictures
-        Of a stream (`VelocityStream`) what it answered after each picture, None where nothing; filled in by whoever
-        runs it. Empty of others.
+    - outcome: How the estimation ended
+    - velocity_m_s: Horizontal velocity (east, north) in m/s: the mean velocity of the camera over `span_s`; None unless
+      the outcome is VALID
+    - details: The algorithm's intermediate products for figures and diagnosis; None where it keeps none
+    - covariance_m2_s2: Covariance of the velocity's error as the algorithm has it, (east, north), m2/s2; None where it
+      states none. Errors are then held against it as well.
+    - span_s: Begin and end of what the velocity is the mean of, as time tags, from the first picture's to the last
+      one's that the algorithm has; equal ones mean the velocity at that instant. None: the last interval, which is from
+      the second to the third picture where there are three.
+    - after_pictures: Of a stream (`VelocityStream`) what it answered after each picture, None where nothing; filled in
+      by whoever runs it. Empty of others.
     """
 
     outcome: VelocityOutcome
@@ -122,12 +114,8 @@ class PixelBox:
 class MastAim:
     """Where a tracker wants the mast to look and which pixels it needs.
 
-    Attributes
-    ----------
-    azimuth_rad, elevation_rad
-        Mast angles to command (see `marsyard.sim.measurements.MastGeometry`).
-    left, right
-        The parts of the full frames to deliver; their exposure is best set for them too.
+    - azimuth_rad, elevation_rad: Mast angles to command (see `marsyard.sim.measurements.MastGeometry`)
+    - left, right: The parts of the full frames to deliver; their exposure is best set for them too
     """
 
     azimuth_rad: float
@@ -140,18 +128,12 @@ class MastAim:
 class TargetUpdate:
     """An answer to "where is the target now".
 
-    Attributes
-    ----------
-    state
-        State after the update.
-    losses
-        Why the target was not found, in the order of `TargetLoss`; empty when it was, or was not looked for (no target,
-        failure).
-    position_rover
-        The target in the rover frame of this stop, metres, shape (3,): triangulated when it was found, else carried
-        along by the pose estimate; None before it was seen for the first time.
-    details
-        The algorithm's intermediate products for figures and diagnosis; None where it keeps none.
+    - state: State after the update
+    - losses: Why the target was not found, in the order of `TargetLoss`; empty when it was, or was not looked for (no
+      target, failure)
+    - position_rover: The target in the rover frame of this stop, metres: triangulated when it was found, else carried
+      along by the pose estimate; None before it was seen for the first time
+    - details: The algorithm's intermediate products for figures and diagnosis; None where it keeps none
     """
 
     state: TrackingState
@@ -223,15 +205,10 @@ class SiteOutcome(Enum):
 class SiteEstimate:
     """An answer to "where can one land".
 
-    Attributes
-    ----------
-    outcome
-        How the search ended.
-    site_world
-        Where to land, in the world frame of the on-board poses, metres; the a-priori site where the algorithm did not
-        converge, None where the ground has no safe site.
-    details
-        The algorithm's intermediate products for figures and diagnosis; None where it keeps none.
+    - outcome: How the search ended
+    - site_world: Where to land, in the world frame of the on-board poses, metres; the a-priori site where the algorithm
+      did not converge, None where the ground has no safe site
+    - details: The algorithm's intermediate products for figures and diagnosis; None where it keeps none
     """
 
     outcome: SiteOutcome

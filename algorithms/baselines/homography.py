@@ -9,7 +9,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from marsyard.algorithms.baselines.pairs import COMMON, CommonOptions, PairMatch, PairPatches, estimate_by_pairs
+from marsyard.algorithms.baselines.pairs import (
+    DEFAULT_COMMON_OPTIONS,
+    CommonOptions,
+    PairMatch,
+    PairPatches,
+    estimate_by_pairs,
+)
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.sim.measurements import DescentMeasurements
 
@@ -18,29 +24,19 @@ from marsyard.sim.measurements import DescentMeasurements
 class HomographyOptions:
     """Options of the estimator.
 
-    Attributes
-    ----------
-    common
-        Geometry and IMU check.
-    features
-        Features looked for in each picture.
-    fast_threshold
-        Grey levels by which a feature differs from its surroundings, after the stretch to 8 bits.
-    max_ratio
-        Largest distance of the best match over that of the second best (Lowe's ratio).
-    reprojection_px
-        Largest distance of an inlier from where the homography puts it, rectified pixels.
-    min_inliers
-        Least number of inliers: chance matches of pictures of different ground agreed in up to 6, those
-        of shifted ones with the flight camera's noise in 190 and above.
-    max_distortion
-        Largest change of any length by the homography in the middle of the inliers, as a share: altitudes and attitudes
-        within specification leave 0.02; more says that they are wrong.
-    confidence, iterations
-        Of the robust estimation.
+    - common: Geometry and IMU check
+    - features: Features looked for in each picture
+    - fast_threshold: Grey levels by which a feature differs from its surroundings, after the stretch to 8 bits
+    - max_ratio: Largest distance of the best match over that of the second best (Lowe's ratio)
+    - reprojection_px: Largest distance of an inlier from where the homography puts it, rectified pixels
+    - min_inliers: Least number of inliers: chance matches of pictures of different ground agreed in up to 6, those of
+      shifted ones with the flight camera's noise in 190 and above
+    - max_distortion: Largest change of any length by the homography in the middle of the inliers, as a share: altitudes
+      and attitudes within specification leave 0.02; more says that they are wrong
+    - confidence, iterations: Of the robust estimation
     """
 
-    common: CommonOptions = COMMON
+    common: CommonOptions = DEFAULT_COMMON_OPTIONS
     features: int = 500
     fast_threshold: int = 5
     max_ratio: float = 0.8
@@ -67,7 +63,7 @@ class HomographyEstimator:
         return estimate_by_pairs(measurements, self._match, self.options.common)
 
     def _match(self, patches: PairPatches) -> PairMatch | None:
-        points = matched_points(patches, self.options)
+        points = match_features(patches, self.options)
         if points is None:
             return None
         first, second = points
@@ -101,20 +97,20 @@ def distortion(
     return float(np.abs(np.linalg.svd(jacobian, compute_uv=False) - 1.0).max())
 
 
-def eight_bit(patch: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
+def stretch_to_8_bits(patch: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
     """The patch stretched to 8 bits between its 0.5 % and its 99.5 % quantile."""
     low, high = np.quantile(patch, (0.005, 0.995))
     scaled = (patch - low) * (255.0 / max(float(high - low), 1e-9))
     return np.asarray(np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
 
 
-def matched_points(
+def match_features(
     patches: PairPatches, options: HomographyOptions
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]] | None:
     """Places (column, row) of features in both pictures that match; None for fewer than a homography takes."""
     orb = cv2.ORB.create(nfeatures=options.features, fastThreshold=options.fast_threshold)
     (first, first_bits), (second, second_bits) = (
-        orb.detectAndCompute(eight_bit(patch), None) for patch in (patches.first, patches.second)
+        orb.detectAndCompute(stretch_to_8_bits(patch), None) for patch in (patches.first, patches.second)
     )
     if first_bits is None or second_bits is None or len(second) < 2:
         return None

@@ -1,25 +1,24 @@
-"""Pairs of pictures rectified to a common camera that looks straight down, and what becomes of their shifts.
+"""Image pairs rectified to a common camera that looks straight down, and the phase correlation of such pairs.
 
-The baselines see the same corrected pictures as DIMES, in the same geometry
-(`marsyard.algorithms.dimes.rectification`), but all of what two pictures share rather than templates; and the IMU
-checks the change between their two velocities as DIMES' check does, with the same threshold. What differs is how the
-shift is found.
+The baselines see the same corrected images as DIMES, in the same geometry (`marsyard.algorithms.dimes.rectify_views`),
+but the whole overlap of two images rather than templates. The IMU checks the change between their two velocities as in
+DIMES, with the same threshold. Only the measurement of the shift differs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import final
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.binning import View, usable_views
-from marsyard.algorithms.dimes.consistency import combinations
-from marsyard.algorithms.dimes.ground import inside_frame, pixel_angle_rad
+from marsyard.algorithms.dimes.binning import View, inside_frame, pixel_angle_rad, usable_views
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.rectification import ground_lattice, rectified_patch
+from marsyard.algorithms.dimes.rectification import ground_lattice, rectify_patch
+from marsyard.algorithms.dimes.validity import combinations
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 
@@ -31,14 +30,10 @@ COARSE_STEP_PX = 8
 class CommonOptions:
     """What both baselines share; the geometry's numbers are DIMES' own.
 
-    Attributes
-    ----------
-    binned_size, max_speed_m_s, max_off_nadir_rad, border_px, imu_threshold_m_s
-        As in `DimesOptions`.
-    min_side_px
-        Least side of the common square, rectified pixels: the search range twice, so that half of it stays in view.
-    max_side_px
-        Largest side of the common square.
+    - binned_size, max_speed_m_s, max_off_nadir_rad, border_px, imu_threshold_m_s: As in `DimesOptions`
+    - min_side_px: Least side of the common square, rectified pixels: the search range twice, so that half of it stays
+      in view
+    - max_side_px: Largest side of the common square
     """
 
     binned_size: tuple[int, int] = DimesOptions.binned_size
@@ -51,19 +46,15 @@ class CommonOptions:
 
 
 #: What both take where they are told nothing else.
-COMMON = CommonOptions()
+DEFAULT_COMMON_OPTIONS = CommonOptions()
 
 
 @dataclass(frozen=True)
 class PairPatches:
     """The same square of ground, were there no motion, in both pictures of a pair.
 
-    Attributes
-    ----------
-    first, second
-        Corrected and rectified, counts, north up, shape (side, side).
-    gsd_m
-        Ground distance between pixels, metres.
+    - first, second: Corrected and rectified, counts, north up, shape (side, side)
+    - gsd_m: Ground distance between pixels
     """
 
     first: Float[np.ndarray, "side side"]
@@ -75,14 +66,9 @@ class PairPatches:
 class PairMatch:
     """The shift of one pair.
 
-    Attributes
-    ----------
-    shift_px
-        By how much what the first patch shows is found shifted in the second: (columns, rows), rectified pixels.
-    score
-        What the match's validity is judged by; larger is better.
-    valid
-        Whether it passed.
+    - shift_px: By how much what the first patch shows is found shifted in the second: (columns, rows), rectified pixels
+    - score: What the match's validity is judged by; larger is better
+    - valid: Whether it passed
     """
 
     shift_px: Float[np.ndarray, "2"]
@@ -101,7 +87,7 @@ class BaselineDetails:
 Matcher = Callable[[PairPatches], PairMatch | None]
 
 
-def common_square(
+def find_common_square(
     first: View, second: View, options: CommonOptions
 ) -> tuple[Float[np.ndarray, "2"], int, float] | None:
     """The largest square of ground that both views see at zero motion: its middle, side in pixels, ground distance.
@@ -122,13 +108,13 @@ def common_square(
     return (lattice[row, column], side, gsd) if side >= options.min_side_px else None
 
 
-def pair_patches(first: View, second: View, options: CommonOptions) -> PairPatches | None:
+def rectify_pair(first: View, second: View, options: CommonOptions) -> PairPatches | None:
     """Both pictures of a pair over their common ground; None where there is too little of it."""
-    found = common_square(first, second, options)
+    found = find_common_square(first, second, options)
     if found is None:
         return None
     middle, side, gsd = found
-    return PairPatches(rectified_patch(first, middle, side, gsd), rectified_patch(second, middle, side, gsd), gsd)
+    return PairPatches(rectify_patch(first, middle, side, gsd), rectify_patch(second, middle, side, gsd), gsd)
 
 
 def pair_velocity(patches: PairPatches, match: PairMatch, interval_s: float) -> Float[np.ndarray, "2"]:
@@ -142,7 +128,7 @@ def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, optio
     if triple is None:
         return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, BaselineDetails((), ()))
     views = ((triple[0], triple[1]), (triple[1], triple[2]))
-    patches = tuple(pair_patches(first, second, options) for first, second in views)
+    patches = tuple(rectify_pair(first, second, options) for first, second in views)
     matches = tuple(None if of_pair is None else matcher(of_pair) for of_pair in patches)
     details = BaselineDetails(patches, matches)
     if None in patches:
@@ -158,3 +144,36 @@ def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, optio
     if not agreement.discrepancy_m_s < options.imu_threshold_m_s:
         return VelocityEstimate(VelocityOutcome.IMU_MISMATCH, None, details)
     return VelocityEstimate(VelocityOutcome.VALID, velocities[1], details)
+
+
+@dataclass(frozen=True)
+class PhaseCorrelationOptions:
+    """Options of the estimator.
+
+    - common: Geometry and IMU check
+    - min_response: Least response: the peak's energy, 1 for equal pictures. Pictures of different ground gave up to
+      0.12, shifted ones with the flight camera's noise 0.79 and above.
+    """
+
+    common: CommonOptions = DEFAULT_COMMON_OPTIONS
+    min_response: float = 0.25
+
+
+@final
+class PhaseCorrelationEstimator:
+    """Horizontal velocity from the shift between rectified pictures, by `cv2.phaseCorrelate` under a Hann window."""
+
+    def __init__(self, options: PhaseCorrelationOptions | None = None) -> None:
+        self.options = PhaseCorrelationOptions() if options is None else options
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """The estimate; its details are `BaselineDetails`. Raises as `DimesEstimator.estimate` does."""
+        return estimate_by_pairs(measurements, self._match, self.options.common)
+
+    def _match(self, patches: PairPatches) -> PairMatch | None:
+        first, second = patches.first, patches.second
+        if np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
+            return None
+        window = cv2.createHanningWindow((first.shape[1], first.shape[0]), cv2.CV_64F)
+        shift, response = cv2.phaseCorrelate(first - first.mean(), second - second.mean(), window)
+        return PairMatch(np.array(shift, dtype=np.float64), float(response), response >= self.options.min_response)

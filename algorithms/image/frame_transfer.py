@@ -21,7 +21,7 @@ from marsyard.algorithms.image.kernels import frame_transfer as kernels
 from marsyard.sim.measurements import DetectorCalibration
 
 
-def without_frame_transfer(
+def remove_frame_transfer(
     signal: Float[np.ndarray, "rows columns"], calibration: DetectorCalibration, rows_summed: int
 ) -> Float[np.ndarray, "rows columns"]:
     """The signal of the exposure alone, in the units of `signal`, from whole columns of a delivered picture.
@@ -29,19 +29,11 @@ def without_frame_transfer(
     Inverts the transfer exactly for a scene that does not move during it and is constant within each delivered row. Of
     a camera without frame transfer it is the signal itself, whatever the exposure.
 
-    Parameters
-    ----------
-    signal
-        Counts above the offset, all rows, any columns: they do not mix.
-    calibration
-        Exposure and row times.
-    rows_summed
-        Physical rows in a row of `signal`.
+    - signal: Counts above the offset, all rows, any columns: they do not mix
+    - calibration: Exposure and row times
+    - rows_summed: Physical rows in a row of `signal`
 
-    Raises
-    ------
-    ValueError
-        If the exposure is too short against the row times for the transfer to be inverted.
+    Raises ValueError if the exposure is too short against the row times for the transfer to be inverted.
     """
     n, a, b = rows_summed, calibration.transfer_row_s, calibration.clear_row_s
     if a == 0.0 and b == 0.0:

@@ -26,12 +26,8 @@ class HandOffOutcome(Enum):
 class ArmTarget:
     """What the arm gets.
 
-    Attributes
-    ----------
-    position_rover
-        The target in the rover frame, metres, shape (3,).
-    error_m
-        Its error of 3 sigma by Eq. 5, metres.
+    - position_rover: The target in the rover frame, metres
+    - error_m: Its error of 3 sigma by Eq. 5.
     """
 
     position_rover: Float[np.ndarray, "3"]

@@ -28,12 +28,8 @@ from marsyard.sim.camera import CameraModel
 class Journey:
     """The distances that the tolerances depend on, metres.
 
-    Attributes
-    ----------
-    seed_m, last_m, now_m
-        From the camera to the target at the seed, at the last sighting, and now.
-    step_m, driven_m
-        How far the rover moved since the last sighting, and along its path since the seed.
+    - seed_m, last_m, now_m: From the camera to the target at the seed, at the last sighting, and now
+    - step_m, driven_m: How far the rover moved since the last sighting, and along its path since the seed
     """
 
     seed_m: float
@@ -72,14 +68,9 @@ def tolerances(journey: Journey, left: CameraModel, right: CameraModel, options:
 class Evidence:
     """What the four criteria judge.
 
-    Attributes
-    ----------
-    match_score, stereo_score
-        Normalised correlation of the match and of point stereo.
-    distance_correction_m
-        Distance of the target found less that predicted.
-    position_correction_m
-        How far the target now lies from where it was first seen, in the world as estimated.
+    - match_score, stereo_score: Normalised correlation of the match and of point stereo
+    - distance_correction_m: Distance of the target found less that predicted
+    - position_correction_m: How far the target now lies from where it was first seen, in the world as estimated
     """
 
     match_score: float
@@ -88,7 +79,7 @@ class Evidence:
     position_correction_m: float
 
 
-def losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) -> tuple[TargetLoss, ...]:
+def find_losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) -> tuple[TargetLoss, ...]:
     """Which of the four criteria declare the target lost."""
     criteria = {
         TargetLoss.LOW_MATCH_SCORE: evidence.match_score < options.min_match_score,

@@ -38,8 +38,8 @@ def match_by_lucas_kanade(
     start = np.full((1, 1, 2), reach, dtype=np.float32)
     guess = (predicted - corner).astype(np.float32).reshape(1, 1, 2)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
-        _eight_bits(before),
-        _eight_bits(after),
+        _normalize_to_8_bits(before),
+        _normalize_to_8_bits(after),
         start,
         guess.copy(),
         winSize=(options.template_px, options.template_px),
@@ -59,7 +59,7 @@ def correlation(a: Float[np.ndarray, "n m"], b: Float[np.ndarray, "n m"]) -> flo
     return float(np.sum(x * y)) / energy if energy > 0.0 else 0.0
 
 
-def _eight_bits(image: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
+def _normalize_to_8_bits(image: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
     """The picture about a middle grey, its contrast made the same: exposures differ from stop to stop."""
     spread = max(float(image.std()), 1e-9)
     return np.asarray(np.clip(MIDDLE + COUNTS_PER_SIGMA * (image - image.mean()) / spread, 0, 255).astype(np.uint8))

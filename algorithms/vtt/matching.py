@@ -10,11 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.image.alignment import SURROUND
-from marsyard.algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
-from marsyard.algorithms.image.peak import Peak, biquadratic_offset
-from marsyard.algorithms.image.registration import Warp, registered, splined
-from marsyard.algorithms.image.resampling import similarity_patch
+from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, coarse_to_fine_peak, normalized_correlation
+from marsyard.algorithms.image.registration import SURROUND, Warp, build_spline, register_template, similarity_patch
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.target import bearing_rad
 from marsyard.sim.camera import CameraModel
@@ -28,18 +25,11 @@ class Sighting:
     The template is not stored: it is resampled from the picture once its magnification and roll are known, so that it
     is interpolated once only, at the target's sub-pixel position.
 
-    Attributes
-    ----------
-    image
-        The left picture.
-    pixel
-        The target in it, full-frame (u, v), shape (2,).
-    position_head
-        The target in the frame of the mast's head as it was, metres, shape (3,).
-    camera
-        The left camera in that frame.
-    world_from_head, world_from_rover
-        The head's and the rover's pose as estimated then.
+    - image: The left picture
+    - pixel: The target in it, full-frame (u, v)
+    - position_head: The target in the frame of the mast's head as it was, metres
+    - camera: The left camera in that frame
+    - world_from_head, world_from_rover: The head's and the rover's pose as estimated then
     """
 
     image: MastImage
@@ -72,14 +62,9 @@ class Change:
 class Match:
     """The target in the new left picture.
 
-    Attributes
-    ----------
-    pixel
-        Full-frame (u, v), shape (2,).
-    score
-        Normalised correlation (Eq. 11) of the template with the picture there.
-    template
-        What was searched for: the old picture about the target, magnified and rolled.
+    - pixel: Full-frame (u, v)
+    - score: Normalised correlation (Eq. 11) of the template with the picture there.
+    - template: What was searched for: the old picture about the target, magnified and rolled
     """
 
     pixel: Float[np.ndarray, "2"]
@@ -129,14 +114,9 @@ def has_room(image: MastImage, pixel: Float[np.ndarray, "2"], side: int) -> bool
 class Refinement:
     """A match below a pixel.
 
-    Attributes
-    ----------
-    corner
-        Row and column of its upper left pixel in the picture's counts, shape (2,).
-    score
-        Normalised correlation of the template as it was searched for, shifted there.
-    warped_score
-        The same of the template as it was registered, warped.
+    - corner: Row and column of its upper left pixel in the picture's counts
+    - score: Normalised correlation of the template as it was searched for, shifted there
+    - warped_score: The same of the template as it was registered, warped
     """
 
     corner: Float[np.ndarray, "2"]
@@ -144,7 +124,7 @@ class Refinement:
     warped_score: float
 
 
-def refined(
+def refine_match(
     template: Float[np.ndarray, "n n"],
     image: MastImage,
     corner: Float[np.ndarray, "2"],
@@ -161,14 +141,14 @@ def refined(
     near = np.maximum(corner.astype(int) - SURROUND - 2, 0)
     far = corner.astype(int) + len(template) + SURROUND + 2
     region = image.counts[near[0] : far[0], near[1] : far[1]].astype(np.float64)
-    part = splined(region, corner + offset - near, len(template))
-    shifted = registered(template, part, corner + offset - near, "shift")
+    part = build_spline(region, corner + offset - near, len(template))
+    shifted = register_template(template, part, corner + offset - near, "shift")
     if shifted is None:
         return Refinement(corner + offset, whole.value, whole.value)
     best = shifted
     for warp in _WARPS[options.warp]:
-        part = splined(region, best.corner, len(template), known=part)
-        warped = registered(template, part, best.corner, warp)
+        part = build_spline(region, best.corner, len(template), known=part)
+        warped = register_template(template, part, best.corner, warp)
         if warped is None:
             break
         best = warped
@@ -189,11 +169,11 @@ def match_by_correlation(
     corner = np.array([peak.row, peak.column]) + np.array(window_corner[::-1], dtype=np.float64) - image.corner[::-1]
     best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
-        best = refined(template, image, corner, _top(template, window, peak), peak, options)
+        best = refine_match(template, image, corner, _biquadratic_top(template, window, peak), peak, options)
     return Match(best.corner[::-1] + half + image.corner, best.score, template)
 
 
-def _top(
+def _biquadratic_top(
     template: Float[np.ndarray, "n n"], window: Float[np.ndarray, "rows columns"], peak: Peak
 ) -> Float[np.ndarray, "2"]:
     """Offset (row, column) of the fit to the correlation about its peak; zero on the window's border."""

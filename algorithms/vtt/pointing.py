@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.image.alignment import SURROUND
+from marsyard.algorithms.image.registration import SURROUND
 from marsyard.algorithms.interface import MastAim, PixelBox
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.stereo import epipolar_pixels
@@ -32,7 +32,7 @@ def mast_angles(
     target stays in both. None where no angles within the mast's limits do it.
     """
     cameras = (mast.left, mast.right) if pair else (mast.left,)
-    angles = _towards(position_rover, mast.geometry)
+    angles = _initial_angles(position_rover, mast.geometry)
     for _ in range(STEPS):
         offset, slope = _offset(position_rover, mast.geometry, cameras, angles)
         if not np.all(np.isfinite(slope)) or abs(np.linalg.det(slope)) < 1e-9:
@@ -40,11 +40,11 @@ def mast_angles(
         angles = angles - np.linalg.solve(slope, offset)
         if np.hypot(*offset) < TOLERANCE_PX:
             azimuth = float(np.arctan2(np.sin(angles[0]), np.cos(angles[0])))
-            return (azimuth, float(angles[1])) if _allowed(azimuth, float(angles[1]), mast.geometry) else None
+            return (azimuth, float(angles[1])) if _is_within_limits(azimuth, float(angles[1]), mast.geometry) else None
     return None
 
 
-def _towards(position_rover: Float[np.ndarray, "3"], mast: MastGeometry) -> Float[np.ndarray, "2"]:
+def _initial_angles(position_rover: Float[np.ndarray, "3"], mast: MastGeometry) -> Float[np.ndarray, "2"]:
     """Angles of the direction from the elevation axis to the point, the axis' own turn neglected."""
     x, y, z = position_rover - mast.base_m - np.array([0.0, 0.0, mast.elbow_m[2]])
     return np.array([np.arctan2(-y, x), np.arctan2(z, np.hypot(x, y))])
@@ -56,10 +56,7 @@ def _offset(
     cameras: tuple[CameraModel, ...],
     angles: Float[np.ndarray, "2"],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
-    """Mean distance of the point's pixels from the frames' middles, and its derivative by azimuth and elevation.
-
-    When the head turns about an axis w through a, a point p fixed in the rover moves by -w x (p - a) in the head.
-    """
+    """Mean distance of the point's pixels from the frames' middles, and its derivative by azimuth and elevation."""
     rover_from_head = mast.rover_from_head(float(angles[0]), float(angles[1]))
     to_head = turn_matrix(rover_from_head).T
     sine, cosine = np.sin(angles[0]), np.cos(angles[0])
@@ -73,7 +70,7 @@ def _offset(
     return np.mean(offsets, axis=0), np.mean(slopes, axis=0)
 
 
-def _allowed(azimuth_rad: float, elevation_rad: float, mast: MastGeometry) -> bool:
+def _is_within_limits(azimuth_rad: float, elevation_rad: float, mast: MastGeometry) -> bool:
     least, most = zip(mast.azimuth_limits_rad, mast.elevation_limits_rad, strict=True)
     return least[0] <= azimuth_rad <= most[0] and least[1] <= elevation_rad <= most[1]
 

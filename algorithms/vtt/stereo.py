@@ -8,9 +8,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.algorithms.image.normalized import normalized_correlation
-from marsyard.algorithms.image.peak import biquadratic_offset, highest_peak
-from marsyard.algorithms.vtt.matching import Refinement, refined
+from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, normalized_correlation
+from marsyard.algorithms.vtt.matching import Refinement, refine_match
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import MastImage
@@ -20,18 +19,12 @@ from marsyard.sim.measurements import MastImage
 class StereoMatch:
     """The target in the right picture.
 
-    Attributes
-    ----------
-    pixel
-        (u, v) in the right full frame, shape (2,).
-    score
-        Normalised correlation there of the template as it was registered. The other camera sees a slanted face
-        stretched, whatever the rover did: at 63 to 76 deg the template as it was cut correlates by 0.66 to 0.70 at the
-        right place, stretched by over 0.9.
-    band
-        The part of the right picture that was searched, counts, shape (rows, columns).
-    band_corner
-        (u, v) of the band's upper left pixel in the full frame.
+    - pixel: (u, v) in the right full frame
+    - score: Normalised correlation there of the template as it was registered. The other camera sees a slanted face
+      stretched, whatever the rover did: at 63 to 76 deg the template as it was cut correlates by 0.66 to 0.70 at the
+      right place, stretched by over 0.9.
+    - band: The part of the right picture that was searched, counts, shape (rows, columns)
+    - band_corner: (u, v) of the band's upper left pixel in the full frame
     """
 
     pixel: Float[np.ndarray, "2"]
@@ -76,7 +69,7 @@ def disparity_px_m(left: CameraModel, right: CameraModel) -> float:
     return right.focal_lengths[0] * float(np.linalg.norm(right.c - left.c))
 
 
-def searched_ranges(left: CameraModel, right: CameraModel, range_m: float, disparity_px: float) -> tuple[float, float]:
+def search_ranges(left: CameraModel, right: CameraModel, range_m: float, disparity_px: float) -> tuple[float, float]:
     """Least and largest range whose disparity differs by `disparity_px` at most from that of `range_m`."""
     step = disparity_px / disparity_px_m(left, right)
     inverse = 1.0 / range_m
@@ -84,27 +77,16 @@ def searched_ranges(left: CameraModel, right: CameraModel, range_m: float, dispa
 
 
 def point_stereo(
-    template: Float[np.ndarray, "n n"],
-    image: MastImage,
-    curve: Float[np.ndarray, "points 2"],
-    options: VttOptions,
+    template: Float[np.ndarray, "n n"], image: MastImage, curve: Float[np.ndarray, "points 2"], options: VttOptions
 ) -> StereoMatch | None:
     """The place near the epipolar curve of the right picture at which the left template matches best.
 
-    Parameters
-    ----------
-    template
-        What the left picture shows about the target.
-    image
-        The right picture.
-    curve
-        From `epipolar_pixels`, full-frame pixels.
-    options
-        Tolerance and sub-pixel refinement.
+    - template: What the left picture shows about the target
+    - image: The right picture
+    - curve: From `epipolar_pixels`, full-frame pixels
+    - options: Tolerance and sub-pixel refinement
 
-    Returns
-    -------
-    None where the picture has no room for the template anywhere along the curve.
+    Returns none where the picture has no room for the template anywhere along the curve.
     """
     half, tolerance = (len(template) - 1) // 2, options.epipolar_tolerance_px
     local = curve - np.array(image.corner, dtype=np.float64)
@@ -119,11 +101,11 @@ def point_stereo(
         return None
     band = image.counts[near[1] : far[1], near[0] : far[0]].astype(np.float64)
     surface = normalized_correlation(template, band)
-    peak = highest_peak(np.where(_off_curve(local - near - half, surface.shape, tolerance), -1.0, surface))
+    peak = highest_peak(np.where(_is_off_curve(local - near - half, surface.shape, tolerance), -1.0, surface))
     corner = near[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
     best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
-        best = refined(template, image, corner, biquadratic_offset(surface, peak), peak, options)
+        best = refine_match(template, image, corner, biquadratic_offset(surface, peak), peak, options)
     return StereoMatch(
         pixel=best.corner[::-1] + half + image.corner,
         score=best.warped_score,
@@ -132,7 +114,7 @@ def point_stereo(
     )
 
 
-def _off_curve(curve: Float[np.ndarray, "n 2"], shape: tuple[int, ...], tolerance: float) -> Bool[np.ndarray, "_ _"]:
+def _is_off_curve(curve: Float[np.ndarray, "n 2"], shape: tuple[int, ...], tolerance: float) -> Bool[np.ndarray, "_ _"]:
     """Which places of the surface lie further than the tolerance above or below the curve."""
     order = np.argsort(curve[:, 0])
     along = np.interp(np.arange(shape[1]), curve[order, 0], curve[order, 1])

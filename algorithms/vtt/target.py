@@ -1,4 +1,4 @@
-"""Where the target is: as it was designated, and after the rover has moved (sections 3 and 4.1, action 1)."""
+"""Prediction of the target's position (sections 3 and 4.1, action 1), magnification and roll (section 4.3.1)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
+from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import SITE_FROM_WORLD, composed
 from marsyard.sim.measurements import RoverTarget, SiteTarget
 
@@ -34,3 +35,49 @@ def predicted_position(
 def bearing_rad(direction_world: Float[np.ndarray, "3"]) -> float:
     """Azimuth of a direction, clockwise from north, radians in (-pi, pi]."""
     return float(np.arctan2(direction_world[0], direction_world[1]))
+
+
+def magnification(
+    old_position: Float[np.ndarray, "3"],
+    old_centre: Float[np.ndarray, "3"],
+    new_position: Float[np.ndarray, "3"],
+    new_centre: Float[np.ndarray, "3"],
+) -> float:
+    """Scale factor, Eq. 6: the target's old distance from the camera's centre over its new one.
+
+    Positions and centres are each in the rover frame of their own stop.
+    """
+    return float(np.linalg.norm(old_position - old_centre) / np.linalg.norm(new_position - new_centre))
+
+
+def horizontal_axis(camera: CameraModel) -> Float[np.ndarray, "3"]:
+    """Unit vector Hx along the picture's x axis, Eqs. 7 to 9; A and H need not be perpendicular."""
+    hs = np.linalg.norm(np.cross(camera.a, camera.h))
+    hc = camera.a @ camera.h
+    return np.asarray((camera.h - hc * camera.a) / hs)
+
+
+def lever_pixels(
+    old_position: Float[np.ndarray, "3"],
+    old_camera: CameraModel,
+    new_camera: CameraModel,
+    new_from_old: RigidTransform,
+    lever_m: float,
+) -> Float[np.ndarray, "2 2"] | None:
+    """Pixels of the target and of the point beside it along the old picture's x axis, `lever_m` away (before Eq. 10).
+
+    As the new camera sees them, (u, v) each. The old camera is in the old frame, the new one in the new; None where the
+    new camera sees one of the points not at all.
+    """
+    points = np.stack([old_position, old_position + lever_m * horizontal_axis(old_camera)])
+    pixels, visible = new_camera.project(np.asarray(new_from_old.apply(points)))
+    return pixels if np.all(visible) else None
+
+
+def roll_angle(lever_px: Float[np.ndarray, "2 2"]) -> float:
+    """How far the target's picture turned, clockwise as seen, radians: Eq. 10 and the text after it.
+
+    The angle of what was horizontal: from the target's pixel to that of the point beside it (`lever_pixels`).
+    """
+    across, down = lever_px[1] - lever_px[0]
+    return float(np.arctan2(down, across))

@@ -1,7 +1,7 @@
 """The visual target tracker: the loop of section 4.1 and its states.
 
-The steps are functions of their own (`target`, `pointing`, `appearance`, `matching`, `stereo`, `loss`, `handoff`); here
-they are put in order. What is known of a target is an immutable `Track`; the tracker only holds the latest.
+The steps are functions of `target`, `pointing`, `matching`, `stereo`, `loss` and `handoff`. The state of a track is an
+immutable `Track`; the tracker holds the latest one.
 """
 
 from __future__ import annotations
@@ -10,13 +10,11 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
-from marsyard.algorithms.vtt.appearance import lever_pixels, magnification, roll_angle
-from marsyard.algorithms.vtt.details import VttDetails
-from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, losses, next_state, tolerances
+from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
 from marsyard.algorithms.vtt.matching import (
     Change,
     Match,
@@ -29,11 +27,14 @@ from marsyard.algorithms.vtt.matching import (
 )
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position
-from marsyard.algorithms.vtt.stereo import nearest_point, pixels_along, point_stereo, searched_ranges
+from marsyard.algorithms.vtt.stereo import StereoMatch, nearest_point, pixels_along, point_stereo, search_ranges
 from marsyard.algorithms.vtt.target import (
     designated_position_world,
+    lever_pixels,
+    magnification,
     pose_change,
     predicted_position,
+    roll_angle,
 )
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import composed
@@ -41,25 +42,57 @@ from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasure
 
 
 @dataclass(frozen=True)
+class VttDetails:
+    """One update, found or not; what the paper's Figs. 15 and 17 and Table III show.
+
+    - seeded: Whether this update took the first template rather than looked for one
+    - predicted_pixel: Where the target was expected in the left picture, full-frame (u, v); None where it cannot be
+      seen
+    - window, window_corner: The search window of the left picture, counts, and the full-frame (u, v) of its upper left
+      pixel; None with `predicted_pixel`
+    - change: Magnification and roll since the last sighting (computed also where the options leave them out of the
+      match); None at the seed and where the target cannot be seen
+    - match: The left match with the template as searched for; None where there was no room for it
+    - template: The new picture about the match, cut at the sub-pixel position: the next template as it is now
+    - stereo: The right match; None without a left one, or without room
+    - distance_m: From the left camera to the target, metres: triangulated, or predicted where it was not
+    - azimuth_rad: Direction from the left camera to the target in the rover frame, positive to the right
+    - azimuth_change_rad: By how much the direction in the world has turned since the last sighting, positive to the
+      right, radians: what changes the target's appearance (a turn in place changes nothing)
+    - position_world: The target in the world as estimated, metres; None where it was not triangulated
+    - step_m: How far the rover moved since the last sighting by its pose estimate
+    - evidence, allowed: What the criteria judged and the tolerances they used; None at the seed and where something was
+      missing
+    """
+
+    seeded: bool
+    predicted_pixel: Float[np.ndarray, "2"] | None
+    window: UInt16[np.ndarray, "rows columns"] | None = None
+    window_corner: tuple[int, int] | None = None
+    change: Change | None = None
+    match: Match | None = None
+    template: Float[np.ndarray, "n n"] | None = None
+    stereo: StereoMatch | None = None
+    distance_m: float = float("nan")
+    azimuth_rad: float = float("nan")
+    azimuth_change_rad: float = 0.0
+    position_world: Float[np.ndarray, "3"] | None = None
+    step_m: float = 0.0
+    evidence: Evidence | None = None
+    allowed: Tolerances | None = None
+
+
+@dataclass(frozen=True)
 class Track:
     """What the tracker knows of its target.
 
-    Attributes
-    ----------
-    designated
-        The target as it was picked in a picture, or else where it lies in the world, metres, shape (3,).
-    world_from_rover
-        The pose at the last update, found or not.
-    state, lost_updates
-        Where it stands in Fig. 6, and for how many updates the target has been looked for.
-    sighting
-        The last time it was found; None before the seed.
-    seed_world
-        Where it was first seen, in the world as estimated, metres, shape (3,); None before.
-    seed_distance_m
-        From the camera, then.
-    driven_m
-        Length of the rover's path since, by its pose estimates at the updates.
+    - designated: The target as it was picked in a picture, or else where it lies in the world, metres
+    - world_from_rover: The pose at the last update, found or not
+    - state, lost_updates: Where it stands in Fig. 6, and for how many updates the target has been looked for.
+    - sighting: The last time it was found; None before the seed
+    - seed_world: Where it was first seen, in the world as estimated, metres; None before
+    - seed_distance_m: From the camera, then
+    - driven_m: Length of the rover's path since, by its pose estimates at the updates
     """
 
     designated: PixelTarget | Float[np.ndarray, "3"]
@@ -118,10 +151,10 @@ class VisualTargetTracker:
             carried = expected_position(self.track, measurements.world_from_rover)
             return TargetUpdate(TrackingState.FAILURE, (), carried)
         if self.track.sighting is None:
-            found = seeded(self.track, measurements, self.options)
+            found = seed_track(self.track, measurements, self.options)
         else:
-            found = followed(self.track, self.track.sighting, measurements, self.options, self.matcher)
-        self.track = advanced(self.track, found, measurements, self.options)
+            found = follow_track(self.track, self.track.sighting, measurements, self.options, self.matcher)
+        self.track = advance_track(self.track, found, measurements, self.options)
         position = found.position_rover
         if position is None:
             position = expected_position(self.track, measurements.world_from_rover)
@@ -178,7 +211,7 @@ def expected_position(track: Track, world_from_frame: RigidTransform) -> Float[n
     return np.asarray(world_from_frame.inv().apply(track.designated.copy()))
 
 
-def seeded(track: Track, measurements: RoverMeasurements, options: VttOptions) -> Finding:
+def seed_track(track: Track, measurements: RoverMeasurements, options: VttOptions) -> Finding:
     """Takes the first template where the target was designated, and its position by point stereo."""
     stop = Stop.of(measurements)
     if isinstance(track.designated, PixelTarget):
@@ -186,13 +219,13 @@ def seeded(track: Track, measurements: RoverMeasurements, options: VttOptions) -
     else:
         expected = np.asarray(stop.world_from_head.inv().apply(track.designated.copy()))
         pixel = stop.left.project(expected)[0]
-        ranges = searched_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
+        ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
     if not np.all(np.isfinite(pixel)) or not has_room(measurements.left, pixel, options.template_px):
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
     template = cut_patch(measurements.left, pixel, options.template_px)
     window, window_corner = search_window(measurements.left, pixel, options.search_px)
     details = VttDetails(True, pixel, window, window_corner, match=Match(pixel, 1.0, template), template=template)
-    placed = ranged(stop, pixel, template, ranges, details, options)
+    placed = triangulate_target(stop, pixel, template, ranges, details, options)
     if placed.sighting is None or placed.details.stereo is None:
         return placed
     if placed.details.stereo.score < options.min_stereo_score:
@@ -200,7 +233,7 @@ def seeded(track: Track, measurements: RoverMeasurements, options: VttOptions) -
     return placed
 
 
-def followed(
+def follow_track(
     track: Track, last: Sighting, measurements: RoverMeasurements, options: VttOptions, matcher: Matcher
 ) -> Finding:
     """Actions 1 to 6 of section 4.1 but the pointing, which came before the pictures; and the criteria of loss."""
@@ -221,14 +254,14 @@ def followed(
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
     template = cut_patch(measurements.left, match.pixel, options.template_px)
     details = replace(details, match=match, template=template)
-    ranges = searched_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
-    placed = ranged(stop, match.pixel, template, ranges, details, options)
+    ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
+    placed = triangulate_target(stop, match.pixel, template, ranges, details, options)
     if placed.sighting is None:
         return placed
-    return judged(track, last, placed, placed.sighting, stop, stop.distance_m(expected), options)
+    return check_losses(track, last, placed, placed.sighting, stop, stop.distance_m(expected), options)
 
 
-def ranged(
+def triangulate_target(
     stop: Stop,
     pixel: Float[np.ndarray, "2"],
     template: Float[np.ndarray, "n n"],
@@ -259,7 +292,7 @@ def ranged(
     return Finding((), details, in_rover[0], sighting)
 
 
-def judged(
+def check_losses(
     track: Track,
     last: Sighting,
     placed: Finding,
@@ -284,11 +317,11 @@ def judged(
     details = replace(
         details,
         step_m=journey.step_m,
-        azimuth_change_rad=_turned(last, sighting),
+        azimuth_change_rad=_azimuth_change_rad(last, sighting),
         evidence=evidence,
         allowed=allowed,
     )
-    failed = losses(evidence, allowed, options)
+    failed = find_losses(evidence, allowed, options)
     return Finding(failed, details) if failed else replace(placed, details=details)
 
 
@@ -304,13 +337,13 @@ def _evidence(track: Track, details: VttDetails, expected_m: float) -> Evidence:
     )
 
 
-def _turned(last: Sighting, now: Sighting) -> float:
+def _azimuth_change_rad(last: Sighting, now: Sighting) -> float:
     """By how much the line of sight turned in the world, clockwise seen from above, radians."""
     turned = now.azimuth_world_rad - last.azimuth_world_rad
     return float(np.arctan2(np.sin(turned), np.cos(turned)))
 
 
-def advanced(track: Track, finding: Finding, measurements: RoverMeasurements, options: VttOptions) -> Track:
+def advance_track(track: Track, finding: Finding, measurements: RoverMeasurements, options: VttOptions) -> Track:
     """The track after an update: the template is replaced by what was found, and kept where nothing was."""
     pose, sighting = measurements.world_from_rover, finding.sighting
     state, lost_updates = next_state(track.state, track.lost_updates, sighting is not None, options.max_lost_updates)

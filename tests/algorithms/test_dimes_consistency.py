@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import View, view
-from marsyard.algorithms.dimes.consistency import combinations, propagated
+from marsyard.algorithms.dimes.binning import View, build_view
 from marsyard.algorithms.dimes.details import PairDetails, Track
 from marsyard.algorithms.dimes.estimator import conclude
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.validity import TrackMetrics, ValidityCheck, failed_checks
+from marsyard.algorithms.dimes.validity import TrackMetrics, ValidityCheck, combinations, failed_checks, propagated
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, calibration
@@ -30,7 +29,7 @@ def track(pair: int, index: int, velocity: np.ndarray, failed: tuple[ValidityChe
 @cache
 def nadir_view() -> View:
     picture = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.binned(1, ROWS_SUMMED), calibration())
-    return view(picture, Rotation.identity(), 2000.0, (256, 256))
+    return build_view(picture, Rotation.identity(), 2000.0, (256, 256))
 
 
 def pair_of(*tracks: Track) -> PairDetails:

@@ -9,11 +9,17 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
-from marsyard.algorithms.image.alignment import refine_shift, shifted_patch, spline_coefficients
-from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
+from marsyard.algorithms.image.correlation import (
+    Peak,
+    biquadratic_offset,
+    highest_peak,
+    peak_width,
+    pseudo_normalized_correlation,
+    second_peak,
+)
 from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
 from marsyard.algorithms.image.kernels import cubic
-from marsyard.algorithms.image.peak import Peak, biquadratic_offset, highest_peak, peak_width, second_peak
+from marsyard.algorithms.image.registration import refine_shift, shifted_patch, spline_coefficients
 
 
 def brute_force(template: np.ndarray, window: np.ndarray) -> np.ndarray:

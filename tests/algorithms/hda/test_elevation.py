@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import ElevationMap, HdaOptions, SurfaceFrame
 from marsyard.algorithms.hda.elevation import elevation_map
-from marsyard.algorithms.hda.surface import plane_normal, surface_from_camera, upwards, world_from_surface
+from marsyard.algorithms.hda.landing import plane_normal, surface_from_camera, up_direction, world_from_surface
 from marsyard.algorithms.hda.view import View, camera_pose
 from tests.algorithms.hda.relief_scene import camera, pose
 
@@ -117,7 +117,7 @@ def test_gravity_comes_from_where_the_options_say() -> None:
     flat = cloud(500, rng, (0.0, 0.0)) + np.array([0.0, 0.0, 1.0]) * rng.normal(0.0, 0.01, (500, 1))
     flat[:150, 2] += rng.uniform(0.5, 2.0, 150)
     points = surface_from_camera(state).inv().apply(flat)
-    found = {frame: upwards(first, leaning, points, HdaOptions(surface_frame=frame)) for frame in SurfaceFrame}
+    found = {frame: up_direction(first, leaning, points, HdaOptions(surface_frame=frame)) for frame in SurfaceFrame}
     np.testing.assert_allclose(found[SurfaceFrame.INCLINOMETER], leaning)
     np.testing.assert_allclose(found[SurfaceFrame.STATE], state)
     # 350 points with 1 cm of noise over 8 m: 0.01 / (sqrt(350) 2.3 m) = 2e-4 rad; a third of them far off.
