@@ -21,7 +21,7 @@ class StreamedEstimator:
     stream: VelocityStream
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """The final answer of the stream, with its earlier ones; raises AlgorithmError for an answer of the wrong form."""
+        """The stream's final answer with its earlier ones; raises AlgorithmError for an answer of the wrong form."""
         tags = measurements.tags_s
         self.stream.start()
         earlier: list[VelocityEstimate | None] = []
@@ -33,7 +33,7 @@ class StreamedEstimator:
 
 
 def spanned(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
-    """The valid answer to images of these tags, with the last interval as default span; raises as `checked_velocity`."""
+    """The valid answer to images of these tags, by default over the last interval; raises as `checked_velocity`."""
     estimate = checked_velocity(answer, tags_s)
     if estimate.span_s is not None or len(tags_s) < 2:
         return estimate

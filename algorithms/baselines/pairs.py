@@ -22,18 +22,17 @@ from marsyard.algorithms.dimes.validity import combinations
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 
-#: Rectified pixels between the points at which common ground is looked for.
+#: Step of the lattice of the common ground, rectified pixels.
 COARSE_STEP_PX = 8
 
 
 @dataclass(frozen=True)
 class CommonOptions:
-    """What both baselines share; the geometry's numbers are DIMES' own.
+    """Options of both baselines; defaults of the geometry are those of `DimesOptions`.
 
-    - binned_size, max_speed_m_s, max_off_nadir_rad, border_px, imu_threshold_m_s: As in `DimesOptions`
-    - min_side_px: Least side of the common square, rectified pixels: the search range twice, so that half of it stays
-      in view
-    - max_side_px: Largest side of the common square
+    - min_side_px: Minimum side of the common square, rectified pixels: twice the search range, half of which stays in
+      view
+    - max_side_px: Maximum side of the common square
     """
 
     binned_size: tuple[int, int] = DimesOptions.binned_size
@@ -45,16 +44,15 @@ class CommonOptions:
     max_side_px: int = 256
 
 
-#: What both take where they are told nothing else.
 DEFAULT_COMMON_OPTIONS = CommonOptions()
 
 
 @dataclass(frozen=True)
 class PairPatches:
-    """The same square of ground, were there no motion, in both pictures of a pair.
+    """The same square of ground, at zero motion, in both images of a pair.
 
-    - first, second: Corrected and rectified, counts, north up, shape (side, side)
-    - gsd_m: Ground distance between pixels
+    - first, second: Corrected and rectified, counts, north up
+    - gsd_m: Ground sample distance
     """
 
     first: Float[np.ndarray, "side side"]
@@ -66,9 +64,9 @@ class PairPatches:
 class PairMatch:
     """The shift of one pair.
 
-    - shift_px: By how much what the first patch shows is found shifted in the second: (columns, rows), rectified pixels
-    - score: What the match's validity is judged by; larger is better
-    - valid: Whether it passed
+    - shift_px: Shift of the second patch's content: (columns, rows), rectified pixels
+    - score: Validity measure of the match; larger is better
+    - valid: Whether the match is accepted
     """
 
     shift_px: Float[np.ndarray, "2"]
@@ -78,7 +76,7 @@ class PairMatch:
 
 @dataclass(frozen=True)
 class BaselineDetails:
-    """What a baseline found: for each pair its patches, None without common ground, and its match, None without one."""
+    """For each pair its patches, None without common ground, and its match, None without one."""
 
     patches: tuple[PairPatches | None, ...]
     matches: tuple[PairMatch | None, ...]
@@ -90,9 +88,9 @@ Matcher = Callable[[PairPatches], PairMatch | None]
 def find_common_square(
     first: View, second: View, options: CommonOptions
 ) -> tuple[Float[np.ndarray, "2"], int, float] | None:
-    """The largest square of ground that both views see at zero motion: its middle, side in pixels, ground distance.
+    """The largest square of ground in both views at zero motion: middle, side in pixels, ground sample distance.
 
-    Sides run east and north. None where it is smaller than `min_side_px`.
+    Sides run east and north. None if it is smaller than `min_side_px`.
     """
     gsd = float(second.centre[2]) * pixel_angle_rad(second)
     reach = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
@@ -101,7 +99,7 @@ def find_common_square(
     seen = np.ones(lattice.shape[:2], dtype=bool)
     for view in (first, second):
         seen &= inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
-    # Steps to the nearest point that is not seen, counted along rows, columns and diagonals: half sides of squares.
+    # chessboard distance to the nearest invisible point: half sides of squares
     steps = cv2.distanceTransform(np.pad(seen, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(steps)), steps.shape)
     side = min(2 * (int(steps[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
@@ -109,7 +107,7 @@ def find_common_square(
 
 
 def rectify_pair(first: View, second: View, options: CommonOptions) -> PairPatches | None:
-    """Both pictures of a pair over their common ground; None where there is too little of it."""
+    """Both images of a pair over their common ground; None if it is too small."""
     found = find_common_square(first, second, options)
     if found is None:
         return None
@@ -118,12 +116,12 @@ def rectify_pair(first: View, second: View, options: CommonOptions) -> PairPatch
 
 
 def pair_velocity(patches: PairPatches, match: PairMatch, interval_s: float) -> Float[np.ndarray, "2"]:
-    """Mean velocity of the camera (east, north), m/s: ground moves against it, and rows run south."""
+    """Mean velocity of the camera (east, north), m/s: opposite to the shift of the ground; rows run south."""
     return np.asarray(patches.gsd_m * np.array([-match.shift_px[0], match.shift_px[1]]) / interval_s)
 
 
 def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, options: CommonOptions) -> VelocityEstimate:
-    """The velocity over the second pair, if both pairs match and the IMU agrees with their difference."""
+    """The velocity over the second pair, if both pairs match and their difference agrees with the IMU."""
     triple = usable_views(measurements, options.binned_size)
     if triple is None:
         return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, BaselineDetails((), ()))
@@ -148,11 +146,11 @@ def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, optio
 
 @dataclass(frozen=True)
 class PhaseCorrelationOptions:
-    """Options of the estimator.
+    """Options of the phase correlation.
 
     - common: Geometry and IMU check
-    - min_response: Least response: the peak's energy, 1 for equal pictures. Pictures of different ground gave up to
-      0.12, shifted ones with the flight camera's noise 0.79 and above.
+    - min_response: Minimum response: the peak's energy, 1 for equal images. Images of different ground gave up to 0.12,
+      shifted ones with the flight camera's noise 0.79 and above.
     """
 
     common: CommonOptions = DEFAULT_COMMON_OPTIONS
@@ -161,13 +159,13 @@ class PhaseCorrelationOptions:
 
 @final
 class PhaseCorrelationEstimator:
-    """Horizontal velocity from the shift between rectified pictures, by `cv2.phaseCorrelate` under a Hann window."""
+    """Horizontal velocity from the shift between rectified images, by `cv2.phaseCorrelate` with a Hann window."""
 
     def __init__(self, options: PhaseCorrelationOptions | None = None) -> None:
         self.options = PhaseCorrelationOptions() if options is None else options
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """The estimate; its details are `BaselineDetails`. Raises as `DimesEstimator.estimate` does."""
+        """The estimate, with `BaselineDetails`. Raises as `DimesEstimator.estimate`."""
         return estimate_by_pairs(measurements, self._match, self.options.common)
 
     def _match(self, patches: PairPatches) -> PairMatch | None:

@@ -42,13 +42,12 @@ from marsyard.sim.measurements import (
 
 #: Version of the files of a case.
 EXCHANGE = 1
-#: Versions of answers, and of the lines of a program that is asked line by line: from 2 on each request has an `id`,
-#: which its answer repeats.
+#: Versions of answers and of request lines; from 2 on each request has an `id`, which its answer repeats.
 ANSWER_VERSIONS = (1, 2)
 
 CASE_FILE, FRAME_FILE = "case.json", "frame.json"
 
-#: What is known of a detector next to its flat field.
+#: Calibration fields of a detector, without its flat field.
 _CALIBRATION = tuple(one.name for one in fields(DetectorCalibration) if one.name != "flat_field")
 
 #: Form in which pictures are written.
@@ -58,7 +57,7 @@ Pictures = Literal["pgm", "png"]
 def write_case(
     folder: Path, measurements: DescentMeasurements | LandingMeasurements, pictures: Pictures = "pgm"
 ) -> None:
-    """Writes what instruments delivered into a folder that is there. Raises OSError where that fails."""
+    """Write the measurements of a case into an existing folder. Raises OSError if that fails."""
     content = (
         _encode_descent(measurements)
         if isinstance(measurements, DescentMeasurements)
@@ -69,7 +68,7 @@ def write_case(
 
 
 def write_frame(folder: Path, frame: DescentFrame) -> None:
-    """Writes what came with one picture of a descent into a folder that is there. Raises OSError where that fails."""
+    """Write one descent image and its measurements into an existing folder. Raises OSError if that fails."""
     (image,) = _write_images(folder, [frame.image], "pgm")
     content = {
         "exchange": EXCHANGE,
@@ -84,7 +83,7 @@ def write_frame(folder: Path, frame: DescentFrame) -> None:
 
 
 def read_frame(folder: Path) -> DescentFrame:
-    """Reads what `write_frame` wrote. Raises ValueError where the folder holds no frame, or one of another version."""
+    """Read a frame of `write_frame`. Raises ValueError for a folder without one, or of another version."""
     with open_json(folder / FRAME_FILE, "picture of a descent") as content:
         _check_version(content)
         return DescentFrame(
@@ -98,7 +97,7 @@ def read_frame(folder: Path) -> DescentFrame:
 
 
 def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
-    """Reads what `write_case` wrote. Raises ValueError where the folder holds no case, or one of another version."""
+    """Read a case of `write_case`. Raises ValueError for a folder without one, or of another version."""
     with open_json(folder / CASE_FILE, "case") as content:
         _check_version(content)
         images = [_read_image(folder, one) for one in content["images"]]
@@ -112,7 +111,7 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
 
 @contextmanager
 def open_json(path: Path, kind: str) -> Iterator[Mapping[str, Any]]:
-    """The table of a JSON file; a fault in the file, or in what is made of it, becomes a ValueError that names both."""
+    """Yield the table of a JSON file; errors in the file or its use become a ValueError that names both."""
     try:
         yield json.loads(path.read_text(encoding="utf-8"))
     except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
@@ -213,7 +212,7 @@ def _read_landing(content: Mapping[str, Any], images: Sequence[DetectorImage]) -
 
 
 def _write_images(folder: Path, images: Sequence[DetectorImage], pictures: Pictures) -> list[dict[str, Any]]:
-    """Writes pictures, cameras and flat fields; a flat field that several pictures share is written once."""
+    """Write images, cameras and flat fields; a shared flat field is written once."""
     written: list[dict[str, Any]] = []
     fields: list[tuple[str, Float[np.ndarray, "rows columns"]]] = []
     for number, image in enumerate(images, start=1):
@@ -244,7 +243,7 @@ def _read_image(folder: Path, content: Mapping[str, Any]) -> DetectorImage:
 
 
 def write_picture(path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> None:
-    """Writes counts as they are: `.pgm` (P5, two bytes a pixel, the more significant first) or `.png` (16 bits)."""
+    """Write counts as `.pgm` (P5, two bytes a pixel, big-endian) or `.png` (16 bits)."""
     if path.suffix == ".pgm":
         rows, columns = counts.shape
         path.write_bytes(b"P5\n%d %d\n65535\n" % (columns, rows) + counts.astype(">u2").tobytes())
@@ -253,7 +252,7 @@ def write_picture(path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> Non
 
 
 def read_picture(path: Path) -> UInt16[np.ndarray, "rows columns"]:
-    """Reads what `write_picture` wrote. Raises ValueError where it is no picture of 16 bits."""
+    """Read counts of `write_picture`. Raises ValueError unless it is a 16-bit image of one band."""
     counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if counts is None or counts.dtype != np.uint16 or counts.ndim != 2:
         raise ValueError(f"{path} is no picture of one band with 16 bits")
@@ -265,7 +264,7 @@ _OFFSETS, _LIMITS = ("base_m", "elbow_m", "head_m"), ("azimuth_limits_rad", "ele
 
 
 def write_mast(folder: Path, mast: MastCalibration) -> None:
-    """Writes a mast and its two cameras into a folder that is there."""
+    """Write a mast and its two cameras into an existing folder."""
     for name, camera in (("left", mast.left), ("right", mast.right)):
         write_cahvor(camera, folder / f"{name}.cahvor", frame=HEAD_FRAME)
     geometry = mast.geometry
@@ -279,7 +278,7 @@ def write_mast(folder: Path, mast: MastCalibration) -> None:
 
 
 def read_mast(folder: Path) -> MastCalibration:
-    """Reads what `write_mast` wrote. Raises ValueError where the folder holds no mast."""
+    """Read a mast of `write_mast`. Raises ValueError for a folder without one."""
     with open_json(folder / MAST_FILE, "mast") as content:
         left, right = (read_cahvor(folder / content[name]["camera"]) for name in ("left", "right"))
         base, elbow, head = (np.array(content[name], dtype=np.float64) for name in _OFFSETS)
@@ -288,7 +287,7 @@ def read_mast(folder: Path) -> MastCalibration:
 
 
 def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
-    """Writes a stop's pictures and angles into a folder that is there; the mast has a file of its own."""
+    """Write a stop's images and angles into an existing folder, without the mast."""
     content: dict[str, Any] = {
         "azimuth_rad": measurements.azimuth_rad,
         "elevation_rad": measurements.elevation_rad,
@@ -302,7 +301,7 @@ def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
 
 
 def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
-    """Reads what `write_stop` wrote. Raises ValueError where the folder holds no stop."""
+    """Read a stop of `write_stop`. Raises ValueError for a folder without one."""
     with open_json(folder / STOP_FILE, "stop") as content:
         left, right = (
             MastImage(
@@ -331,7 +330,7 @@ def read_pose(content: Mapping[str, Any]) -> RigidTransform:
 
 
 def encode_target(target: TargetDesignation) -> dict[str, Any]:
-    """A designation, in one of the three ways."""
+    """A target designation in one of its three forms."""
     match target:
         case PixelTarget():
             angles = {"azimuth_rad": target.azimuth_rad, "elevation_rad": target.elevation_rad}

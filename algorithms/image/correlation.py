@@ -16,7 +16,7 @@ _ROW, _COLUMN = np.mgrid[-1.0:2.0, -1.0:2.0]
 
 @dataclass(frozen=True)
 class Peak:
-    """The highest value of a surface: its row and column in whole pixels, and whether that is on the border."""
+    """Maximum of a surface: row, column, value, and whether it lies on the border."""
 
     row: int
     column: int
@@ -25,17 +25,17 @@ class Peak:
 
 
 def highest_peak(surface: Float[np.ndarray, "rows columns"]) -> Peak:
-    """The highest value of the surface; the first of equals."""
+    """The maximum of the surface; the first of equals."""
     row, column = (int(i) for i in np.unravel_index(int(np.argmax(surface)), surface.shape))
     on_border = row in (0, surface.shape[0] - 1) or column in (0, surface.shape[1] - 1)
     return Peak(row, column, float(surface[row, column]), on_border)
 
 
 def biquadratic_offset(surface: Float[np.ndarray, "rows columns"], peak: Peak) -> Float[np.ndarray, "2"]:
-    """Offset (row, column) of the top of the quadric through the 3 x 3 values about the peak, by least squares.
+    """Offset (row, column) of the top of the least-squares quadric through the 3 x 3 values about the peak.
 
-    In pixels, held to [-1, 1]; zero on the border and where the quadric has no maximum. Its bias towards whole pixels
-    reaches several hundredths of a pixel; see `marsyard.algorithms.image.registration` for what removes it.
+    In pixels, clipped to [-1, 1]; zero on the border and without a maximum. Its bias towards whole pixels reaches
+    several hundredths of a pixel; `refine_shift` has no such bias.
     """
     if peak.on_border:
         return np.zeros(2)
@@ -54,8 +54,8 @@ def biquadratic_offset(surface: Float[np.ndarray, "rows columns"], peak: Peak) -
 def peak_width(surface: Float[np.ndarray, "rows columns"], peak: Peak, level: float = 0.75) -> float:
     """Full width of the peak at `level` times its height along its longest direction, in pixels.
 
-    Of the connected region about the peak that is above that, the major axis of the ellipse with the same second
-    moments. A sharp peak of one pixel has 1.15; a ridge has its length. The surface's diagonal where there is no peak.
+    The major axis of the ellipse with the second moments of the connected region above the level. A sharp peak of one
+    pixel has 1.15; a ridge has its length. The surface's diagonal without a positive peak.
     """
     if peak.value <= 0.0:
         return float(np.hypot(*surface.shape))
@@ -67,7 +67,7 @@ def peak_width(surface: Float[np.ndarray, "rows columns"], peak: Peak, level: fl
 
 
 def second_peak(surface: Float[np.ndarray, "rows columns"], peak: Peak, exclusion: float) -> float:
-    """The highest local maximum (of 3 x 3) further than `exclusion` pixels from the peak; 0 if none is positive."""
+    """The highest local maximum (of 3 x 3) further than `exclusion` pixels from the peak; 0 without a positive one."""
     maxima = np.argwhere(surface >= ndimage.maximum_filter(surface, size=3, mode="nearest"))
     distances = np.hypot(maxima[:, 0] - peak.row, maxima[:, 1] - peak.column)
     others = maxima[distances > exclusion]
@@ -76,9 +76,9 @@ def second_peak(surface: Float[np.ndarray, "rows columns"], peak: Peak, exclusio
 
 
 def cross_sums(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ _"]) -> Float[np.ndarray, "_ _"]:
-    """Sums of products of the template with the window at every place where it fits, by FFT.
+    """Sums of products of the template with the window at every position, by FFT.
 
-    The transform is as large as the window: what wraps around falls on places where the template does not fit.
+    The transform has the window's size: wrap-around only affects positions where the template does not fit.
     """
     shape = (fft.next_fast_len(window.shape[0], real=True), fft.next_fast_len(window.shape[1], real=True))
     spectrum = fft.rfft2(window, shape) * np.conj(fft.rfft2(template, shape))
@@ -91,9 +91,9 @@ def pseudo_normalized_correlation(
 ) -> Float[np.ndarray, "_ _"]:
     """``2 sum(A B) / (sum(A A) + sum(B B))`` with A the template and B the window's patch, each less its own mean.
 
-    Entry (i, j) belongs to the patch whose upper left pixel is (i, j) of the window; the shape is (rows - n + 1,
-    columns - m + 1). Values lie in [-1, 1], 1 for equal patches up to a constant; unlike normalised correlation it
-    falls when the contrasts of the two differ. Zero where neither has contrast. (DIMES, section II.A.)
+    Entry (i, j) belongs to the patch with its upper left pixel at (i, j) of the window; the shape is (rows - n + 1,
+    columns - m + 1). Values lie in [-1, 1]; unlike normalised correlation it falls with a contrast difference. Zero if
+    neither has contrast. (DIMES, section II.A.)
     """
     scale = max(float(np.abs(template).max()), float(np.abs(window).max()))
     a = template - template.mean(dtype=np.float64)
@@ -103,7 +103,7 @@ def pseudo_normalized_correlation(
     return np.asarray(kernels.pseudo_normalized(cross, b, template.shape, float(np.sum(a * a)), floor))
 
 
-#: Places searched about a candidate of the level above, pixels: it is right to one pixel, and one more for sampling.
+#: Search radius about a candidate of the coarser level, pixels: its error is one pixel, and one more for sampling.
 REACH_PX = 2
 
 
@@ -112,11 +112,9 @@ def normalized_correlation(
 ) -> Float[np.ndarray, "_ _"]:
     """``sum(A B) / sqrt(sum(A A) sum(B B))`` with A the template and B the window's patch, each less its own mean.
 
-    Entry (i, j) belongs to the patch whose upper left pixel is (i, j) of the window; the shape is (rows - n + 1,
-    columns - m + 1). Values lie in [-1, 1]; zero where either has no contrast. Right to about 1e-5: sums of products
-    are float32. (Tracking paper, Eq. 11.)
-
-    Raises ValueError if the template is larger than the window.
+    Entry (i, j) belongs to the patch with its upper left pixel at (i, j) of the window; the shape is (rows - n + 1,
+    columns - m + 1). Values lie in [-1, 1]; zero if either has no contrast. Accurate to about 1e-5: products are summed
+    in float32. (Tracking paper, Eq. 11.) Raises ValueError if the template is larger than the window.
     """
     _check_fit(template, window)
     a, bright_a = kernels.centred(np.ascontiguousarray(template, dtype=np.float32))
@@ -127,13 +125,12 @@ def normalized_correlation(
 def coarse_to_fine_peak(
     template: Float[np.ndarray, "n m"], window: Float[np.ndarray, "rows columns"], levels: int, candidates: int
 ) -> Peak:
-    """The highest peak of `normalized_correlation`, searched at a lower resolution first.
+    """The maximum of `normalized_correlation`, searched at reduced resolution first.
 
-    Template and window are halved `levels` times by averaging 2 x 2 pixels. The smallest are correlated at every place;
-    the best local maxima, at most `candidates`, are followed through the levels up to the full resolution, where the
-    best of them wins. With no levels it is the full search. (Rosenfeld & Vanderbrug 1977; tracking paper, 4.3.2.)
-
-    Raises ValueError if the template is larger than the window, or nothing is left of it after halving.
+    Template and window are halved `levels` times. The best local maxima of the coarsest correlation, at most
+    `candidates`, are refined level by level; the best at full resolution wins. No levels: full search. (Rosenfeld &
+    Vanderbrug 1977; tracking paper, 4.3.2.) Raises ValueError if the template is larger than the window, or too small
+    to be halved.
     """
     if min(template.shape) >> levels < 2:
         raise ValueError(f"a template of {template.shape} pixels cannot be halved {levels} times: 2 must be left")
@@ -153,7 +150,7 @@ def coarse_to_fine_peak(
 
 
 def halve(image: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "_ _"]:
-    """Means of 2 x 2 pixels; an odd last row or column is left out."""
+    """Means of 2 x 2 pixels; an odd last row or column is dropped."""
     rows, columns = image.shape[0] // 2, image.shape[1] // 2
     even = np.ascontiguousarray(image[: 2 * rows, : 2 * columns])
     return np.asarray(cv2.resize(even, (columns, rows), interpolation=cv2.INTER_AREA))
@@ -165,14 +162,14 @@ def _check_fit(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ 
 
 
 def _flat_energy(template: Float[np.ndarray, "_ _"], largest: float) -> float:
-    """The energy below which a patch counts as flat, for values up to `largest`."""
+    """The energy of a flat patch, for values up to `largest`."""
     return kernels.FLAT_ENERGY * template.size * largest * largest
 
 
 def _local_maxima(
     surface: Float[np.ndarray, "rows columns"], count: int
 ) -> tuple[Int[np.ndarray, "places 2"], Float[np.ndarray, " places"]]:
-    """Row and column of the highest local maxima (of 3 x 3), at most `count`, the highest first."""
+    """Row and column of the highest local maxima (of 3 x 3), at most `count`, in descending order."""
     maxima = np.argwhere(surface >= cv2.dilate(surface, np.ones((3, 3), np.uint8)))
     values = surface[maxima[:, 0], maxima[:, 1]]
     order = np.argsort(-values, kind="stable")[:count]

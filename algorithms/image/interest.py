@@ -1,4 +1,4 @@
-"""Interest operators: where a picture has structure enough to be found again."""
+"""Interest operators: structure tensor and Harris interest."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Registration and resampling of templates by quintic splines, to hundredths of a pixel.
 
 Fits of a surface to a correlation peak are biased towards whole pixels (up to about 0.09 px for the biquadratic);
-OpenCV's warps place samples up to 0.05 px wrong. Gauss-Newton registration of the images themselves, with a spline of
-high order between pixels, has no such bias. A pure shift is biased where the image is stretched relative to the
+OpenCV's warps misplace samples by up to 0.05 px. Gauss-Newton registration of the images, with a spline of high order
+between pixels, has no such bias. A pure shift is biased where the image is stretched relative to the
 template, by up to tenths of a pixel; a linear map removes that bias. A round surface seen from another height bends the
 image; a quadratic map removes that bias.
 """
@@ -21,9 +21,9 @@ from marsyard.algorithms.image.kernels import quintic
 from marsyard.algorithms.image.kernels import registration as kernels
 
 ORDER: Final = 5
-#: A step below this, pixels, ends the iteration; the one that would follow is smaller by a factor of ten or more.
+#: Step that ends the shift refinement; the next step is smaller by a factor of ten or more.
 ALIGNMENT_TOLERANCE_PX = 1e-3
-#: Pixels around the start that the spline is computed from; what is beyond shifts the result by less than 1e-4 px.
+#: Margin of pixels for the spline; pixels beyond shift the result by less than 1e-4 px.
 SURROUND = 12
 _TAPS = np.arange(ORDER + 1) - ORDER // 2
 _BASIS = BSpline.basis_element(np.arange(ORDER + 2) - (ORDER + 1) / 2.0, extrapolate=False)
@@ -31,7 +31,7 @@ _SLOPE = _BASIS.derivative()
 
 
 def spline_coefficients(image: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
-    """Coefficients of the quintic spline through the picture; borders mirror about their last pixels."""
+    """Coefficients of the quintic spline through the image; borders mirror about their last pixels."""
     return np.asarray(ndimage.spline_filter(image, order=ORDER, output=np.float64, mode="mirror"))
 
 
@@ -40,15 +40,15 @@ def shifted_patch(
 ) -> Float[np.ndarray, "3 n m"]:
     """The patch of `shape` with its upper left pixel at `corner` (row, column), and its derivatives by row and column.
 
-    All pixels share the fraction of the shift, so the spline is a separable filter of six taps. The patch must lie at
-    least three pixels inside the picture.
+    All pixels share the fraction of the shift: the spline is a separable filter of six taps. The patch must lie at
+    least three pixels inside the image.
     """
     whole = np.floor(corner)
     places = (corner - whole)[:, np.newaxis] - _TAPS
     taps = np.stack([_BASIS(places), _SLOPE(places)])
-    taken = np.empty((3, *shape))
-    quintic.shifted(coefficients, int(whole[0]), int(whole[1]), taps[:, 0], taps[:, 1], taken)
-    return taken
+    samples = np.empty((3, *shape))
+    quintic.shifted(coefficients, int(whole[0]), int(whole[1]), taps[:, 0], taps[:, 1], samples)
+    return samples
 
 
 def refine_shift(
@@ -58,40 +58,40 @@ def refine_shift(
     iterations: int = 6,
     reach: float = 1.5,
 ) -> Float[np.ndarray, "2"] | None:
-    """Corner (row, column) in the window at which the template matches best, to hundredths of a pixel.
+    """Refine the corner (row, column) of a template in the window to hundredths of a pixel.
 
     Minimises ``sum (A - gain B)^2`` over shift and gain, A and B less their means, from `corner` by Gauss-Newton. None
-    when it leaves the circle of `reach` pixels about the start, when the patch comes within three pixels of the
-    window's border, or when the normal equations are singular.
+    if it moves more than `reach` pixels, comes within three pixels of the window's border, or the normal equations are
+    singular.
     """
     near = np.maximum(np.floor(corner).astype(int) - SURROUND, 0)
     far = np.floor(corner).astype(int) + np.array(template.shape) + SURROUND
     region = window[near[0] : far[0], near[1] : far[1]]
     coefficients = spline_coefficients(region)
-    room = np.array(region.shape) - np.array(template.shape) - 4.0
+    last = np.array(region.shape) - np.array(template.shape) - 4.0
     a = template - template.mean()
     start = corner - near
-    place = start
+    position = start
     for _ in range(iterations):
-        if np.hypot(*(place - start)) > reach or np.any(place < 3.0) or np.any(place > room):
+        if np.hypot(*(position - start)) > reach or np.any(position < 3.0) or np.any(position > last):
             return None
-        step = _step(a, shifted_patch(coefficients, place, (template.shape[0], template.shape[1])))
+        step = _step(a, shifted_patch(coefficients, position, (template.shape[0], template.shape[1])))
         if step is None:
             return None
-        place = place + step
+        position = position + step
         if np.hypot(*step) < ALIGNMENT_TOLERANCE_PX:
             break
-    return place + near if np.hypot(*(place - start)) <= reach else None
+    return position + near if np.hypot(*(position - start)) <= reach else None
 
 
-def _step(a: Float[np.ndarray, "n m"], taken: Float[np.ndarray, "3 n m"]) -> Float[np.ndarray, "2"] | None:
-    """One Gauss-Newton step of the shift (row, column), the gain solved for at once; see `shifted_patch`."""
-    b = taken[0] - taken[0].mean()
+def _step(a: Float[np.ndarray, "n m"], samples: Float[np.ndarray, "3 n m"]) -> Float[np.ndarray, "2"] | None:
+    """One Gauss-Newton step of the shift (row, column), with the gain; see `shifted_patch`."""
+    b = samples[0] - samples[0].mean()
     energy = float(np.sum(b * b))
     gain = float(np.sum(a * b)) / energy if energy > 0.0 else 0.0
     if gain <= 0.0:
         return None
-    slopes = taken[1:].reshape(2, -1)
+    slopes = samples[1:].reshape(2, -1)
     jacobian = gain * (slopes - slopes.mean(axis=1, keepdims=True))
     normal = jacobian @ jacobian.T
     if np.linalg.det(normal) <= 1e-10 * np.trace(normal) ** 2:
@@ -99,22 +99,22 @@ def _step(a: Float[np.ndarray, "n m"], taken: Float[np.ndarray, "3 n m"]) -> Flo
     return np.asarray(np.linalg.solve(normal, jacobian @ (a - gain * b).ravel()))
 
 
-#: What a template may have undergone: a shift; a linear map too; a quadratic map of its offsets too.
+#: Model of the registration: shift; with a linear map; with a quadratic map of the offsets.
 Warp = Literal["shift", "stretch", "bend"]
 _ORDERS: dict[Warp, int] = {"shift": 0, "stretch": 1, "bend": 2}
-#: A step below this, pixels, ends the iteration; what is left is less than 1e-3 px.
+#: Step that ends the registration; the remaining error is less than 1e-3 px.
 REGISTRATION_TOLERANCE_PX = 3e-3
-#: A pivot of the normal equations, their diagonal made 1, below which texture does not tell one unknown from another.
+#: Minimum pivot of the normal equations with unit diagonal; below, the texture does not separate the unknowns.
 SINGULAR = 1e-4
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far a registration may go before it is not believed.
+    """Limits of a registration.
 
-    - shift_px: Largest distance of the middle from where it started
+    - shift_px: Largest displacement of the middle
     - stretch: Largest entry of the linear map's difference from the identity, and of the bend at the template's border
-    - steps: Steps allowed; four to six are the rule
+    - steps: Maximum number of steps; four to six are usual
     """
 
     shift_px: float = 1.5
@@ -122,17 +122,13 @@ class Limits:
     steps: int = 12
 
 
-#: What is believed where nothing else is said.
+#: Default limits.
 LIMITS = Limits()
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Where a template matches best.
-
-    - corner: Row and column of its upper left pixel in the window, as if it were only shifted
-    - score: Normalised correlation of the template with what it was registered to
-    """
+    """Best match: corner (row, column in the window) of the unwarped template, and normalised correlation."""
 
     corner: Float[np.ndarray, "2"]
     score: float
@@ -140,11 +136,7 @@ class Registration:
 
 @dataclass(frozen=True)
 class SplinePart:
-    """The part of a window about a template's place, as a spline.
-
-    - near, far: Its first row and column, and those after its last
-    - coefficients: Of the quintic spline
-    """
+    """Part of a window about a template: first row and column, those after its last, quintic spline coefficients."""
 
     near: tuple[int, int]
     far: tuple[int, int]
@@ -159,7 +151,7 @@ def build_spline(
 ) -> SplinePart:
     """The spline about a template of `side` pixels with its upper left one at `corner` (row, column).
 
-    What is `known` of the same window is given back where it is the same part.
+    Returns `known`, of the same window, if it is the same part.
     """
     first = np.maximum(np.floor(corner).astype(int) - SURROUND, 0)
     last = np.ceil(corner).astype(int) + side + SURROUND
@@ -176,13 +168,12 @@ def register_template(
     warp: Warp,
     limits: Limits = LIMITS,
 ) -> Registration | None:
-    """The place in the window, or in the part of it about `corner`, at which the template matches best, by its middle.
+    """Register a template in a window, or in the part of it about `corner`, from `corner` (row, column).
 
     Minimises ``sum (B(c + M d + Q(d)) - gain A(d) - offset)^2`` over the middle c, gain, offset and, as `warp` allows,
-    the matrix M, which else is 1, and the quadratic form Q, which else is 0; A is the template over offsets d from its
-    middle, B the window by quintic splines. It goes from `corner` (row, column) by the inverse compositional method
-    (Baker & Matthews 2004): derivatives are those of the template, taken once. None when it leaves the limits or the
-    window, does not converge, or when the texture does not determine the unknowns.
+    the matrix M (else the identity) and the quadratic form Q (else zero); A is the template over offsets d from its
+    middle, B the window by quintic splines. Inverse compositional method (Baker & Matthews 2004). None if it leaves the
+    limits or the window, does not converge, or the texture does not determine the unknowns.
     """
     half = 0.5 * (len(template) - 1)
     part = window if isinstance(window, SplinePart) else build_spline(window, corner, len(template))
@@ -202,28 +193,27 @@ def similarity_patch(
     magnification: float = 1.0,
     roll_rad: float = 0.0,
 ) -> Float[np.ndarray, "side side"]:
-    """The square of `side` pixels about `centre` of the picture after it is magnified and rolled about that point.
+    """The square of `side` pixels about `centre` of the magnified and rolled image.
 
-    - image: The picture; what lies outside it is mirrored about its last pixels
-    - centre: Column and row (u, v) of what comes to lie in the middle, within the picture
-    - side: Pixels along each side of the patch
-    - magnification: How much larger things become; below 1 they shrink (unfiltered: meant for steps down to about 0.7)
-    - roll_rad: How far they turn, clockwise as seen
+    - image: Image, mirrored about its last pixels outside
+    - centre: Column and row (u, v) of the middle, within the image
+    - magnification: Scale factor; unfiltered, meant for factors down to about 0.7
+    - roll_rad: Rotation, clockwise as seen
 
-    Raises ValueError if the centre is not in the picture.
+    Raises ValueError if the centre is outside the image.
     """
-    turned = np.zeros((2, 5))
-    turned[:, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
-    turned /= magnification
-    reach = int(np.ceil(0.5 * (side - 1) * np.abs(turned).sum(axis=1).max())) + SURROUND
-    place = centre[::-1]
-    near = np.floor(place).astype(int) - reach
+    linear = np.zeros((2, 5))
+    linear[:, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
+    linear /= magnification
+    reach = int(np.ceil(0.5 * (side - 1) * np.abs(linear).sum(axis=1).max())) + SURROUND
+    position = centre[::-1]
+    near = np.floor(position).astype(int) - reach
     far = near + 2 * reach + 2
     inside = image[max(near[0], 0) : max(far[0], 0), max(near[1], 0) : max(far[1], 0)]
     beyond = [(max(-a, 0), max(b - n, 0)) for a, b, n in zip(near, far, image.shape, strict=True)]
     region = np.pad(inside, beyond, mode="reflect") if np.any(beyond) else inside
     values = np.empty(side * side)
-    row, column = place - near
-    if not quintic.sample(spline_coefficients(region), side, row, column, turned, values):
+    row, column = position - near
+    if not quintic.sample(spline_coefficients(region), side, row, column, linear, values):
         raise ValueError(f"the middle of a patch, {centre}, is not in the picture of {image.shape[::-1]} pixels")
     return values.reshape(side, side)

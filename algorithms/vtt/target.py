@@ -14,21 +14,21 @@ from marsyard.sim.measurements import RoverTarget, SiteTarget
 def designated_position_world(
     target: RoverTarget | SiteTarget, world_from_rover: RigidTransform
 ) -> Float[np.ndarray, "3"]:
-    """A target that was given by its position, in the world frame; `world_from_rover` is the pose at designation."""
+    """World position of a target designated by position; `world_from_rover` is the pose at designation."""
     if isinstance(target, RoverTarget):
         return np.asarray(world_from_rover.apply(target.position_rover.copy()))
     return np.asarray(SITE_FROM_WORLD.inv().apply(target.position_site.copy()))
 
 
 def pose_change(old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform) -> RigidTransform:
-    """The transform from the frame as it lay into the frame as it lies."""
+    """The transform from the old frame into the new frame."""
     return composed(new_world_from_frame.inv(), old_world_from_frame)
 
 
 def predicted_position(
     position: Float[np.ndarray, "3"], old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform
 ) -> Float[np.ndarray, "3"]:
-    """A point fixed in the world, in a frame that moved (the rover's, or the mast head's), from where it was there."""
+    """Position of a static point in a frame that moved (rover or mast head), from its old position there."""
     return np.asarray(pose_change(old_world_from_frame, new_world_from_frame).apply(position.copy()))
 
 
@@ -43,15 +43,15 @@ def magnification(
     new_position: Float[np.ndarray, "3"],
     new_centre: Float[np.ndarray, "3"],
 ) -> float:
-    """Scale factor, Eq. 6: the target's old distance from the camera's centre over its new one.
+    """Scale factor, Eq. 6: the target's old distance from the camera over its new one.
 
-    Positions and centres are each in the rover frame of their own stop.
+    Positions and camera centres are each in the rover frame of their own stop.
     """
     return float(np.linalg.norm(old_position - old_centre) / np.linalg.norm(new_position - new_centre))
 
 
 def horizontal_axis(camera: CameraModel) -> Float[np.ndarray, "3"]:
-    """Unit vector Hx along the picture's x axis, Eqs. 7 to 9; A and H need not be perpendicular."""
+    """Unit vector Hx along the image's x axis, Eqs. 7 to 9; A and H need not be perpendicular."""
     hs = np.linalg.norm(np.cross(camera.a, camera.h))
     hc = camera.a @ camera.h
     return np.asarray((camera.h - hc * camera.a) / hs)
@@ -64,10 +64,10 @@ def lever_pixels(
     new_from_old: RigidTransform,
     lever_m: float,
 ) -> Float[np.ndarray, "2 2"] | None:
-    """Pixels of the target and of the point beside it along the old picture's x axis, `lever_m` away (before Eq. 10).
+    """Pixels (u, v) in the new image of the target and of a point `lever_m` along the old image's x axis (before Eq.
+    10).
 
-    As the new camera sees them, (u, v) each. The old camera is in the old frame, the new one in the new; None where the
-    new camera sees one of the points not at all.
+    Each camera is in the frame of its own stop. None if the new camera cannot image one of the points.
     """
     points = np.stack([old_position, old_position + lever_m * horizontal_axis(old_camera)])
     pixels, visible = new_camera.project(np.asarray(new_from_old.apply(points)))
@@ -75,9 +75,6 @@ def lever_pixels(
 
 
 def roll_angle(lever_px: Float[np.ndarray, "2 2"]) -> float:
-    """How far the target's picture turned, clockwise as seen, radians: Eq. 10 and the text after it.
-
-    The angle of what was horizontal: from the target's pixel to that of the point beside it (`lever_pixels`).
-    """
+    """Clockwise roll of the target's image, radians, from `lever_pixels`: Eq. 10 and the text after it."""
     across, down = lever_px[1] - lever_px[0]
     return float(np.arctan2(down, across))

@@ -43,26 +43,22 @@ from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasure
 
 @dataclass(frozen=True)
 class VttDetails:
-    """One update, found or not; what the paper's Figs. 15 and 17 and Table III show.
+    """Intermediate products of one update, as shown in the paper's Figs. 15 and 17 and Table III.
 
-    - seeded: Whether this update took the first template rather than looked for one
-    - predicted_pixel: Where the target was expected in the left picture, full-frame (u, v); None where it cannot be
-      seen
-    - window, window_corner: The search window of the left picture, counts, and the full-frame (u, v) of its upper left
-      pixel; None with `predicted_pixel`
-    - change: Magnification and roll since the last sighting (computed also where the options leave them out of the
-      match); None at the seed and where the target cannot be seen
-    - match: The left match with the template as searched for; None where there was no room for it
-    - template: The new picture about the match, cut at the sub-pixel position: the next template as it is now
-    - stereo: The right match; None without a left one, or without room
-    - distance_m: From the left camera to the target, metres: triangulated, or predicted where it was not
+    - seeded: Whether this update took the first template
+    - predicted_pixel: Predicted full-frame (u, v) in the left image; None if invisible
+    - window, window_corner: Left search window, counts, and the full-frame (u, v) of its upper left pixel; None with
+      `predicted_pixel`
+    - change: Computed magnification and roll since the last match, applied or not; None at the seed or if invisible
+    - match: The left match with its searched template; None if the window does not fit
+    - template: The new image about the match: the next template as it is now
+    - stereo: The right match; None without a left one, or if it does not fit
+    - distance_m: From the left camera to the target: triangulated, else predicted
     - azimuth_rad: Direction from the left camera to the target in the rover frame, positive to the right
-    - azimuth_change_rad: By how much the direction in the world has turned since the last sighting, positive to the
-      right, radians: what changes the target's appearance (a turn in place changes nothing)
-    - position_world: The target in the world as estimated, metres; None where it was not triangulated
-    - step_m: How far the rover moved since the last sighting by its pose estimate
-    - evidence, allowed: What the criteria judged and the tolerances they used; None at the seed and where something was
-      missing
+    - azimuth_change_rad: Change of the direction in the world since the last match, positive to the right
+    - position_world: Triangulated target in the estimated world frame, metres; None without triangulation
+    - step_m: Estimated rover motion since the last match
+    - evidence, allowed: Input of the loss criteria and their tolerances; None at the seed and for incomplete updates
     """
 
     seeded: bool
@@ -84,15 +80,15 @@ class VttDetails:
 
 @dataclass(frozen=True)
 class Track:
-    """What the tracker knows of its target.
+    """State of the tracker for its target.
 
-    - designated: The target as it was picked in a picture, or else where it lies in the world, metres
+    - designated: The designated pixel, or the target's position in the world, metres
     - world_from_rover: The pose at the last update, found or not
-    - state, lost_updates: Where it stands in Fig. 6, and for how many updates the target has been looked for.
-    - sighting: The last time it was found; None before the seed
-    - seed_world: Where it was first seen, in the world as estimated, metres; None before
-    - seed_distance_m: From the camera, then
-    - driven_m: Length of the rover's path since, by its pose estimates at the updates
+    - state, lost_updates: State of Fig. 6, and number of updates since the loss
+    - sighting: The last match; None before the seed
+    - seed_world: Position at the seed, in the estimated world frame, metres; None before
+    - seed_distance_m: Distance from the camera at the seed
+    - driven_m: Estimated path length of the rover since the seed
     """
 
     designated: PixelTarget | Float[np.ndarray, "3"]
@@ -107,10 +103,10 @@ class Track:
 
 @final
 class VisualTargetTracker:
-    """Follows a target by its template, scaled and rolled as the rover's motion says; see `TargetTracker`.
+    """Tracks a target by its template, scaled and rolled with the rover's motion; see `TargetTracker`.
 
-    `PURE_NCC` as options is the paper's baseline; another `matcher` replaces the search in the left picture (see
-    `marsyard.algorithms.vtt.lucas_kanade`), all else remaining the same.
+    `PURE_NCC` as options is the paper's baseline; `matcher` replaces the search in the left image (see
+    `marsyard.algorithms.vtt.lucas_kanade`).
     """
 
     def __init__(self, options: VttOptions | None = None, matcher: Matcher = match_by_correlation) -> None:
@@ -120,22 +116,22 @@ class VisualTargetTracker:
 
     @property
     def state(self) -> TrackingState:
-        """Where the tracker stands."""
+        """State of the tracker."""
         return TrackingState.NO_TARGET if self.track is None else self.track.state
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
-        """Takes a target, with the rover's estimated pose, in place of any other."""
+        """Set the target, with the rover's estimated pose."""
         if isinstance(target, PixelTarget):
             self.track = Track(target, world_from_rover)
         else:
             self.track = Track(designated_position_world(target, world_from_rover), world_from_rover)
 
     def clear(self) -> None:
-        """Forgets the target."""
+        """Clear the target."""
         self.track = None
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
-        """Where to look from this pose; None without a target, or where the mast cannot show it."""
+        """Mast aim from this pose; None without a target, or if the mast cannot show it."""
         if self.track is None:
             return None
         if self.track.sighting is None and isinstance(self.track.designated, PixelTarget):
@@ -144,12 +140,12 @@ class VisualTargetTracker:
         return None if expected is None else aim_at_position(expected, mast, self.options)
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
-        """Finds the target in a new stereo pair; its details are `VttDetails`. After a failure it looks no more."""
+        """Match the target in a new stereo pair, with `VttDetails`. In the failure state no search is made."""
         if self.track is None:
             return TargetUpdate(TrackingState.NO_TARGET, (), None)
         if self.track.state is TrackingState.FAILURE:
-            carried = expected_position(self.track, measurements.world_from_rover)
-            return TargetUpdate(TrackingState.FAILURE, (), carried)
+            predicted = expected_position(self.track, measurements.world_from_rover)
+            return TargetUpdate(TrackingState.FAILURE, (), predicted)
         if self.track.sighting is None:
             found = seed_track(self.track, measurements, self.options)
         else:
@@ -163,7 +159,7 @@ class VisualTargetTracker:
 
 @dataclass(frozen=True)
 class Finding:
-    """What one update found: why it did not, or the target in the rover frame and the sighting to go on from."""
+    """Result of one update: losses, or the target in the rover frame and the new sighting."""
 
     losses: tuple[TargetLoss, ...]
     details: VttDetails
@@ -173,7 +169,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Stop:
-    """What was measured at a stop, and the mast's head as it stands there; cameras are in the head's frame."""
+    """Measurements of a stop, and the estimated head pose; cameras are in the head's frame."""
 
     measurements: RoverMeasurements
     rover_from_head: RigidTransform
@@ -181,7 +177,7 @@ class Stop:
 
     @classmethod
     def of(cls, measurements: RoverMeasurements) -> Stop:
-        """The stop at which this was measured."""
+        """The stop of these measurements."""
         angles = (measurements.azimuth_rad, measurements.elevation_rad)
         rover_from_head = measurements.mast.geometry.rover_from_head(*angles)
         return cls(measurements, rover_from_head, composed(measurements.world_from_rover, rover_from_head))
@@ -202,7 +198,7 @@ class Stop:
 
 
 def expected_position(track: Track, world_from_frame: RigidTransform) -> Float[np.ndarray, "3"] | None:
-    """The target in a frame of this pose (the rover's, the head's); None for a pixel not yet seen in stereo."""
+    """Predicted target position in a frame of this pose (rover or head); None for a pixel target before the seed."""
     if track.sighting is not None:
         last = track.sighting
         return predicted_position(last.position_head, last.world_from_head, world_from_frame)
@@ -212,7 +208,7 @@ def expected_position(track: Track, world_from_frame: RigidTransform) -> Float[n
 
 
 def seed_track(track: Track, measurements: RoverMeasurements, options: VttOptions) -> Finding:
-    """Takes the first template where the target was designated, and its position by point stereo."""
+    """Take the first template at the designated target, and triangulate it by point stereo."""
     stop = Stop.of(measurements)
     if isinstance(track.designated, PixelTarget):
         pixel, ranges = track.designated.pixel, options.seed_range_m
@@ -225,18 +221,18 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
     template = cut_patch(measurements.left, pixel, options.template_px)
     window, window_corner = search_window(measurements.left, pixel, options.search_px)
     details = VttDetails(True, pixel, window, window_corner, match=Match(pixel, 1.0, template), template=template)
-    placed = triangulate_target(stop, pixel, template, ranges, details, options)
-    if placed.sighting is None or placed.details.stereo is None:
-        return placed
-    if placed.details.stereo.score < options.min_stereo_score:
-        return Finding((TargetLoss.LOW_STEREO_SCORE,), placed.details)
-    return placed
+    located = triangulate_target(stop, pixel, template, ranges, details, options)
+    if located.sighting is None or located.details.stereo is None:
+        return located
+    if located.details.stereo.score < options.min_stereo_score:
+        return Finding((TargetLoss.LOW_STEREO_SCORE,), located.details)
+    return located
 
 
 def follow_track(
     track: Track, last: Sighting, measurements: RoverMeasurements, options: VttOptions, matcher: Matcher
 ) -> Finding:
-    """Actions 1 to 6 of section 4.1 but the pointing, which came before the pictures; and the criteria of loss."""
+    """Actions 1 to 6 of section 4.1 except pointing, and the loss criteria."""
     stop = Stop.of(measurements)
     new_from_old = pose_change(last.world_from_head, stop.world_from_head)
     expected = np.asarray(new_from_old.apply(last.position_head.copy()))
@@ -255,10 +251,10 @@ def follow_track(
     template = cut_patch(measurements.left, match.pixel, options.template_px)
     details = replace(details, match=match, template=template)
     ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
-    placed = triangulate_target(stop, match.pixel, template, ranges, details, options)
-    if placed.sighting is None:
-        return placed
-    return check_losses(track, last, placed, placed.sighting, stop, stop.distance_m(expected), options)
+    located = triangulate_target(stop, match.pixel, template, ranges, details, options)
+    if located.sighting is None:
+        return located
+    return check_losses(track, last, located, located.sighting, stop, stop.distance_m(expected), options)
 
 
 def triangulate_target(
@@ -269,7 +265,7 @@ def triangulate_target(
     details: VttDetails,
     options: VttOptions,
 ) -> Finding:
-    """The target's position by point stereo from its left pixel; the right picture is searched over these ranges."""
+    """Triangulate the target from its left pixel by point stereo over these ranges."""
     sight = stop.left.rays(pixel)
     curve = pixels_along(sight, stop.left, stop.right, ranges_m)
     stereo = point_stereo(template, stop.measurements.right, curve, options)
@@ -295,14 +291,14 @@ def triangulate_target(
 def check_losses(
     track: Track,
     last: Sighting,
-    placed: Finding,
+    located: Finding,
     sighting: Sighting,
     stop: Stop,
     expected_m: float,
     options: VttOptions,
 ) -> Finding:
-    """What was found, or nothing where one of the four criteria says that it is not the target."""
-    details = placed.details
+    """Apply the four loss criteria to a match."""
+    details = located.details
     moved = sighting.world_from_rover.translation - last.world_from_rover.translation
     since_update = sighting.world_from_rover.translation - track.world_from_rover.translation
     journey = Journey(
@@ -322,7 +318,7 @@ def check_losses(
         allowed=allowed,
     )
     failed = find_losses(evidence, allowed, options)
-    return Finding(failed, details) if failed else replace(placed, details=details)
+    return Finding(failed, details) if failed else replace(located, details=details)
 
 
 def _evidence(track: Track, details: VttDetails, expected_m: float) -> Evidence:
@@ -338,13 +334,13 @@ def _evidence(track: Track, details: VttDetails, expected_m: float) -> Evidence:
 
 
 def _azimuth_change_rad(last: Sighting, now: Sighting) -> float:
-    """By how much the line of sight turned in the world, clockwise seen from above, radians."""
+    """Change of the line of sight's azimuth in the world, clockwise from above."""
     turned = now.azimuth_world_rad - last.azimuth_world_rad
     return float(np.arctan2(np.sin(turned), np.cos(turned)))
 
 
 def advance_track(track: Track, finding: Finding, measurements: RoverMeasurements, options: VttOptions) -> Track:
-    """The track after an update: the template is replaced by what was found, and kept where nothing was."""
+    """The track after an update; a new match replaces the template."""
     pose, sighting = measurements.world_from_rover, finding.sighting
     state, lost_updates = next_state(track.state, track.lost_updates, sighting is not None, options.max_lost_updates)
     moved = float(np.linalg.norm(pose.translation - track.world_from_rover.translation))

@@ -274,4 +274,4 @@ def _shift(patch: np.ndarray, expected: np.ndarray, truth: object, lattice: np.n
     ]
     design = np.column_stack([slopes[0].ravel(), slopes[1].ravel(), np.ones(patch.size)])
     solution, *_ = np.linalg.lstsq(design, (patch - expected).ravel())
-    return solution[:2]
+    return np.asarray(solution[:2])

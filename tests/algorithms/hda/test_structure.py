@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import Fate, HdaEstimator, HdaOptions
+from marsyard.algorithms.hda import Fate, HdaDetails, HdaEstimator, HdaOptions
 from marsyard.algorithms.hda.kernels import matching
 from marsyard.algorithms.hda.structure import (
     clip_to_image,
@@ -40,7 +40,7 @@ def seen(scene: Pass) -> LandingScene:
 
 def true_depths(scene: Pass, pixels: np.ndarray) -> np.ndarray:
     one = scene.camera(0)
-    return (scene.ground(0, pixels) - one.c) @ one.a
+    return np.asarray((scene.ground(0, pixels) - one.c) @ one.a)
 
 
 def test_the_poses_motion_is_the_cameras(scene: Pass, seen: LandingScene) -> None:
@@ -152,7 +152,9 @@ def test_the_grid_lies_in_the_middle_and_keeps_from_the_border() -> None:
 def test_all_lengths_follow_the_altimeter(factor: float, scene: Pass) -> None:
     exact = measured(scene)
     answer = HdaEstimator(OPTIONS).estimate(replace(exact, slant_range_m=factor * exact.slant_range_m))
+    assert isinstance(answer.details, HdaDetails)
     motion = answer.details.motion
+    assert motion is not None
     # Issue 6, bar 1: 1 % of the baseline, the scale by the altimeter exact.
     expected = factor * scene.second_from_first.translation
     assert np.linalg.norm(motion.second_from_first.translation - expected) < 0.01 * np.linalg.norm(expected)

@@ -253,6 +253,7 @@ def test_triangulation_inverts_projection(mast: MastCalibration) -> None:
     rng = np.random.default_rng(4)
     for point in rng.uniform([2.0, -0.15, -0.15], [12.0, 0.15, 0.15], (20, 3)):
         found = triangulated(mast.left, mast.right, mast.left.project(point)[0], mast.right.project(point)[0])
+        assert found is not None
         np.testing.assert_allclose(found, point, atol=1e-6)
 
 
