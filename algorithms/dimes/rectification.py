@@ -45,9 +45,9 @@ def ground_lattice(centre: Float[np.ndarray, "2"], side_px: int, gsd_m: float) -
     return lattice
 
 
-def _check_span(least: float, largest: float, size: int) -> slice:
-    """Whole pixels around values from `least` to `largest`, with the spline's margin, within 0 .. size."""
-    low, high = max(int(least - SPLINE_MARGIN), 0), min(int(largest + SPLINE_MARGIN + 1), size)
+def _pixel_range(smallest: float, largest: float, size: int) -> slice:
+    """Whole pixels around values from `smallest` to `largest`, with the spline's margin, within 0 .. size."""
+    low, high = max(int(smallest - SPLINE_MARGIN), 0), min(int(largest + SPLINE_MARGIN + 1), size)
     return slice(min(low, size - 1), max(high, 1))
 
 
@@ -62,7 +62,7 @@ def rectify_patch(
     pixels, visible = pixels_from_ground(view, ground_lattice(centre, side_px, gsd_m))
     columns, rows = view.size
     left, right, top, bottom = kernels.hold(pixels, visible, columns, rows)
-    in_rows, in_columns = _check_span(top, bottom, rows), _check_span(left, right, columns)
+    in_rows, in_columns = _pixel_range(top, bottom, rows), _pixel_range(left, right, columns)
     patch = correct_patch(view, in_rows, in_columns)
     coefficients = ndimage.spline_filter(patch, order=3, mode="mirror")
     values = np.empty((side_px, side_px))

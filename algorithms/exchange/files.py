@@ -323,7 +323,7 @@ def encode_pose(pose: RigidTransform) -> dict[str, list[float]]:
 
 
 def read_pose(content: Mapping[str, Any]) -> RigidTransform:
-    """Read what `encode_pose` wrote."""
+    """Read a pose of `encode_pose`."""
     return rigid(
         Rotation.from_quat(content["world_from_rover_xyzw"]), np.array(content["position_world_m"], dtype=np.float64)
     )
@@ -342,7 +342,7 @@ def encode_target(target: TargetDesignation) -> dict[str, Any]:
 
 
 def read_target(content: Mapping[str, Any]) -> TargetDesignation:
-    """Read what `encode_target` wrote."""
+    """Read a designation of `encode_target`."""
     if "pixel" in content:
         return PixelTarget(
             np.array(content["pixel"], dtype=np.float64), content["azimuth_rad"], content["elevation_rad"]

@@ -68,10 +68,10 @@ def read_member(answer: Mapping[str, Any], name: str, kinds: type[Member]) -> Me
     return parse_member(name, answer.get(name), kinds)
 
 
-def parse_member(what: str, name: object, kinds: type[Member]) -> Member:
+def parse_member(label: str, name: object, kinds: type[Member]) -> Member:
     """The member of an enumeration by name."""
     if not isinstance(name, str) or name not in kinds.__members__:
-        raise bad_answer(f"{what} is {name!r}; allowed: {', '.join(kinds.__members__)}")
+        raise bad_answer(f"{label} is {name!r}; allowed: {', '.join(kinds.__members__)}")
     return kinds[name]
 
 

@@ -179,11 +179,11 @@ def match_disparities(
             views, (first_from_rectified, second_from_first.rotation * first_from_rectified), strict=True
         )
     ]
-    reach = pair.focal_px * pair.baseline_m
-    least = int(reach / bounds_m[1])
-    count = DISPARITY_STEP * (int(reach / bounds_m[0] - least) // DISPARITY_STEP + 1)
+    disparity_px_m = pair.focal_px * pair.baseline_m
+    min_disparity = int(disparity_px_m / bounds_m[1])
+    count = DISPARITY_STEP * (int(disparity_px_m / bounds_m[0] - min_disparity) // DISPARITY_STEP + 1)
     matcher = cv2.StereoSGBM.create(
-        minDisparity=least,
+        minDisparity=min_disparity,
         numDisparities=count,
         blockSize=BLOCK_PX,
         P1=SMALL_STEP,
@@ -195,7 +195,7 @@ def match_disparities(
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
     found = matcher.compute(*pictures).astype(np.float64) * DISPARITY_UNIT
-    return np.where(found >= max(least, 1), found, np.nan)
+    return np.where(found >= max(min_disparity, 1), found, np.nan)
 
 
 def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> Matches:

@@ -63,7 +63,7 @@ class HdaOptions:
     - plane_trials: Random triples of points for the least-median-of-squares plane of a footprint. With half of the
       points off the plane 30 trials find it in 98 % of footprints, with 30 % in all but 3 in a million.
     - refine_planes: Whether each plane is refined by least squares over its inliers (Rousseeuw & Leroy 1987)
-    - max_slope_rad, max_roughness_m: What the lander can stand on; the user's to set (section III)
+    - max_slope_rad, max_roughness_m: Limits of the lander, set by the user (section III)
     - hazard_growth, unknown_growth: By how many diameters hazards, and borders and holes of the map, are grown. The
       paper has 1 for hazards; "near" borders is taken as half of one: the lander would stand on ground that was not
       seen.

@@ -17,7 +17,7 @@ class VttOptions:
     - search_px: Side of the search window, full-frame pixels (paper: 161; 200 and 600 in section 5.2)
     - scale, roll: Whether the template is magnified (Eq. 6) and rolled (Eqs. 7 to 10) before it is matched. Without
       both this is the paper's pure NCC.
-    - roll_lever_m: Distance k of the hypothetical point beside the target (paper: 5 cm, "arbitrary, small")
+    - roll_lever_m: Distance k of the hypothetical point next to the target (paper: 5 cm, "arbitrary, small")
     - coarse_levels: How often template and window are halved for the coarse search; 0 searches all places at full
       resolution
     - coarse_candidates: Local maxima of the coarse correlation that are followed to full resolution
@@ -82,7 +82,7 @@ class VttOptions:
         if self.max_lost_updates < 0:
             raise ValueError(f"max_lost_updates is {self.max_lost_updates}; it must not be negative")
         if not 0.0 < self.seed_range_m[0] < self.seed_range_m[1]:
-            raise ValueError(f"seed_range_m is {self.seed_range_m}; it must be two ranges above 0, the least first")
+            raise ValueError(f"seed_range_m is {self.seed_range_m}; it must be two ranges above 0, the smaller first")
         for name in ("roll_lever_m", "epipolar_tolerance_px", "stereo_search_share"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")

@@ -74,8 +74,8 @@ def _offset(
 
 
 def _is_within_limits(azimuth_rad: float, elevation_rad: float, mast: MastGeometry) -> bool:
-    least, most = zip(mast.azimuth_limits_rad, mast.elevation_limits_rad, strict=True)
-    return least[0] <= azimuth_rad <= most[0] and least[1] <= elevation_rad <= most[1]
+    (min_azimuth, max_azimuth), (min_elevation, max_elevation) = mast.azimuth_limits_rad, mast.elevation_limits_rad
+    return min_azimuth <= azimuth_rad <= max_azimuth and min_elevation <= elevation_rad <= max_elevation
 
 
 def middle(camera: CameraModel) -> Float[np.ndarray, "2"]:
