@@ -1,1 +1,1 @@
-"""What is being validated: estimators that see measurements only (of `sim`: frames, camera, measurements)."""
+"""Algorithms under test: estimators that see measurements only (of `sim`: frames, camera, measurements)."""

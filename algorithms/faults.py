@@ -1,4 +1,4 @@
-"""What an algorithm under test must not do, and what is said of it when it does."""
+"""Faults of an algorithm under test, and the error that reports one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Fault(Enum):
 
 
 def describe_error(error: BaseException | None) -> str:
-    """Type and message of an error; the type alone where its message cannot be had."""
+    """Type and message of an error; the type alone if the message cannot be formatted."""
     try:
         return f"{type(error).__name__}: {error}"
     except Exception:
@@ -24,17 +24,7 @@ def describe_error(error: BaseException | None) -> str:
 
 
 class AlgorithmError(Exception):
-    """An algorithm under test that failed to answer.
-
-    Parameters
-    ----------
-    fault
-        In which way.
-    message
-        What is wrong, in the same words each time.
-    stderr
-        The last that it wrote to its standard error; empty where that is not known.
-    """
+    """Failure of an algorithm under test to answer; `stderr` is the end of its standard error output, if known."""
 
     def __init__(self, fault: Fault, message: str, stderr: str = "") -> None:
         super().__init__(message)

@@ -31,27 +31,17 @@ class VelocityOutcome(Enum):
 
 @dataclass(frozen=True)
 class VelocityEstimate:
-    """An answer to "how fast does the lander move over the ground".
+    """Horizontal velocity of the lander over the ground.
 
-    Attributes
-    ----------
-    outcome
-        How the estimation ended.
-    velocity_m_s
-        Horizontal velocity (east, north) in m/s: the mean velocity of the camera over `span_s`; None unless the outcome
-        is VALID.
-    details
-        The algorithm's intermediate products for figures and diagnosis; None where it keeps none.
-    covariance_m2_s2
-        Covariance of the velocity's error as the algorithm has it, (east, north), m2/s2; None where it states none.
-        Errors are then held against it as well.
-    span_s
-        Begin and end of what the velocity is the mean of, as time tags, from the first picture's to the last one's that
-        the algorithm has; equal ones mean the velocity at that instant. None: the last interval, which is from the
-        second to the third picture where there are three.
-    after_pictures
-        Of a stream (`VelocityStream`) what it answered after each picture, None where nothing; filled in by whoever
-        runs it. Empty of others.
+    - outcome: Result of the estimation
+    - velocity_m_s: Mean horizontal velocity of the camera (east, north) over `span_s`; None unless the outcome is VALID
+    - details: Intermediate products for figures and diagnosis, or None
+    - covariance_m2_s2: Covariance of the velocity error (east, north) by the algorithm, or None. Errors are then tested
+      against it as well.
+    - span_s: Begin and end of the averaging interval, as time tags within those of the images; equal ones mean the
+      velocity at that instant. None: the last interval, from the second to the third of three images.
+    - after_pictures: Answers of a stream (`VelocityStream`) after each image, None for no answer; filled in by the
+      caller. Empty for other estimators.
     """
 
     outcome: VelocityOutcome
@@ -63,7 +53,7 @@ class VelocityEstimate:
 
 
 class VelocityEstimator(Protocol):
-    """Estimates horizontal velocity from three descent pictures and the measurements taken with them."""
+    """Estimates horizontal velocity from three descent images and their measurements."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """The estimate; never raises for a picture, attitude or altitude that an instrument can deliver."""
@@ -72,26 +62,26 @@ class VelocityEstimator(Protocol):
 
 @runtime_checkable
 class VelocityStream(Protocol):
-    """Estimates horizontal velocity from any number of descent pictures, given one by one as they are taken.
+    """Estimates horizontal velocity from any number of descent images, given one by one.
 
     `marsyard.algorithms.streams.StreamedEstimator` makes it a `VelocityEstimator`.
     """
 
     def start(self) -> None:
-        """A new descent begins: forgets all of the one before."""
+        """Reset the state for a new descent."""
         ...
 
     def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
-        """Takes the next picture; what is known by now, or None. Never raises, as `VelocityEstimator.estimate`."""
+        """Process the next image; return an estimate or None. Never raises, as `VelocityEstimator.estimate`."""
         ...
 
     def finish(self) -> VelocityEstimate:
-        """The answer to the descent; no further picture comes. A failure where there were too few."""
+        """The final answer for the descent; a failure outcome if there were too few images."""
         ...
 
 
 class TrackingState(Enum):
-    """Where a target tracker stands (tracking paper, Fig. 6)."""
+    """State of a target tracker (tracking paper, Fig. 6)."""
 
     NO_TARGET = "no target is designated, or it was cleared"
     NORMAL = "a target is designated and, since it was first seen, tracked"
@@ -100,7 +90,7 @@ class TrackingState(Enum):
 
 
 class TargetLoss(Enum):
-    """Why an update lost the target. Each is an expected failure."""
+    """Reason for the loss of the target in an update. Each is an expected failure."""
 
     LOW_MATCH_SCORE = "the template matches nowhere well enough"
     LOW_STEREO_SCORE = "the target is not found in the right picture"
@@ -112,7 +102,7 @@ class TargetLoss(Enum):
 
 @dataclass(frozen=True)
 class PixelBox:
-    """A part of a full frame: its upper left pixel (column, row) and its size (columns, rows)."""
+    """Part of a full frame: its upper left pixel (column, row) and its size (columns, rows)."""
 
     corner: tuple[int, int]
     size: tuple[int, int]
@@ -120,14 +110,10 @@ class PixelBox:
 
 @dataclass(frozen=True)
 class MastAim:
-    """Where a tracker wants the mast to look and which pixels it needs.
+    """Requested mast angles and image parts.
 
-    Attributes
-    ----------
-    azimuth_rad, elevation_rad
-        Mast angles to command (see `marsyard.sim.measurements.MastGeometry`).
-    left, right
-        The parts of the full frames to deliver; their exposure is best set for them too.
+    - azimuth_rad, elevation_rad: Mast angles to command (see `marsyard.sim.measurements.MastGeometry`)
+    - left, right: The parts of the full frames to deliver; exposures should be set for them too
     """
 
     azimuth_rad: float
@@ -138,20 +124,13 @@ class MastAim:
 
 @dataclass(frozen=True)
 class TargetUpdate:
-    """An answer to "where is the target now".
+    """Result of one tracking update.
 
-    Attributes
-    ----------
-    state
-        State after the update.
-    losses
-        Why the target was not found, in the order of `TargetLoss`; empty when it was, or was not looked for (no target,
-        failure).
-    position_rover
-        The target in the rover frame of this stop, metres, shape (3,): triangulated when it was found, else carried
-        along by the pose estimate; None before it was seen for the first time.
-    details
-        The algorithm's intermediate products for figures and diagnosis; None where it keeps none.
+    - losses: Reasons of the loss, in the order of `TargetLoss`; empty after a match or without a search (no target,
+      failure)
+    - position_rover: The target in the rover frame of this stop, metres: triangulated, else propagated by the pose
+      estimate; None before the first match.
+    - details: Intermediate products for figures and diagnosis, or None
     """
 
     state: TrackingState
@@ -161,47 +140,46 @@ class TargetUpdate:
 
     @property
     def found(self) -> bool:
-        """Whether this update found the target."""
+        """Whether this update matched the target."""
         return self.state is TrackingState.NORMAL
 
 
 class TargetTracker(Protocol):
-    """Follows one designated target from stop to stop of a rover.
+    """Tracks one designated target from stop to stop of a rover.
 
-    At each stop: `aim`, point the mast, take pictures, `update`. The first update after `designate` seeds the template.
+    At each stop: `aim`, point the mast, take images, `update`. The first update after `designate` seeds the template.
     """
 
     @property
     def state(self) -> TrackingState:
-        """Where the tracker stands."""
+        """State of the tracker."""
         ...
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
-        """Takes a target, with the rover's estimated pose, in place of any other."""
+        """Set the target, with the rover's estimated pose; replaces any other."""
         ...
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
-        """Where to look from this pose; None where the mast cannot show the target.
+        """Mast aim from this pose; None if the mast cannot show the target.
 
-        Pictures taken at any other angles then make an update that loses it.
+        An update with images taken at other angles then loses the target.
         """
         ...
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
-        """Finds the target; never raises for pictures, angles or poses that the rover can deliver."""
+        """Match the target; never raises for images, angles or poses that the rover can deliver."""
         ...
 
     def clear(self) -> None:
-        """Forgets the target."""
+        """Clear the target."""
         ...
 
 
 class SiteOutcome(Enum):
-    """How the search for a place to land ended.
+    """Result of the search for a landing site.
 
-    With SAFE_SITE a site is reported, with NO_SAFE_SITE none: the ground was mapped and no part of it is safe. Every
-    other member means that the algorithm did not converge: the a-priori site is what is left, and nothing is known of
-    it.
+    SAFE_SITE reports a site. NO_SAFE_SITE reports none: the ground was mapped and no part of it is safe. With every
+    other member the algorithm did not converge: the a-priori site is reported, untested.
     """
 
     SAFE_SITE = "a safe site is reported"
@@ -221,17 +199,12 @@ class SiteOutcome(Enum):
 
 @dataclass(frozen=True)
 class SiteEstimate:
-    """An answer to "where can one land".
+    """Landing site.
 
-    Attributes
-    ----------
-    outcome
-        How the search ended.
-    site_world
-        Where to land, in the world frame of the on-board poses, metres; the a-priori site where the algorithm did not
-        converge, None where the ground has no safe site.
-    details
-        The algorithm's intermediate products for figures and diagnosis; None where it keeps none.
+    - outcome: Result of the search
+    - site_world: Site in the world frame of the on-board poses, metres; the a-priori site without convergence, None
+      without a safe site
+    - details: Intermediate products for figures and diagnosis, or None
     """
 
     outcome: SiteOutcome
@@ -240,7 +213,7 @@ class SiteEstimate:
 
 
 class SiteEstimator(Protocol):
-    """Finds a safe place to land from two pictures and the measurements taken with them."""
+    """Selects a safe landing site from two images and their measurements."""
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """The estimate; never raises for pictures, poses or a range that instruments can deliver."""

@@ -13,13 +13,11 @@ from benchmarks.timing import Figure, core_seconds
 from marsyard.algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, hazard_maps
 from marsyard.algorithms.hda.baselines import SemiGlobalEstimator
 from marsyard.algorithms.hda.estimator import expected_pixels, matched_structure, motion_from_tracks
-from marsyard.algorithms.hda.features import select_features
-from marsyard.algorithms.hda.footprints import map_resolution
+from marsyard.algorithms.hda.hazards import map_resolution
 from marsyard.algorithms.hda.landing import map_ground
-from marsyard.algorithms.hda.scale import scale_factor
-from marsyard.algorithms.hda.sighting import sighting
-from marsyard.algorithms.hda.tracking import track_features
-from marsyard.algorithms.hda.view import undistorted
+from marsyard.algorithms.hda.structure import scale_factor
+from marsyard.algorithms.hda.tracking import select_features, track_features
+from marsyard.algorithms.hda.view import build_scene, undistort
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
@@ -71,7 +69,7 @@ def figures(repeats: int) -> list[Figure]:
 
 def table_one(given: LandingMeasurements, repeats: int) -> list[Figure]:
     """The four stages of Table I; the scale is part of structure from motion."""
-    seen = sighting(given)
+    seen = build_scene(given)
     details = HdaEstimator(PAPER).estimate(given).details
     assert isinstance(details, HdaDetails)
     tracks, motion, matches, ground = details.tracks, details.motion, details.matches, details.ground
@@ -80,7 +78,7 @@ def table_one(given: LandingMeasurements, repeats: int) -> list[Figure]:
     assert matches is not None
     assert ground is not None
     first, second = (view.counts for view in seen.views)
-    places = undistorted(seen.views[0].camera, tracks.first[tracks.accepted])
+    places = undistort(seen.views[0].camera, tracks.first[tracks.accepted])
     resolution = map_resolution(motion, seen.views[0].focal_px, PAPER)
 
     def track() -> None:

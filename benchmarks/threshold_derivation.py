@@ -18,12 +18,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import View
-from marsyard.algorithms.dimes.consistency import combinations
-from marsyard.algorithms.dimes.ground import ground_from_pixels
+from marsyard.algorithms.dimes.binning import View, ground_from_pixels
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.overlap import search_geometry, template_candidates
-from marsyard.algorithms.dimes.selection import best_candidates
+from marsyard.algorithms.dimes.overlap import best_candidates, search_geometry, template_candidates
+from marsyard.algorithms.dimes.validity import combinations
 from marsyard.sim.camera import Cahv, CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorCalibration

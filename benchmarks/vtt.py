@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from benchmarks.timing import Figure, core_seconds
-from marsyard.algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
+from marsyard.algorithms.image.correlation import coarse_to_fine_peak, normalized_correlation
 from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
 from marsyard.algorithms.vtt.matching import cut_patch, search_window
 from marsyard.algorithms.vtt.options import VttOptions

@@ -1,8 +1,13 @@
-"""What a user would take instead of DIMES: ready-made image registration behind the same interface."""
+"""Baselines for DIMES: image registration by OpenCV behind the same interface."""
 
 from marsyard.algorithms.baselines.homography import HomographyEstimator, HomographyOptions
-from marsyard.algorithms.baselines.pairs import BaselineDetails, PairMatch, PairPatches
-from marsyard.algorithms.baselines.phase import PhaseCorrelationEstimator, PhaseCorrelationOptions
+from marsyard.algorithms.baselines.pairs import (
+    BaselineDetails,
+    PairMatch,
+    PairPatches,
+    PhaseCorrelationEstimator,
+    PhaseCorrelationOptions,
+)
 
 __all__ = [
     "BaselineDetails",

@@ -9,38 +9,34 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from marsyard.algorithms.baselines.pairs import COMMON, CommonOptions, PairMatch, PairPatches, estimate_by_pairs
+from marsyard.algorithms.baselines.pairs import (
+    DEFAULT_COMMON_OPTIONS,
+    CommonOptions,
+    PairMatch,
+    PairPatches,
+    estimate_by_pairs,
+)
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.sim.measurements import DescentMeasurements
 
 
 @dataclass(frozen=True)
 class HomographyOptions:
-    """Options of the estimator.
+    """Options of the homography.
 
-    Attributes
-    ----------
-    common
-        Geometry and IMU check.
-    features
-        Features looked for in each picture.
-    fast_threshold
-        Grey levels by which a feature differs from its surroundings, after the stretch to 8 bits.
-    max_ratio
-        Largest distance of the best match over that of the second best (Lowe's ratio).
-    reprojection_px
-        Largest distance of an inlier from where the homography puts it, rectified pixels.
-    min_inliers
-        Least number of inliers: chance matches of pictures of different ground agreed in up to 6, those
-        of shifted ones with the flight camera's noise in 190 and above.
-    max_distortion
-        Largest change of any length by the homography in the middle of the inliers, as a share: altitudes and attitudes
-        within specification leave 0.02; more says that they are wrong.
-    confidence, iterations
-        Of the robust estimation.
+    - common: Geometry and IMU check
+    - features: Maximum number of features in each image
+    - fast_threshold: FAST threshold, grey levels after the stretch to 8 bits
+    - max_ratio: Largest distance of the best match over that of the second best (Lowe's ratio)
+    - reprojection_px: Largest reprojection error of an inlier, rectified pixels
+    - min_inliers: Minimum number of inliers: chance matches of images of different ground agreed in up to 6, those of
+      shifted ones with the flight camera's noise in 190 and above.
+    - max_distortion: Largest relative length change by the homography in the middle of the inliers: attitudes and
+      altitudes within specification leave 0.02.
+    - confidence, iterations: Of the robust estimation
     """
 
-    common: CommonOptions = COMMON
+    common: CommonOptions = DEFAULT_COMMON_OPTIONS
     features: int = 500
     fast_threshold: int = 5
     max_ratio: float = 0.8
@@ -53,21 +49,21 @@ class HomographyOptions:
 
 @final
 class HomographyEstimator:
-    """Horizontal velocity from a homography of ORB features between rectified pictures, by MAGSAC++.
+    """Horizontal velocity from a homography of ORB features between rectified images, by MAGSAC++.
 
-    Rectified with exact attitude and altitude the homography is a shift; what their errors leave is taken up by its
-    other parts. The shift is the homography's in the middle of the inliers, where it is known best.
+    With exact attitude and altitude the homography is a shift; its other parameters absorb their errors. The shift is
+    taken in the middle of the inliers, where it is most accurate.
     """
 
     def __init__(self, options: HomographyOptions | None = None) -> None:
         self.options = HomographyOptions() if options is None else options
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """The estimate; its details are `BaselineDetails`. Raises as `DimesEstimator.estimate` does."""
+        """The estimate, with `BaselineDetails`. Raises as `DimesEstimator.estimate`."""
         return estimate_by_pairs(measurements, self._match, self.options.common)
 
     def _match(self, patches: PairPatches) -> PairMatch | None:
-        points = matched_points(patches, self.options)
+        points = match_features(patches, self.options)
         if points is None:
             return None
         first, second = points
@@ -93,28 +89,28 @@ class HomographyEstimator:
 def distortion(
     homography: Float[np.ndarray, "3 3"], depth: float | np.floating, place: Float[np.ndarray, "2"]
 ) -> float:
-    """Largest share by which the homography changes lengths about the point that it puts at `place`.
+    """Largest relative length change by the homography about the point that it maps to `place`.
 
-    `depth` is the third component of that point before it is divided by it.
+    `depth` is the third homogeneous component of the mapped point.
     """
     jacobian = (homography[:2, :2] - np.outer(place, homography[2, :2])) / depth
     return float(np.abs(np.linalg.svd(jacobian, compute_uv=False) - 1.0).max())
 
 
-def eight_bit(patch: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
-    """The patch stretched to 8 bits between its 0.5 % and its 99.5 % quantile."""
+def stretch_to_8_bits(patch: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
+    """The patch stretched to 8 bits between its 0.5 % and 99.5 % quantiles."""
     low, high = np.quantile(patch, (0.005, 0.995))
     scaled = (patch - low) * (255.0 / max(float(high - low), 1e-9))
     return np.asarray(np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
 
 
-def matched_points(
+def match_features(
     patches: PairPatches, options: HomographyOptions
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]] | None:
-    """Places (column, row) of features in both pictures that match; None for fewer than a homography takes."""
+    """Positions (column, row) of matching features in both images; None if too few for a homography."""
     orb = cv2.ORB.create(nfeatures=options.features, fastThreshold=options.fast_threshold)
     (first, first_bits), (second, second_bits) = (
-        orb.detectAndCompute(eight_bit(patch), None) for patch in (patches.first, patches.second)
+        orb.detectAndCompute(stretch_to_8_bits(patch), None) for patch in (patches.first, patches.second)
     )
     if first_bits is None or second_bits is None or len(second) < 2:
         return None

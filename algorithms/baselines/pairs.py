@@ -1,44 +1,38 @@
-"""Pairs of pictures rectified to a common camera that looks straight down, and what becomes of their shifts.
+"""Image pairs rectified to a common camera that looks straight down, and the phase correlation of such pairs.
 
-The baselines see the same corrected pictures as DIMES, in the same geometry
-(`marsyard.algorithms.dimes.rectification`), but all of what two pictures share rather than templates; and the IMU
-checks the change between their two velocities as DIMES' check does, with the same threshold. What differs is how the
-shift is found.
+The baselines see the same corrected images as DIMES, in the same geometry (`marsyard.algorithms.dimes.rectify_views`),
+but the whole overlap of two images rather than templates. The IMU checks the change between their two velocities as in
+DIMES, with the same threshold. Only the measurement of the shift differs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import final
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.binning import View, usable_views
-from marsyard.algorithms.dimes.consistency import combinations
-from marsyard.algorithms.dimes.ground import inside_frame, pixel_angle_rad
+from marsyard.algorithms.dimes.binning import View, inside_frame, pixel_angle_rad, usable_views
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.rectification import ground_lattice, rectified_patch
+from marsyard.algorithms.dimes.rectification import ground_lattice, rectify_patch
+from marsyard.algorithms.dimes.validity import combinations
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 
-#: Rectified pixels between the points at which common ground is looked for.
+#: Step of the lattice of the common ground, rectified pixels.
 COARSE_STEP_PX = 8
 
 
 @dataclass(frozen=True)
 class CommonOptions:
-    """What both baselines share; the geometry's numbers are DIMES' own.
+    """Options of both baselines; defaults of the geometry are those of `DimesOptions`.
 
-    Attributes
-    ----------
-    binned_size, max_speed_m_s, max_off_nadir_rad, border_px, imu_threshold_m_s
-        As in `DimesOptions`.
-    min_side_px
-        Least side of the common square, rectified pixels: the search range twice, so that half of it stays in view.
-    max_side_px
-        Largest side of the common square.
+    - min_side_px: Minimum side of the common square, rectified pixels: twice the search range, half of which stays in
+      view
+    - max_side_px: Maximum side of the common square
     """
 
     binned_size: tuple[int, int] = DimesOptions.binned_size
@@ -50,20 +44,15 @@ class CommonOptions:
     max_side_px: int = 256
 
 
-#: What both take where they are told nothing else.
-COMMON = CommonOptions()
+DEFAULT_COMMON_OPTIONS = CommonOptions()
 
 
 @dataclass(frozen=True)
 class PairPatches:
-    """The same square of ground, were there no motion, in both pictures of a pair.
+    """The same square of ground, at zero motion, in both images of a pair.
 
-    Attributes
-    ----------
-    first, second
-        Corrected and rectified, counts, north up, shape (side, side).
-    gsd_m
-        Ground distance between pixels, metres.
+    - first, second: Corrected and rectified, counts, north up
+    - gsd_m: Ground sample distance
     """
 
     first: Float[np.ndarray, "side side"]
@@ -75,14 +64,9 @@ class PairPatches:
 class PairMatch:
     """The shift of one pair.
 
-    Attributes
-    ----------
-    shift_px
-        By how much what the first patch shows is found shifted in the second: (columns, rows), rectified pixels.
-    score
-        What the match's validity is judged by; larger is better.
-    valid
-        Whether it passed.
+    - shift_px: Shift of the second patch's content: (columns, rows), rectified pixels
+    - score: Validity measure of the match; larger is better
+    - valid: Whether the match is accepted
     """
 
     shift_px: Float[np.ndarray, "2"]
@@ -92,7 +76,7 @@ class PairMatch:
 
 @dataclass(frozen=True)
 class BaselineDetails:
-    """What a baseline found: for each pair its patches, None without common ground, and its match, None without one."""
+    """For each pair its patches, None without common ground, and its match, None without one."""
 
     patches: tuple[PairPatches | None, ...]
     matches: tuple[PairMatch | None, ...]
@@ -101,12 +85,12 @@ class BaselineDetails:
 Matcher = Callable[[PairPatches], PairMatch | None]
 
 
-def common_square(
+def find_common_square(
     first: View, second: View, options: CommonOptions
 ) -> tuple[Float[np.ndarray, "2"], int, float] | None:
-    """The largest square of ground that both views see at zero motion: its middle, side in pixels, ground distance.
+    """The largest square of ground in both views at zero motion: middle, side in pixels, ground sample distance.
 
-    Sides run east and north. None where it is smaller than `min_side_px`.
+    Sides run east and north. None if it is smaller than `min_side_px`.
     """
     gsd = float(second.centre[2]) * pixel_angle_rad(second)
     reach = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
@@ -115,34 +99,34 @@ def common_square(
     seen = np.ones(lattice.shape[:2], dtype=bool)
     for view in (first, second):
         seen &= inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
-    # Steps to the nearest point that is not seen, counted along rows, columns and diagonals: half sides of squares.
+    # chessboard distance to the nearest invisible point: half sides of squares
     steps = cv2.distanceTransform(np.pad(seen, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(steps)), steps.shape)
     side = min(2 * (int(steps[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
     return (lattice[row, column], side, gsd) if side >= options.min_side_px else None
 
 
-def pair_patches(first: View, second: View, options: CommonOptions) -> PairPatches | None:
-    """Both pictures of a pair over their common ground; None where there is too little of it."""
-    found = common_square(first, second, options)
+def rectify_pair(first: View, second: View, options: CommonOptions) -> PairPatches | None:
+    """Both images of a pair over their common ground; None if it is too small."""
+    found = find_common_square(first, second, options)
     if found is None:
         return None
     middle, side, gsd = found
-    return PairPatches(rectified_patch(first, middle, side, gsd), rectified_patch(second, middle, side, gsd), gsd)
+    return PairPatches(rectify_patch(first, middle, side, gsd), rectify_patch(second, middle, side, gsd), gsd)
 
 
 def pair_velocity(patches: PairPatches, match: PairMatch, interval_s: float) -> Float[np.ndarray, "2"]:
-    """Mean velocity of the camera (east, north), m/s: ground moves against it, and rows run south."""
+    """Mean velocity of the camera (east, north), m/s: opposite to the shift of the ground; rows run south."""
     return np.asarray(patches.gsd_m * np.array([-match.shift_px[0], match.shift_px[1]]) / interval_s)
 
 
 def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, options: CommonOptions) -> VelocityEstimate:
-    """The velocity over the second pair, if both pairs match and the IMU agrees with their difference."""
+    """The velocity over the second pair, if both pairs match and their difference agrees with the IMU."""
     triple = usable_views(measurements, options.binned_size)
     if triple is None:
         return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, BaselineDetails((), ()))
     views = ((triple[0], triple[1]), (triple[1], triple[2]))
-    patches = tuple(pair_patches(first, second, options) for first, second in views)
+    patches = tuple(rectify_pair(first, second, options) for first, second in views)
     matches = tuple(None if of_pair is None else matcher(of_pair) for of_pair in patches)
     details = BaselineDetails(patches, matches)
     if None in patches:
@@ -158,3 +142,36 @@ def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, optio
     if not agreement.discrepancy_m_s < options.imu_threshold_m_s:
         return VelocityEstimate(VelocityOutcome.IMU_MISMATCH, None, details)
     return VelocityEstimate(VelocityOutcome.VALID, velocities[1], details)
+
+
+@dataclass(frozen=True)
+class PhaseCorrelationOptions:
+    """Options of the phase correlation.
+
+    - common: Geometry and IMU check
+    - min_response: Minimum response: the peak's energy, 1 for equal images. Images of different ground gave up to 0.12,
+      shifted ones with the flight camera's noise 0.79 and above.
+    """
+
+    common: CommonOptions = DEFAULT_COMMON_OPTIONS
+    min_response: float = 0.25
+
+
+@final
+class PhaseCorrelationEstimator:
+    """Horizontal velocity from the shift between rectified images, by `cv2.phaseCorrelate` with a Hann window."""
+
+    def __init__(self, options: PhaseCorrelationOptions | None = None) -> None:
+        self.options = PhaseCorrelationOptions() if options is None else options
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """The estimate, with `BaselineDetails`. Raises as `DimesEstimator.estimate`."""
+        return estimate_by_pairs(measurements, self._match, self.options.common)
+
+    def _match(self, patches: PairPatches) -> PairMatch | None:
+        first, second = patches.first, patches.second
+        if np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
+            return None
+        window = cv2.createHanningWindow((first.shape[1], first.shape[0]), cv2.CV_64F)
+        shift, response = cv2.phaseCorrelate(first - first.mean(), second - second.mean(), window)
+        return PairMatch(np.array(shift, dtype=np.float64), float(response), response >= self.options.min_response)

@@ -1,10 +1,9 @@
 """DIMES: horizontal velocity from three descent pictures (Johnson, Willson, Goguen, Alexander & Meller, section II)."""
 
-from marsyard.algorithms.dimes.consistency import Combination, propagated
 from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track, dimes_products
 from marsyard.algorithms.dimes.estimator import DimesEstimator
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.validity import TrackMetrics, ValidityCheck
+from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck, propagated
 
 __all__ = [
     "Combination",

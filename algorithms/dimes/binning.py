@@ -1,4 +1,4 @@
-"""From delivered pictures to the binned views that DIMES works on (section II.A, first sentence)."""
+"""Binned images above their ground planes, and the mapping between their pixels and the ground (section II.A)."""
 
 from __future__ import annotations
 
@@ -6,39 +6,29 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration, DetectorImage
 
-#: Heights outside of which nothing is tried: lower than the airbags are large, higher than the atmosphere.
+#: Range of usable heights: from the size of the airbags to above the atmosphere.
 HEIGHTS_M = (1.0, 1e6)
-_PICTURES = 3
+_IMAGE_COUNT = 3
 
 
 @dataclass(frozen=True)
 class View:
-    """One binned picture and where it was taken from.
+    """One binned image above its ground plane.
 
-    Attributes
-    ----------
-    signal
-        Counts above the offset, averaged over the pixels binned by software, shape (rows, columns); not yet corrected.
-    flat_field
-        Relative response, binned likewise.
-    camera
-        Camera model of the binned picture in the view's ground frame: axes east, north, up; the ground is the plane
-        z = 0 at the measured altitude below the body's origin, and the origin lies straight below the camera.
-    centre
-        The camera's place in that frame, metres: (0, 0, height).
-    time_s
-        Time tag of the middle of the exposure.
-    calibration
-        The detector's calibration.
-    rows_summed
-        Physical rows in one row of `signal`, on the chip and by software together.
+    - signal: Counts above the offset, averaged over the pixels binned by software; not yet corrected
+    - flat_field: Relative response, binned likewise
+    - camera: Camera model of the binned image in the view's ground frame: axes east, north, up; the ground is the plane
+      z = 0 at the measured altitude below the body's origin, and the origin is the camera's nadir point
+    - centre: The camera's position in that frame, metres: (0, 0, height)
+    - time_s: Time tag of the middle of the exposure
+    - rows_summed: Physical rows in one row of `signal`, on the chip and by software together
     """
 
     signal: Float[np.ndarray, "rows columns"]
@@ -51,17 +41,14 @@ class View:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Columns and rows of the binned picture."""
+        """Columns and rows of the binned image."""
         return (self.signal.shape[1], self.signal.shape[0])
 
 
 def bin_factors(shape: tuple[int, int], binned_size: tuple[int, int]) -> tuple[int, int]:
-    """Columns and rows to average by software for a delivered picture of `shape` to get `binned_size` (columns, rows).
+    """Software binning factors (columns, rows) from a delivered image of `shape` to `binned_size` (columns, rows).
 
-    Raises
-    ------
-    ValueError
-        If the delivered picture is no whole multiple of the binned one.
+    Raises ValueError if the delivered size is not a multiple of the binned size.
     """
     rows, columns = shape
     if columns % binned_size[0] or rows % binned_size[1]:
@@ -82,25 +69,24 @@ def bin_mean(
 def placed_camera(
     camera: CameraModel, world_from_body: Rotation, altitude_m: float
 ) -> tuple[CameraModel, Float[np.ndarray, "3"]]:
-    """A body's camera above the ground plane by attitude and altitude, in a view's ground frame, and its place there.
+    """A body's camera in a view's ground frame by attitude and altitude, and its position there.
 
-    The altitude is taken as that of the body's origin; the camera's own height follows from its place in the body.
+    The altitude is that of the body's origin; the camera's height follows from its lever arm.
     """
     lever = world_from_body.as_matrix() @ camera.c
     placed = rigid(world_from_body, np.array([-lever[0], -lever[1], altitude_m]))
     return camera.moved(placed), np.array([0.0, 0.0, altitude_m + lever[2]])
 
 
-def view(
+def build_view(
     image: DetectorImage,
     world_from_body: Rotation,
     altitude_m: float,
     binned_size: tuple[int, int],
     before: View | None = None,
 ) -> View:
-    """The binned picture, with its camera placed above the ground plane by measured attitude and altitude.
-
-    The view `before` lends its flat field where both have one calibration.
+    """The binned image with its camera above the ground plane; the flat field of `before` is shared if its calibration
+    is.
     """
     columns, rows = bin_factors(image.counts.shape, binned_size)
     known = image.calibration
@@ -118,10 +104,10 @@ def view(
 
 
 def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, "pictures"]:
-    """Measured altitudes carried from their own time tags to those of the pictures, metres.
+    """Measured altitudes propagated from their own time tags to those of the images, metres.
 
-    The vertical velocity is the inertial one: that of the first interval for the first picture, of the last for the
-    last, and the mean of both neighbours for those between.
+    The vertical velocity is inertial: that of the first and of the last interval for the first and last image, the mean
+    of both neighbours between.
     """
     vertical = measurements.interval_velocities_m_s[:, 2]
     rates = np.concatenate([vertical[:1], 0.5 * (vertical[:-1] + vertical[1:]), vertical[-1:]])
@@ -130,18 +116,13 @@ def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, 
 
 
 def usable_views(measurements: DescentMeasurements, binned_size: tuple[int, int]) -> tuple[View, View, View] | None:
-    """The three binned pictures, each above its own ground plane.
+    """The three binned images, each above its own ground plane.
 
-    None where altitudes or times are not finite, the pictures do not follow each other, or a height is out of
-    `HEIGHTS_M`.
-
-    Raises
-    ------
-    ValueError
-        Where there are not three of them.
+    None if altitudes or times are not finite, times do not increase, or a height is outside `HEIGHTS_M`. Raises
+    ValueError unless there are three images.
     """
-    if len(measurements.images) != _PICTURES:
-        raise ValueError(f"{len(measurements.images)} pictures are given; this estimator takes {_PICTURES}")
+    if len(measurements.images) != _IMAGE_COUNT:
+        raise ValueError(f"{len(measurements.images)} pictures are given; this estimator takes {_IMAGE_COUNT}")
     altitudes = altitudes_at_images(measurements)
     times = np.array([image.time_s for image in measurements.images])
     if not (np.all(np.isfinite(altitudes)) and np.all(np.isfinite(times)) and np.all(np.diff(times) > 0.0)):
@@ -149,8 +130,73 @@ def usable_views(measurements: DescentMeasurements, binned_size: tuple[int, int]
     views: list[View] = []
     for image, attitude, altitude in zip(measurements.images, measurements.attitudes, altitudes, strict=True):
         before = views[-1] if views else None
-        views.append(view(image, attitude.world_from_body, float(altitude), binned_size, before))
+        views.append(build_view(image, attitude.world_from_body, float(altitude), binned_size, before))
     first, second, third = views
     lowest, highest = HEIGHTS_M
     in_range = all(lowest <= one.centre[2] <= highest for one in views)
     return (first, second, third) if in_range else None
+
+
+def ground_from_pixels(
+    view: View, pixels: Float[np.ndarray, "n 2"], max_off_nadir_rad: float
+) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
+    """Intersections of the rays of pixels (u, v) with the ground: (east, north) in the ground frame, metres.
+
+    A ray further from the nadir than `max_off_nadir_rad` is bent down to that angle in its azimuth, which bounds the
+    outline of an image with a horizon; the mask is true for the other rays.
+    """
+    origins, directions = view.camera.rays(pixels)
+    horizontal = np.hypot(directions[:, 0], directions[:, 1])
+    steepest = np.tan(max_off_nadir_rad)
+    down = -directions[:, 2]
+    near = (down > 0.0) & (horizontal <= steepest * down)
+    slope = np.where(near, horizontal / np.where(near, down, 1.0), steepest)
+    azimuths = directions[:, :2] / np.maximum(horizontal, np.finfo(np.float64).tiny)[:, None]
+    return origins[:, :2] + (origins[:, 2] * slope)[:, None] * azimuths, near
+
+
+def pixels_from_ground(
+    view: View, ground: Float[np.ndarray, "*shape 2"]
+) -> tuple[Float[np.ndarray, "*shape 2"], Bool[np.ndarray, "*shape"]]:
+    """Pixels (u, v) of ground points (east, north), and whether the optics can image them (in frame or not)."""
+    points = np.zeros((*ground.shape[:-1], 3))
+    points[..., :2] = ground
+    pixels, visible = view.camera.project(points)
+    return pixels, visible
+
+
+def inside_frame(
+    view: View, ground: Float[np.ndarray, "*shape 2"], border_px: float, max_off_nadir_rad: float
+) -> Bool[np.ndarray, "*shape"]:
+    """Whether ground points lie at least `border_px` inside the image and within the off-nadir limit; False for NaN."""
+    pixels, visible = pixels_from_ground(view, ground)
+    columns, rows = view.size
+    u, v = pixels[..., 0], pixels[..., 1]
+    in_u = (u >= border_px) & (u <= columns - 1 - border_px)
+    in_v = (v >= border_px) & (v <= rows - 1 - border_px)
+    off_nadir = np.hypot(ground[..., 0], ground[..., 1]) / view.centre[2]
+    return np.asarray(visible & in_u & in_v & (off_nadir <= np.tan(max_off_nadir_rad)))
+
+
+def pixel_angle_rad(view: View) -> float:
+    """Mean angle of one pixel along columns and rows in the middle of the image."""
+    columns, rows = view.size
+    middle = np.array([(columns - 1) / 2.0, (rows - 1) / 2.0])
+    around = middle + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
+    _, directions = view.camera.rays(around)
+    across = np.linalg.norm(directions[[1, 3]] - directions[[0, 2]], axis=1)
+    return float(across.mean())
+
+
+def square(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
+    """A lattice of `per_side` x `per_side` points (east, north) over a square of half side `half_m`."""
+    steps = np.linspace(-half_m, half_m, per_side)
+    east, north = np.meshgrid(steps, steps)
+    return np.column_stack([east.ravel(), north.ravel()])
+
+
+def square_outline(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
+    """The points of `square` on its outline."""
+    on_edge = np.ones((per_side, per_side), dtype=bool)
+    on_edge[1:-1, 1:-1] = False
+    return np.asarray(square(half_m, per_side)[on_edge.ravel()])

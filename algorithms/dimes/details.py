@@ -1,4 +1,4 @@
-"""What DIMES did, for figures and diagnosis: all that the paper's Figs. 7-9 show."""
+"""Intermediate products of DIMES, as shown in the paper's Figs. 7-9."""
 
 from __future__ import annotations
 
@@ -8,37 +8,23 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.binning import View
-from marsyard.algorithms.dimes.consistency import Combination
-from marsyard.algorithms.dimes.ground import ground_from_pixels, pixels_from_ground
-from marsyard.algorithms.dimes.validity import TrackMetrics, ValidityCheck
+from marsyard.algorithms.dimes.binning import View, ground_from_pixels, pixels_from_ground
+from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck
 
 
 @dataclass(frozen=True)
 class Track:
-    """One template followed from the earlier to the later picture of a pair.
+    """A template tracked from the earlier to the later image of a pair.
 
-    Attributes
-    ----------
-    pair, index
-        Pair (0: pictures 1 and 2; 1: pictures 2 and 3) and number of the template in it, best contrast first.
-    template_pixel
-        Middle of the template, (u, v) in the pair's earlier binned picture.
-    match_pixel
-        Where it was found, (u, v) in the later binned picture; NaN where that cannot be said.
-    ground_m
-        Ground point under the template's middle, (east, north) of the point below the earlier camera; the window's
-        middle is the point at the same offset from the later one.
-    template, window
-        Rectified and corrected patches, counts, north up: shapes (template_px, template_px), (window_px, window_px).
-    match
-        Row and column in `window` of the matched template's middle.
-    surface
-        Correlation at every shift; shape (2 search_px + 1,) twice, its middle is no motion.
-    metrics, failed
-        The validity metrics and the checks that they fail.
-    velocity_m_s
-        Mean velocity of the camera over the pair (east, north), m/s, also of invalid tracks.
+    - pair, index: Pair (0: images 1 and 2; 1: images 2 and 3) and number of the template in it, best contrast first
+    - template_pixel: Middle of the template, (u, v) in the earlier binned image
+    - match_pixel: Its match, (u, v) in the later binned image; NaN if outside the camera's view
+    - ground_m: Template middle on the ground, (east, north) of the earlier nadir point; the window's middle is the
+      point at the same offset from the later nadir point.
+    - template, window: Rectified and corrected patches, counts, north up
+    - match: Row and column in `window` of the matched template's middle
+    - surface: Correlation at every shift; its middle is zero motion
+    - velocity_m_s: Mean velocity of the camera over the pair (east, north), also of invalid tracks
     """
 
     pair: int
@@ -56,28 +42,19 @@ class Track:
 
     @property
     def valid(self) -> bool:
-        """Whether every check was passed."""
+        """Whether every check passed."""
         return not self.failed
 
 
 @dataclass(frozen=True)
 class PairDetails:
-    """One pair of pictures.
+    """Products of one pair of images.
 
-    Attributes
-    ----------
-    overlap_polygon
-        Outline (u, v) in the earlier picture of what the later one sees, were there no horizontal motion.
-    zero_phase_pixels
-        Middle of the zero-phase spot (u, v) in the earlier and in the later picture, shape (2, 2); NaN if not seen.
-    gsd_m
-        Ground distance between rectified pixels, metres.
-    candidates
-        Number of places on the coarse grid that had room for template and window.
-    tracks
-        The templates tracked, valid or not.
-    views
-        The pair's earlier and later binned picture with their cameras.
+    - overlap_polygon: Outline (u, v) in the earlier image of the later one's footprint at zero horizontal motion
+    - zero_phase_pixels: Middle of the zero-phase spot (u, v) in both images; NaN if invisible
+    - gsd_m: Ground sample distance of rectified pixels
+    - candidates: Number of feasible template positions on the coarse grid
+    - tracks: All tracks, valid or not
     """
 
     overlap_polygon: Float[np.ndarray, "n 2"]
@@ -90,16 +67,11 @@ class PairDetails:
 
 @dataclass(frozen=True)
 class DimesDetails:
-    """Everything that DIMES found on the way to its answer.
+    """Intermediate products of the estimator.
 
-    Attributes
-    ----------
-    pairs
-        Both pairs of pictures; none where times, altitudes or attitudes made no sense.
-    combinations
-        All combinations of valid tracks, best agreement with the IMU first.
-    chosen
-        The combination whose second-pair velocity is reported, or None.
+    - pairs: Both pairs of images; empty for unusable times, altitudes or attitudes
+    - combinations: All combinations of valid tracks, best agreement with the IMU first
+    - chosen: The combination of the reported velocity, or None
     """
 
     pairs: tuple[PairDetails, ...]
@@ -130,9 +102,9 @@ TRACK_COLUMNS = (
     "ground_north_m",
     *(f"failed_{check.name.lower()}" for check in ValidityCheck),
 )
-#: Points along a side of the lattice that pictures are rectified by for figures: enough for a horizon's perspective.
+#: Points along a side of the lattice for rectified figures: enough for a horizon's perspective.
 LATTICE_POINTS = 49
-#: Ground further from the nadir than this is left out of figures: a little more than DIMES uses.
+#: Off-nadir limit of figures: slightly more than DIMES uses.
 FIGURE_OFF_NADIR_RAD = float(np.deg2rad(60.0))
 
 
@@ -157,15 +129,10 @@ def _track_row(track: Track) -> list[float]:
 def rectified_lattice(
     pair: PairDetails,
 ) -> tuple[Float[np.ndarray, "3"], tuple[Float[np.ndarray, "n n 2"], Float[np.ndarray, "n n 2"]]]:
-    """Where the virtual camera's picture of a pair comes from, by few points: what Figs. 7-9 show above is drawn so.
+    """Sampling lattice of the virtual camera's image of a pair, for Figs. 7-9.
 
-    Returns
-    -------
-    frame
-        East and north of the lattice's first point (its upper left) from the point below each camera, and its step,
-        metres. Rows run south.
-    pixels
-        Pixels (u, v) of the earlier and the later picture at the lattice's points; NaN where the camera cannot see.
+    Returns (east and north of the first, upper left point from the nadir point, step), metres, with rows running south;
+    and the pixels (u, v) of the earlier and the later image at the lattice points, NaN if invisible.
     """
     spans = np.stack([_footprint(view) for view in pair.views])
     low, high = spans[:, 0].min(axis=0), spans[:, 1].max(axis=0)
@@ -181,7 +148,7 @@ def rectified_lattice(
 
 
 def _footprint(view: View) -> Float[np.ndarray, "2 2"]:
-    """Least and greatest (east, north) of the ground that a view sees, out to `FIGURE_OFF_NADIR_RAD`."""
+    """Bounds (east, north) of the ground that a view sees, out to `FIGURE_OFF_NADIR_RAD`."""
     columns, rows = view.size
     steps = np.linspace(0.0, 1.0, 17)
     u, v = np.meshgrid(steps * (columns - 1.0), steps * (rows - 1.0))

@@ -1,4 +1,4 @@
-"""The DIMES estimator: three pictures to a horizontal velocity or 'unsuccessful' (section II.B)."""
+"""The DIMES estimator: templates tracked in two image pairs give a horizontal velocity or a failure (section II)."""
 
 from __future__ import annotations
 
@@ -7,58 +7,148 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.binning import usable_views
-from marsyard.algorithms.dimes.consistency import combinations
-from marsyard.algorithms.dimes.details import DimesDetails, PairDetails
+from marsyard.algorithms.dimes.binning import View, pixels_from_ground, usable_views
+from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.tracking import track_pair
+from marsyard.algorithms.dimes.overlap import (
+    SearchGeometry,
+    overlap_polygon,
+    search_geometry,
+    select_templates,
+    template_candidates,
+    zero_phase_pixel,
+)
+from marsyard.algorithms.dimes.rectification import rectify_patch
+from marsyard.algorithms.dimes.validity import combinations, failed_checks, track_metrics
+from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, highest_peak, pseudo_normalized_correlation
+from marsyard.algorithms.image.registration import refine_shift
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
+
+
+def match_corner(
+    template: Float[np.ndarray, "n n"],
+    window: Float[np.ndarray, "w w"],
+    surface: Float[np.ndarray, "s s"],
+    peak: Peak,
+    options: DimesOptions,
+) -> Float[np.ndarray, "2"]:
+    """Row and column in the window of the matched template's upper left pixel, refined as the options require."""
+    whole = np.array([peak.row, peak.column], dtype=np.float64)
+    if not options.subpixel:
+        return whole
+    start = whole + biquadratic_offset(surface, peak)
+    aligned = refine_shift(template, window, start) if options.align and not peak.on_border else None
+    return start if aligned is None else aligned
+
+
+def camera_displacement(corner: Float[np.ndarray, "2"], geometry: SearchGeometry) -> Float[np.ndarray, "2"]:
+    """Horizontal displacement (east, north) of the camera between the images, metres.
+
+    A ground point at r1 from the first nadir point and r2 from the second means a displacement of r1 - r2. The
+    template's middle is r1, the window's middle the same offset: r2 - r1 is the shift from the window's middle times
+    the ground sample distance, with rows running south.
+    """
+    shift = corner - geometry.search_px
+    return np.asarray(geometry.gsd_m * np.array([-shift[1], shift[0]]))
+
+
+def track_template(
+    first: View,
+    second: View,
+    geometry: SearchGeometry,
+    place: tuple[int, int],
+    pixel: Float[np.ndarray, "2"],
+    ground: Float[np.ndarray, "2"],
+    contrast: float,
+    options: DimesOptions,
+) -> Track:
+    """Track the template at `pixel` of the first view, over the ground point `ground`; `place` is (pair, index)."""
+    template = rectify_patch(first, ground, geometry.template_px, geometry.gsd_m)
+    window = rectify_patch(second, ground, geometry.window_px, geometry.gsd_m)
+    surface = pseudo_normalized_correlation(template, window)
+    peak = highest_peak(surface)
+    corner = match_corner(template, window, surface, peak, options)
+    metrics = track_metrics(contrast, surface, peak, options)
+    displacement = camera_displacement(corner, geometry)
+    match_pixel, _ = pixels_from_ground(second, ground - displacement)
+    return Track(
+        pair=place[0],
+        index=place[1],
+        template_pixel=pixel,
+        match_pixel=match_pixel,
+        ground_m=ground,
+        template=template,
+        window=window,
+        match=corner + 0.5 * (geometry.template_px - 1),
+        surface=surface,
+        metrics=metrics,
+        failed=failed_checks(metrics, options),
+        velocity_m_s=displacement / (second.time_s - first.time_s),
+    )
+
+
+def track_pair(
+    pair: int, first: View, second: View, sun_direction: Float[np.ndarray, "3"], options: DimesOptions
+) -> PairDetails:
+    """Select and track the templates of one pair of views."""
+    geometry = search_geometry(first, second, options)
+    candidates = template_candidates(first, second, geometry, sun_direction, options)
+    chosen, contrasts = select_templates(first, candidates, options)
+    return PairDetails(
+        overlap_polygon=overlap_polygon(first, second, options),
+        zero_phase_pixels=np.stack([zero_phase_pixel(view, sun_direction) for view in (first, second)]),
+        gsd_m=geometry.gsd_m,
+        candidates=len(candidates.pixels),
+        tracks=tuple(
+            track_template(
+                first,
+                second,
+                geometry,
+                (pair, index),
+                candidates.pixels[candidate],
+                candidates.ground[candidate],
+                float(contrast),
+                options,
+            )
+            for index, (candidate, contrast) in enumerate(zip(chosen, contrasts, strict=True))
+        ),
+        views=(first, second),
+    )
 
 
 @final
 class DimesEstimator:
     """The Descent Image Motion Estimation System of the Mars Exploration Rovers.
 
-    Two templates are tracked between the first and second picture and two between the second and third. The velocity
-    reported is that of the second-pair track in the combination of a first- and a second-pair track whose change of
-    velocity agrees best with the IMU's, if it agrees within the threshold.
-
-    The ground is taken as level planes, at each picture's own altitude below the body. Images are trusted in their
-    calibrated camera model, attitude and time tag; nothing is read from the inertial velocity but its change (and its
-    vertical part, to carry altitudes to the time of the pictures).
+    Two templates are tracked in each pair of consecutive images. The reported velocity is that of the second-pair track
+    in the combination of tracks whose velocity change agrees best with the IMU, if within the threshold. The ground is
+    modelled as level planes, at each image's own altitude. Only changes of the inertial velocity are used, and its
+    vertical part to propagate altitudes to the images.
     """
 
     def __init__(self, options: DimesOptions | None = None) -> None:
         self.options = DimesOptions() if options is None else options
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """The estimate; its details are `DimesDetails`.
+        """The estimate, with `DimesDetails`.
 
-        Raises
-        ------
-        ValueError
-            If the pictures' size does not bin to the size that the options ask for, or their calibration is not
-            possible. Never for what the pictures show or the instruments measure.
+        Raises ValueError if the image size does not bin to the size in the options, or for an impossible calibration;
+        never for image content or measurements.
         """
         triple = usable_views(measurements, self.options.binned_size)
         if triple is None:
             return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, DimesDetails((), (), None))
         first, second, third = triple
         sun = measurements.sun_direction
-        pairs = (
-            track_pair(0, first, second, sun, self.options),
-            track_pair(1, second, third, sun, self.options),
-        )
+        pairs = (track_pair(0, first, second, sun, self.options), track_pair(1, second, third, sun, self.options))
         return conclude(pairs, measurements.interval_velocities_m_s, self.options.imu_threshold_m_s)
 
 
 def conclude(
-    pairs: tuple[PairDetails, PairDetails],
-    interval_velocities_m_s: Float[np.ndarray, "2 3"],
-    imu_threshold_m_s: float,
+    pairs: tuple[PairDetails, PairDetails], interval_velocities_m_s: Float[np.ndarray, "2 3"], imu_threshold_m_s: float
 ) -> VelocityEstimate:
-    """The answer that the tracks of both pairs and the IMU give together."""
+    """Combine the tracks of both pairs with the IMU."""
     if not all(pair.tracks for pair in pairs):
         return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, DimesDetails(pairs, (), None))
     valid = [[(track.index, track.velocity_m_s) for track in pair.tracks if track.valid] for pair in pairs]

@@ -1,4 +1,4 @@
-"""Where a template may lie: overlap of two views, room for template and window, zero-phase spot (section II.A)."""
+"""Template candidates in the overlap region of two views, and the selection among them (section II.A)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.algorithms.dimes.binning import View
-from marsyard.algorithms.dimes.ground import (
+from marsyard.algorithms.dimes.binning import (
+    View,
     ground_from_pixels,
     inside_frame,
     pixel_angle_rad,
@@ -17,20 +17,16 @@ from marsyard.algorithms.dimes.ground import (
     square_outline,
 )
 from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
 
 
 @dataclass(frozen=True)
 class SearchGeometry:
     """Sizes of template and search window of a pair, in the virtual camera that looks straight down.
 
-    Attributes
-    ----------
-    gsd_m
-        Ground distance between rectified pixels: what one binned pixel of the second view covers at its nadir, metres.
-    template_px
-        Side of the template, rectified pixels.
-    search_px
-        Largest shift searched in each direction, rectified pixels.
+    - gsd_m: Ground sample distance: one binned pixel of the second view at its nadir
+    - template_px: Side of the template
+    - search_px: Largest shift searched in each direction
     """
 
     gsd_m: float
@@ -39,29 +35,29 @@ class SearchGeometry:
 
     @property
     def window_px(self) -> int:
-        """Side of the search window, rectified pixels."""
+        """Side of the search window."""
         return self.template_px + 2 * self.search_px
 
     @property
     def template_half_m(self) -> float:
-        """From the template's middle to the outer edge of its pixels, metres."""
+        """Half the side of the template on the ground."""
         return 0.5 * self.template_px * self.gsd_m
 
     @property
     def window_half_m(self) -> float:
-        """From the window's middle to the outer edge of its pixels, metres."""
+        """Half the side of the search window on the ground."""
         return 0.5 * self.window_px * self.gsd_m
 
 
 def search_geometry(first: View, second: View, options: DimesOptions) -> SearchGeometry:
-    """Sizes from the second view's height, its pixels' angle, the time between pictures and the largest speed."""
+    """Sizes from the second view's height, pixel angle, image interval and largest speed."""
     gsd = float(second.centre[2]) * pixel_angle_rad(second)
     reach_m = options.max_speed_m_s * (second.time_s - first.time_s)
     return SearchGeometry(gsd, options.template_px, int(np.ceil(reach_m / gsd)) + options.search_margin_px)
 
 
 def border_pixels(size: tuple[int, int], per_side: int = 8) -> Float[np.ndarray, "n 2"]:
-    """Points along the border of a picture of `size` (columns, rows), corners included, in order around it."""
+    """Pixels along the border of an image of `size` (columns, rows), in order."""
     columns, rows = size
     steps = np.arange(per_side) / per_side
     u, v = columns - 1.0, rows - 1.0
@@ -73,9 +69,8 @@ def border_pixels(size: tuple[int, int], per_side: int = 8) -> Float[np.ndarray,
 
 
 def overlap_polygon(first: View, second: View, options: DimesOptions) -> Float[np.ndarray, "n 2"]:
-    """The second view's border cast to the ground and seen in the first view, were there no horizontal motion.
-
-    Pixels (u, v) of the first view, in order around the polygon; points that the first camera cannot see are left out.
+    """The second view's border in the first view at zero horizontal motion: pixels (u, v) in order; invisible ones
+    omitted.
     """
     ground, _ = ground_from_pixels(second, border_pixels(second.size), options.max_off_nadir_rad)
     pixels, visible = pixels_from_ground(first, ground)
@@ -83,19 +78,19 @@ def overlap_polygon(first: View, second: View, options: DimesOptions) -> Float[n
 
 
 def grid_pixels(size: tuple[int, int], step: int) -> Float[np.ndarray, "n 2"]:
-    """The coarse grid of candidate pixels (u, v) of a picture of `size` (columns, rows), centred in it, row by row."""
+    """The coarse grid of candidate pixels (u, v), centred in an image of `size` (columns, rows), row by row."""
     u, v = (np.arange((n - 1) % step // 2, n, step, dtype=np.float64) for n in size)
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
 def anti_solar_direction(sun_direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Unit vector from the lander to the middle of the zero-phase spot: away from the sun, world axes."""
+    """Unit vector from the lander to the middle of the zero-phase spot, world axes."""
     length = float(np.linalg.norm(sun_direction))
     return -np.asarray(sun_direction, dtype=np.float64) / (length if length > 0.0 else 1.0)
 
 
 def zero_phase_pixel(view: View, sun_direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
-    """Pixel (u, v) of the middle of the zero-phase spot, in or out of frame; NaN where the camera cannot see it."""
+    """Pixel (u, v) of the middle of the zero-phase spot, in or out of frame; NaN if the camera cannot image it."""
     away = 1e7 * anti_solar_direction(sun_direction)
     pixels, visible = view.camera.project((view.centre + away)[None, :])
     return np.asarray(pixels[0]) if visible[0] else np.full(2, np.nan)
@@ -104,7 +99,7 @@ def zero_phase_pixel(view: View, sun_direction: Float[np.ndarray, "3"]) -> Float
 def outside_zero_phase(
     view: View, ground: Float[np.ndarray, "*shape 2"], sun_direction: Float[np.ndarray, "3"], radius_rad: float
 ) -> Bool[np.ndarray, "*shape"]:
-    """Whether ground points (east, north) are seen further than `radius_rad` from the anti-solar direction."""
+    """Whether ground points (east, north) are further than `radius_rad` from the anti-solar direction."""
     spot = anti_solar_direction(sun_direction)
     height = view.centre[2]
     ranges = np.sqrt(ground[..., 0] ** 2 + ground[..., 1] ** 2 + height**2)
@@ -114,10 +109,10 @@ def outside_zero_phase(
 
 @dataclass(frozen=True)
 class Candidates:
-    """Places for a template: pixels (u, v) of the first view, their ground points, and which are preferred.
+    """Feasible template positions: pixels (u, v) of the first view, ground points, and preference.
 
-    All have room for template and window and show no zero-phase spot in the template at zero motion; the preferred have
-    none anywhere in the search window either.
+    Template and search window are feasible at each, and the template is clear of the zero-phase spot at zero motion.
+    The whole search window of a preferred candidate is clear of it.
     """
 
     pixels: Float[np.ndarray, "n 2"]
@@ -126,13 +121,9 @@ class Candidates:
 
 
 def template_candidates(
-    first: View,
-    second: View,
-    geometry: SearchGeometry,
-    sun_direction: Float[np.ndarray, "3"],
-    options: DimesOptions,
+    first: View, second: View, geometry: SearchGeometry, sun_direction: Float[np.ndarray, "3"], options: DimesOptions
 ) -> Candidates:
-    """All places of the coarse grid where a template may lie."""
+    """All feasible template positions on the coarse grid."""
     limit = options.max_off_nadir_rad
     pixels = grid_pixels(first.size, options.grid_step_px)
     ground, seen = ground_from_pixels(first, pixels, limit)
@@ -150,3 +141,50 @@ def template_candidates(
     clear = dark(first, geometry.template_half_m, 4) & dark(second, geometry.template_half_m, 4)
     preferred = dark(second, geometry.window_half_m, 7)
     return Candidates(pixels[clear], ground[clear], preferred[clear])
+
+
+#: Minimum mean signal that divides the interest, as a fraction of the full scale.
+DARK_FRACTION = 0.01
+
+
+def contrasts(view: View, pixels: Float[np.ndarray, "n 2"], support: int) -> Float[np.ndarray, "n"]:
+    """Harris interest over squares of `support` pixels about whole pixels (u, v), divided by the mean signal there.
+
+    Computed on the delivered image: the frame-transfer ramp is smooth along columns and hardly changes the interest.
+    """
+    columns, rows = np.rint(pixels).astype(int).T
+    uu, vv, uv = (part[rows, columns] for part in structure_tensor(view.signal, support))
+    mean = local_mean(view.signal, support)[rows, columns]
+    return np.asarray(harris_interest(uu, vv, uv) / np.maximum(mean, DARK_FRACTION * view.calibration.full_scale_dn))
+
+
+def best_candidates(
+    contrasts: Float[np.ndarray, "n"],
+    pixels: Float[np.ndarray, "n 2"],
+    preferred: Bool[np.ndarray, "n"],
+    count: int,
+    exclusion_px: float,
+) -> list[int]:
+    """Indices of up to `count` candidates by decreasing contrast, preferred ones first.
+
+    Each choice excludes the candidates closer than `exclusion_px` in both column and row.
+    """
+    left = np.ones(len(contrasts), dtype=bool)
+    chosen: list[int] = []
+    while len(chosen) < count and left.any():
+        pool = left & preferred if np.any(left & preferred) else left
+        best = int(np.argmax(np.where(pool, contrasts, -np.inf)))
+        chosen.append(best)
+        left &= np.abs(pixels - pixels[best]).max(axis=1) >= exclusion_px
+    return chosen
+
+
+def select_templates(
+    view: View, candidates: Candidates, options: DimesOptions
+) -> tuple[list[int], Float[np.ndarray, "k"]]:
+    """Indices of the selected candidates, best first, and their contrasts."""
+    found = contrasts(view, candidates.pixels, options.template_px)
+    chosen = best_candidates(
+        found, candidates.pixels, candidates.preferred, options.templates_per_pair, options.exclusion_px
+    )
+    return chosen, found[chosen]

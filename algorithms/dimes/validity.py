@@ -1,19 +1,21 @@
-"""Validity of a track: the four metrics of section II.A and their thresholds."""
+"""Checks of a track: the four validity metrics (section II.A) and the agreement with the IMU (section II.B)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float
 
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.image.peak import Peak, peak_width, second_peak
+from marsyard.algorithms.image.correlation import Peak, peak_width, second_peak
 
 
 class ValidityCheck(Enum):
-    """What a track can fail."""
+    """Validity checks of a track."""
 
     CONTRAST = "too little contrast in the template"
     PEAK_HEIGHT = "correlation peak too low"
@@ -24,20 +26,13 @@ class ValidityCheck(Enum):
 
 @dataclass(frozen=True)
 class TrackMetrics:
-    """What the validity of a track is judged by.
+    """Validity metrics of a track.
 
-    Attributes
-    ----------
-    contrast
-        Harris interest of the template divided by its mean signal, per binned pixel (see `selection.contrasts`).
-    peak
-        Height of the correlation peak, at most 1.
-    peak_width_px
-        Its full width at three quarters of its height along its longest direction, rectified pixels.
-    second_peak_ratio
-        Second highest local maximum over the peak; 1 where there is no positive peak.
-    on_border
-        Whether the highest correlation lies on the border of the search range: then it is no peak.
+    - contrast: Harris interest of the template divided by its mean signal, per binned pixel
+    - peak: Height of the correlation peak, at most 1
+    - peak_width_px: Its full width at three quarters of its height along its longest direction, rectified pixels
+    - second_peak_ratio: Second highest local maximum over the peak; 1 without a positive peak
+    - on_border: Whether the highest correlation lies on the border of the search range
     """
 
     contrast: float
@@ -50,7 +45,7 @@ class TrackMetrics:
 def track_metrics(
     contrast: float, surface: Float[np.ndarray, "rows columns"], peak: Peak, options: DimesOptions
 ) -> TrackMetrics:
-    """The metrics of a correlation surface and the contrast of its template."""
+    """The metrics of a correlation surface and its template's contrast."""
     second = second_peak(surface, peak, options.second_peak_exclusion_px)
     return TrackMetrics(
         contrast=contrast,
@@ -62,7 +57,7 @@ def track_metrics(
 
 
 def failed_checks(metrics: TrackMetrics, options: DimesOptions) -> tuple[ValidityCheck, ...]:
-    """The checks that the metrics fail, none for a valid track."""
+    """The failed checks, none for a valid track."""
     failures = {
         ValidityCheck.CONTRAST: not metrics.contrast >= options.min_contrast,
         ValidityCheck.PEAK_HEIGHT: not metrics.peak >= options.min_peak,
@@ -71,3 +66,43 @@ def failed_checks(metrics: TrackMetrics, options: DimesOptions) -> tuple[Validit
         ValidityCheck.SEARCH_BORDER: metrics.on_border,
     }
     return tuple(check for check, failed in failures.items() if failed)
+
+
+Horizontal = Float[np.ndarray, "2"]
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Indices of a first-pair and a second-pair track, and their discrepancy from the IMU.
+
+    The discrepancy is the length of the horizontal velocity change less the change measured by the IMU.
+    """
+
+    first: int
+    second: int
+    discrepancy_m_s: float
+
+
+def combinations(
+    first: Sequence[tuple[int, Horizontal]],
+    second: Sequence[tuple[int, Horizontal]],
+    interval_velocities_m_s: Float[np.ndarray, "2 3"],
+) -> tuple[Combination, ...]:
+    """All combinations of valid tracks (index, velocity) of both pairs, best agreement first."""
+    change = (interval_velocities_m_s[1] - interval_velocities_m_s[0])[:2]
+    found = [
+        Combination(i, j, float(np.hypot(*(v_second - v_first - change))))
+        for (i, v_first), (j, v_second) in product(first, second)
+    ]
+    return tuple(sorted(found, key=lambda c: c.discrepancy_m_s))
+
+
+def propagated(
+    velocity_m_s: Horizontal, inertial_then_m_s: Horizontal, inertial_now_m_s: Horizontal
+) -> Float[np.ndarray, "2"]:
+    """Propagate a velocity by the inertial unit, for example to thruster firing near 100 m (section I), m/s.
+
+    `inertial_then_m_s` is the inertial mean velocity over the second pair's interval. The unknown error common to both
+    inertial velocities cancels.
+    """
+    return np.asarray(velocity_m_s + (inertial_now_m_s - inertial_then_m_s))

@@ -6,10 +6,20 @@ from marsyard.algorithms.exchange.executable import (
     ExecutableVelocityEstimator,
     ExecutableVelocityStream,
 )
-from marsyard.algorithms.exchange.files import EXCHANGE, Pictures, read_case, read_frame, write_case, write_frame
+from marsyard.algorithms.exchange.files import (
+    EXCHANGE,
+    Pictures,
+    read_case,
+    read_frame,
+    read_mast,
+    read_pose,
+    read_stop,
+    read_target,
+    write_case,
+    write_frame,
+)
 from marsyard.algorithms.exchange.process import PREFIXES, Command, ExecutableLimits, command_of
-from marsyard.algorithms.exchange.replies import ProgramDetails
-from marsyard.algorithms.exchange.stops import read_mast, read_pose, read_stop, read_target
+from marsyard.algorithms.exchange.serving import ProgramDetails
 
 __all__ = [
     "EXCHANGE",

@@ -1,9 +1,7 @@
-"""One case as files: pictures as 16-bit PGM or PNG, cameras as `.cahvor`, all else in `case.json`.
+"""Cases, frames and rover stops as files: images as 16-bit PGM or PNG, cameras as `.cahvor`, all else as JSON.
 
-One picture of a descent, as a stream gets it, is such a folder too, with `frame.json`.
-
-What is written is read back as it was: counts and the flat field bit for bit, numbers too (JSON carries the shortest
-text that gives the same float64), attitudes to within rounding of a quaternion's norm.
+Reading restores counts, flat fields and numbers bit for bit (JSON holds the shortest text of the same float64), and
+attitudes to within rounding of a quaternion's norm.
 """
 
 from __future__ import annotations
@@ -19,9 +17,9 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from jaxtyping import Float, Float64, UInt16
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.camera import BODY_FRAME, read_cahvor, write_cahvor
+from marsyard.sim.camera import BODY_FRAME, HEAD_FRAME, read_cahvor, write_cahvor
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import (
     AltitudeMeasurement,
@@ -31,18 +29,25 @@ from marsyard.sim.measurements import (
     DetectorCalibration,
     DetectorImage,
     LandingMeasurements,
+    MastCalibration,
+    MastGeometry,
+    MastImage,
+    PixelTarget,
     PoseMeasurement,
+    RoverMeasurements,
+    RoverTarget,
+    SiteTarget,
+    TargetDesignation,
 )
 
 #: Version of the files of a case.
 EXCHANGE = 1
-#: Versions of answers, and of the lines of a program that is asked line by line: from 2 on each request has an `id`,
-#: which its answer repeats.
+#: Versions of answers and of request lines; from 2 on each request has an `id`, which its answer repeats.
 ANSWER_VERSIONS = (1, 2)
 
 CASE_FILE, FRAME_FILE = "case.json", "frame.json"
 
-#: What is known of a detector next to its flat field.
+#: Calibration fields of a detector, without its flat field.
 _CALIBRATION = tuple(one.name for one in fields(DetectorCalibration) if one.name != "flat_field")
 
 #: Form in which pictures are written.
@@ -52,14 +57,18 @@ Pictures = Literal["pgm", "png"]
 def write_case(
     folder: Path, measurements: DescentMeasurements | LandingMeasurements, pictures: Pictures = "pgm"
 ) -> None:
-    """Writes what instruments delivered into a folder that is there. Raises OSError where that fails."""
-    content = _descent(measurements) if isinstance(measurements, DescentMeasurements) else _landing(measurements)
+    """Write the measurements of a case into an existing folder. Raises OSError if that fails."""
+    content = (
+        _encode_descent(measurements)
+        if isinstance(measurements, DescentMeasurements)
+        else _encode_landing(measurements)
+    )
     images = _write_images(folder, measurements.images, pictures)
     write_json(folder / CASE_FILE, {"exchange": EXCHANGE, **content, "images": images})
 
 
 def write_frame(folder: Path, frame: DescentFrame) -> None:
-    """Writes what came with one picture of a descent into a folder that is there. Raises OSError where that fails."""
+    """Write one descent image and its measurements into an existing folder. Raises OSError if that fails."""
     (image,) = _write_images(folder, [frame.image], "pgm")
     content = {
         "exchange": EXCHANGE,
@@ -74,8 +83,8 @@ def write_frame(folder: Path, frame: DescentFrame) -> None:
 
 
 def read_frame(folder: Path) -> DescentFrame:
-    """Reads what `write_frame` wrote. Raises ValueError where the folder holds no frame, or one of another version."""
-    with reading(folder / FRAME_FILE, "picture of a descent") as content:
+    """Read a frame of `write_frame`. Raises ValueError for a folder without one, or of another version."""
+    with open_json(folder / FRAME_FILE, "picture of a descent") as content:
         _check_version(content)
         return DescentFrame(
             image=_read_image(folder, content["image"]),
@@ -88,14 +97,8 @@ def read_frame(folder: Path) -> DescentFrame:
 
 
 def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
-    """Reads what `write_case` wrote.
-
-    Raises
-    ------
-    ValueError
-        Where the folder holds no case, or one of another version.
-    """
-    with reading(folder / CASE_FILE, "case") as content:
+    """Read a case of `write_case`. Raises ValueError for a folder without one, or of another version."""
+    with open_json(folder / CASE_FILE, "case") as content:
         _check_version(content)
         images = [_read_image(folder, one) for one in content["images"]]
         return _read_descent(content, images) if content["task"] == "velocity" else _read_landing(content, images)
@@ -107,8 +110,8 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def reading(path: Path, kind: str) -> Iterator[Mapping[str, Any]]:
-    """The table of a JSON file; a fault in the file, or in what is made of it, becomes a ValueError that names both."""
+def open_json(path: Path, kind: str) -> Iterator[Mapping[str, Any]]:
+    """Yield the table of a JSON file; errors in the file or its use become a ValueError that names both."""
     try:
         yield json.loads(path.read_text(encoding="utf-8"))
     except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
@@ -120,7 +123,7 @@ def _check_version(content: Mapping[str, Any]) -> None:
         raise ValueError(f"it has version {content['exchange']} of the exchange; this program reads {EXCHANGE}")
 
 
-def _descent(measurements: DescentMeasurements) -> dict[str, Any]:
+def _encode_descent(measurements: DescentMeasurements) -> dict[str, Any]:
     at = measurements.inertial_velocities_m_s
     return {
         "task": "velocity",
@@ -173,7 +176,7 @@ def _optional_vector(content: Any) -> Float64[np.ndarray, "..."] | None:
     return None if content is None else _vector(content)
 
 
-def _landing(measurements: LandingMeasurements) -> dict[str, Any]:
+def _encode_landing(measurements: LandingMeasurements) -> dict[str, Any]:
     known = math.isfinite(measurements.slant_range_m)
     return {
         "task": "landing",
@@ -209,7 +212,7 @@ def _read_landing(content: Mapping[str, Any], images: Sequence[DetectorImage]) -
 
 
 def _write_images(folder: Path, images: Sequence[DetectorImage], pictures: Pictures) -> list[dict[str, Any]]:
-    """Writes pictures, cameras and flat fields; a flat field that several pictures share is written once."""
+    """Write images, cameras and flat fields; a shared flat field is written once."""
     written: list[dict[str, Any]] = []
     fields: list[tuple[str, Float[np.ndarray, "rows columns"]]] = []
     for number, image in enumerate(images, start=1):
@@ -240,7 +243,7 @@ def _read_image(folder: Path, content: Mapping[str, Any]) -> DetectorImage:
 
 
 def write_picture(path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> None:
-    """Writes counts as they are: `.pgm` (P5, two bytes a pixel, the more significant first) or `.png` (16 bits)."""
+    """Write counts as `.pgm` (P5, two bytes a pixel, big-endian) or `.png` (16 bits)."""
     if path.suffix == ".pgm":
         rows, columns = counts.shape
         path.write_bytes(b"P5\n%d %d\n65535\n" % (columns, rows) + counts.astype(">u2").tobytes())
@@ -249,8 +252,101 @@ def write_picture(path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> Non
 
 
 def read_picture(path: Path) -> UInt16[np.ndarray, "rows columns"]:
-    """Reads what `write_picture` wrote. Raises ValueError where it is no picture of 16 bits."""
+    """Read counts of `write_picture`. Raises ValueError unless it is a 16-bit image of one band."""
     counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if counts is None or counts.dtype != np.uint16 or counts.ndim != 2:
         raise ValueError(f"{path} is no picture of one band with 16 bits")
     return np.asarray(counts, dtype=np.uint16)
+
+
+MAST_FILE, STOP_FILE = "mast.json", "stop.json"
+_OFFSETS, _LIMITS = ("base_m", "elbow_m", "head_m"), ("azimuth_limits_rad", "elevation_limits_rad")
+
+
+def write_mast(folder: Path, mast: MastCalibration) -> None:
+    """Write a mast and its two cameras into an existing folder."""
+    for name, camera in (("left", mast.left), ("right", mast.right)):
+        write_cahvor(camera, folder / f"{name}.cahvor", frame=HEAD_FRAME)
+    geometry = mast.geometry
+    content = {
+        **{name: getattr(geometry, name).tolist() for name in _OFFSETS},
+        **{name: list(getattr(geometry, name)) for name in _LIMITS},
+        "left": {"camera": "left.cahvor", "columns": mast.left.size[0], "rows": mast.left.size[1]},
+        "right": {"camera": "right.cahvor", "columns": mast.right.size[0], "rows": mast.right.size[1]},
+    }
+    write_json(folder / MAST_FILE, content)
+
+
+def read_mast(folder: Path) -> MastCalibration:
+    """Read a mast of `write_mast`. Raises ValueError for a folder without one."""
+    with open_json(folder / MAST_FILE, "mast") as content:
+        left, right = (read_cahvor(folder / content[name]["camera"]) for name in ("left", "right"))
+        base, elbow, head = (np.array(content[name], dtype=np.float64) for name in _OFFSETS)
+        azimuths, elevations = ((content[name][0], content[name][1]) for name in _LIMITS)
+        return MastCalibration(MastGeometry(base, elbow, head, azimuths, elevations), left, right)
+
+
+def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
+    """Write a stop's images and angles into an existing folder, without the mast."""
+    content: dict[str, Any] = {
+        "azimuth_rad": measurements.azimuth_rad,
+        "elevation_rad": measurements.elevation_rad,
+        "world_from_rover": encode_pose(measurements.world_from_rover),
+    }
+    for name, image in (("left", measurements.left), ("right", measurements.right)):
+        write_picture(folder / f"{name}.pgm", image.counts)
+        rows, columns = image.counts.shape
+        content[name] = {"file": f"{name}.pgm", "corner": list(image.corner), "columns": columns, "rows": rows}
+    write_json(folder / STOP_FILE, content)
+
+
+def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
+    """Read a stop of `write_stop`. Raises ValueError for a folder without one."""
+    with open_json(folder / STOP_FILE, "stop") as content:
+        left, right = (
+            MastImage(
+                read_picture(folder / content[name]["file"]),
+                (int(content[name]["corner"][0]), int(content[name]["corner"][1])),
+            )
+            for name in ("left", "right")
+        )
+        azimuth, elevation = float(content["azimuth_rad"]), float(content["elevation_rad"])
+        return RoverMeasurements(left, right, mast, azimuth, elevation, read_pose(content["world_from_rover"]))
+
+
+def encode_pose(pose: RigidTransform) -> dict[str, list[float]]:
+    """A rover's pose: position in the world and unit quaternion, scalar last."""
+    return {
+        "position_world_m": np.asarray(pose.translation).tolist(),
+        "world_from_rover_xyzw": pose.rotation.as_quat().tolist(),
+    }
+
+
+def read_pose(content: Mapping[str, Any]) -> RigidTransform:
+    """Read a pose of `encode_pose`."""
+    return rigid(
+        Rotation.from_quat(content["world_from_rover_xyzw"]), np.array(content["position_world_m"], dtype=np.float64)
+    )
+
+
+def encode_target(target: TargetDesignation) -> dict[str, Any]:
+    """A target designation in one of its three forms."""
+    match target:
+        case PixelTarget():
+            angles = {"azimuth_rad": target.azimuth_rad, "elevation_rad": target.elevation_rad}
+            return {"pixel": target.pixel.tolist(), **angles}
+        case RoverTarget():
+            return {"position_rover": target.position_rover.tolist()}
+        case SiteTarget():
+            return {"position_site": target.position_site.tolist()}
+
+
+def read_target(content: Mapping[str, Any]) -> TargetDesignation:
+    """Read a designation of `encode_target`."""
+    if "pixel" in content:
+        return PixelTarget(
+            np.array(content["pixel"], dtype=np.float64), content["azimuth_rad"], content["elevation_rad"]
+        )
+    if "position_rover" in content:
+        return RoverTarget(np.array(content["position_rover"], dtype=np.float64))
+    return SiteTarget(np.array(content["position_site"], dtype=np.float64))

@@ -1,6 +1,6 @@
-"""Programs under test: how they are named, and how one runs within limits on time, memory and output.
+"""Programs under test: their commands, and their execution within limits on time, memory and output.
 
-A program leads a process group of its own, which is ended as a whole, and ends with the process that started it.
+A program leads its own process group, which is killed as a whole, and ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from pydantic import BaseModel, ConfigDict, Field
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.processes import descendants, resident_bytes
 
-#: Seconds between two looks at the memory that a program has.
-_LOOK_S = 0.02
-#: Characters of standard error that are kept: the last ones.
-KEPT_STDERR = 4000
-#: Seconds that a persistent program has to end by itself once its input is closed.
-_LEAVE_S = 0.5
+#: Interval of the memory checks, seconds.
+_POLL_S = 0.02
+#: Number of last characters of standard error that are kept.
+MAX_STDERR_CHARACTERS = 4000
+#: Time for a persistent program to exit after its input is closed, seconds.
+_EXIT_GRACE_S = 0.5
 
 _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None)
 
 
 class ExecutableLimits(BaseModel):
-    """What a program under test may use for one case."""
+    """Limits of a program under test for one case."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -47,16 +47,11 @@ class ExecutableLimits(BaseModel):
 
 @dataclass(frozen=True)
 class Command:
-    """A program under test.
+    """Command line of a program under test.
 
-    Attributes
-    ----------
-    words
-        The program and its arguments.
-    persistent
-        Whether one process answers many cases.
-    stream
-        Whether it is given a descent's pictures one by one.
+    - words: The program and its arguments
+    - persistent: Whether one process answers many cases
+    - stream: Whether it gets a descent's images one by one
     """
 
     words: tuple[str, ...]
@@ -64,7 +59,7 @@ class Command:
     stream: bool = False
 
 
-#: How a program is named: whether one process answers many cases, and whether it gets pictures one by one.
+#: Prefixes of commands, with `Command.persistent` and `Command.stream`.
 PREFIXES: Mapping[str, tuple[bool, bool]] = {
     "exec:": (False, False),
     "serve:": (True, False),
@@ -74,12 +69,9 @@ PREFIXES: Mapping[str, tuple[bool, bool]] = {
 
 
 def command_of(text: str) -> Command | None:
-    """The program that a text names (`exec:./mine --flag`); None where it names none.
+    """Parse a command (`exec:./mine --flag`); None for a text without one of the prefixes.
 
-    Raises
-    ------
-    ValueError
-        Where it names one that is not there, or its quotes do not close.
+    Raises ValueError if the program does not exist or a quote is not closed.
     """
     prefix = next((one for one in PREFIXES if text.startswith(one)), None)
     if prefix is None:
@@ -97,22 +89,19 @@ def command_of(text: str) -> Command | None:
 
 
 @dataclass(frozen=True)
-class Said:
-    """What a program wrote in answer to one case, and the wall-clock seconds that it took."""
+class Output:
+    """Output of a program for one case, and its wall-clock time."""
 
-    output: bytes
+    stdout: bytes
     stderr: str
     time_s: float
 
 
 @dataclass
-class Child:
-    """A program that runs.
+class RunningProgram:
+    """A running program under test.
 
-    Raises
-    ------
-    AlgorithmError
-        From every method, once the program breaks a limit, ends too early or cannot be started; it is ended then.
+    Every method raises AlgorithmError, after ending the program, if it breaks a limit, ends early or cannot be started.
     """
 
     words: tuple[str, ...]
@@ -130,7 +119,7 @@ class Child:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 process_group=0,
-                preexec_fn=_go_with_parent if sys.platform == "linux" else None,
+                preexec_fn=_end_with_parent if sys.platform == "linux" else None,
             )
         except OSError as error:
             message = f"{self.words[0]} cannot be started: {error.strerror or error}"
@@ -139,44 +128,43 @@ class Child:
 
     @property
     def process(self) -> int:
-        """Its process id."""
+        """Process id."""
         return self._process.pid
 
-    def answer(self) -> Said:
-        """All that the program writes until it ends by itself, with status 0."""
+    def answer(self) -> Output:
+        """The whole output of the program until it exits with status 0."""
         started = time.perf_counter()
         self._close_input()
         self._read(lambda: False)
         self._wait()
-        said = self._said(bytes(self._output), started)
+        output = self._collect_output(bytes(self._output), started)
         self._kill()
-        return said
+        return output
 
-    def line(self, asked: str | None = None) -> Said:
-        """The next line that the program writes, after a line that it is given.
+    def line(self, asked: str | None = None) -> Output:
+        """The next output line of the program, after an optional request line.
 
-        A program that has written something since its last answer is ended (BAD_ANSWER): a late second line would be
-        taken as the answer to the next case.
+        Output before the request is a fault (BAD_ANSWER): a late second line would answer the next case.
         """
         started = time.perf_counter()
         self._reset()
         if asked is not None:
             self._refuse_unasked_output()
-            self._tell(asked)
+            self._write_line(asked)
         self._read(lambda: b"\n" in self._output)
         if b"\n" not in self._output:
             self._wait()
-            raise self._ended(Fault.CRASHED, "its output ended before it had answered")
+            raise self._end_with_fault(Fault.CRASHED, "its output ended before it had answered")
         first, _, rest = bytes(self._output).partition(b"\n")
         if rest:
-            raise self._ended(Fault.BAD_ANSWER, "it wrote more than the one line of its answer")
-        return self._said(first, started)
+            raise self._end_with_fault(Fault.BAD_ANSWER, "it wrote more than the one line of its answer")
+        return self._collect_output(first, started)
 
     def leave(self) -> None:
-        """Ends the program: its input is closed, and if that is not enough it is killed."""
+        """End the program: close its input, then kill it if it does not exit."""
         self._close_input()
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_LEAVE_S)
+            self._process.wait(_EXIT_GRACE_S)
         self._kill()
 
     def _reset(self) -> None:
@@ -184,7 +172,7 @@ class Child:
         self._stderr.clear()
         self._deadline_s = time.monotonic() + self.limits.time_s
 
-    def _tell(self, line: str) -> None:
+    def _write_line(self, line: str) -> None:
         stdin = self._process.stdin
         try:
             if stdin is None or stdin.closed:
@@ -193,7 +181,7 @@ class Child:
             stdin.flush()
         except BrokenPipeError:
             self._wait()
-            raise self._ended(Fault.CRASHED, "it reads no more cases") from None
+            raise self._end_with_fault(Fault.CRASHED, "it reads no more cases") from None
 
     def _refuse_unasked_output(self) -> None:
         stdout = self._process.stdout
@@ -203,8 +191,8 @@ class Child:
             selector.register(stdout, selectors.EVENT_READ)
             # an empty read is the end of its output, which is reported when it is asked
             if selector.select(0.0) and (unasked := os.read(stdout.fileno(), 1 << 16)):
-                message = f"before it was asked it wrote {shortened(unasked)}; expected one line for each request"
-                raise self._ended(Fault.BAD_ANSWER, message)
+                message = f"before it was asked it wrote {shorten(unasked)}; expected one line for each request"
+                raise self._end_with_fault(Fault.BAD_ANSWER, message)
 
     def _close_input(self) -> None:
         if self._process.stdin is not None:
@@ -212,7 +200,7 @@ class Child:
                 self._process.stdin.close()
 
     def _read(self, enough: Callable[[], bool]) -> None:
-        """Reads both streams until they end or there is enough, while watching time, memory and size."""
+        """Read both streams until they end or `enough` holds, under the limits on time, memory and size."""
         streams = {self._process.stdout: self._output, self._process.stderr: self._stderr}
         with selectors.DefaultSelector() as selector:
             for stream, kept in streams.items():
@@ -220,7 +208,7 @@ class Child:
                     selector.register(stream, selectors.EVENT_READ, kept)
             while selector.get_map() and not enough():
                 self._check()
-                for key, _ in selector.select(_LOOK_S):
+                for key, _ in selector.select(_POLL_S):
                     read = os.read(key.fd, 1 << 16)
                     if read:
                         key.data.extend(read)
@@ -229,31 +217,30 @@ class Child:
 
     def _check(self) -> None:
         if time.monotonic() > self._deadline_s:
-            raise self._ended(Fault.TIMED_OUT, f"no answer within {self.limits.time_s:g} s")
+            raise self._end_with_fault(Fault.TIMED_OUT, f"no answer within {self.limits.time_s:g} s")
         if len(self._output) + len(self._stderr) > self.limits.output_mb * 1e6:
-            raise self._ended(Fault.TOO_MUCH_OUTPUT, f"it wrote more than {self.limits.output_mb:g} MB")
+            raise self._end_with_fault(Fault.TOO_MUCH_OUTPUT, f"it wrote more than {self.limits.output_mb:g} MB")
         if resident_bytes([self._process.pid, *descendants(self._process.pid)]) > self.limits.memory_gb * 1e9:
-            raise self._ended(Fault.OUT_OF_MEMORY, f"it took more than {self.limits.memory_gb:g} GB of memory")
+            raise self._end_with_fault(Fault.OUT_OF_MEMORY, f"it took more than {self.limits.memory_gb:g} GB of memory")
 
     def _wait(self) -> None:
-        """Waits for the program's end; one that ends badly is a fault."""
+        """Wait for the program to exit; a non-zero status is a fault."""
         while True:
             self._check()
             with suppress(subprocess.TimeoutExpired):
-                status = self._process.wait(_LOOK_S)
+                status = self._process.wait(_POLL_S)
                 break
         if status < 0:
-            raise self._ended(Fault.CRASHED, f"it was ended by {_signal_name(-status)}")
+            raise self._end_with_fault(Fault.CRASHED, f"it was ended by {_signal_name(-status)}")
         if status > 0:
-            raise self._ended(Fault.CRASHED, f"it ended with status {status}")
+            raise self._end_with_fault(Fault.CRASHED, f"it ended with status {status}")
 
-    def _ended(self, fault: Fault, message: str) -> AlgorithmError:
-        """Ends the program, and gives what is said of it."""
+    def _end_with_fault(self, fault: Fault, message: str) -> AlgorithmError:
         self._kill()
-        return AlgorithmError(fault, message, _text(self._stderr))
+        return AlgorithmError(fault, message, _decode_tail(self._stderr))
 
     def _kill(self) -> None:
-        """Ends the program and all that it started in its group."""
+        """Kill the program and its process group."""
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -262,19 +249,19 @@ class Child:
                 with suppress(BrokenPipeError):
                     stream.close()
 
-    def _said(self, output: bytes, started: float) -> Said:
-        """The answer, with what stands in the pipe of standard error by now."""
+    def _collect_output(self, output: bytes, started: float) -> Output:
+        """The answer, with the pending content of standard error."""
         stream = self._process.stderr
         if stream is not None and not stream.closed:
             with selectors.DefaultSelector() as selector:
                 selector.register(stream, selectors.EVENT_READ)
                 while selector.select(0.0) and (read := os.read(stream.fileno(), 1 << 16)):
                     self._stderr.extend(read)
-        return Said(output, _text(self._stderr), time.perf_counter() - started)
+        return Output(output, _decode_tail(self._stderr), time.perf_counter() - started)
 
 
-def _go_with_parent() -> None:
-    """Between fork and exec: has Linux end the program when the thread that started it ends."""
+def _end_with_parent() -> None:
+    """Between fork and exec: let Linux kill the program when the thread that started it ends."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
@@ -285,13 +272,13 @@ def _signal_name(number: int) -> str:
         return f"signal {number}"
 
 
-def shortened(raw: bytes) -> str:
-    """The first 200 bytes that a program wrote, as text in quotes."""
+def shorten(raw: bytes) -> str:
+    """The first 200 bytes of output, as text in quotes."""
     text = raw[:200].decode("utf-8", errors="replace")
     return repr(text + ("..." if len(raw) > 200 else ""))
 
 
-def _text(raw: bytearray) -> str:
-    """The last of what a program wrote, as text that any file takes."""
-    text = bytes(raw[-4 * KEPT_STDERR :]).decode("utf-8", errors="replace")[-KEPT_STDERR:]
+def _decode_tail(raw: bytearray) -> str:
+    """The end of an output as printable text."""
+    text = bytes(raw[-4 * MAX_STDERR_CHARACTERS :]).decode("utf-8", errors="replace")[-MAX_STDERR_CHARACTERS:]
     return "".join(letter if letter.isprintable() or letter in "\n\t" else "�" for letter in text)

@@ -1,8 +1,8 @@
-"""Programs that are asked line by line, and the one exchange of question and answer that all programs take part in.
+"""Requests to programs and their replies: one JSON object a line, with the exchange's version and known keys.
 
-A persistent program (`serve:`) is started once in a process, asked for many cases, and ended with it. One that is not
-(`exec:`) is a server of a single run: of one target, one stream, or one case. For one case it needs no greeting: the
-case's folder is its last argument, and its answer all that it writes until it ends.
+A persistent program (`serve:`) is started once in a process, answers many cases, and ends with the process. An `exec:`
+program serves a single target, stream or case. For one case it needs no greeting: the case's folder is its last
+argument, and its answer is its whole output.
 """
 
 from __future__ import annotations
@@ -14,66 +14,143 @@ import tempfile
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from marsyard.algorithms.exchange.files import ANSWER_VERSIONS
-from marsyard.algorithms.exchange.process import Child, Command, ExecutableLimits, Said, shortened
-from marsyard.algorithms.exchange.replies import ProgramDetails, table_of
+from marsyard.algorithms.exchange.process import Command, ExecutableLimits, Output, RunningProgram, shorten
 from marsyard.algorithms.faults import AlgorithmError, Fault
+
+Member = TypeVar("Member", bound=Enum)
+Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True)
+class ProgramDetails:
+    """Standard error and wall-clock time of a program's answer."""
+
+    stderr: str
+    time_s: float
+
+
+def parse_table(output: Output) -> Mapping[str, Any]:
+    """Parse the JSON object of an output, keys unchecked; raises AlgorithmError (BAD_ANSWER)."""
+    try:
+        answer = json.loads(output.stdout.decode("utf-8"), parse_constant=float)
+    except (ValueError, RecursionError) as error:
+        message = f"its output is not one JSON object: {shorten(output.stdout)} ({error})"
+        raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr) from error
+    if not isinstance(answer, dict):
+        raise AlgorithmError(
+            Fault.BAD_ANSWER, f"its output is not one JSON object: {shorten(output.stdout)}", output.stderr
+        )
+    return answer
+
+
+def check_keys(answer: Mapping[str, Any], allowed: set[str]) -> None:
+    """Raise AlgorithmError (BAD_ANSWER) for another version of the exchange or an unknown key."""
+    if type(answer.get("exchange")) is not int or answer["exchange"] not in ANSWER_VERSIONS:
+        raise bad_answer(
+            f"the answer's exchange is {answer.get('exchange')!r}; allowed: {', '.join(map(str, ANSWER_VERSIONS))}"
+        )
+    unknown = sorted(set(answer) - allowed - {"exchange"})
+    if unknown:
+        raise bad_answer(
+            f"the answer has an unknown key '{unknown[0]}'; allowed: {', '.join(sorted(allowed | {'exchange'}))}"
+        )
+
+
+def read_member(answer: Mapping[str, Any], name: str, kinds: type[Member]) -> Member:
+    """The member of an enumeration under a key of the answer."""
+    return parse_member(name, answer.get(name), kinds)
+
+
+def parse_member(label: str, name: object, kinds: type[Member]) -> Member:
+    """The member of an enumeration by name."""
+    if not isinstance(name, str) or name not in kinds.__members__:
+        raise bad_answer(f"{label} is {name!r}; allowed: {', '.join(kinds.__members__)}")
+    return kinds[name]
+
+
+def read_numbers(answer: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray | None:
+    """An array under a key of the answer; None if it is null or absent."""
+    value = answer.get(name)
+    if value is None:
+        return None
+    if not _is_nested(value, shape):
+        shown = shorten(json.dumps(value).encode())
+        raise bad_answer(f"{name} is {shown}; allowed: numbers in the shape {list(shape)}")
+    return np.array(value, dtype=np.float64)
+
+
+def _is_nested(value: Any, shape: tuple[int, ...]) -> bool:
+    """Whether a value consists of numbers in nested lists of this shape."""
+    if not shape:
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+    return isinstance(value, list) and len(value) == shape[0] and all(_is_nested(one, shape[1:]) for one in value)
+
+
+def attach_stderr(stderr: str, make: Callable[[], Answer]) -> Answer:
+    """Call `make`; an AlgorithmError gets the program's standard error attached."""
+    try:
+        return make()
+    except AlgorithmError as error:
+        raise AlgorithmError(error.fault, str(error), stderr) from error
+
+
+def bad_answer(message: str) -> AlgorithmError:
+    """The error for an answer of the wrong form."""
+    return AlgorithmError(Fault.BAD_ANSWER, message)
 
 
 @dataclass
 class Server:
-    """A program that has reported that it is ready.
+    """A running program after its greeting.
 
-    Attributes
-    ----------
-    child
-        Its process.
-    version
-        The exchange's version in its first line, one of `ANSWER_VERSIONS`.
-    requests
-        How many it was asked: the `id` of the last one.
+    - version: The exchange's version in the greeting, one of `ANSWER_VERSIONS`
+    - requests: Number of requests so far: the `id` of the last one
     """
 
-    child: Child
+    child: RunningProgram
     version: int
     requests: int = 0
 
-    def ask(self, request: Mapping[str, Any]) -> tuple[Mapping[str, Any], Said]:
-        """Return the program's answer to one request without its `id`, and what it wrote.
+    def ask(self, request: Mapping[str, Any]) -> tuple[Mapping[str, Any], Output]:
+        """The program's answer to one request, without its `id`, and its raw output.
 
-        Raises AlgorithmError where it fails, where its answer is not one JSON object, and where that answers another
-        request; the program is ended then.
+        Raises AlgorithmError, after ending the program, if it fails, its answer is not one JSON object, or the answer
+        belongs to another request.
         """
         self.requests += 1
         identity = {"id": self.requests} if self.version > 1 else {}
-        said = self.child.line(json.dumps({"exchange": self.version, **identity, **request}, allow_nan=False))
+        output = self.child.line(json.dumps({"exchange": self.version, **identity, **request}, allow_nan=False))
         try:
-            answer = table_of(said)
+            answer = parse_table(output)
             for key, expected in {"exchange": self.version, **identity}.items():
                 if type(answer.get(key)) is not int or answer[key] != expected:
                     message = f"the answer's {key} is {answer.get(key)!r}; allowed: {expected}, that of the request"
-                    raise AlgorithmError(Fault.BAD_ANSWER, message, said.stderr)
+                    raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
         except AlgorithmError:
             self.child.leave()
             raise
-        return {key: value for key, value in answer.items() if key not in identity}, said
+        return {key: value for key, value in answer.items() if key not in identity}, output
 
 
-#: Programs that wait for a case, by their command and limits.
+#: Idle persistent programs by command and limits.
 _waiting: dict[tuple[Command, ExecutableLimits], Server] = {}
 
 
 def acquire(command: Command, limits: ExecutableLimits) -> Server:
-    """A program that reads lines: a persistent one that waits, else one that is started now. It is the caller's."""
+    """A waiting persistent program, or a new one; the caller owns it."""
     waiting = _waiting.pop((command, limits), None) if command.persistent else None
     return waiting or _start(command, limits)
 
 
 def release(command: Command, limits: ExecutableLimits, server: Server) -> None:
-    """Keep a persistent program that has answered all requests for the next case; end another."""
+    """Keep a persistent program for the next case; end any other."""
     if command.persistent and (command, limits) not in _waiting:
         _waiting[command, limits] = server
     else:
@@ -81,23 +158,23 @@ def release(command: Command, limits: ExecutableLimits, server: Server) -> None:
 
 
 def waiting_processes() -> set[int]:
-    """Process ids of the persistent programs that wait for a case."""
+    """Process ids of the waiting persistent programs."""
     return {server.child.process for server in _waiting.values()}
 
 
 @atexit.register
 def end_persistent() -> None:
-    """Ends the persistent programs of this process."""
+    """End the persistent programs of this process."""
     while _waiting:
         _waiting.popitem()[1].child.leave()
 
 
 def _start(command: Command, limits: ExecutableLimits) -> Server:
-    """Start a program and read its greeting, in one of the exchange's versions."""
-    child = Child(command.words, limits)
-    said = child.line()
+    """Start a program and check its greeting."""
+    child = RunningProgram(command.words, limits)
+    output = child.line()
     try:
-        greeting = dict(table_of(said))
+        greeting = dict(parse_table(output))
         version = greeting.get("exchange")
         if (
             type(version) is not int
@@ -105,8 +182,8 @@ def _start(command: Command, limits: ExecutableLimits) -> Server:
             or greeting != {"exchange": version, "ready": True}
         ):
             expected = f'{{"exchange": {ANSWER_VERSIONS[-1]}, "ready": true}}'
-            message = f"its first line is {shortened(said.output)}; expected {expected}"
-            raise AlgorithmError(Fault.BAD_ANSWER, message, said.stderr)
+            message = f"its first line is {shorten(output.stdout)}; expected {expected}"
+            raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
     except AlgorithmError:
         child.leave()
         raise
@@ -114,12 +191,9 @@ def _start(command: Command, limits: ExecutableLimits) -> Server:
 
 
 class Session:
-    """One algorithm's exchange with a program that is asked line by line, started when it is first asked.
+    """A dialogue of one algorithm with a program, one JSON line per request; the first request starts the program.
 
-    Attributes
-    ----------
-    folder
-        Where its input files are written; removed with the session.
+    The session's `folder` holds the input files and is removed with it.
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
@@ -132,14 +206,9 @@ class Session:
     def ask(
         self, do: str, values: Mapping[str, Any], files: Mapping[str, Callable[[Path], None]] | None = None
     ) -> tuple[Mapping[str, Any], ProgramDetails]:
-        """The program's answer to one line, read but not checked.
+        """The program's answer to the request `do` with `values`, keys unchecked.
 
-        Parameters
-        ----------
-        do, values
-            The request, and what else stands in the line.
-        files
-            By the key that names the folder in the line: what writes it. It is there until the program has answered.
+        `files` maps keys of the request to writers of the folders named there; the folders exist until the answer.
         """
         request = {"do": do, **values}
         if self._server is None:
@@ -152,29 +221,29 @@ class Session:
                 write(folder)
                 request[key] = str(folder)
             try:
-                answer, said = self._server.ask(request)
+                answer, output = self._server.ask(request)
             except AlgorithmError:
-                # it is ended already, and is not to be asked by others
+                # it has ended already: do not return it to the idle programs
                 if self._release is not None:
                     self._release.detach()
                 raise
-        return answer, ProgramDetails(said.stderr, said.time_s)
+        return answer, ProgramDetails(output.stderr, output.time_s)
 
 
 def ask_case(
     command: Command, limits: ExecutableLimits, write: Callable[[Path], None]
 ) -> tuple[Mapping[str, Any], ProgramDetails]:
-    """A program's answer to one case, read but not checked; `write` writes the case into a folder.
+    """A program's answer to one case, keys unchecked; `write` writes the case into a folder.
 
-    A persistent program that fails is ended, and started again for the next case.
+    A persistent program that fails is ended; the next case starts it again.
     """
     with tempfile.TemporaryDirectory(prefix="marsyard-case-") as folder:
         write(Path(folder))
         if command.persistent:
             server = acquire(command, limits)
-            answer, said = server.ask({"case": folder})
+            answer, output = server.ask({"case": folder})
             release(command, limits, server)
         else:
-            said = Child((*command.words, folder), limits).answer()
-            answer = table_of(said)
-    return answer, ProgramDetails(said.stderr, said.time_s)
+            output = RunningProgram((*command.words, folder), limits).answer()
+            answer = parse_table(output)
+    return answer, ProgramDetails(output.stderr, output.time_s)

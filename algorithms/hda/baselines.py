@@ -1,7 +1,6 @@
-"""What a user would take instead: OpenCV's essential matrix for motion, its semi-global matching for structure.
+"""Baselines from OpenCV: essential matrix for motion, semi-global matching for structure.
 
-Features, tracks, scale and all that follows the point cloud are shared with the algorithm under test, so that what
-differs is how motion and structure are found.
+All other stages are shared with the algorithm under test.
 """
 
 from __future__ import annotations
@@ -15,75 +14,67 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.hda.estimator import find_site, matched_structure
-from marsyard.algorithms.hda.motion import Motion, assessed
+from marsyard.algorithms.hda.motion import Motion, assess_motion
 from marsyard.algorithms.hda.options import HdaOptions
-from marsyard.algorithms.hda.sighting import Sighting, sighting
-from marsyard.algorithms.hda.structure import (
-    Fate,
-    Matches,
-    depth_bounds,
-    epipolar_segments,
-    pixel_lattice,
-    triangulated,
-)
+from marsyard.algorithms.hda.structure import Fate, Matches, depth_bounds, epipolar_segments, pixel_lattice, triangulate
 from marsyard.algorithms.hda.tracking import Tracks
-from marsyard.algorithms.hda.view import View, pixels_of, points_at, undistorted
+from marsyard.algorithms.hda.view import LandingScene, View, build_scene, points_at_depth, project_points, undistort
 from marsyard.algorithms.interface import SiteEstimate
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
 
-#: Confidence with which the search for an essential matrix meets five right tracks.
+#: Confidence of the search for an essential matrix.
 CONFIDENCE = 0.9999
-#: Methods and inlier distances, pixels. Two motions explain a plane, and each method takes the wrong one now and then;
-#: it puts most tracks behind a camera.
+#: Methods and inlier distances, pixels. Two motions explain a plane; each method sometimes returns the wrong one, which
+#: puts most tracks behind a camera.
 ATTEMPTS = ((cv2.LMEDS, 1.0), (cv2.RANSAC, 0.1), (cv2.RANSAC, 0.3), (cv2.RANSAC, 1.0), (cv2.USAC_PROSAC, 0.1))
-#: Windows of the semi-global matching, pixels, and its penalties of small and large steps as OpenCV recommends them.
+#: Window of the semi-global matching, pixels, and the penalties of disparity steps recommended by OpenCV.
 BLOCK_PX = 5
 SMALL_STEP, LARGE_STEP = 8 * BLOCK_PX**2, 32 * BLOCK_PX**2
-#: Steps of the compared disparities: OpenCV wants their number to be a multiple.
+#: OpenCV requires the number of disparities to be a multiple of this.
 DISPARITY_STEP = 16
-#: OpenCV gives disparities in sixteenths of a pixel.
+#: OpenCV's unit of disparity, pixels.
 DISPARITY_UNIT = 1.0 / 16.0
-#: Largest cosine between the baseline and the mean optical axis at which pictures are rectified.
-LARGEST_COSINE = 0.8
-#: Largest side of a rectified picture, in diagonals of the pictures.
-LARGEST_SIDE = 2.0
+#: Largest cosine between the baseline and the mean optical axis.
+MAX_BASELINE_COSINE = 0.8
+#: Largest side of a rectified image, in diagonals of the original images.
+MAX_SIDE_DIAGONALS = 2.0
 
 
 @final
 class EssentialMatrixEstimator:
-    """The motion from OpenCV's essential matrix, structure as the algorithm under test has it."""
+    """Motion from OpenCV's essential matrix, structure as in `HdaEstimator`."""
 
     def __init__(self, options: HdaOptions | None = None) -> None:
         self.options = HdaOptions() if options is None else options
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """The estimate; details and errors are those of `HdaEstimator.estimate`."""
-        return find_site(sighting(measurements), essential_motion, matched_structure, self.options)
+        return find_site(build_scene(measurements), essential_motion, matched_structure, self.options)
 
 
 @final
 class SemiGlobalEstimator:
-    """The motion from OpenCV's essential matrix, structure from its semi-global matching of the rectified pictures."""
+    """Motion from OpenCV's essential matrix, structure from its semi-global matching of the rectified images."""
 
     def __init__(self, options: HdaOptions | None = None) -> None:
         self.options = HdaOptions() if options is None else options
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """The estimate; details and errors are those of `HdaEstimator.estimate`."""
-        return find_site(sighting(measurements), essential_motion, semi_global_structure, self.options)
+        return find_site(build_scene(measurements), essential_motion, semi_global_structure, self.options)
 
 
-def essential_motion(seen: Sighting, tracks: Tracks, options: HdaOptions) -> Motion | None:
-    """Of several essential matrices the motion with most tracks before both cameras; None if there is none.
+def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion | None:
+    """The essential matrix motion with most tracks in front of both cameras; None without any.
 
-    Its scale is such that the median depth is the range.
+    Its scale makes the median depth equal the range.
     """
-    focal = seen.views[1].focal_px
+    focal = scene.views[1].focal_px
     first, second = (
-        undistorted(one.camera, pixels[tracks.accepted])
-        for one, pixels in zip(seen.views, (tracks.first, tracks.second), strict=True)
+        undistort(one.camera, pixels[tracks.accepted])
+        for one, pixels in zip(scene.views, (tracks.first, tracks.second), strict=True)
     )
     found = [_essential_pose(focal * first, focal * second, focal, *attempt) for attempt in ATTEMPTS]
     poses = [pose for pose in found if pose is not None]
@@ -91,19 +82,19 @@ def essential_motion(seen: Sighting, tracks: Tracks, options: HdaOptions) -> Mot
         return None
     _, rotation, translation = max(poses, key=lambda pose: pose[0])
     moved = rigid(Rotation.from_matrix(rotation), translation)
-    depths = triangulated(first, second, moved)
+    depths = triangulate(first, second, moved)
     depths[~(np.abs(depths) > 0.0)] = np.inf
     ahead = depths[np.isfinite(depths) & (depths > 0.0)]
     if len(ahead) == 0:
         return None
-    motion = assessed(first, second, focal, moved, depths, True, options)
-    return motion.scaled(seen.range_m / float(np.median(ahead)))
+    motion = assess_motion(first, second, focal, moved, depths, True, options)
+    return motion.scaled(scene.range_m / float(np.median(ahead)))
 
 
 def _essential_pose(
     first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"], focal_px: float, method: int, inlier_px: float
 ) -> tuple[int, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
-    """How many tracks lie before both cameras, rotation and direction of translation; None without a matrix."""
+    """Number of tracks in front of both cameras, rotation and translation direction; None without a matrix."""
     intrinsics = np.diag([focal_px, focal_px, 1.0])
     matrix, agreeing = cv2.findEssentialMat(first, second, intrinsics, method, CONFIDENCE, inlier_px)
     if matrix is None or matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
@@ -114,16 +105,11 @@ def _essential_pose(
 
 @dataclass(frozen=True)
 class Rectification:
-    """A pair of linear cameras with parallel axes and their columns along the baseline, the second ahead along it.
+    """A pair of linear cameras with parallel axes and columns along the baseline.
 
-    Attributes
-    ----------
-    rectified_from_first
-        From the first camera's frame to the rectified one, both with the first camera as origin.
-    baseline_m
-        Distance of the two.
-    camera
-        The camera of both rectified pictures.
+    - rectified_from_first: From the first camera's frame to the rectified one, with the same origin
+    - baseline_m: Distance between the cameras
+    - camera: The camera of both rectified images
     """
 
     rectified_from_first: Rotation
@@ -136,14 +122,14 @@ class Rectification:
         return self.camera.focal_lengths[0]
 
 
-def rectification(views: tuple[View, View], second_from_first: RigidTransform) -> Rectification | None:
-    """The rectification of a pair; None where the camera moved along its axis."""
+def rectify_views(views: tuple[View, View], second_from_first: RigidTransform) -> Rectification | None:
+    """The rectification of a pair; None for motion along the optical axis."""
     first_from_second = second_from_first.inv()
     baseline = float(np.linalg.norm(first_from_second.translation))
     along = first_from_second.translation / baseline
     axis = np.array([0.0, 0.0, 1.0]) + first_from_second.rotation.apply(np.array([0.0, 0.0, 1.0]))
     axis /= np.linalg.norm(axis)
-    if abs(float(along @ axis)) > LARGEST_COSINE:
+    if abs(float(along @ axis)) > MAX_BASELINE_COSINE:
         return None
     axis -= (along @ axis) * along
     axis /= np.linalg.norm(axis)
@@ -158,7 +144,7 @@ def rectification(views: tuple[View, View], second_from_first: RigidTransform) -
         return None
     edges = focal * edges[:, :2] / edges[:, 2:]
     low, high = np.floor(edges.min(axis=0)), np.ceil(edges.max(axis=0))
-    if float((high - low).max()) > LARGEST_SIDE * float(np.hypot(*views[0].camera.size)):
+    if float((high - low).max()) > MAX_SIDE_DIAGONALS * float(np.hypot(*views[0].camera.size)):
         return None
     camera = Cahv.from_axes(
         (focal, focal),
@@ -170,10 +156,10 @@ def rectification(views: tuple[View, View], second_from_first: RigidTransform) -
     return Rectification(turn, baseline, camera)
 
 
-def rectified_picture(
+def rectify_image(
     one: View, camera_from_rectified: Rotation, camera: Cahv, full_scale: float
 ) -> UInt8[np.ndarray, "rows columns"]:
-    """A picture as the rectified camera would take it, in 8 bits; black where it was not seen."""
+    """The image of the rectified camera in 8 bits; black outside the field of view."""
     rays = camera_from_rectified.apply(camera.rays(camera.pixel_grid())[1].reshape(-1, 3))
     pixels, _ = one.camera.project(rays)
     pixels = np.nan_to_num(pixels, nan=-10.0).astype(np.float32).reshape(camera.size[1], camera.size[0], 2)
@@ -181,23 +167,23 @@ def rectified_picture(
     return np.asarray(np.rint(cv2.remap(grey, pixels, None, cv2.INTER_LINEAR)).astype(np.uint8))
 
 
-def disparities(
+def match_disparities(
     views: tuple[View, View], pair: Rectification, second_from_first: RigidTransform, bounds_m: tuple[float, float]
 ) -> Float[np.ndarray, "rows columns"]:
-    """Disparities of the first rectified picture by semi-global matching, pixels; NaN where none was found."""
+    """Disparities of the first rectified image by semi-global matching, pixels; NaN without a match."""
     first_from_rectified = pair.rectified_from_first.inv()
     full_scale = max(float(np.quantile(views[0].counts, 0.995)), 1.0)
     pictures = [
-        rectified_picture(one, turn, pair.camera, full_scale)
+        rectify_image(one, turn, pair.camera, full_scale)
         for one, turn in zip(
             views, (first_from_rectified, second_from_first.rotation * first_from_rectified), strict=True
         )
     ]
-    reach = pair.focal_px * pair.baseline_m
-    least = int(reach / bounds_m[1])
-    count = DISPARITY_STEP * (int(reach / bounds_m[0] - least) // DISPARITY_STEP + 1)
+    disparity_px_m = pair.focal_px * pair.baseline_m
+    min_disparity = int(disparity_px_m / bounds_m[1])
+    count = DISPARITY_STEP * (int(disparity_px_m / bounds_m[0] - min_disparity) // DISPARITY_STEP + 1)
     matcher = cv2.StereoSGBM.create(
-        minDisparity=least,
+        minDisparity=min_disparity,
         numDisparities=count,
         blockSize=BLOCK_PX,
         P1=SMALL_STEP,
@@ -209,36 +195,35 @@ def disparities(
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
     found = matcher.compute(*pictures).astype(np.float64) * DISPARITY_UNIT
-    return np.where(found >= max(least, 1), found, np.nan)
+    return np.where(found >= max(min_disparity, 1), found, np.nan)
 
 
-def semi_global_structure(seen: Sighting, motion: Motion, options: HdaOptions) -> Matches:
-    """Structure of the same grid of pixels from the disparities of the rectified pictures; no match where none is."""
-    first, second = seen.views
+def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> Matches:
+    """Structure on the same pixel grid from the disparities of the rectified images."""
+    first, second = scene.views
     bounds = depth_bounds(motion.depth_range_m, options.depth_margin)
     border = options.search_half_px + 1
     pixels = pixel_lattice(first.camera.size, options.grid_px, border)
-    places = undistorted(first.camera, pixels)
+    places = undistort(first.camera, pixels)
     starts, ends, room = epipolar_segments(second, motion.second_from_first, places, bounds, border)
     pixels, places, starts, ends = pixels[room], places[room], starts[room], ends[room]
     depths = np.full(len(pixels), np.nan)
-    pair = rectification(seen.views, motion.second_from_first)
+    pair = rectify_views(scene.views, motion.second_from_first)
     if pair is not None:
-        found = disparities(seen.views, pair, motion.second_from_first, bounds)
-        depths = _depths(pair, found, places)
+        found = match_disparities(scene.views, pair, motion.second_from_first, bounds)
+        depths = _depths_from_disparities(pair, found, places)
     accepted = (depths > bounds[0]) & (depths < bounds[1])
     fates = np.where(accepted, Fate.ACCEPTED, Fate.OUT_OF_BOUNDS).astype(np.uint8)
-    points = points_at(places, depths)
-    matched, _ = pixels_of(second.camera, motion.second_from_first.apply(points))
+    points = points_at_depth(places, depths)
+    matched, _ = project_points(second.camera, motion.second_from_first.apply(points))
     return Matches(pixels, starts, ends, matched, np.full(len(pixels), np.nan), depths, fates, points[accepted])
 
 
-def _depths(
+def _depths_from_disparities(
     pair: Rectification, found: Float[np.ndarray, "rows columns"], places: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n"]:
-    """Depths in the first camera's frame of undistorted coordinates, by the disparity of the nearest pixel."""
+    """Depths in the first camera's frame from the disparity of the nearest pixel."""
     rays = pair.rectified_from_first.apply(np.column_stack([places, np.ones(len(places))]))
     pixels, _ = pair.camera.project(rays)
     column, row = np.rint(pixels).astype(np.int64).T
-    # Rectified depth over that of the ray of depth one is how long the ray is.
     return np.asarray(pair.focal_px * pair.baseline_m / found[row, column] / rays[:, 2])

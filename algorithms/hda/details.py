@@ -1,4 +1,4 @@
-"""What the hazard detection did, for figures and diagnosis: all that the paper's Figs. 1-5 and 7 show."""
+"""Intermediate products of the hazard detection, as shown in the paper's Figs. 1-5 and 7."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from marsyard.algorithms.hda.hazards import HazardMaps
 from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.structure import Matches
 from marsyard.algorithms.hda.tracking import Tracks
-from marsyard.algorithms.hda.view import View, points_at, undistorted
+from marsyard.algorithms.hda.view import View, points_at_depth, undistort
 
 #: The stages of Table I, in order; the scale belongs to motion, the elevation map to hazards.
 STAGES = ("tracking", "motion", "structure", "hazards")
@@ -24,22 +24,13 @@ STAGES = ("tracking", "motion", "structure", "hazards")
 
 @dataclass(frozen=True)
 class Ground:
-    """The ground as mapped.
+    """The mapped ground.
 
-    Attributes
-    ----------
-    surface_from_camera
-        From the first camera's frame to the surface frame; both have their origin in that camera.
-    world_from_surface
-        The rotation about the vertical that is left, by the on-board pose.
-    points
-        The point cloud in the surface frame, metres.
-    elevation, hazards
-        The maps.
-    apriori_cell
-        Row and column of the a-priori site, whole or not, perhaps outside the map.
-    site_cell
-        Row and column of the chosen site; None if nothing is safe.
+    - surface_from_camera: From the first camera's frame to the surface frame, both with their origin in that camera
+    - world_from_surface: The remaining rotation about the vertical, by the on-board pose
+    - points: The point cloud in the surface frame, metres
+    - apriori_cell: Row and column of the a-priori site, fractional, possibly outside the map
+    - site_cell: Row and column of the chosen site; None if no cell is safe
     """
 
     surface_from_camera: Rotation
@@ -53,23 +44,11 @@ class Ground:
 
 @dataclass(frozen=True)
 class HdaDetails:
-    """Everything found on the way to the answer, as far as it went: None for what was not reached.
+    """Intermediate products of the estimator; None for stages that were not reached.
 
-    Attributes
-    ----------
-    views
-        The two pictures with their cameras, each in its camera's frame, and the on-board poses.
-    tracks
-        All features and their tracks.
-    motion
-        Motion, and depths of the tracks that were accepted, in that order; its scale is the altimeter's if there are
-        matches.
-    matches
-        The dense matches.
-    ground
-        Maps and site.
-    ends_s
-        Processor time at the start, and at the end of every stage of `STAGES` that was reached.
+    - views: The two images with their cameras and on-board poses
+    - motion: Motion, and depths of the accepted tracks; at the altimeter's scale if there are matches
+    - ends_s: Processor time at the start and at the end of every completed stage of `STAGES`
     """
 
     views: tuple[View, View]
@@ -80,12 +59,12 @@ class HdaDetails:
     ends_s: tuple[float, ...] = field(default_factory=lambda: (time.process_time(),))
 
     def ended(self, **found: Any) -> HdaDetails:
-        """These details with what a stage found, which ends now."""
+        """These details with the products of a stage that ends now."""
         return replace(self, **found, ends_s=(*self.ends_s, time.process_time()))
 
     @property
     def times_s(self) -> Mapping[str, float]:
-        """Processor time that each stage took; those alone that were reached."""
+        """Processor time of each completed stage."""
         lengths = np.diff(self.ends_s)
         return {name: float(length) for name, length in zip(STAGES, lengths, strict=False)}
 
@@ -122,11 +101,11 @@ def hda_products(details: HdaDetails) -> dict[str, Any]:
 
 
 def _motion_products(views: tuple[View, View], tracks: Tracks, motion: Motion) -> dict[str, Any]:
-    places = undistorted(views[0].camera, tracks.first[tracks.accepted])
+    places = undistort(views[0].camera, tracks.first[tracks.accepted])
     products: dict[str, Any] = {
         "rotation": motion.second_from_first.rotation.as_matrix(),
         "translation": motion.second_from_first.translation,
-        "sparse_points": points_at(places, motion.depths),
+        "sparse_points": points_at_depth(places, motion.depths),
         "residuals_px": motion.residuals_px,
         "inliers": motion.inliers,
     }

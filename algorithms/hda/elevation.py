@@ -9,23 +9,18 @@ from jaxtyping import Float
 
 from marsyard.algorithms.hda.kernels import elevation as kernels
 
-#: Least sum of bilinear weights for a cell to be known: a point less than 0.9 of a cell away along an axis.
-LEAST_WEIGHT = 0.1
+#: Minimum sum of bilinear weights of a known cell: a point less than 0.9 of a cell away along an axis.
+MIN_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
 class ElevationMap:
     """Elevations on a level grid in the surface frame.
 
-    Attributes
-    ----------
-    elevation_m
-        z of the middle of each cell, metres; NaN where no point is near. Rows run along -y, columns along x, so that it
-        lies as the picture does.
-    corner_m
-        (x, y) of the middle of the first cell, metres.
-    cell_m
-        Side of a cell, metres.
+    - elevation_m: z of the middle of each cell; NaN without near points. Rows run along -y, columns along x, as in the
+      image.
+    - corner_m: (x, y) of the middle of the first cell
+    - cell_m: Side of a cell
     """
 
     elevation_m: Float[np.ndarray, "rows columns"]
@@ -43,9 +38,9 @@ class ElevationMap:
 
 
 def elevation_map(points: Float[np.ndarray, "n 3"]) -> ElevationMap | None:
-    """The map of points in the surface frame; None where they cover no area.
+    """The map of points in the surface frame; None if they cover no area.
 
-    With A the area of their horizontal bounding box cells have the side sqrt(A / N): about one point each. An elevation
+    The cell side is sqrt(A / N) with A the area of the horizontal bounding box: about one point per cell. An elevation
     is the mean of the points about a cell by bilinear weights.
     """
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
@@ -54,10 +49,9 @@ def elevation_map(points: Float[np.ndarray, "n 3"]) -> ElevationMap | None:
     if not cell > 1e-6 * float(extent.max()):
         return None
     columns, rows = (int(count) for count in np.ceil(extent / cell))
-    # The grid is a whole number of cells and lies about the middle of the box.
     corner = 0.5 * (low + high) + 0.5 * cell * np.array([-(columns - 1.0), rows - 1.0])
     empty = ElevationMap(np.full((rows, columns), np.nan), corner, cell)
     row, column = empty.cells(points[:, :2]).T
     sums, weights = kernels.spread(row, column, points[:, 2], (rows, columns))
-    values = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights >= LEAST_WEIGHT)
+    values = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights >= MIN_WEIGHT)
     return ElevationMap(values, corner, cell)

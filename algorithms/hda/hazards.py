@@ -1,4 +1,4 @@
-"""Slope and roughness of an elevation map, and where it is safe to land (section III)."""
+"""Slope and roughness of an elevation map, the safe landing map and the landing site (section III)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from marsyard.algorithms.hda.elevation import ElevationMap
 from marsyard.algorithms.hda.kernels import elevation as kernels
+from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.options import HdaOptions
 
 #: Least side of the regions that planes are fitted to, cells: a median of squares needs more than a few points.
-LEAST_SIDE = 3
+MIN_SIDE_CELLS = 3
 
 
 class Safety(IntEnum):
-    """What the safe landing map says of a cell: green, yellow and red in the paper's figures."""
+    """Values of the safe landing map: green, yellow and red in the paper's figures."""
 
     SAFE = 0
     UNKNOWN = 1
@@ -27,21 +28,14 @@ class Safety(IntEnum):
 
 @dataclass(frozen=True)
 class HazardMaps:
-    """What is known of the ground for landing; all maps have the elevation map's cells.
+    """Hazard maps on the cells of the elevation map.
 
-    Attributes
-    ----------
-    planes
-        Of each footprint: elevation at its middle (metres) and slopes per metre along columns and rows, shape
-        (m, n, 3); NaN where too little is known.
-    smooth_m
-        The smooth underlying elevation, metres.
-    roughness_m
-        How far the elevation is off it, metres, upwards or downwards.
-    slope_rad
-        Angle between the ground's normal and the vertical.
-    safety
-        The safe landing map, values of `Safety`.
+    - planes: Of each footprint: elevation at its middle (metres) and slopes per metre along columns and rows; NaN if
+      unknown
+    - smooth_m: Elevation of the smooth underlying surface
+    - roughness_m: Absolute distance of the elevation from the smooth surface
+    - slope_rad: Angle between the ground's normal and the vertical
+    - safety: The safe landing map, values of `Safety`
     """
 
     planes: Float[np.ndarray, "m n 3"]
@@ -63,13 +57,12 @@ def smooth_surface(
 ) -> tuple[Float[np.ndarray, "m n 3"], Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
     """Robust planes of the footprints, and elevation (metres) and slope (radians) interpolated between their middles.
 
-    The map is partitioned into squares of the footprint's side, spread evenly where it is not a whole number of them.
-    Beyond the outermost middles the interpolation goes on in a straight line, for slopes not below zero; what is not
-    known comes out as NaN. A square is known if half of its cells are.
+    Squares of the footprint's side are spread evenly over the map. Beyond the outermost middles the extrapolation is
+    linear, with slopes clipped at zero. A square with fewer than half of its cells known has NaN.
     """
-    side = max(round(options.lander_diameter_m / ground.cell_m), LEAST_SIDE)
+    side = max(round(options.lander_diameter_m / ground.cell_m), MIN_SIDE_CELLS)
     shape = ground.elevation_m.shape
-    starts = [_starts(extent, side) for extent in shape]
+    starts = [_square_starts(extent, side) for extent in shape]
     triples = np.random.default_rng(options.seed).uniform(size=(options.plane_trials, 3))
     planes = kernels.footprint_planes(
         ground.elevation_m, starts[0], starts[1], side, max(side * side // 2, 4), triples, options.refine_planes
@@ -78,19 +71,19 @@ def smooth_surface(
     if planes.size == 0:
         return planes, np.full(shape, np.nan), np.full(shape, np.nan)
     middles = [start + 0.5 * (side - 1) for start in starts]
-    rows, columns = (_interpolation(middle, extent) for middle, extent in zip(middles, shape, strict=True))
-    smooth = _between(planes[..., 0], rows, columns)
+    rows, columns = (_interpolation_weights(middle, extent) for middle, extent in zip(middles, shape, strict=True))
+    smooth = _interpolate(planes[..., 0], rows, columns)
     # Along an axis with a single footprint nothing can be interpolated: the planes' own slope is taken.
     for axis, middle in enumerate(middles):
         if len(middle) == 1:
             offsets = np.expand_dims(np.arange(shape[axis]) - middle[0], 1 - axis)
-            smooth = smooth + _between(planes[..., 2 - axis], rows, columns) * ground.cell_m * offsets
+            smooth = smooth + _interpolate(planes[..., 2 - axis], rows, columns) * ground.cell_m * offsets
     slopes = np.arctan(np.hypot(planes[..., 1], planes[..., 2]))
-    return planes, smooth, np.maximum(_between(slopes, rows, columns), 0.0)
+    return planes, smooth, np.maximum(_interpolate(slopes, rows, columns), 0.0)
 
 
-def _starts(extent: int, side: int) -> Int[np.ndarray, "n"]:
-    """First cells of the squares along an axis, spread evenly from end to end; none where not even one has room."""
+def _square_starts(extent: int, side: int) -> Int[np.ndarray, "n"]:
+    """First cells of the squares along an axis, evenly spread from end to end; empty if the axis is too short."""
     if extent < side:
         return np.zeros(0, dtype=np.int64)
     count = round(extent / side)
@@ -99,8 +92,8 @@ def _starts(extent: int, side: int) -> Int[np.ndarray, "n"]:
     return np.rint(np.linspace(0.0, extent - side, count)).astype(np.int64)
 
 
-def _interpolation(middles: Float[np.ndarray, "n"], extent: int) -> Float[np.ndarray, "extent n"]:
-    """Weights of the middles for every cell along an axis: linear between neighbours and beyond the last ones."""
+def _interpolation_weights(middles: Float[np.ndarray, "n"], extent: int) -> Float[np.ndarray, "extent n"]:
+    """Weights of the middles for every cell along an axis: piecewise linear, extrapolated at the ends."""
     weights = np.zeros((extent, len(middles)))
     cells = np.arange(extent)
     if len(middles) == 1:
@@ -113,10 +106,10 @@ def _interpolation(middles: Float[np.ndarray, "n"], extent: int) -> Float[np.nda
     return weights
 
 
-def _between(
+def _interpolate(
     values: Float[np.ndarray, "m n"], rows: Float[np.ndarray, "r m"], columns: Float[np.ndarray, "c n"]
 ) -> Float[np.ndarray, "r c"]:
-    """Values of footprints interpolated to cells by the weights of rows and columns; NaN where one that counts is."""
+    """Interpolate footprint values to cells by row and column weights; NaN if a value with weight is NaN."""
     unknown = np.isnan(values)
     touched = (rows != 0.0).astype(np.float64) @ unknown @ (columns != 0.0).T
     return np.where(touched > 0.0, np.nan, rows @ np.where(unknown, 0.0, values) @ columns.T)
@@ -128,40 +121,42 @@ def safe_landing_map(
     cell_m: float,
     options: HdaOptions,
 ) -> UInt8[np.ndarray, "rows columns"]:
-    """Which cells are safe: values of `Safety`.
+    """Classify cells by slope and roughness: values of `Safety`.
 
-    Slope and roughness above what the lander can stand on are hazards, each grown by the lander's diameter; what is
-    near the map's border or a cell where either is not known is unknown. A cell that is both is a hazard.
+    Hazards grow by the lander's diameter. Cells near the map's border or near an unknown cell are unknown. Hazard has
+    precedence over unknown.
     """
     with np.errstate(invalid="ignore"):
         hazards = [slope_rad > options.max_slope_rad, roughness_m > options.max_roughness_m]
     reach = options.hazard_growth * options.lander_diameter_m / cell_m
-    hazard = np.logical_or(*(_grown(one, reach) for one in hazards))
+    hazard = np.logical_or(*(_dilate(one, reach) for one in hazards))
     # The cells around the map are as unknown as its holes.
     holes = np.pad(np.isnan(slope_rad) | np.isnan(roughness_m), 1, constant_values=True)
-    unknown = _grown(holes, options.unknown_growth * options.lander_diameter_m / cell_m)[1:-1, 1:-1]
+    unknown = _dilate(holes, options.unknown_growth * options.lander_diameter_m / cell_m)[1:-1, 1:-1]
     safety = np.where(hazard, Safety.HAZARD, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
     return np.asarray(safety.astype(np.uint8))
 
 
-def grassfire(burning: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
-    """Distance of every cell from the nearest that burns, cells; infinite where none does (Blum 1973)."""
-    if not np.any(burning):
-        return np.full(burning.shape, np.inf)
-    distances = cv2.distanceTransform((~burning).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+def grassfire(marked: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """Distance of every cell from the nearest marked cell, cells; infinite without any (grassfire transform, Blum
+    1973).
+    """
+    if not np.any(marked):
+        return np.full(marked.shape, np.inf)
+    distances = cv2.distanceTransform((~marked).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(distances.astype(np.float64))
 
 
-def _grown(burning: Bool[np.ndarray, "rows columns"], reach: float) -> Bool[np.ndarray, "rows columns"]:
-    return np.asarray(burning | (grassfire(burning) <= reach))
+def _dilate(marked: Bool[np.ndarray, "rows columns"], reach: float) -> Bool[np.ndarray, "rows columns"]:
+    return np.asarray(marked | (grassfire(marked) <= reach))
 
 
 def safe_site(
     safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Float[np.ndarray, "2"]
 ) -> tuple[int, int] | None:
-    """The safe cell (row, column) farthest from all that are not, of equals the nearest to the a-priori site.
+    """The safe cell (row, column) farthest from all unsafe cells, ties broken by distance to the a-priori site.
 
-    None if no cell is safe. Those around the map are not.
+    None if no cell is safe. Cells outside the map are unsafe.
     """
     distances = grassfire(np.pad(safety != Safety.SAFE, 1, constant_values=True))[1:-1, 1:-1]
     farthest = float(distances.max(initial=0.0))
@@ -170,3 +165,99 @@ def safe_site(
     equals = np.argwhere(distances >= farthest - 1e-4)
     nearest = np.argmin(np.hypot(*(equals - apriori_cell).T))
     return int(equals[nearest, 0]), int(equals[nearest, 1])
+
+
+#: Number of fitted points, and of tested positions, across a footprint.
+POINTS_ACROSS = 16
+#: Ratio of standard deviation to median absolute value of a normal distribution.
+DEVIATION_OF_MEDIAN = 1.4826
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Side of the matched windows on the ground, and standard deviation of a point's elevation."""
+
+    window_m: float
+    noise_m: float
+
+
+def map_resolution(motion: Motion, focal_px: float, options: HdaOptions) -> Resolution:
+    """Resolution of a map at the features' median depth.
+
+    The tracks' residuals estimate the match error across epipolar lines; the same error along them is a depth error.
+    """
+    depth = float(np.median(motion.depths[motion.inliers]))
+    error_px = DEVIATION_OF_MEDIAN * float(np.median(motion.residuals_px[motion.inliers]))
+    error_px = float(np.hypot(error_px, options.match_error_px))
+    return Resolution(depth * (2 * options.search_half_px + 1) / focal_px, depth * error_px / motion.parallax_px)
+
+
+def roughness_limit_m(resolution: Resolution, cell_m: float, options: HdaOptions) -> float:
+    """Largest roughness of a safe footprint in the map; not above 0 if the map cannot resolve hazards.
+
+    A match averages a window of side w; a cell of side s averages points up to s away and its middle is up to s / 2 off
+    the top of a hazard. A paraboloid of width D appears with the fraction ``1 - 4 r2 / D**2`` of its height, with r2
+    the mean square distance from its top: w**2 / 6 (window) + s**2 / 3 (weights) + s**2 / 2 (position). The limit is
+    the appearing height of the narrowest hazard of the lander's limit, less the map's noise.
+    """
+    spread = resolution.window_m**2 / 6.0 + 5.0 / 6.0 * cell_m**2
+    width = options.narrowest_hazard * options.max_roughness_m
+    resolved = max(1.0 - 4.0 * spread / width**2, 0.0)
+    return resolved * options.max_roughness_m - options.margin_deviations * resolution.noise_m
+
+
+def check_footprints(
+    safety: UInt8[np.ndarray, "rows columns"], ground: ElevationMap, resolution: Resolution, options: HdaOptions
+) -> UInt8[np.ndarray, "rows columns"]:
+    """The safe landing map with unsafe footprints as hazards.
+
+    The maps of section III know planes of fixed squares only. Here the footprint about each position is tested for the
+    slope of its own robust plane and its largest distance from that plane. A lattice of `POINTS_ACROSS` positions per
+    diameter is tested; each cell takes the result of the nearest one.
+    """
+    cells_across = options.lander_diameter_m / ground.cell_m
+    step = max(int(cells_across / POINTS_ACROSS), 1)
+    lattice = np.zeros(safety.shape, dtype=bool)
+    lattice[::step, ::step] = True
+    # a safe cell off the lattice needs its nearest lattice cell tested, safe or not
+    wanted = np.zeros_like(lattice)
+    safe_rows, safe_columns = np.nonzero(safety == Safety.SAFE)
+    nearest = tuple(
+        _nearest_lattice_cell(cells, step, extent)
+        for cells, extent in zip((safe_rows, safe_columns), safety.shape, strict=True)
+    )
+    wanted[nearest] = True
+    rows, columns = np.nonzero(wanted & lattice)
+    offsets = disc_cells(0.5 * cells_across)
+    fitted = offsets[np.all(offsets % step == 0, axis=1)].copy()
+    triples = np.random.default_rng(options.seed).uniform(size=(options.plane_trials, 3))
+    slopes, roughness = kernels.under_lander(
+        ground.elevation_m, rows, columns, offsets, fitted, max(len(fitted) // 2, 4), triples, options.refine_planes
+    )
+    max_slope_rad = options.max_slope_rad - options.margin_deviations * options.level_error_rad
+    max_roughness_m = roughness_limit_m(resolution, ground.cell_m, options)
+    with np.errstate(invalid="ignore"):
+        good = (
+            (np.arctan(slopes / ground.cell_m) <= max_slope_rad)
+            & (roughness <= max_roughness_m)
+            & (max_roughness_m > 0.0)
+        )
+    fails = np.zeros_like(lattice)
+    fails[rows[~good], columns[~good]] = True
+    result = safety.copy()
+    failed = fails[nearest]
+    result[safe_rows[failed], safe_columns[failed]] = Safety.HAZARD
+    return result
+
+
+def disc_cells(radius_cells: float) -> Int[np.ndarray, "n 2"]:
+    """Cells (row, column) of a disc, relative to its middle."""
+    reach = int(radius_cells)
+    across = np.arange(-reach, reach + 1)
+    cells = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.asarray(cells[np.hypot(*cells.T) <= radius_cells])
+
+
+def _nearest_lattice_cell(cells: Int[np.ndarray, "n"], step: int, extent: int) -> Int[np.ndarray, "n"]:
+    """Nearest lattice cell along an axis."""
+    return np.asarray(np.minimum((cells + step // 2) // step * step, (extent - 1) // step * step))

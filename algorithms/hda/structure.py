@@ -1,4 +1,4 @@
-"""Dense structure: epipolar segments, the match along each, triangulation (section II.C)."""
+"""Dense structure by matches along epipolar segments (section II.C), and the scale from the laser altimeter."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.hda.kernels import matching
+from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.options import HdaOptions
-from marsyard.algorithms.hda.view import View, pixels_of, points_at, undistorted
+from marsyard.algorithms.hda.view import View, points_at_depth, project_points, undistort
 
 
 class Fate(IntEnum):
-    """What became of a structure match; the first reason to drop it counts."""
+    """Result of a structure match; the first failed check counts."""
 
     ACCEPTED = 0
     UNLIKE = 1
@@ -25,25 +26,15 @@ class Fate(IntEnum):
 
 @dataclass(frozen=True)
 class Matches:
-    """Pixels of the first picture and where they were found in the second.
+    """Structure matches between the images.
 
-    Attributes
-    ----------
-    first
-        Pixels (u, v) whose epipolar segment lies in the second picture, with room for the windows.
-    starts, ends
-        Their segments' ends, at the least and the greatest depth.
-    second
-        Where they were found.
-    correlations
-        Eq. 3 there.
-    depths
-        By triangulation, metres, in the first camera's frame.
-    fates
-        Values of `Fate`: whether each match is believed, and why not: too low a correlation, a depth out of bounds, or
-        another pixel found on the way back.
-    points
-        Points of the accepted ones in the first camera's frame, metres.
+    - first: Pixels (u, v) of the first image whose epipolar segment fits the second image
+    - starts, ends: Ends of the segments, at the smallest and the largest depth
+    - second: Matched pixels (u, v) of the second image
+    - correlations: Eq. 3 at the match
+    - depths: By triangulation, metres, in the first camera's frame
+    - fates: Values of `Fate`
+    - points: Points of the accepted matches in the first camera's frame, metres
     """
 
     first: Float[np.ndarray, "n 2"]
@@ -57,17 +48,17 @@ class Matches:
 
     @property
     def accepted(self) -> Bool[np.ndarray, "n"]:
-        """Whether each match is believed."""
+        """Whether each match passed all checks."""
         return np.asarray(self.fates == Fate.ACCEPTED)
 
 
 def depth_bounds(depth_range_m: tuple[float, float], margin: float) -> tuple[float, float]:
-    """Depths between which structure is looked for: those of the features, widened by a share of themselves."""
+    """Depth range of the features, widened by the fraction `margin`."""
     return (1.0 - margin) * depth_range_m[0], (1.0 + margin) * depth_range_m[1]
 
 
 def pixel_lattice(size: tuple[int, int], spacing_px: int, border_px: int) -> Float[np.ndarray, "n 2"]:
-    """Pixels (u, v) of a grid over a picture of (columns, rows), in its middle, that keep from the border."""
+    """Pixels (u, v) of a centred grid over an image of size (columns, rows), inside the border."""
     axes = []
     for extent in size:
         room = max(extent - 1 - 2 * border_px, 0)
@@ -82,26 +73,25 @@ def epipolar_segments(
     bounds_m: tuple[float, float],
     border_px: int,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
-    """Ends of the epipolar segments of undistorted coordinates (Eqs. 6-8), and whether both have room."""
+    """Ends of the epipolar segments of undistorted coordinates (Eqs. 6-8), and whether both are inside the border."""
     ends = []
     room = np.ones(len(places), dtype=bool)
     for depth in bounds_m:
-        moved = second_from_first.apply(points_at(places, np.full(len(places), depth)))
-        pixels, seen = pixels_of(second.camera, moved)
+        moved = second_from_first.apply(points_at_depth(places, np.full(len(places), depth)))
+        pixels, seen = project_points(second.camera, moved)
         with np.errstate(invalid="ignore"):
-            # A whole pixel less: segments are walked at rounded places.
-            far = (pixels >= border_px) & (pixels <= np.array(second.camera.size) - 1.0 - border_px)
-        room &= seen & far.all(axis=1)
+            inside = (pixels >= border_px) & (pixels <= np.array(second.camera.size) - 1.0 - border_px)
+        room &= seen & inside.all(axis=1)
         ends.append(pixels)
     return ends[0], ends[1], room
 
 
-def triangulated(
+def triangulate(
     first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"], second_from_first: RigidTransform
 ) -> Float[np.ndarray, "n"]:
-    """Depths z in the first camera's frame that best fit z' h' = z R h + t, metres; NaN for parallel lines of sight.
+    """Depths z in the first camera's frame that best fit z' h' = z R h + t, metres; NaN for parallel rays.
 
-    Least squares over both depths (Weng, Ahuja & Huang 1993); h and h' are the undistorted coordinates with a one.
+    Least squares over both depths (Weng, Ahuja & Huang 1993); h and h' are homogeneous undistorted coordinates.
     """
     a = second_from_first.rotation.apply(np.column_stack([first, np.ones(len(first))]))
     b = np.column_stack([second, np.ones(len(second))])
@@ -120,16 +110,16 @@ def match_pixels(
     bounds_m: tuple[float, float],
     options: HdaOptions,
 ) -> Matches:
-    """Matches of whole pixels of the first picture along their epipolar segments.
+    """Match whole pixels of the first image along their epipolar segments.
 
-    The least sum of absolute differences (Eq. 9) on the segment, then the top of the biquadratic through the
-    correlations about it. (The paper says "the maximum SAD value"; the best match is the least.) Pixels whose segment
-    leaves the second picture are dropped; matches with too low a correlation or a depth out of bounds are not accepted,
-    nor, with `max_return_px`, those that do not find their way back.
+    The smallest sum of absolute differences (Eq. 9) on the segment, then the top of the biquadratic through the
+    correlations about it. (The paper says "the maximum SAD value"; the best match is the smallest.) Pixels whose
+    segment leaves the second image are dropped. Accepted matches pass the limits on correlation and depth and, with
+    `max_return_px`, the check of the reverse match.
     """
     first, second = views
     border = options.search_half_px + 1
-    places = undistorted(first.camera, pixels)
+    places = undistort(first.camera, pixels)
     starts, ends, room = epipolar_segments(second, second_from_first, places, bounds_m, border)
     pixels, places, starts, ends = pixels[room], places[room], starts[room], ends[room]
     whole = pixels.astype(np.int64)
@@ -137,7 +127,7 @@ def match_pixels(
     matched, correlations = matching.refine_shifts(
         first.counts, second.counts, whole[:, ::-1], (found - whole)[:, ::-1], options.search_half_px
     )
-    depths = triangulated(places, undistorted(second.camera, matched), second_from_first)
+    depths = triangulate(places, undistort(second.camera, matched), second_from_first)
     fates = np.full(len(pixels), Fate.ACCEPTED, dtype=np.uint8)
     fates[~((depths > bounds_m[0]) & (depths < bounds_m[1]))] = Fate.OUT_OF_BOUNDS
     fates[~(correlations >= options.min_match_correlation)] = Fate.UNLIKE
@@ -149,7 +139,7 @@ def match_pixels(
         fates[left[way > options.max_return_px]] = Fate.NOT_RETURNED
     accepted = fates == Fate.ACCEPTED
     return Matches(
-        pixels, starts, ends, matched, correlations, depths, fates, points_at(places[accepted], depths[accepted])
+        pixels, starts, ends, matched, correlations, depths, fates, points_at_depth(places[accepted], depths[accepted])
     )
 
 
@@ -162,38 +152,66 @@ def return_distance(
     bounds_m: tuple[float, float],
     half_px: int,
 ) -> Float[np.ndarray, "n"]:
-    """How far from each pixel of the first picture the one lies that its match in the second finds there.
+    """Distance of each pixel of the first image from the reverse match of its match.
 
-    Pixels are whole, `places` their undistorted coordinates. What the match sees is looked for at the depths in the
-    second camera's frame that the bounds are there, as far as the first picture goes: the search has as many rivals as
-    on the way there, and a patch that only resembles another finds the other.
+    Pixels are whole, `places` their undistorted coordinates. The reverse search covers the depth bounds in the second
+    camera's frame, clipped to the first image.
     """
     first, second = views
-    ends = [second_from_first.apply(points_at(places, np.full(len(places), depth)))[:, 2] for depth in bounds_m]
-    back = undistorted(second.camera, found.astype(np.float64))
-    reached = [pixels_of(first.camera, second_from_first.inv().apply(points_at(back, depths)))[0] for depths in ends]
-    near, far = (within(first.camera.size, pixels.astype(np.float64), end, half_px + 1.0) for end in reached)
+    ends = [second_from_first.apply(points_at_depth(places, np.full(len(places), depth)))[:, 2] for depth in bounds_m]
+    back = undistort(second.camera, found.astype(np.float64))
+    reached = [
+        project_points(first.camera, second_from_first.inv().apply(points_at_depth(back, depths)))[0] for depths in ends
+    ]
+    near, far = (clip_to_image(first.camera.size, pixels.astype(np.float64), end, half_px + 1.0) for end in reached)
     returned = matching.search_segments(second.counts, first.counts, found, near, far, half_px)
     return np.asarray(np.hypot(*(returned - pixels).T))
 
 
-def within(
+def clip_to_image(
     size: tuple[int, int], inside: Float[np.ndarray, "n 2"], ends: Float[np.ndarray, "n 2"], border_px: float
 ) -> Float[np.ndarray, "n 2"]:
-    """Ends of lines from places inside of a picture of (columns, rows), cut where they come too near to its border."""
+    """Ends of lines from positions inside an image of size (columns, rows), clipped at the border."""
     away = np.nan_to_num(ends - inside)
     limits = np.where(away > 0.0, np.array(size) - 1.0 - border_px, border_px)
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(away == 0.0, 1.0, (limits - inside) / away)
-    return np.asarray(inside + np.clip(share.min(axis=1), 0.0, 1.0)[:, None] * away)
+        fraction = np.where(away == 0.0, 1.0, (limits - inside) / away)
+    return np.asarray(inside + np.clip(fraction.min(axis=1), 0.0, 1.0)[:, None] * away)
 
 
 def dense_structure(
-    views: tuple[View, View],
-    second_from_first: RigidTransform,
-    depth_range_m: tuple[float, float],
-    options: HdaOptions,
+    views: tuple[View, View], second_from_first: RigidTransform, depth_range_m: tuple[float, float], options: HdaOptions
 ) -> Matches:
-    """Matches of a grid of pixels, searched between the widened depths of the features."""
+    """Matches of a grid of pixels, searched within the widened depth range of the features."""
     pixels = pixel_lattice(views[0].camera.size, options.grid_px, options.search_half_px + 1)
     return match_pixels(views, second_from_first, pixels, depth_bounds(depth_range_m, options.depth_margin), options)
+
+
+#: Offsets of the pixels matched about the laser's spot; their median depth is that of the spot.
+SPOT_OFFSETS_PX = np.arange(-4.0, 5.0, 2.0)
+#: Minimum number of matches in the spot.
+MIN_SPOT_MATCHES = 5
+
+
+def scale_factor(
+    views: tuple[View, View], motion: Motion, places: Float[np.ndarray, "n 2"], range_m: float, options: HdaOptions
+) -> float:
+    """Factor on all lengths of the motion that makes the depth on the optical axis equal the laser's range.
+
+    Pixels about the laser's spot are matched as structure is; with too few matches the plane through the features'
+    inverse depths gives the depth (`places` are their undistorted coordinates). The paper sets the initial depths by
+    the range and does not correct the scale afterwards.
+    """
+    spot, _ = views[0].camera.project(np.array([[0.0, 0.0, 1.0]]))
+    across, down = np.meshgrid(SPOT_OFFSETS_PX, SPOT_OFFSETS_PX)
+    pixels = np.rint(spot) + np.column_stack([across.ravel(), down.ravel()])
+    room = options.search_half_px + 1
+    inside = np.all((pixels >= room) & (pixels < np.array(views[0].camera.size) - room), axis=1)
+    bounds = depth_bounds(motion.depth_range_m, options.depth_margin)
+    spot_matches = match_pixels(views, motion.second_from_first, pixels[inside], bounds, options)
+    depths = spot_matches.depths[spot_matches.accepted]
+    if len(depths) >= MIN_SPOT_MATCHES:
+        return range_m / float(np.median(depths))
+    design = np.column_stack([places, np.ones(len(places))])[motion.inliers]
+    plane = np.linalg.lstsq(design, 1.0 / motion.depths[motion.inliers], rcond=None)[0]
+    return range_m * float(plane[2])

@@ -1,8 +1,8 @@
-"""A picture with its camera in the camera's own frame, and the geometry of a pixel at a depth.
+"""Measurements in the cameras' own frames, and the geometry of a pixel at a depth.
 
 The camera frame has its origin in the centre of projection C, z along the optical axis A, x to the right along the
-picture's columns and y = z x x. Depth is z: the component along A, as in Eqs. 6-8. Undistorted ("unit focal length")
-coordinates of a pixel are (x / z, y / z) of its line of sight; the entrance pupil's motion in CAHVORE is left out.
+image columns and y = z x x. Depth is z: the component along A, as in Eqs. 6-8. Undistorted (unit focal length)
+coordinates of a pixel are (x / z, y / z) of its line of sight. The motion of CAHVORE's entrance pupil is neglected.
 """
 
 from __future__ import annotations
@@ -13,28 +13,22 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.image.frame_transfer import without_frame_transfer
+from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
-from marsyard.sim.measurements import DetectorImage, PoseMeasurement
+from marsyard.sim.measurements import DetectorImage, LandingMeasurements, PoseMeasurement
 
-#: Least relative response that is divided by: less is a dead pixel's.
-LEAST_RESPONSE = 0.05
+#: Minimum relative response for the division; dead pixels have less.
+MIN_RESPONSE = 0.05
 
 
 @dataclass(frozen=True)
 class View:
-    """One picture.
+    """One image in its camera's frame.
 
-    Attributes
-    ----------
-    counts
-        Detector counts that frame transfer, the pixels' response and the lens's fall-off are taken off, shape (rows,
-        columns).
-    camera
-        Its camera, in the camera frame.
-    world_from_camera
-        The camera's pose by the on-board filter.
+    - counts: Detector counts without frame transfer, pixel response and lens fall-off
+    - camera: Its camera, in the camera frame
+    - world_from_camera: The camera's pose by the on-board filter
     """
 
     counts: UInt16[np.ndarray, "rows columns"]
@@ -43,18 +37,12 @@ class View:
 
     @property
     def focal_px(self) -> float:
-        """Mean focal length, pixels: what a change of undistorted coordinates is worth."""
+        """Mean focal length: pixels per unit of undistorted coordinates."""
         return float(np.mean(self.camera.focal_lengths))
 
 
-def view(image: DetectorImage, pose: PoseMeasurement) -> View:
-    """The view of a picture taken at a pose.
-
-    Raises
-    ------
-    ValueError
-        If the picture's size is not its camera's.
-    """
+def build_view(image: DetectorImage, pose: PoseMeasurement) -> View:
+    """The view of an image taken at a pose. Raises ValueError if the image's size is not its camera's."""
     if image.counts.shape != image.camera.size[::-1]:
         raise ValueError(f"the picture has (rows, columns) {image.counts.shape}, its camera {image.camera.size[::-1]}")
     body_from_camera = camera_pose(image.camera)
@@ -64,30 +52,28 @@ def view(image: DetectorImage, pose: PoseMeasurement) -> View:
 
 
 def flat_fielded(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]:
-    """Counts without the offset, as pixels would give them that all respond like the brightest.
+    """Counts without offset, frame transfer and response variations.
 
-    A lens passes a third less light in its corners: sums of absolute differences (Eq. 9) of the same ground, seen once
-    in the middle and once near the border, would be least at another place. Over rendered rocks from 15 m a fifth of
-    the points was wrong without this, and half a per cent with it.
-
-    What a camera without shutter gathers while rows are cleared and shifted out is taken off before, as it is of other
-    ground than the pixel's: at 10 ms it is half of the exposure's light in the last of the MER camera's 1,024 rows.
+    A lens passes a third less light in its corners, which biases sums of absolute differences (Eq. 9) of the same
+    ground seen in the middle and near the border. Over rendered rocks from 15 m a fifth of the points was wrong without
+    this correction, and half a per cent with it. Frame transfer is removed first: at 10 ms it is half of the exposure's
+    light in the last of the MER camera's 1,024 rows.
     """
     known = image.calibration
-    response = np.maximum(known.flat_field, LEAST_RESPONSE).astype(np.float32)
+    response = np.maximum(known.flat_field, MIN_RESPONSE).astype(np.float32)
     signal = image.counts - np.float32(known.offset_dn)
-    signal = without_frame_transfer(signal, known, known.rows_summed).astype(np.float32, copy=False)
+    signal = remove_frame_transfer(signal, known, known.rows_summed).astype(np.float32, copy=False)
     return np.asarray(np.rint(np.clip(signal / response, 0.0, 65535.0)).astype(np.uint16))
 
 
 def camera_pose(camera: CameraModel) -> RigidTransform:
-    """The transform from the camera frame to the frame that the camera is given in."""
+    """The transform from the camera frame to the frame of the camera model."""
     axes = np.column_stack([camera.right, np.cross(camera.a, camera.right), camera.a])
     return rigid(Rotation.from_matrix(axes), np.array(camera.c))
 
 
-def undistorted(camera: CameraModel, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Unit focal length coordinates of pixels; NaN where no ray reaches them, or none that goes forwards."""
+def undistort(camera: CameraModel, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Unit focal length coordinates of pixels; NaN without a forward ray."""
     directions = camera.rays(pixels)[1]
     with np.errstate(divide="ignore", invalid="ignore"):
         places: Float[np.ndarray, "n 2"] = directions[:, :2] / directions[:, 2:]
@@ -95,14 +81,44 @@ def undistorted(camera: CameraModel, pixels: Float[np.ndarray, "n 2"]) -> Float[
     return places
 
 
-def points_at(places: Float[np.ndarray, "n 2"], depths: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+def points_at_depth(places: Float[np.ndarray, "n 2"], depths: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
     """Points (camera frame) of undistorted coordinates at depths (Eq. 6)."""
     return np.asarray(np.column_stack([places, np.ones(len(places))]) * depths[:, None])
 
 
-def pixels_of(
+def project_points(
     camera: CameraModel, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
     """Pixels of points in the camera frame and whether they lie in the picture."""
     pixels, visible = camera.project(points)
     return pixels, visible & camera.in_frame(pixels)
+
+
+@dataclass(frozen=True)
+class LandingScene:
+    """Two views and the measurements taken with the first.
+
+    - range_m: Depth of the ground on the first camera's optical axis; NaN if unknown
+    - up_camera: Unit vector upwards by the inclinometers, in the first camera's frame
+    - apriori_site_world: Default landing site
+    """
+
+    views: tuple[View, View]
+    range_m: float
+    up_camera: Float[np.ndarray, "3"]
+    apriori_site_world: Float[np.ndarray, "3"]
+
+    @property
+    def second_from_first(self) -> RigidTransform:
+        """The camera's motion by the on-board poses."""
+        return self.views[1].world_from_camera.inv() * self.views[0].world_from_camera
+
+
+def build_scene(measurements: LandingMeasurements) -> LandingScene:
+    """Transform the measurements to the cameras' frames. Raises ValueError if an image's size is not its camera's."""
+    first, second = (
+        build_view(image, pose) for image, pose in zip(measurements.images, measurements.poses, strict=True)
+    )
+    body_from_camera = camera_pose(measurements.images[0].camera)
+    up_camera = body_from_camera.rotation.inv().apply(np.array(measurements.up_body))
+    return LandingScene((first, second), measurements.slant_range_m, up_camera, measurements.apriori_site_world)

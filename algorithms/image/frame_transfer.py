@@ -1,4 +1,4 @@
-"""The frame-transfer ramp of a camera without shutter, taken off again (DIMES paper, section II.A).
+"""Removal of the frame-transfer ramp of a camera without shutter (DIMES paper, section II.A).
 
 Without a shutter a charge packet gathers light under every row that it passes. A packet that ends as physical row r
 passes under rows r+1 .. N-1 while the detector is cleared before the exposure (`clear_row_s` under each) and under rows
@@ -21,27 +21,14 @@ from marsyard.algorithms.image.kernels import frame_transfer as kernels
 from marsyard.sim.measurements import DetectorCalibration
 
 
-def without_frame_transfer(
+def remove_frame_transfer(
     signal: Float[np.ndarray, "rows columns"], calibration: DetectorCalibration, rows_summed: int
 ) -> Float[np.ndarray, "rows columns"]:
-    """The signal of the exposure alone, in the units of `signal`, from whole columns of a delivered picture.
+    """The signal of the exposure alone, in the units of `signal`, from whole columns of a delivered image.
 
-    Inverts the transfer exactly for a scene that does not move during it and is constant within each delivered row. Of
-    a camera without frame transfer it is the signal itself, whatever the exposure.
-
-    Parameters
-    ----------
-    signal
-        Counts above the offset, all rows, any columns: they do not mix.
-    calibration
-        Exposure and row times.
-    rows_summed
-        Physical rows in a row of `signal`.
-
-    Raises
-    ------
-    ValueError
-        If the exposure is too short against the row times for the transfer to be inverted.
+    `signal` holds counts above the offset, all rows, any columns; `rows_summed` physical rows per row. The inversion is
+    exact for a static scene that is constant within each delivered row. Without frame transfer it is the identity.
+    Raises ValueError if the exposure is too short against the row times.
     """
     n, a, b = rows_summed, calibration.transfer_row_s, calibration.clear_row_s
     if a == 0.0 and b == 0.0:

@@ -1,4 +1,4 @@
-"""Interest operators: where a picture has structure enough to be found again."""
+"""Interest operators: structure tensor and Harris interest."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ from jaxtyping import Float
 
 def structure_tensor(
     image: Float[np.ndarray, "rows columns"], support: int
-) -> tuple[
-    Float[np.ndarray, "rows columns"],
-    Float[np.ndarray, "rows columns"],
-    Float[np.ndarray, "rows columns"],
-]:
+) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
     """Mean products of the picture's gradients over a square of `support` pixels about every pixel.
 
     Returns the means of ``g_u g_u``, ``g_v g_v`` and ``g_u g_v`` in squared counts per squared pixel, each of shape

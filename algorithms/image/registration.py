@@ -1,43 +1,120 @@
-"""Registration of a template that may have been shifted, stretched and bent: Gauss-Newton on quintic splines.
+"""Registration and resampling of templates by quintic splines, to hundredths of a pixel.
 
-Shifting alone leans: where the picture is longer one way than the template, texture that is denser on one side pulls
-the match to that side, by up to tenths of a pixel. Solving for the stretch as well takes that out. Of a round surface
-seen from another height the picture bends: its middle moves otherwise than its border does on the mean, always to the
-same side, and solving for the bend takes that out.
+Fits of a surface to a correlation peak are biased towards whole pixels (up to about 0.09 px for the biquadratic);
+OpenCV's warps misplace samples by up to 0.05 px. Gauss-Newton registration of the images, with a spline of high order
+between pixels, has no such bias. A pure shift is biased where the image is stretched relative to the
+template, by up to tenths of a pixel; a linear map removes that bias. A round surface seen from another height bends the
+image; a quadratic map removes that bias.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy import ndimage
+from scipy.interpolate import BSpline
 
-from marsyard.algorithms.image.alignment import SURROUND, spline_coefficients
+from marsyard.algorithms.image.kernels import quintic
 from marsyard.algorithms.image.kernels import registration as kernels
 
-#: What a template may have undergone: a shift; a linear map too; a quadratic map of its offsets too.
+ORDER: Final = 5
+#: Step that ends the shift refinement; the next step is smaller by a factor of ten or more.
+ALIGNMENT_TOLERANCE_PX = 1e-3
+#: Margin of pixels for the spline; pixels beyond shift the result by less than 1e-4 px.
+SURROUND = 12
+_TAPS = np.arange(ORDER + 1) - ORDER // 2
+_BASIS = BSpline.basis_element(np.arange(ORDER + 2) - (ORDER + 1) / 2.0, extrapolate=False)
+_SLOPE = _BASIS.derivative()
+
+
+def spline_coefficients(image: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """Coefficients of the quintic spline through the image; borders mirror about their last pixels."""
+    return np.asarray(ndimage.spline_filter(image, order=ORDER, output=np.float64, mode="mirror"))
+
+
+def shifted_patch(
+    coefficients: Float[np.ndarray, "rows columns"], corner: Float[np.ndarray, "2"], shape: tuple[int, int]
+) -> Float[np.ndarray, "3 n m"]:
+    """The patch of `shape` with its upper left pixel at `corner` (row, column), and its derivatives by row and column.
+
+    All pixels share the fraction of the shift: the spline is a separable filter of six taps. The patch must lie at
+    least three pixels inside the image.
+    """
+    whole = np.floor(corner)
+    places = (corner - whole)[:, np.newaxis] - _TAPS
+    taps = np.stack([_BASIS(places), _SLOPE(places)])
+    samples = np.empty((3, *shape))
+    quintic.shifted(coefficients, int(whole[0]), int(whole[1]), taps[:, 0], taps[:, 1], samples)
+    return samples
+
+
+def refine_shift(
+    template: Float[np.ndarray, "n m"],
+    window: Float[np.ndarray, "rows columns"],
+    corner: Float[np.ndarray, "2"],
+    iterations: int = 6,
+    reach: float = 1.5,
+) -> Float[np.ndarray, "2"] | None:
+    """Refine the corner (row, column) of a template in the window to hundredths of a pixel.
+
+    Minimises ``sum (A - gain B)^2`` over shift and gain, A and B less their means, from `corner` by Gauss-Newton. None
+    if it moves more than `reach` pixels, comes within three pixels of the window's border, or the normal equations are
+    singular.
+    """
+    near = np.maximum(np.floor(corner).astype(int) - SURROUND, 0)
+    far = np.floor(corner).astype(int) + np.array(template.shape) + SURROUND
+    region = window[near[0] : far[0], near[1] : far[1]]
+    coefficients = spline_coefficients(region)
+    last = np.array(region.shape) - np.array(template.shape) - 4.0
+    a = template - template.mean()
+    start = corner - near
+    position = start
+    for _ in range(iterations):
+        if np.hypot(*(position - start)) > reach or np.any(position < 3.0) or np.any(position > last):
+            return None
+        step = _step(a, shifted_patch(coefficients, position, (template.shape[0], template.shape[1])))
+        if step is None:
+            return None
+        position = position + step
+        if np.hypot(*step) < ALIGNMENT_TOLERANCE_PX:
+            break
+    return position + near if np.hypot(*(position - start)) <= reach else None
+
+
+def _step(a: Float[np.ndarray, "n m"], samples: Float[np.ndarray, "3 n m"]) -> Float[np.ndarray, "2"] | None:
+    """One Gauss-Newton step of the shift (row, column), with the gain; see `shifted_patch`."""
+    b = samples[0] - samples[0].mean()
+    energy = float(np.sum(b * b))
+    gain = float(np.sum(a * b)) / energy if energy > 0.0 else 0.0
+    if gain <= 0.0:
+        return None
+    slopes = samples[1:].reshape(2, -1)
+    jacobian = gain * (slopes - slopes.mean(axis=1, keepdims=True))
+    normal = jacobian @ jacobian.T
+    if np.linalg.det(normal) <= 1e-10 * np.trace(normal) ** 2:
+        return None
+    return np.asarray(np.linalg.solve(normal, jacobian @ (a - gain * b).ravel()))
+
+
+#: Model of the registration: shift; with a linear map; with a quadratic map of the offsets.
 Warp = Literal["shift", "stretch", "bend"]
 _ORDERS: dict[Warp, int] = {"shift": 0, "stretch": 1, "bend": 2}
-#: A step below this, pixels, ends the iteration; what is left is less than 1e-3 px.
-TOLERANCE = 3e-3
-#: A pivot of the normal equations, their diagonal made 1, below which texture does not tell one unknown from another.
+#: Step that ends the registration; the remaining error is less than 1e-3 px.
+REGISTRATION_TOLERANCE_PX = 3e-3
+#: Minimum pivot of the normal equations with unit diagonal; below, the texture does not separate the unknowns.
 SINGULAR = 1e-4
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far a registration may go before it is not believed.
+    """Limits of a registration.
 
-    Attributes
-    ----------
-    shift_px
-        Largest distance of the middle from where it started.
-    stretch
-        Largest entry of the linear map's difference from the identity, and of the bend at the template's border.
-    steps
-        Steps allowed; four to six are the rule.
+    - shift_px: Largest displacement of the middle
+    - stretch: Largest entry of the linear map's difference from the identity, and of the bend at the template's border
+    - steps: Maximum number of steps; four to six are usual
     """
 
     shift_px: float = 1.5
@@ -45,82 +122,98 @@ class Limits:
     steps: int = 12
 
 
-#: What is believed where nothing else is said.
+#: Default limits.
 LIMITS = Limits()
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Where a template matches best.
-
-    Attributes
-    ----------
-    corner
-        Row and column of its upper left pixel in the window, as if it were only shifted, shape (2,).
-    score
-        Normalised correlation of the template with what it was registered to.
-    """
+    """Best match: corner (row, column in the window) of the unwarped template, and normalised correlation."""
 
     corner: Float[np.ndarray, "2"]
     score: float
 
 
 @dataclass(frozen=True)
-class SplinedPart:
-    """The part of a window about a template's place, as a spline.
-
-    Attributes
-    ----------
-    near, far
-        Its first row and column, and those after its last.
-    coefficients
-        Of the quintic spline.
-    """
+class SplinePart:
+    """Part of a window about a template: first row and column, those after its last, quintic spline coefficients."""
 
     near: tuple[int, int]
     far: tuple[int, int]
     coefficients: Float[np.ndarray, "rows columns"]
 
 
-def splined(
+def build_spline(
     window: Float[np.ndarray, "rows columns"],
     corner: Float[np.ndarray, "2"],
     side: int,
-    known: SplinedPart | None = None,
-) -> SplinedPart:
+    known: SplinePart | None = None,
+) -> SplinePart:
     """The spline about a template of `side` pixels with its upper left one at `corner` (row, column).
 
-    What is `known` of the same window is given back where it is the same part.
+    Returns `known`, of the same window, if it is the same part.
     """
     first = np.maximum(np.floor(corner).astype(int) - SURROUND, 0)
     last = np.ceil(corner).astype(int) + side + SURROUND
     near, far = (int(first[0]), int(first[1])), (int(last[0]), int(last[1]))
     if known is not None and (known.near, known.far) == (near, far):
         return known
-    return SplinedPart(near, far, spline_coefficients(window[near[0] : far[0], near[1] : far[1]]))
+    return SplinePart(near, far, spline_coefficients(window[near[0] : far[0], near[1] : far[1]]))
 
 
-def registered(
+def register_template(
     template: Float[np.ndarray, "n n"],
-    window: Float[np.ndarray, "rows columns"] | SplinedPart,
+    window: Float[np.ndarray, "rows columns"] | SplinePart,
     corner: Float[np.ndarray, "2"],
     warp: Warp,
     limits: Limits = LIMITS,
 ) -> Registration | None:
-    """The place in the window, or in the part of it about `corner`, at which the template matches best, by its middle.
+    """Register a template in a window, or in the part of it about `corner`, from `corner` (row, column).
 
     Minimises ``sum (B(c + M d + Q(d)) - gain A(d) - offset)^2`` over the middle c, gain, offset and, as `warp` allows,
-    the matrix M, which else is 1, and the quadratic form Q, which else is 0; A is the template over offsets d from its
-    middle, B the window by quintic splines. It goes from `corner` (row, column) by the inverse compositional method
-    (Baker & Matthews 2004): derivatives are those of the template, taken once. None when it leaves the limits or the
-    window, does not converge, or when the texture does not determine the unknowns.
+    the matrix M (else the identity) and the quadratic form Q (else zero); A is the template over offsets d from its
+    middle, B the window by quintic splines. Inverse compositional method (Baker & Matthews 2004). None if it leaves the
+    limits or the window, does not converge, or the texture does not determine the unknowns.
     """
     half = 0.5 * (len(template) - 1)
-    part = window if isinstance(window, SplinedPart) else splined(window, corner, len(template))
+    part = window if isinstance(window, SplinePart) else build_spline(window, corner, len(template))
     near = np.array(part.near)
     start = corner - near + half
     bounds = (limits.shift_px, limits.stretch, limits.steps)
     done, row, column, score = kernels.register(
-        template, part.coefficients, start[0], start[1], _ORDERS[warp], bounds, TOLERANCE, SINGULAR
+        template, part.coefficients, start[0], start[1], _ORDERS[warp], bounds, REGISTRATION_TOLERANCE_PX, SINGULAR
     )
     return Registration(np.array([row, column]) - half + near, score) if done else None
+
+
+def similarity_patch(
+    image: Float[np.ndarray, "rows columns"],
+    centre: Float[np.ndarray, "2"],
+    side: int,
+    magnification: float = 1.0,
+    roll_rad: float = 0.0,
+) -> Float[np.ndarray, "side side"]:
+    """The square of `side` pixels about `centre` of the magnified and rolled image.
+
+    - image: Image, mirrored about its last pixels outside
+    - centre: Column and row (u, v) of the middle, within the image
+    - magnification: Scale factor; unfiltered, meant for factors down to about 0.7
+    - roll_rad: Rotation, clockwise as seen
+
+    Raises ValueError if the centre is outside the image.
+    """
+    linear = np.zeros((2, 5))
+    linear[:, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
+    linear /= magnification
+    reach = int(np.ceil(0.5 * (side - 1) * np.abs(linear).sum(axis=1).max())) + SURROUND
+    position = centre[::-1]
+    near = np.floor(position).astype(int) - reach
+    far = near + 2 * reach + 2
+    inside = image[max(near[0], 0) : max(far[0], 0), max(near[1], 0) : max(far[1], 0)]
+    beyond = [(max(-a, 0), max(b - n, 0)) for a, b, n in zip(near, far, image.shape, strict=True)]
+    region = np.pad(inside, beyond, mode="reflect") if np.any(beyond) else inside
+    values = np.empty(side * side)
+    row, column = position - near
+    if not quintic.sample(spline_coefficients(region), side, row, column, linear, values):
+        raise ValueError(f"the middle of a patch, {centre}, is not in the picture of {image.shape[::-1]} pixels")
+    return values.reshape(side, side)

@@ -1,4 +1,4 @@
-"""How well a target can be approached: Eqs. 1 to 5 of the tracking paper, and its Table I computed from them.
+"""Approach accuracy: Eqs. 1 to 5 of the tracking paper, and its Table I.
 
 Distances are in metres; 3 sigma where the disparity error is that of 3 sigma (the paper takes 1 pixel).
 """
@@ -10,7 +10,7 @@ from decimal import ROUND_HALF_UP, Decimal
 
 import numpy as np
 
-#: Where the paper stands before and after its traverse (section 4.2), metres.
+#: Target distances before and after the traverse (section 4.2), metres.
 START_M, GOAL_M = 10.0, 2.0
 #: Wheel and visual odometry together: "roughly 2% of the rover travel distance".
 NAVIGATION_ERROR = 0.02
@@ -18,15 +18,7 @@ NAVIGATION_ERROR = 0.02
 
 @dataclass(frozen=True)
 class StereoDesign:
-    """What the accuracy of a stereo pair follows from.
-
-    Attributes
-    ----------
-    name
-        For tables.
-    focal_length_m, pixel_m, baseline_m
-        Focal length, distance of the pixels and of the cameras.
-    """
+    """Parameters of a stereo pair: focal length, pixel pitch and baseline."""
 
     name: str
     focal_length_m: float
@@ -64,10 +56,10 @@ def tracked_approach_error_m(stereo_error_m: float, drift_error_m: float) -> flo
     return float(np.hypot(stereo_error_m, drift_error_m))
 
 
-def printed(value: float, digits: int) -> float:
-    """A value as a table prints it, halves away from zero.
+def round_half_up(value: float, digits: int) -> float:
+    """Round half away from zero, as in printed tables.
 
-    Float noise below 1e-9 does not decide: 38.75 cm comes out of the equations as 38.7499...
+    Float noise below 1e-9 is removed first: 38.75 cm comes out of the equations as 38.7499...
     """
     return float(Decimal(str(round(value, 9))).quantize(Decimal(1).scaleb(-digits), ROUND_HALF_UP))
 
@@ -76,18 +68,11 @@ def printed(value: float, digits: int) -> float:
 class AccuracyRow:
     """A row of Table I as printed, centimetres, 3 sigma.
 
-    Attributes
-    ----------
-    name
-        Camera.
-    designation_cm
-        Stereo range error at 10 m.
-    untracked_cm
-        Approach error at 2 m after 8 m by visual odometry, without tracker.
-    stereo_cm
-        Stereo range error at 2 m: the first term of the last column.
-    drift_cm_px
-        Cross-range error of a pixel of drift at 2 m: what N is multiplied by in the last column.
+    - name: Camera
+    - designation_cm: Stereo range error at 10 m
+    - untracked_cm: Approach error at 2 m after 8 m by visual odometry, without tracker
+    - stereo_cm: Stereo range error at 2 m: the first term of the last column
+    - drift_cm_px: Cross-range error of a pixel of drift at 2 m: the factor of N in the last column
     """
 
     name: str
@@ -109,17 +94,17 @@ class AccuracyRow:
 def accuracy_row(design: StereoDesign) -> AccuracyRow:
     """A row of Table I.
 
-    Each column is rounded before the next is computed from it, as the paper did: 42.0 cm for the navcam is
+    Each column is rounded before the next is computed, as in the paper: 42.0 cm for the navcam is
     ``sqrt(38.8^2 + 16^2)``; with 38.75 it would be 41.9.
     """
-    designation = printed(100.0 * stereo_range_error_m(START_M, design.focal_px, design.baseline_m), 1)
+    designation = round_half_up(100.0 * stereo_range_error_m(START_M, design.focal_px, design.baseline_m), 1)
     navigation = 100.0 * NAVIGATION_ERROR * (START_M - GOAL_M)
     return AccuracyRow(
         name=design.name,
         designation_cm=designation,
-        untracked_cm=printed(untracked_approach_error_m(designation, navigation), 1),
-        stereo_cm=printed(100.0 * stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m), 1),
-        drift_cm_px=printed(100.0 * drift_error_m(GOAL_M, design.focal_px, 1.0), 2),
+        untracked_cm=round_half_up(untracked_approach_error_m(designation, navigation), 1),
+        stereo_cm=round_half_up(100.0 * stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m), 1),
+        drift_cm_px=round_half_up(100.0 * drift_error_m(GOAL_M, design.focal_px, 1.0), 2),
     )
 
 

@@ -24,15 +24,7 @@ class HandOffOutcome(Enum):
 
 @dataclass(frozen=True)
 class ArmTarget:
-    """What the arm gets.
-
-    Attributes
-    ----------
-    position_rover
-        The target in the rover frame, metres, shape (3,).
-    error_m
-        Its error of 3 sigma by Eq. 5, metres.
-    """
+    """Target for the arm: position in the rover frame, metres, and its 3 sigma error by Eq. 5."""
 
     position_rover: Float[np.ndarray, "3"]
     error_m: float
@@ -48,7 +40,7 @@ class HandOff:
 
 @dataclass(frozen=True)
 class GoalReached:
-    """When the rover is at its goal: the target's horizontal distance from the rover's origin, metres."""
+    """Goal criterion: the target's horizontal distance from the rover's origin."""
 
     distance_m: float
     tolerance_m: float
@@ -59,10 +51,10 @@ class GoalReached:
 
 
 def hand_off(update: TargetUpdate, goal: GoalReached, mast: MastCalibration, drift_px: float = 2.5) -> HandOff:
-    """The target for the arm, if it is tracked and the rover at its goal.
+    """Hand the target over to the arm, if it is tracked and the rover is at its goal.
 
-    `drift_px` is the drift to allow for (paper: 2.5 px from 10 m to 2 m). The distance from the camera, on which the
-    error depends, is taken as that from the mast's elevation axis.
+    `drift_px` is the assumed drift (paper: 2.5 px from 10 m to 2 m). The range for the error is that from the mast's
+    elevation axis.
     """
     position = update.position_rover
     if not update.found or position is None:

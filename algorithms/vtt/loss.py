@@ -1,15 +1,14 @@
-"""When the target is lost, and what follows (section 4.6).
+"""Loss criteria of the target and their consequences (section 4.6).
 
-Tolerances. Fig. 5 shows that both tolerances are computed anew at each update; the text gives no values, and none can
-be read from the figure. Here they are what the errors that the paper names explain, with D the distance now, D_old that
-of the last sighting, D_0 that at the seed, s the length of the last move and S that of all moves since the seed:
+Fig. 5 shows that both tolerances are computed at each update; the paper gives no values. Here they follow from the
+errors that the paper names, with D the distance now, D_old that of the last match, D_0 that at the seed, s the
+length of the last move and S that of all moves since the seed:
 
     distance tolerance = floor + sqrt(dR(D_old)^2 + dR(D)^2 + (e s)^2)
     position tolerance = floor + sqrt(dR(D_0)^2   + dR(D)^2 + (e S)^2 + (w D)^2)
 
 dR is the stereo range error of Eq. 1 for the disparity error of 3 sigma, e the error of the estimated position as a
-share of the distance driven, w that of the direction to the target. The first tolerance shrinks as the rover comes
-nearer; the second is never less than what the first designation and the drive may have been wrong by.
+fraction of the distance driven, w the error of the direction to the target.
 """
 
 from __future__ import annotations
@@ -26,14 +25,10 @@ from marsyard.sim.camera import CameraModel
 
 @dataclass(frozen=True)
 class Journey:
-    """The distances that the tolerances depend on, metres.
+    """Distances that determine the tolerances.
 
-    Attributes
-    ----------
-    seed_m, last_m, now_m
-        From the camera to the target at the seed, at the last sighting, and now.
-    step_m, driven_m
-        How far the rover moved since the last sighting, and along its path since the seed.
+    - seed_m, last_m, now_m: From the camera to the target at the seed, at the last match, and now
+    - step_m, driven_m: Rover motion since the last match, and path length since the seed
     """
 
     seed_m: float
@@ -45,14 +40,14 @@ class Journey:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Largest corrections by which a target is still believed, metres: of its distance, and of its position in all."""
+    """Largest accepted corrections: of the target's distance, and of its position since the seed."""
 
     distance_m: float
     position_m: float
 
 
 def tolerances(journey: Journey, left: CameraModel, right: CameraModel, options: VttOptions) -> Tolerances:
-    """The tolerances of Fig. 5 for this update, by the formula above."""
+    """The tolerances of Fig. 5 for this update, by the formula of the module."""
     scale = disparity_px_m(left, right)
 
     def tolerance(before_m: float, moved_m: float, across_m: float) -> float:
@@ -70,16 +65,11 @@ def tolerances(journey: Journey, left: CameraModel, right: CameraModel, options:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the four criteria judge.
+    """Input of the four loss criteria.
 
-    Attributes
-    ----------
-    match_score, stereo_score
-        Normalised correlation of the match and of point stereo.
-    distance_correction_m
-        Distance of the target found less that predicted.
-    position_correction_m
-        How far the target now lies from where it was first seen, in the world as estimated.
+    - match_score, stereo_score: Normalised correlations of the match and of point stereo
+    - distance_correction_m: Measured less predicted distance of the target
+    - position_correction_m: Distance of the target from its position at the seed, in the estimated world frame
     """
 
     match_score: float
@@ -88,8 +78,8 @@ class Evidence:
     position_correction_m: float
 
 
-def losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) -> tuple[TargetLoss, ...]:
-    """Which of the four criteria declare the target lost."""
+def find_losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) -> tuple[TargetLoss, ...]:
+    """Failed loss criteria."""
     criteria = {
         TargetLoss.LOW_MATCH_SCORE: evidence.match_score < options.min_match_score,
         TargetLoss.LOW_STEREO_SCORE: evidence.stereo_score < options.min_stereo_score,
@@ -100,9 +90,9 @@ def losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) -> tupl
 
 
 def next_state(state: TrackingState, lost_updates: int, found: bool, limit: int) -> tuple[TrackingState, int]:
-    """The state after an update, and for how many updates the target has been looked for since it was lost (Fig. 6).
+    """State after an update, and number of updates since the loss (Fig. 6).
 
-    Losing it leads to LOST; up to `limit` further updates may find it again; then it is FAILURE, which no update ends.
+    A loss leads to LOST; up to `limit` further updates may recover the target; then FAILURE is final.
     """
     if state in (TrackingState.FAILURE, TrackingState.NO_TARGET):
         return state, lost_updates

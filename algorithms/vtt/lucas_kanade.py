@@ -1,4 +1,4 @@
-"""The search of a user who reaches for OpenCV: pyramidal Lucas-Kanade, in the same loop as the paper's tracker."""
+"""Baseline matcher from OpenCV: pyramidal Lucas-Kanade in the loop of the paper's tracker."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker
 from marsyard.sim.measurements import MastImage
 
-#: Pyramid levels above the full resolution: with windows of 21 px they reach about as far as the search window.
+#: Pyramid levels above the full resolution: with windows of 21 px the range is about that of the search window.
 LEVELS = 3
 #: OpenCV's pictures have 8 bits: this many counts for one standard deviation, about a middle grey.
 COUNTS_PER_SIGMA, MIDDLE = 40.0, 128.0
@@ -20,10 +20,9 @@ COUNTS_PER_SIGMA, MIDDLE = 40.0, 128.0
 def match_by_lucas_kanade(
     sighting: Sighting, image: MastImage, predicted: Float[np.ndarray, "2"], change: Change, options: VttOptions
 ) -> Match | None:
-    """A `Matcher`: the optical flow of the target from the old picture, magnified and rolled, to the new one.
+    """A `Matcher`: optical flow of the target from the old image, magnified and rolled, to the new one.
 
-    The score is the normalised correlation of the template with the new picture at the place found, 0 where the flow
-    does not converge in the window.
+    The score is the normalised correlation at the match, 0 if the flow does not converge in the window.
     """
     window, corner = search_window(image, predicted, options.search_px)
     if min(window.shape) < options.template_px:
@@ -38,8 +37,8 @@ def match_by_lucas_kanade(
     start = np.full((1, 1, 2), reach, dtype=np.float32)
     guess = (predicted - corner).astype(np.float32).reshape(1, 1, 2)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
-        _eight_bits(before),
-        _eight_bits(after),
+        _normalize_to_8_bits(before),
+        _normalize_to_8_bits(after),
         start,
         guess.copy(),
         winSize=(options.template_px, options.template_px),
@@ -59,12 +58,12 @@ def correlation(a: Float[np.ndarray, "n m"], b: Float[np.ndarray, "n m"]) -> flo
     return float(np.sum(x * y)) / energy if energy > 0.0 else 0.0
 
 
-def _eight_bits(image: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
-    """The picture about a middle grey, its contrast made the same: exposures differ from stop to stop."""
+def _normalize_to_8_bits(image: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
+    """The image with normalised mean and contrast: exposures differ from stop to stop."""
     spread = max(float(image.std()), 1e-9)
     return np.asarray(np.clip(MIDDLE + COUNTS_PER_SIGMA * (image - image.mean()) / spread, 0, 255).astype(np.uint8))
 
 
 def lucas_kanade_tracker(options: VttOptions | None = None) -> VisualTargetTracker:
-    """The target tracker with this search; of the options those of the correlation's search have no effect."""
+    """The target tracker with this matcher; options of the correlation search have no effect."""
     return VisualTargetTracker(options, match_by_lucas_kanade)

@@ -1,4 +1,4 @@
-"""Cutting templates and finding them again (sections 4.3.2 and 4.3.3)."""
+"""Template extraction and matching (sections 4.3.2 and 4.3.3)."""
 
 from __future__ import annotations
 
@@ -10,11 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.image.alignment import SURROUND
-from marsyard.algorithms.image.normalized import coarse_to_fine_peak, normalized_correlation
-from marsyard.algorithms.image.peak import Peak, biquadratic_offset
-from marsyard.algorithms.image.registration import Warp, registered, splined
-from marsyard.algorithms.image.resampling import similarity_patch
+from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, coarse_to_fine_peak, normalized_correlation
+from marsyard.algorithms.image.registration import SURROUND, Warp, build_spline, register_template, similarity_patch
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.target import bearing_rad
 from marsyard.sim.camera import CameraModel
@@ -23,23 +20,16 @@ from marsyard.sim.measurements import MastImage
 
 @dataclass(frozen=True)
 class Sighting:
-    """A stop at which the target was found: what the next update starts from.
+    """The last stop with a match: start of the next update.
 
-    The template is not stored: it is resampled from the picture once its magnification and roll are known, so that it
-    is interpolated once only, at the target's sub-pixel position.
+    The template is resampled from the image once magnification and roll are known: one interpolation only, at the
+    target's sub-pixel position.
 
-    Attributes
-    ----------
-    image
-        The left picture.
-    pixel
-        The target in it, full-frame (u, v), shape (2,).
-    position_head
-        The target in the frame of the mast's head as it was, metres, shape (3,).
-    camera
-        The left camera in that frame.
-    world_from_head, world_from_rover
-        The head's and the rover's pose as estimated then.
+    - image: The left image
+    - pixel: The target in it, full-frame (u, v)
+    - position_head: The target in the mast head's frame at that stop, metres
+    - camera: The left camera in that frame
+    - world_from_head, world_from_rover: Estimated poses of head and rover at that stop
     """
 
     image: MastImage
@@ -56,13 +46,13 @@ class Sighting:
 
     @cached_property
     def azimuth_world_rad(self) -> float:
-        """Direction from the camera to the target in the world as estimated, clockwise from north."""
+        """Direction from the camera to the target in the estimated world frame, clockwise from north."""
         return bearing_rad(self.world_from_head.as_matrix()[:3, :3] @ (self.position_head - self.camera.c))
 
 
 @dataclass(frozen=True)
 class Change:
-    """How the target's picture changed since it was last found: magnification, and roll in radians, clockwise."""
+    """Change of the target's appearance since the last match: magnification, and clockwise roll."""
 
     magnification: float = 1.0
     roll_rad: float = 0.0
@@ -70,16 +60,11 @@ class Change:
 
 @dataclass(frozen=True)
 class Match:
-    """The target in the new left picture.
+    """The target in the new left image.
 
-    Attributes
-    ----------
-    pixel
-        Full-frame (u, v), shape (2,).
-    score
-        Normalised correlation (Eq. 11) of the template with the picture there.
-    template
-        What was searched for: the old picture about the target, magnified and rolled.
+    - pixel: Full-frame (u, v)
+    - score: Normalised correlation (Eq. 11) of the template with the image there
+    - template: The old image about the target, magnified and rolled
     """
 
     pixel: Float[np.ndarray, "2"]
@@ -87,29 +72,29 @@ class Match:
     template: Float[np.ndarray, "n n"]
 
 
-#: What a match is registered with after its shift, in this order.
+#: Registrations after the shift, in this order.
 _WARPS: dict[Warp, tuple[Warp, ...]] = {"shift": (), "stretch": ("stretch",), "bend": ("stretch", "bend")}
-#: Finds what was seen at a sighting in a new picture near a full-frame pixel; None where there is no room for it.
+#: Matches a sighting in a new image near a full-frame pixel; None if the window does not fit.
 Matcher = Callable[[Sighting, MastImage, Float[np.ndarray, "2"], Change, VttOptions], Match | None]
 
 
 def cut_patch(
     image: MastImage, pixel: Float[np.ndarray, "2"], side: int, change: Change | None = None
 ) -> Float[np.ndarray, "side side"]:
-    """A square about a full-frame pixel, cut at its sub-pixel position, magnified and rolled by `change`."""
-    drawn = Change() if change is None else change
-    # Only what the patch is made of becomes floating point: its diagonal, and the spline's surroundings.
-    reach = int(np.ceil(0.75 * side / min(drawn.magnification, 1.0))) + SURROUND + 1
+    """A square about a full-frame pixel, at its sub-pixel position, magnified and rolled by `change`."""
+    applied = Change() if change is None else change
+    # convert only the patch's diagonal and the spline's margin to floating point
+    reach = int(np.ceil(0.75 * side / min(applied.magnification, 1.0))) + SURROUND + 1
     centre = pixel - np.array(image.corner, dtype=np.float64)
     near = np.maximum(np.floor(centre).astype(int) - reach, 0)
     region = image.counts[near[1] : max(int(centre[1]) + reach, 1), near[0] : max(int(centre[0]) + reach, 1)]
-    return similarity_patch(region.astype(np.float64), centre - near, side, drawn.magnification, drawn.roll_rad)
+    return similarity_patch(region.astype(np.float64), centre - near, side, applied.magnification, applied.roll_rad)
 
 
 def search_window(
     image: MastImage, pixel: Float[np.ndarray, "2"], side: int
 ) -> tuple[UInt16[np.ndarray, "rows columns"], tuple[int, int]]:
-    """The square of `side` pixels about a full-frame pixel, as far as the picture goes, and its corner in the frame."""
+    """The square of `side` pixels about a full-frame pixel, clipped to the image, and its corner in the frame."""
     near = np.rint(pixel - 0.5 * (side - 1)).astype(int) - np.array(image.corner)
     far = np.maximum(near + side, 0)
     near = np.maximum(near, 0)
@@ -118,7 +103,7 @@ def search_window(
 
 
 def has_room(image: MastImage, pixel: Float[np.ndarray, "2"], side: int) -> bool:
-    """Whether a square of `side` pixels about a full-frame pixel lies in the picture."""
+    """Whether a square of `side` pixels about a full-frame pixel lies in the image."""
     local = pixel - np.array(image.corner, dtype=np.float64)
     rows, columns = image.counts.shape
     reach = 0.5 * (side - 1)
@@ -127,16 +112,11 @@ def has_room(image: MastImage, pixel: Float[np.ndarray, "2"], side: int) -> bool
 
 @dataclass(frozen=True)
 class Refinement:
-    """A match below a pixel.
+    """A sub-pixel match.
 
-    Attributes
-    ----------
-    corner
-        Row and column of its upper left pixel in the picture's counts, shape (2,).
-    score
-        Normalised correlation of the template as it was searched for, shifted there.
-    warped_score
-        The same of the template as it was registered, warped.
+    - corner: Row and column of its upper left pixel in the image's counts
+    - score: Normalised correlation of the shifted template
+    - warped_score: Normalised correlation of the warped template
     """
 
     corner: Float[np.ndarray, "2"]
@@ -144,7 +124,7 @@ class Refinement:
     warped_score: float
 
 
-def refined(
+def refine_match(
     template: Float[np.ndarray, "n n"],
     image: MastImage,
     corner: Float[np.ndarray, "2"],
@@ -152,23 +132,22 @@ def refined(
     whole: Peak,
     options: VttOptions,
 ) -> Refinement:
-    """The match below a pixel, by registration: a shift, then the stretch and the bend that the options allow.
+    """Refine a match by registration: a shift, then the stretch and bend of the options.
 
-    `corner` is that of the best whole pixel, with the correlation of `whole`, and `offset` where the fit to the
-    correlation has its top: the answer where registration fails. Where the texture does not tell a bend the stretch
-    stands, and where it does not tell that, the shift.
+    `corner` is that of the best whole pixel, with the correlation of `whole`; `offset` is the top of the fit to the
+    correlation, the result if registration fails. If the bend is not determined the stretch is kept, else the shift.
     """
     near = np.maximum(corner.astype(int) - SURROUND - 2, 0)
     far = corner.astype(int) + len(template) + SURROUND + 2
     region = image.counts[near[0] : far[0], near[1] : far[1]].astype(np.float64)
-    part = splined(region, corner + offset - near, len(template))
-    shifted = registered(template, part, corner + offset - near, "shift")
+    part = build_spline(region, corner + offset - near, len(template))
+    shifted = register_template(template, part, corner + offset - near, "shift")
     if shifted is None:
         return Refinement(corner + offset, whole.value, whole.value)
     best = shifted
     for warp in _WARPS[options.warp]:
-        part = splined(region, best.corner, len(template), known=part)
-        warped = registered(template, part, best.corner, warp)
+        part = build_spline(region, best.corner, len(template), known=part)
+        warped = register_template(template, part, best.corner, warp)
         if warped is None:
             break
         best = warped
@@ -178,7 +157,7 @@ def refined(
 def match_by_correlation(
     sighting: Sighting, image: MastImage, predicted: Float[np.ndarray, "2"], change: Change, options: VttOptions
 ) -> Match | None:
-    """The paper's matcher: normalised correlation of the magnified, rolled template in a window, coarse to fine."""
+    """The paper's matcher: coarse-to-fine normalised correlation of the magnified, rolled template in a window."""
     template = cut_patch(sighting.image, sighting.pixel, options.template_px, change)
     counts, window_corner = search_window(image, predicted, options.search_px)
     if min(counts.shape) < options.template_px:
@@ -189,11 +168,11 @@ def match_by_correlation(
     corner = np.array([peak.row, peak.column]) + np.array(window_corner[::-1], dtype=np.float64) - image.corner[::-1]
     best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
-        best = refined(template, image, corner, _top(template, window, peak), peak, options)
+        best = refine_match(template, image, corner, _biquadratic_top(template, window, peak), peak, options)
     return Match(best.corner[::-1] + half + image.corner, best.score, template)
 
 
-def _top(
+def _biquadratic_top(
     template: Float[np.ndarray, "n n"], window: Float[np.ndarray, "rows columns"], peak: Peak
 ) -> Float[np.ndarray, "2"]:
     """Offset (row, column) of the fit to the correlation about its peak; zero on the window's border."""

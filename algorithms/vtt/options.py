@@ -1,4 +1,4 @@
-"""Every number of the target tracker that could have been another one, with why it is what it is."""
+"""Options of the target tracker, with the reasons for their defaults."""
 
 from __future__ import annotations
 
@@ -13,53 +13,37 @@ from marsyard.algorithms.image.registration import Warp
 class VttOptions:
     """Options of the visual target tracker (paper: sections 4 and 5 of 'Targeted Driving Using Visual Tracking').
 
-    Attributes
-    ----------
-    template_px
-        Side of the template, odd (paper: 21, "it provided the best result for natural rock images").
-    search_px
-        Side of the search window, full-frame pixels (paper: 161; 200 and 600 in section 5.2).
-    scale, roll
-        Whether the template is magnified (Eq. 6) and rolled (Eqs. 7 to 10) before it is matched. Without both this is
-        the paper's pure NCC.
-    roll_lever_m
-        Distance k of the hypothetical point beside the target (paper: 5 cm, "arbitrary, small").
-    coarse_levels
-        How often template and window are halved for the coarse search; 0 searches all places at full resolution.
-    coarse_candidates
-        Local maxima of the coarse correlation that are followed to full resolution.
-    subpixel
-        Whether the matches, left and right, are refined below a pixel (the paper does not say that VTT did). Every
-        step's error is magnified by all later steps: 16 steps from 10 m to 2 m turn 0.3 px, the error of whole pixels,
-        into 3 px.
-    warp
-        What the refinement solves for besides the place: nothing (``shift``), a stretch of the picture (``stretch``),
-        or a quadratic bend too (``bend``). The paper's tracker did not; approaching a slanted surface stretches the
-        picture and approaching a round one, seen ever more from above, bends it: a match by less leans the same way at
-        each step (docs/adr/0010). The score stays that of the shifted template.
-    epipolar_tolerance_px
-        How far from the epipolar curve the right picture is searched (paper: 2, default).
-    stereo_search_share
-        Disparities searched, as a share of `search_px`, about that of the predicted range (paper: one half).
-    seed_range_m
-        Least and largest range of a target given by a pixel: its first stereo search covers all between.
-    aim_pair
-        Whether the mast centres the target between the two cameras rather than in the left one (the paper's way). A
-        pancam at 2 m sees 512 px of disparity: with the target in the middle of the left picture it leaves the right.
-    min_match_score, min_stereo_score
-        Least NCC of the match and of point stereo (paper: 0.7, "set empirically").
-    stereo_disparity_error_px
-        Disparity error of 3 sigma in the tolerances (paper: 1 pixel).
-    pose_error
-        Error of the estimated position in the tolerances, as a share of the distance driven. 0.2 lets wheels slip by
-        as much, as on gentle slopes: a right match is not given up for what the wheels lost. Visual odometry needs less
-        (paper: "roughly 2%"), steep ground without it more, up to 1.
-    direction_error_rad
-        Error of the direction to the target, from attitude and mast, in the tolerance of the position: 1.7 deg.
-    tolerance_floor_m
-        Part of both tolerances that does not depend on distance: relief under a drifting match, mast pointing.
-    max_lost_updates
-        Updates in a row, after the one that lost the target, in which it may be found again (paper: N, default 2).
+    - template_px: Side of the template, odd (paper: 21, "it provided the best result for natural rock images")
+    - search_px: Side of the search window, full-frame pixels (paper: 161; 200 and 600 in section 5.2)
+    - scale, roll: Whether the template is magnified (Eq. 6) and rolled (Eqs. 7 to 10) before it is matched. Without
+      both this is the paper's pure NCC.
+    - roll_lever_m: Distance k of the hypothetical point next to the target (paper: 5 cm, "arbitrary, small")
+    - coarse_levels: How often template and window are halved for the coarse search; 0 searches all places at full
+      resolution
+    - coarse_candidates: Local maxima of the coarse correlation that are followed to full resolution
+    - subpixel: Whether the matches, left and right, are refined below a pixel (not stated in the paper). Later steps
+      magnify each step's error: 16 steps from 10 m to 2 m turn 0.3 px, the error of whole pixels, into 3 px.
+    - warp: Model of the refinement: a shift (``shift``), with a stretch of the image (``stretch``), or with a quadratic
+      bend (``bend``). The paper's tracker used none. Approaching a slanted surface stretches the image and approaching
+      a round one bends it: a match by a simpler model has the same bias at each step (docs/adr/0010). The score stays
+      that of the shifted template.
+    - epipolar_tolerance_px: Search range across the epipolar curve of the right image (paper: 2, default)
+    - stereo_search_share: Range of searched disparities, as a fraction of `search_px`, about the predicted one (paper:
+      one half)
+    - seed_range_m: Smallest and largest range of a target given by a pixel, for its first stereo search
+    - aim_pair: Whether the mast centres the target between the two cameras rather than in the left one (as in the
+      paper). A pancam at 2 m sees 512 px of disparity: with the target centred in the left image it leaves the right
+      one.
+    - min_match_score, min_stereo_score: Least NCC of the match and of point stereo (paper: 0.7, "set empirically")
+    - stereo_disparity_error_px: Disparity error of 3 sigma in the tolerances (paper: 1 pixel)
+    - pose_error: Error of the estimated position in the tolerances, as a fraction of the distance driven. 0.2 covers
+      the same wheel slip, as on gentle slopes. Visual odometry needs less (paper: "roughly 2%"), steep ground without
+      it more, up to 1.
+    - direction_error_rad: Error of the direction to the target, from attitude and mast, in the tolerance of the
+      position: 1.7 deg
+    - tolerance_floor_m: Part of both tolerances that does not depend on distance: relief under a drifting match, mast
+      pointing
+    - max_lost_updates: Consecutive updates after a loss in which the target may be recovered (paper: N, default 2)
     """
 
     template_px: int = 21
@@ -98,7 +82,7 @@ class VttOptions:
         if self.max_lost_updates < 0:
             raise ValueError(f"max_lost_updates is {self.max_lost_updates}; it must not be negative")
         if not 0.0 < self.seed_range_m[0] < self.seed_range_m[1]:
-            raise ValueError(f"seed_range_m is {self.seed_range_m}; it must be two ranges above 0, the least first")
+            raise ValueError(f"seed_range_m is {self.seed_range_m}; it must be two ranges above 0, the smaller first")
         for name in ("roll_lever_m", "epipolar_tolerance_px", "stereo_search_share"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")

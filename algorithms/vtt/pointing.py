@@ -1,4 +1,4 @@
-"""Pointing the mast so that the target comes to lie where it is wanted (section 4.1, action 2).
+"""Mast pointing at the target (section 4.1, action 2).
 
 The mast turns in azimuth and elevation only. Both angles follow from the calibrated camera models and the mast's
 geometry, lens distortion included, by Newton's method on the target's pixel.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.image.alignment import SURROUND
+from marsyard.algorithms.image.registration import SURROUND
 from marsyard.algorithms.interface import MastAim, PixelBox
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.stereo import epipolar_pixels
@@ -17,9 +17,9 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import turn_matrix
 from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget
 
-#: Newton's steps, and the error before a step that makes it the last: each about squares the error of the one before.
+#: Maximum number of Newton steps, and the error that makes a step the last one (quadratic convergence).
 STEPS, TOLERANCE_PX = 12, 1e-2
-#: A target in the middle of the frame puts a part's border on a whole pixel: rounding of the last bit must not move it.
+#: Keeps rounding errors from moving a border that lies on a whole pixel.
 _SLACK_PX = 1e-6
 
 
@@ -28,11 +28,11 @@ def mast_angles(
 ) -> tuple[float, float] | None:
     """Azimuth and elevation that bring a point to the middle of the left frame.
 
-    With `pair`, to where its pixels in both frames lie equally far, in opposite directions, from the middles: a near
-    target stays in both. None where no angles within the mast's limits do it.
+    With `pair`, its pixels in both frames lie equally far, in opposite directions, from the middles: a near target
+    stays in both. None without a solution within the mast's limits.
     """
     cameras = (mast.left, mast.right) if pair else (mast.left,)
-    angles = _towards(position_rover, mast.geometry)
+    angles = _initial_angles(position_rover, mast.geometry)
     for _ in range(STEPS):
         offset, slope = _offset(position_rover, mast.geometry, cameras, angles)
         if not np.all(np.isfinite(slope)) or abs(np.linalg.det(slope)) < 1e-9:
@@ -40,12 +40,12 @@ def mast_angles(
         angles = angles - np.linalg.solve(slope, offset)
         if np.hypot(*offset) < TOLERANCE_PX:
             azimuth = float(np.arctan2(np.sin(angles[0]), np.cos(angles[0])))
-            return (azimuth, float(angles[1])) if _allowed(azimuth, float(angles[1]), mast.geometry) else None
+            return (azimuth, float(angles[1])) if _is_within_limits(azimuth, float(angles[1]), mast.geometry) else None
     return None
 
 
-def _towards(position_rover: Float[np.ndarray, "3"], mast: MastGeometry) -> Float[np.ndarray, "2"]:
-    """Angles of the direction from the elevation axis to the point, the axis' own turn neglected."""
+def _initial_angles(position_rover: Float[np.ndarray, "3"], mast: MastGeometry) -> Float[np.ndarray, "2"]:
+    """Direction from the elevation axis to the point, neglecting the axis' own rotation."""
     x, y, z = position_rover - mast.base_m - np.array([0.0, 0.0, mast.elbow_m[2]])
     return np.array([np.arctan2(-y, x), np.arctan2(z, np.hypot(x, y))])
 
@@ -56,9 +56,9 @@ def _offset(
     cameras: tuple[CameraModel, ...],
     angles: Float[np.ndarray, "2"],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
-    """Mean distance of the point's pixels from the frames' middles, and its derivative by azimuth and elevation.
+    """Mean offset of the point's pixels from the frames' middles, and its derivative by azimuth and elevation.
 
-    When the head turns about an axis w through a, a point p fixed in the rover moves by -w x (p - a) in the head.
+    For a head rotation about an axis w through a, a point p fixed in the rover moves by -w x (p - a) in the head.
     """
     rover_from_head = mast.rover_from_head(float(angles[0]), float(angles[1]))
     to_head = turn_matrix(rover_from_head).T
@@ -73,9 +73,9 @@ def _offset(
     return np.mean(offsets, axis=0), np.mean(slopes, axis=0)
 
 
-def _allowed(azimuth_rad: float, elevation_rad: float, mast: MastGeometry) -> bool:
-    least, most = zip(mast.azimuth_limits_rad, mast.elevation_limits_rad, strict=True)
-    return least[0] <= azimuth_rad <= most[0] and least[1] <= elevation_rad <= most[1]
+def _is_within_limits(azimuth_rad: float, elevation_rad: float, mast: MastGeometry) -> bool:
+    (min_azimuth, max_azimuth), (min_elevation, max_elevation) = mast.azimuth_limits_rad, mast.elevation_limits_rad
+    return min_azimuth <= azimuth_rad <= max_azimuth and min_elevation <= elevation_rad <= max_elevation
 
 
 def middle(camera: CameraModel) -> Float[np.ndarray, "2"]:
@@ -86,10 +86,7 @@ def middle(camera: CameraModel) -> Float[np.ndarray, "2"]:
 def box_around(
     pixels: Float[np.ndarray, "n 2"], margin_px: float, camera: CameraModel, beside_px: float = 0.0
 ) -> PixelBox | None:
-    """The part of the frame within the margin of any of the pixels; None if one of them is outside the frame.
-
-    `beside_px` comes on top along the rows.
-    """
+    """The part of the frame within the margin of all pixels, wider by `beside_px`; None if a pixel is outside."""
     if not bool(np.all(camera.in_frame(pixels))):
         return None
     margin = margin_px + np.array([beside_px, 0.0])
@@ -101,9 +98,9 @@ def box_around(
 def aim_at_position(
     position_rover: Float[np.ndarray, "3"], mast: MastCalibration, options: VttOptions
 ) -> MastAim | None:
-    """Mast angles for a target at this position, and what to read out; None where the mast cannot show it.
+    """Mast aim for a target position; None if the mast cannot show it.
 
-    The right picture's part covers the disparities searched wherever in the left search window the target is found.
+    The right image part covers the searched disparities of the whole left search window.
     """
     angles = mast_angles(position_rover, mast, options.aim_pair)
     if angles is None:
@@ -119,7 +116,7 @@ def aim_at_position(
 
 
 def aim_at_pixel(target: PixelTarget, mast: MastCalibration, options: VttOptions) -> MastAim | None:
-    """The angles at which the target was picked, and what to read out: in the right picture all ranges allowed."""
+    """The mast aim at the designation; the right image part covers all ranges allowed."""
     margin = 0.5 * options.search_px + SURROUND
     box = box_around(target.pixel[None], margin, mast.left)
     curve = epipolar_pixels(mast.left, mast.right, target.pixel, options.seed_range_m)

@@ -8,9 +8,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.algorithms.image.normalized import normalized_correlation
-from marsyard.algorithms.image.peak import biquadratic_offset, highest_peak
-from marsyard.algorithms.vtt.matching import Refinement, refined
+from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, normalized_correlation
+from marsyard.algorithms.vtt.matching import Refinement, refine_match
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import MastImage
@@ -18,20 +17,13 @@ from marsyard.sim.measurements import MastImage
 
 @dataclass(frozen=True)
 class StereoMatch:
-    """The target in the right picture.
+    """The target in the right image.
 
-    Attributes
-    ----------
-    pixel
-        (u, v) in the right full frame, shape (2,).
-    score
-        Normalised correlation there of the template as it was registered. The other camera sees a slanted face
-        stretched, whatever the rover did: at 63 to 76 deg the template as it was cut correlates by 0.66 to 0.70 at the
-        right place, stretched by over 0.9.
-    band
-        The part of the right picture that was searched, counts, shape (rows, columns).
-    band_corner
-        (u, v) of the band's upper left pixel in the full frame.
+    - pixel: (u, v) in the right full frame
+    - score: Normalised correlation of the warped template. The other camera sees a slanted face stretched: at 63 to 76
+      deg the unwarped template correlates by 0.66 to 0.70 at the correct position, the stretched one by over 0.9.
+    - band: The searched part of the right image, counts
+    - band_corner: (u, v) of the band's upper left pixel in the full frame
     """
 
     pixel: Float[np.ndarray, "2"]
@@ -43,23 +35,20 @@ class StereoMatch:
 def epipolar_pixels(
     left: CameraModel, right: CameraModel, pixel: Float[np.ndarray, "2"], ranges_m: tuple[float, float]
 ) -> Float[np.ndarray, "n 2"]:
-    """Where the right camera sees the points along the left pixel's line of sight, from the far range to the near.
-
-    Both cameras are in one frame.
-    """
+    """Right pixels of the points along the left pixel's line of sight, from far to near; both cameras in one frame."""
     return pixels_along(left.rays(pixel), left, right, ranges_m)
 
 
-#: Where a line of sight starts and its direction, a unit vector.
+#: Origin and unit direction of a line of sight.
 Sight = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 
 
 def pixels_along(
     sight: Sight, left: CameraModel, right: CameraModel, ranges_m: tuple[float, float]
 ) -> Float[np.ndarray, "n 2"]:
-    """As `epipolar_pixels`, given the left pixel's line of sight.
+    """As `epipolar_pixels`, from the left pixel's line of sight.
 
-    Points are about half a pixel of disparity apart; what the right camera does not see is left out. Lens distortion
+    Points are about half a pixel of disparity apart; those invisible to the right camera are omitted. Lens distortion
     bends the curve.
     """
     origin, direction = sight
@@ -72,39 +61,22 @@ def pixels_along(
 
 @lru_cache(maxsize=32)
 def disparity_px_m(left: CameraModel, right: CameraModel) -> float:
-    """Focal length times baseline: disparity times range, pixels metres. Kept, as every update asks for it thrice."""
+    """Focal length times baseline: disparity times range, pixels metres. Cached for repeated use in an update."""
     return right.focal_lengths[0] * float(np.linalg.norm(right.c - left.c))
 
 
-def searched_ranges(left: CameraModel, right: CameraModel, range_m: float, disparity_px: float) -> tuple[float, float]:
-    """Least and largest range whose disparity differs by `disparity_px` at most from that of `range_m`."""
+def search_ranges(left: CameraModel, right: CameraModel, range_m: float, disparity_px: float) -> tuple[float, float]:
+    """Smallest and largest range whose disparity differs by at most `disparity_px` from that of `range_m`."""
     step = disparity_px / disparity_px_m(left, right)
     inverse = 1.0 / range_m
     return 1.0 / (inverse + step), 1.0 / max(inverse - step, 1e-6)
 
 
 def point_stereo(
-    template: Float[np.ndarray, "n n"],
-    image: MastImage,
-    curve: Float[np.ndarray, "points 2"],
-    options: VttOptions,
+    template: Float[np.ndarray, "n n"], image: MastImage, curve: Float[np.ndarray, "points 2"], options: VttOptions
 ) -> StereoMatch | None:
-    """The place near the epipolar curve of the right picture at which the left template matches best.
-
-    Parameters
-    ----------
-    template
-        What the left picture shows about the target.
-    image
-        The right picture.
-    curve
-        From `epipolar_pixels`, full-frame pixels.
-    options
-        Tolerance and sub-pixel refinement.
-
-    Returns
-    -------
-    None where the picture has no room for the template anywhere along the curve.
+    """Match the left template near the epipolar `curve` (full-frame pixels) of the right image; None if it does not
+    fit.
     """
     half, tolerance = (len(template) - 1) // 2, options.epipolar_tolerance_px
     local = curve - np.array(image.corner, dtype=np.float64)
@@ -119,11 +91,11 @@ def point_stereo(
         return None
     band = image.counts[near[1] : far[1], near[0] : far[0]].astype(np.float64)
     surface = normalized_correlation(template, band)
-    peak = highest_peak(np.where(_off_curve(local - near - half, surface.shape, tolerance), -1.0, surface))
+    peak = highest_peak(np.where(_is_off_curve(local - near - half, surface.shape, tolerance), -1.0, surface))
     corner = near[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
     best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
-        best = refined(template, image, corner, biquadratic_offset(surface, peak), peak, options)
+        best = refine_match(template, image, corner, biquadratic_offset(surface, peak), peak, options)
     return StereoMatch(
         pixel=best.corner[::-1] + half + image.corner,
         score=best.warped_score,
@@ -132,8 +104,8 @@ def point_stereo(
     )
 
 
-def _off_curve(curve: Float[np.ndarray, "n 2"], shape: tuple[int, ...], tolerance: float) -> Bool[np.ndarray, "_ _"]:
-    """Which places of the surface lie further than the tolerance above or below the curve."""
+def _is_off_curve(curve: Float[np.ndarray, "n 2"], shape: tuple[int, ...], tolerance: float) -> Bool[np.ndarray, "_ _"]:
+    """Whether positions of the surface are further than the tolerance above or below the curve."""
     order = np.argsort(curve[:, 0])
     along = np.interp(np.arange(shape[1]), curve[order, 0], curve[order, 1])
     return np.asarray(np.abs(np.arange(shape[0])[:, None] - along) > tolerance)
@@ -142,14 +114,14 @@ def _off_curve(curve: Float[np.ndarray, "n 2"], shape: tuple[int, ...], toleranc
 def triangulated(
     left: CameraModel, right: CameraModel, left_pixel: Float[np.ndarray, "2"], right_pixel: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "3"] | None:
-    """The point half-way between two pixels' lines of sight where they are nearest to each other: `nearest_point`."""
+    """The midpoint of the shortest segment between two pixels' lines of sight: see `nearest_point`."""
     return nearest_point(left.rays(left_pixel), right.rays(right_pixel))
 
 
 def nearest_point(left: Sight, right: Sight) -> Float[np.ndarray, "3"] | None:
-    """The point half-way between two lines of sight where they are nearest to each other.
+    """The midpoint of the shortest segment between two lines of sight, in their frame, metres.
 
-    In their frame, metres. None where they are parallel or meet behind a camera.
+    None if they are parallel or meet behind a camera.
     """
     (a, d), (b, e) = left, right
     between, cosine = b - a, float(d @ e)

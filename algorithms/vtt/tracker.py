@@ -1,7 +1,7 @@
 """The visual target tracker: the loop of section 4.1 and its states.
 
-The steps are functions of their own (`target`, `pointing`, `appearance`, `matching`, `stereo`, `loss`, `handoff`); here
-they are put in order. What is known of a target is an immutable `Track`; the tracker only holds the latest.
+The steps are functions of `target`, `pointing`, `matching`, `stereo`, `loss` and `handoff`. The state of a track is an
+immutable `Track`; the tracker holds the latest one.
 """
 
 from __future__ import annotations
@@ -10,13 +10,11 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
-from marsyard.algorithms.vtt.appearance import lever_pixels, magnification, roll_angle
-from marsyard.algorithms.vtt.details import VttDetails
-from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, losses, next_state, tolerances
+from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
 from marsyard.algorithms.vtt.matching import (
     Change,
     Match,
@@ -29,11 +27,14 @@ from marsyard.algorithms.vtt.matching import (
 )
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position
-from marsyard.algorithms.vtt.stereo import nearest_point, pixels_along, point_stereo, searched_ranges
+from marsyard.algorithms.vtt.stereo import StereoMatch, nearest_point, pixels_along, point_stereo, search_ranges
 from marsyard.algorithms.vtt.target import (
     designated_position_world,
+    lever_pixels,
+    magnification,
     pose_change,
     predicted_position,
+    roll_angle,
 )
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import composed
@@ -41,25 +42,53 @@ from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasure
 
 
 @dataclass(frozen=True)
-class Track:
-    """What the tracker knows of its target.
+class VttDetails:
+    """Intermediate products of one update, as shown in the paper's Figs. 15 and 17 and Table III.
 
-    Attributes
-    ----------
-    designated
-        The target as it was picked in a picture, or else where it lies in the world, metres, shape (3,).
-    world_from_rover
-        The pose at the last update, found or not.
-    state, lost_updates
-        Where it stands in Fig. 6, and for how many updates the target has been looked for.
-    sighting
-        The last time it was found; None before the seed.
-    seed_world
-        Where it was first seen, in the world as estimated, metres, shape (3,); None before.
-    seed_distance_m
-        From the camera, then.
-    driven_m
-        Length of the rover's path since, by its pose estimates at the updates.
+    - seeded: Whether this update took the first template
+    - predicted_pixel: Predicted full-frame (u, v) in the left image; None if invisible
+    - window, window_corner: Left search window, counts, and the full-frame (u, v) of its upper left pixel; None with
+      `predicted_pixel`
+    - change: Computed magnification and roll since the last match, applied or not; None at the seed or if invisible
+    - match: The left match with its searched template; None if the window does not fit
+    - template: The new image about the match: the next template as it is now
+    - stereo: The right match; None without a left one, or if it does not fit
+    - distance_m: From the left camera to the target: triangulated, else predicted
+    - azimuth_rad: Direction from the left camera to the target in the rover frame, positive to the right
+    - azimuth_change_rad: Change of the direction in the world since the last match, positive to the right
+    - position_world: Triangulated target in the estimated world frame, metres; None without triangulation
+    - step_m: Estimated rover motion since the last match
+    - evidence, allowed: Input of the loss criteria and their tolerances; None at the seed and for incomplete updates
+    """
+
+    seeded: bool
+    predicted_pixel: Float[np.ndarray, "2"] | None
+    window: UInt16[np.ndarray, "rows columns"] | None = None
+    window_corner: tuple[int, int] | None = None
+    change: Change | None = None
+    match: Match | None = None
+    template: Float[np.ndarray, "n n"] | None = None
+    stereo: StereoMatch | None = None
+    distance_m: float = float("nan")
+    azimuth_rad: float = float("nan")
+    azimuth_change_rad: float = 0.0
+    position_world: Float[np.ndarray, "3"] | None = None
+    step_m: float = 0.0
+    evidence: Evidence | None = None
+    allowed: Tolerances | None = None
+
+
+@dataclass(frozen=True)
+class Track:
+    """State of the tracker for its target.
+
+    - designated: The designated pixel, or the target's position in the world, metres
+    - world_from_rover: The pose at the last update, found or not
+    - state, lost_updates: State of Fig. 6, and number of updates since the loss
+    - sighting: The last match; None before the seed
+    - seed_world: Position at the seed, in the estimated world frame, metres; None before
+    - seed_distance_m: Distance from the camera at the seed
+    - driven_m: Estimated path length of the rover since the seed
     """
 
     designated: PixelTarget | Float[np.ndarray, "3"]
@@ -74,10 +103,10 @@ class Track:
 
 @final
 class VisualTargetTracker:
-    """Follows a target by its template, scaled and rolled as the rover's motion says; see `TargetTracker`.
+    """Tracks a target by its template, scaled and rolled with the rover's motion; see `TargetTracker`.
 
-    `PURE_NCC` as options is the paper's baseline; another `matcher` replaces the search in the left picture (see
-    `marsyard.algorithms.vtt.lucas_kanade`), all else remaining the same.
+    `PURE_NCC` as options is the paper's baseline; `matcher` replaces the search in the left image (see
+    `marsyard.algorithms.vtt.lucas_kanade`).
     """
 
     def __init__(self, options: VttOptions | None = None, matcher: Matcher = match_by_correlation) -> None:
@@ -87,22 +116,22 @@ class VisualTargetTracker:
 
     @property
     def state(self) -> TrackingState:
-        """Where the tracker stands."""
+        """State of the tracker."""
         return TrackingState.NO_TARGET if self.track is None else self.track.state
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
-        """Takes a target, with the rover's estimated pose, in place of any other."""
+        """Set the target, with the rover's estimated pose."""
         if isinstance(target, PixelTarget):
             self.track = Track(target, world_from_rover)
         else:
             self.track = Track(designated_position_world(target, world_from_rover), world_from_rover)
 
     def clear(self) -> None:
-        """Forgets the target."""
+        """Clear the target."""
         self.track = None
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
-        """Where to look from this pose; None without a target, or where the mast cannot show it."""
+        """Mast aim from this pose; None without a target, or if the mast cannot show it."""
         if self.track is None:
             return None
         if self.track.sighting is None and isinstance(self.track.designated, PixelTarget):
@@ -111,17 +140,17 @@ class VisualTargetTracker:
         return None if expected is None else aim_at_position(expected, mast, self.options)
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
-        """Finds the target in a new stereo pair; its details are `VttDetails`. After a failure it looks no more."""
+        """Match the target in a new stereo pair, with `VttDetails`. In the failure state no search is made."""
         if self.track is None:
             return TargetUpdate(TrackingState.NO_TARGET, (), None)
         if self.track.state is TrackingState.FAILURE:
-            carried = expected_position(self.track, measurements.world_from_rover)
-            return TargetUpdate(TrackingState.FAILURE, (), carried)
+            predicted = expected_position(self.track, measurements.world_from_rover)
+            return TargetUpdate(TrackingState.FAILURE, (), predicted)
         if self.track.sighting is None:
-            found = seeded(self.track, measurements, self.options)
+            found = seed_track(self.track, measurements, self.options)
         else:
-            found = followed(self.track, self.track.sighting, measurements, self.options, self.matcher)
-        self.track = advanced(self.track, found, measurements, self.options)
+            found = follow_track(self.track, self.track.sighting, measurements, self.options, self.matcher)
+        self.track = advance_track(self.track, found, measurements, self.options)
         position = found.position_rover
         if position is None:
             position = expected_position(self.track, measurements.world_from_rover)
@@ -130,7 +159,7 @@ class VisualTargetTracker:
 
 @dataclass(frozen=True)
 class Finding:
-    """What one update found: why it did not, or the target in the rover frame and the sighting to go on from."""
+    """Result of one update: losses, or the target in the rover frame and the new sighting."""
 
     losses: tuple[TargetLoss, ...]
     details: VttDetails
@@ -140,7 +169,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Stop:
-    """What was measured at a stop, and the mast's head as it stands there; cameras are in the head's frame."""
+    """Measurements of a stop, and the estimated head pose; cameras are in the head's frame."""
 
     measurements: RoverMeasurements
     rover_from_head: RigidTransform
@@ -148,7 +177,7 @@ class Stop:
 
     @classmethod
     def of(cls, measurements: RoverMeasurements) -> Stop:
-        """The stop at which this was measured."""
+        """The stop of these measurements."""
         angles = (measurements.azimuth_rad, measurements.elevation_rad)
         rover_from_head = measurements.mast.geometry.rover_from_head(*angles)
         return cls(measurements, rover_from_head, composed(measurements.world_from_rover, rover_from_head))
@@ -169,7 +198,7 @@ class Stop:
 
 
 def expected_position(track: Track, world_from_frame: RigidTransform) -> Float[np.ndarray, "3"] | None:
-    """The target in a frame of this pose (the rover's, the head's); None for a pixel not yet seen in stereo."""
+    """Predicted target position in a frame of this pose (rover or head); None for a pixel target before the seed."""
     if track.sighting is not None:
         last = track.sighting
         return predicted_position(last.position_head, last.world_from_head, world_from_frame)
@@ -178,32 +207,32 @@ def expected_position(track: Track, world_from_frame: RigidTransform) -> Float[n
     return np.asarray(world_from_frame.inv().apply(track.designated.copy()))
 
 
-def seeded(track: Track, measurements: RoverMeasurements, options: VttOptions) -> Finding:
-    """Takes the first template where the target was designated, and its position by point stereo."""
+def seed_track(track: Track, measurements: RoverMeasurements, options: VttOptions) -> Finding:
+    """Take the first template at the designated target, and triangulate it by point stereo."""
     stop = Stop.of(measurements)
     if isinstance(track.designated, PixelTarget):
         pixel, ranges = track.designated.pixel, options.seed_range_m
     else:
         expected = np.asarray(stop.world_from_head.inv().apply(track.designated.copy()))
         pixel = stop.left.project(expected)[0]
-        ranges = searched_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
+        ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
     if not np.all(np.isfinite(pixel)) or not has_room(measurements.left, pixel, options.template_px):
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
     template = cut_patch(measurements.left, pixel, options.template_px)
     window, window_corner = search_window(measurements.left, pixel, options.search_px)
     details = VttDetails(True, pixel, window, window_corner, match=Match(pixel, 1.0, template), template=template)
-    placed = ranged(stop, pixel, template, ranges, details, options)
-    if placed.sighting is None or placed.details.stereo is None:
-        return placed
-    if placed.details.stereo.score < options.min_stereo_score:
-        return Finding((TargetLoss.LOW_STEREO_SCORE,), placed.details)
-    return placed
+    located = triangulate_target(stop, pixel, template, ranges, details, options)
+    if located.sighting is None or located.details.stereo is None:
+        return located
+    if located.details.stereo.score < options.min_stereo_score:
+        return Finding((TargetLoss.LOW_STEREO_SCORE,), located.details)
+    return located
 
 
-def followed(
+def follow_track(
     track: Track, last: Sighting, measurements: RoverMeasurements, options: VttOptions, matcher: Matcher
 ) -> Finding:
-    """Actions 1 to 6 of section 4.1 but the pointing, which came before the pictures; and the criteria of loss."""
+    """Actions 1 to 6 of section 4.1 except pointing, and the loss criteria."""
     stop = Stop.of(measurements)
     new_from_old = pose_change(last.world_from_head, stop.world_from_head)
     expected = np.asarray(new_from_old.apply(last.position_head.copy()))
@@ -221,14 +250,14 @@ def followed(
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
     template = cut_patch(measurements.left, match.pixel, options.template_px)
     details = replace(details, match=match, template=template)
-    ranges = searched_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
-    placed = ranged(stop, match.pixel, template, ranges, details, options)
-    if placed.sighting is None:
-        return placed
-    return judged(track, last, placed, placed.sighting, stop, stop.distance_m(expected), options)
+    ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
+    located = triangulate_target(stop, match.pixel, template, ranges, details, options)
+    if located.sighting is None:
+        return located
+    return check_losses(track, last, located, located.sighting, stop, stop.distance_m(expected), options)
 
 
-def ranged(
+def triangulate_target(
     stop: Stop,
     pixel: Float[np.ndarray, "2"],
     template: Float[np.ndarray, "n n"],
@@ -236,7 +265,7 @@ def ranged(
     details: VttDetails,
     options: VttOptions,
 ) -> Finding:
-    """The target's position by point stereo from its left pixel; the right picture is searched over these ranges."""
+    """Triangulate the target from its left pixel by point stereo over these ranges."""
     sight = stop.left.rays(pixel)
     curve = pixels_along(sight, stop.left, stop.right, ranges_m)
     stereo = point_stereo(template, stop.measurements.right, curve, options)
@@ -259,17 +288,17 @@ def ranged(
     return Finding((), details, in_rover[0], sighting)
 
 
-def judged(
+def check_losses(
     track: Track,
     last: Sighting,
-    placed: Finding,
+    located: Finding,
     sighting: Sighting,
     stop: Stop,
     expected_m: float,
     options: VttOptions,
 ) -> Finding:
-    """What was found, or nothing where one of the four criteria says that it is not the target."""
-    details = placed.details
+    """Apply the four loss criteria to a match."""
+    details = located.details
     moved = sighting.world_from_rover.translation - last.world_from_rover.translation
     since_update = sighting.world_from_rover.translation - track.world_from_rover.translation
     journey = Journey(
@@ -284,12 +313,12 @@ def judged(
     details = replace(
         details,
         step_m=journey.step_m,
-        azimuth_change_rad=_turned(last, sighting),
+        azimuth_change_rad=_azimuth_change_rad(last, sighting),
         evidence=evidence,
         allowed=allowed,
     )
-    failed = losses(evidence, allowed, options)
-    return Finding(failed, details) if failed else replace(placed, details=details)
+    failed = find_losses(evidence, allowed, options)
+    return Finding(failed, details) if failed else replace(located, details=details)
 
 
 def _evidence(track: Track, details: VttDetails, expected_m: float) -> Evidence:
@@ -304,14 +333,14 @@ def _evidence(track: Track, details: VttDetails, expected_m: float) -> Evidence:
     )
 
 
-def _turned(last: Sighting, now: Sighting) -> float:
-    """By how much the line of sight turned in the world, clockwise seen from above, radians."""
+def _azimuth_change_rad(last: Sighting, now: Sighting) -> float:
+    """Change of the line of sight's azimuth in the world, clockwise from above."""
     turned = now.azimuth_world_rad - last.azimuth_world_rad
     return float(np.arctan2(np.sin(turned), np.cos(turned)))
 
 
-def advanced(track: Track, finding: Finding, measurements: RoverMeasurements, options: VttOptions) -> Track:
-    """The track after an update: the template is replaced by what was found, and kept where nothing was."""
+def advance_track(track: Track, finding: Finding, measurements: RoverMeasurements, options: VttOptions) -> Track:
+    """The track after an update; a new match replaces the template."""
     pose, sighting = measurements.world_from_rover, finding.sighting
     state, lost_updates = next_state(track.state, track.lost_updates, sighting is not None, options.max_lost_updates)
     moved = float(np.linalg.norm(pose.translation - track.world_from_rover.translation))

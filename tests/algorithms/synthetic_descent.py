@@ -14,6 +14,7 @@ import numpy as np
 from scipy import fft
 from scipy.spatial.transform import Rotation
 
+from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import (
@@ -50,7 +51,7 @@ class Texture:
         row, column = np.mod(np.array([-origin[1], origin[0]]) / self.step_m, size)
         rows = np.float32(row) - east.dtype.type(1.0 / self.step_m) * north
         columns = np.float32(column) + east.dtype.type(1.0 / self.step_m) * east
-        return cv2.remap(self.values, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        return np.asarray(cv2.remap(self.values, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
 @cache
@@ -87,7 +88,7 @@ def fall_off() -> np.ndarray:
 
 @cache
 def delivered_fall_off() -> np.ndarray:
-    return fall_off().reshape(-1, ROWS_SUMMED, 1024).mean(axis=1)
+    return np.asarray(fall_off().reshape(-1, ROWS_SUMMED, 1024).mean(axis=1))
 
 
 def calibration(transfer_row_s: float = 5e-6, clear_row_s: float = 2e-6) -> DetectorCalibration:
@@ -122,7 +123,7 @@ def delivered(
     if noise is not None:
         electrons = noise.poisson(counts * 11000.0 / 1600.0) + 50.0 * noise.standard_normal(counts.shape)
         counts = electrons * 1600.0 / 11000.0
-    return np.clip(np.rint(counts + known.offset_dn), 0, known.full_scale_dn).astype(np.uint16)
+    return np.asarray(np.clip(np.rint(counts + known.offset_dn), 0, known.full_scale_dn).astype(np.uint16))
 
 
 @dataclass(frozen=True)
@@ -192,3 +193,9 @@ def render(
         for attitude, position in zip(flown.attitudes, flown.positions, strict=True)
     ]
     return measurements_of(flown, counts, known)
+
+
+def velocity_of(answer: VelocityEstimate) -> np.ndarray:
+    """The velocity of a valid answer."""
+    assert answer.velocity_m_s is not None
+    return answer.velocity_m_s

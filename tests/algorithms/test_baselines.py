@@ -10,13 +10,12 @@ import pytest
 
 from marsyard.algorithms.baselines import BaselineDetails, HomographyEstimator, PairPatches, PhaseCorrelationEstimator
 from marsyard.algorithms.baselines.homography import distortion
-from marsyard.algorithms.baselines.pairs import COMMON, common_square, pair_patches
+from marsyard.algorithms.baselines.pairs import DEFAULT_COMMON_OPTIONS, find_common_square, rectify_pair
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.algorithms.dimes.binning import usable_views
-from marsyard.algorithms.dimes.ground import inside_frame, square
+from marsyard.algorithms.dimes.binning import inside_frame, square, usable_views
 from marsyard.algorithms.interface import VelocityEstimator, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
-from tests.algorithms.synthetic_descent import INTERVAL_S, Flight, flight, render, terrain, tilted, waves
+from tests.algorithms.synthetic_descent import INTERVAL_S, Flight, flight, render, terrain, tilted, velocity_of, waves
 
 ESTIMATORS: dict[str, VelocityEstimator] = {"phase": PhaseCorrelationEstimator(), "homography": HomographyEstimator()}
 both = pytest.mark.parametrize("name", ESTIMATORS)
@@ -39,7 +38,7 @@ def test_east_is_east_and_north_is_north(name: str, velocity: tuple[float, float
     answer = ESTIMATORS[name].estimate(render(flown(velocity)))
     assert answer.outcome is VelocityOutcome.VALID
     # Half a rectified pixel is 0.6 m/s.
-    np.testing.assert_allclose(answer.velocity_m_s, velocity, atol=0.3)
+    np.testing.assert_allclose(velocity_of(answer), velocity, atol=0.3)
 
 
 @both
@@ -144,15 +143,19 @@ def test_answers_repeat_and_tell_their_matches(name: str, ordinary: DescentMeasu
 def test_common_square_is_seen_by_both_and_as_large_as_can_be() -> None:
     triple = usable_views(render(flown((0.0, 0.0))), DimesOptions().binned_size)
     assert triple is not None
-    middle, side, gsd = common_square(triple[0], triple[1], replace(COMMON, max_side_px=1000)) or (None, 0, 0.0)
+    middle, side, gsd = find_common_square(triple[0], triple[1], replace(DEFAULT_COMMON_OPTIONS, max_side_px=1000)) or (
+        None,
+        0,
+        0.0,
+    )
     assert middle is not None
     ground = middle + square(0.5 * side * gsd, 9)
     for view in triple[:2]:
-        assert inside_frame(view, ground, 0.0, COMMON.max_off_nadir_rad).all()
+        assert inside_frame(view, ground, 0.0, DEFAULT_COMMON_OPTIONS.max_off_nadir_rad).all()
     # At nadir the second picture is 256 pixels on a side; turned by 120 deg and tilted, a square within is smaller.
     assert 140 <= side <= 230
-    assert common_square(triple[0], triple[1], replace(COMMON, min_side_px=side + 16)) is None
-    patches = pair_patches(triple[0], triple[1], COMMON)
+    assert find_common_square(triple[0], triple[1], replace(DEFAULT_COMMON_OPTIONS, min_side_px=side + 16)) is None
+    patches = rectify_pair(triple[0], triple[1], DEFAULT_COMMON_OPTIONS)
     assert patches is not None
     # Without motion both patches show the same ground.
     assert np.corrcoef(patches.first.ravel(), patches.second.ravel())[0, 1] > 0.9

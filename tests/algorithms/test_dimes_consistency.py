@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import View, view
-from marsyard.algorithms.dimes.consistency import combinations, propagated
+from marsyard.algorithms.dimes.binning import View, build_view
 from marsyard.algorithms.dimes.details import PairDetails, Track
 from marsyard.algorithms.dimes.estimator import conclude
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.validity import TrackMetrics, ValidityCheck, failed_checks
+from marsyard.algorithms.dimes.validity import TrackMetrics, ValidityCheck, combinations, failed_checks, propagated
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DetectorImage
-from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, calibration
+from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, calibration, velocity_of
 
 THRESHOLD = DimesOptions().imu_threshold_m_s
 METRICS = TrackMetrics(contrast=0.02, peak=0.9, peak_width_px=4.0, second_peak_ratio=0.3, on_border=False)
@@ -30,7 +30,7 @@ def track(pair: int, index: int, velocity: np.ndarray, failed: tuple[ValidityChe
 @cache
 def nadir_view() -> View:
     picture = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.binned(1, ROWS_SUMMED), calibration())
-    return view(picture, Rotation.identity(), 2000.0, (256, 256))
+    return build_view(picture, Rotation.identity(), 2000.0, (256, 256))
 
 
 def pair_of(*tracks: Track) -> PairDetails:
@@ -61,7 +61,7 @@ def test_reported_is_the_second_pairs_velocity_of_the_best_combination() -> None
         [np.array([5.0, 5.0]), np.array([30.0, 5.0])], [np.array([6.5, 7.0]), np.array([6.1, 7.0])], velocities
     )
     assert answer.outcome is VelocityOutcome.VALID
-    np.testing.assert_allclose(answer.velocity_m_s, [6.1, 7.0])
+    np.testing.assert_allclose(velocity_of(answer), [6.1, 7.0])
 
 
 def test_one_track_per_pair_is_enough_and_none_is_not() -> None:
@@ -148,7 +148,7 @@ def test_propagation_drops_the_inertial_bias() -> None:
         ({"contrast": float("nan")}, ValidityCheck.CONTRAST),
     ],
 )
-def test_each_metric_has_its_check(change: dict[str, float], check: ValidityCheck) -> None:
+def test_each_metric_has_its_check(change: dict[str, Any], check: ValidityCheck) -> None:
     from dataclasses import replace
 
     assert failed_checks(METRICS, DimesOptions()) == ()
@@ -159,6 +159,6 @@ def test_each_metric_has_its_check(change: dict[str, float], check: ValidityChec
     "wrong",
     [{"template_px": 30}, {"template_px": 3}, {"search_margin_px": 0}, {"grid_step_px": 0}, {"max_off_nadir_rad": 2.0}],
 )
-def test_options_say_what_is_wrong(wrong: dict[str, float]) -> None:
+def test_options_say_what_is_wrong(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         DimesOptions(**wrong)

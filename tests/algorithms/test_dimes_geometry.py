@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import View, view
-from marsyard.algorithms.dimes.ground import (
+from marsyard.algorithms.dimes.binning import (
+    View,
+    build_view,
     ground_from_pixels,
     inside_frame,
     pixel_angle_rad,
@@ -19,15 +20,17 @@ from marsyard.algorithms.dimes.ground import (
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.overlap import (
     Candidates,
+    best_candidates,
     border_pixels,
+    contrasts,
     grid_pixels,
     overlap_polygon,
     search_geometry,
+    select_templates,
     template_candidates,
     zero_phase_pixel,
 )
-from marsyard.algorithms.dimes.rectification import ground_lattice, rectified_patch
-from marsyard.algorithms.dimes.selection import best_candidates, contrasts, select_templates
+from marsyard.algorithms.dimes.rectification import ground_lattice, rectify_patch
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import (
@@ -48,7 +51,7 @@ NIGHT = direction(0.0, -1.0)  # the sun below the horizon: no zero-phase spot on
 
 def blank(attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None) -> View:
     picture = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
-    return view(
+    return build_view(
         DetectorImage(picture, time_s, CAMERA.binned(1, ROWS_SUMMED), calibration()), attitude, altitude_m, (256, 256)
     )
 
@@ -95,7 +98,7 @@ def test_camera_stands_above_the_origin_whatever_its_place_in_the_body() -> None
         CAMERA.binned(1, ROWS_SUMMED).moved(RigidTransform.from_translation(lever)),
         calibration(),
     )
-    seen = view(image, attitude, 1400.0, (256, 256))
+    seen = build_view(image, attitude, 1400.0, (256, 256))
     np.testing.assert_allclose(seen.camera.c, seen.centre, atol=1e-9)
     np.testing.assert_allclose(seen.centre, [0.0, 0.0, 1400.0 + attitude.apply(lever)[2]], atol=1e-9)
 
@@ -253,7 +256,7 @@ def test_rectified_patch_shows_the_ground_that_it_names(attitude: Rotation) -> N
     seen = blank(attitude, 1700.0, 0.0, counts)
     centre, near = ground_from_pixels(seen, np.array([[150.0, 90.0]]), LIMIT)
     assert near[0]
-    patch = rectified_patch(seen, centre[0], 61, 5.5)
+    patch = rectify_patch(seen, centre[0], 61, 5.5)
     lattice = ground_lattice(centre[0], 61, 5.5) + position[:2]
     expected = chart_at(lattice[..., 0], lattice[..., 1])
     shift = _shift(patch / 1600.0, expected, chart_at, lattice)
@@ -271,4 +274,4 @@ def _shift(patch: np.ndarray, expected: np.ndarray, truth: object, lattice: np.n
     ]
     design = np.column_stack([slopes[0].ravel(), slopes[1].ravel(), np.ones(patch.size)])
     solution, *_ = np.linalg.lstsq(design, (patch - expected).ravel())
-    return solution[:2]
+    return np.asarray(solution[:2])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import View, bin_factors, bin_mean, view
-from marsyard.algorithms.dimes.radiometry import corrected_patch
-from marsyard.algorithms.image.frame_transfer import without_frame_transfer
+from marsyard.algorithms.dimes.binning import View, bin_factors, bin_mean, build_view
+from marsyard.algorithms.dimes.rectification import correct_patch
+from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, calibration, delivered, fall_off, scene, terrain
 
@@ -40,7 +40,7 @@ def test_inversion_is_exact_where_summed_rows_are_alike(times: tuple[float, floa
     )
     charge = transferred(rates, known.exposure_s, *times)
     signal = charge.reshape(16, rows_summed, 3).mean(axis=1)
-    exposed = without_frame_transfer(signal, known, rows_summed)
+    exposed = remove_frame_transfer(signal, known, rows_summed)
     # Rounding only; the steepest case loses a factor of ten per row-block of its recursion at most.
     np.testing.assert_allclose(exposed, known.exposure_s * rates[::rows_summed], rtol=1e-9, atol=1e-9)
 
@@ -48,14 +48,14 @@ def test_inversion_is_exact_where_summed_rows_are_alike(times: tuple[float, floa
 def test_exposure_shorter_than_the_transfer_is_refused_with_its_numbers() -> None:
     known = replace(calibration(), exposure_s=1e-6)
     with pytest.raises(ValueError, match="1e-06 s is too short"):
-        without_frame_transfer(np.ones((256, 4)), known, 4)
+        remove_frame_transfer(np.ones((256, 4)), known, 4)
 
 
 def test_without_frame_transfer_the_exposure_need_not_be_known() -> None:
     """Real pictures come without it, and there is nothing to take off."""
     known = replace(calibration(0.0, 0.0), exposure_s=0.0)
     signal = np.arange(12.0).reshape(4, 3)
-    np.testing.assert_array_equal(without_frame_transfer(signal, known, 2), signal)
+    np.testing.assert_array_equal(remove_frame_transfer(signal, known, 2), signal)
 
 
 def picture(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, View]:
@@ -64,14 +64,14 @@ def picture(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, View
     radiance = scene(terrain(), attitude, np.array([500.0, 300.0, 1700.0]))
     known = calibration(transfer_row_s, clear_row_s)
     image = DetectorImage(delivered(radiance, known, level=LEVEL), 0.0, CAMERA.binned(1, ROWS_SUMMED), known)
-    return radiance, view(image, attitude, 1700.0, (256, 256))
+    return radiance, build_view(image, attitude, 1700.0, (256, 256))
 
 
 @pytest.mark.parametrize("times", [(5e-6, 2e-6), (1e-6, 5e-6), (0.0, 0.0)])
 def test_still_scene_is_restored_to_a_thousandth_of_full_scale(times: tuple[float, float]) -> None:
     radiance, seen = picture(*times)
     irradiance = bin_mean(LEVEL * radiance * fall_off(), 4, 4)
-    restored = without_frame_transfer(seen.signal, seen.calibration, seen.rows_summed)
+    restored = remove_frame_transfer(seen.signal, seen.calibration, seen.rows_summed)
     assert np.abs(seen.signal - irradiance).max() > (0.1 * 4095 if times[0] else 0.0)  # there was something to remove
     # Rows within a delivered row are not quite alike, counts are rounded: 0.2 % of full scale at worst, 0.1 % rms.
     assert np.abs(restored - irradiance).max() < 0.002 * 4095
@@ -80,7 +80,7 @@ def test_still_scene_is_restored_to_a_thousandth_of_full_scale(times: tuple[floa
 
 def test_patch_is_corrected_for_fall_off_too() -> None:
     radiance, seen = picture(5e-6, 2e-6)
-    patch = corrected_patch(seen, slice(0, 60), slice(200, 256))  # a corner, where fall-off is to one half
+    patch = correct_patch(seen, slice(0, 60), slice(200, 256))  # a corner, where fall-off is to one half
     expected = bin_mean(LEVEL * radiance, 4, 4)[0:60, 200:256]
     assert np.abs(patch - expected).max() < 0.004 * 4095
 

@@ -101,8 +101,8 @@ def test_the_files_hold_no_truth(measured: DescentMeasurements, tmp_path: Path) 
     assert names == [*cameras, "case.json", "flat_field_1.f64", *images]
     # every number in the files is one of the measurement, and the true velocity is none of these
     written = json.loads((tmp_path / "case.json").read_text())
-    numbers = np.array(list(_numbers(written)))
-    given = np.array(list(_numbers(_plain(measured))))
+    numbers = np.array(list(_check_numbers(written)))
+    given = np.array(list(_check_numbers(_plain(measured))))
     counted = {float(k) for k in range(max(512, *measured.images[0].counts.shape) + 1)}
     assert set(numbers) <= set(given) | counted
     assert not np.isclose(numbers[:, None], TRUE, atol=1e-3).any()
@@ -119,12 +119,12 @@ def _plain(value: object) -> object:
     return [_plain(one) for one in value] if isinstance(value, (tuple, list)) else value
 
 
-def _numbers(value: object) -> Iterator[float]:
+def _check_numbers(value: object) -> Iterator[float]:
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list):
         for one in value:
-            yield from _numbers(one)
+            yield from _check_numbers(one)
     elif isinstance(value, (int, float)):
         yield float(value)
 

@@ -19,8 +19,8 @@ from marsyard.algorithms.exchange import (
     read_stop,
     read_target,
 )
+from marsyard.algorithms.exchange.files import encode_target, write_mast, write_stop
 from marsyard.algorithms.exchange.serving import end_persistent
-from marsyard.algorithms.exchange.stops import encode_target, write_mast, write_stop
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import TargetLoss, TargetTracker, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions

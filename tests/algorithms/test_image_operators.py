@@ -9,11 +9,17 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
-from marsyard.algorithms.image.alignment import refine_shift, shifted_patch, spline_coefficients
-from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
+from marsyard.algorithms.image.correlation import (
+    Peak,
+    biquadratic_offset,
+    highest_peak,
+    peak_width,
+    pseudo_normalized_correlation,
+    second_peak,
+)
 from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
 from marsyard.algorithms.image.kernels import cubic
-from marsyard.algorithms.image.peak import Peak, biquadratic_offset, highest_peak, peak_width, second_peak
+from marsyard.algorithms.image.registration import refine_shift, shifted_patch, spline_coefficients
 
 
 def brute_force(template: np.ndarray, window: np.ndarray) -> np.ndarray:
@@ -85,9 +91,8 @@ def subpixel_errors(align: bool) -> np.ndarray:
         window = blobs(k % 2, (fy, fx))
         surface = pseudo_normalized_correlation(template, window)
         peak = highest_peak(surface)
-        found: np.ndarray | None = np.array([peak.row, peak.column]) + biquadratic_offset(surface, peak)
-        if align:
-            found = refine_shift(template, window, found)
+        start = np.array([peak.row, peak.column]) + biquadratic_offset(surface, peak)
+        found = refine_shift(template, window, start) if align else start
         assert found is not None
         errors.append(found - 12.0 - np.array([fy, fx]))
     return np.array(errors)
@@ -163,7 +168,7 @@ def test_biquadratic_stays_put_without_a_maximum() -> None:
 
 def gaussian(rows: float, columns: float, widths: tuple[float, float] = (1.5, 1.5)) -> np.ndarray:
     y, x = np.mgrid[:41, :41]
-    return np.exp(-((y - rows) ** 2) / (2 * widths[0] ** 2) - (x - columns) ** 2 / (2 * widths[1] ** 2))
+    return np.asarray(np.exp(-((y - rows) ** 2) / (2 * widths[0] ** 2) - (x - columns) ** 2 / (2 * widths[1] ** 2)))
 
 
 def test_peak_width_is_that_of_the_longest_direction() -> None:

@@ -116,7 +116,7 @@ def test_a_target_on_a_large_rock_is_avoided_unless_it_is_named() -> None:
     assert named.commands == (DriveCommand(forward_m=0.5),)
 
 
-def _mapped(apex_east: float, azimuths_deg: tuple[float, ...], rocks: tuple[Obstacle, ...]) -> TerrainMap:
+def _is_mapped(apex_east: float, azimuths_deg: tuple[float, ...], rocks: tuple[Obstacle, ...]) -> TerrainMap:
     """Navcam wedges, 45 deg wide, whose lower edges see the ground from 1.8 m on."""
     terrain = TerrainMap()
     for azimuth in azimuths_deg:
@@ -129,19 +129,19 @@ def test_one_wedge_is_too_narrow_to_pass_an_obstacle_and_two_suffice() -> None:
     # seen from the place where the map was begun, 2.6 m behind; the obstacle is 2 m ahead
     rocks = (_rock(2.0, 0.0),)
     goal = np.array([6.0, 0.0])
-    one, two = (_mapped(-2.6, azimuths, rocks) for azimuths in ((90.0,), (70.0, 110.0)))
+    one, two = (_is_mapped(-2.6, azimuths, rocks) for azimuths in ((90.0,), (70.0, 110.0)))
     assert navigate(one, _pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
     places = _driven(two, _pose(0.0, 0.0), goal, 0.5)
     assert places[-1] == pytest.approx(goal, abs=0.02)
     assert two.mapped(places).all()
     # without the obstacle one is wide enough
-    free = _mapped(-2.6, (90.0,), ())
+    free = _is_mapped(-2.6, (90.0,), ())
     assert navigate(free, _pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.PATH
 
 
 def test_the_ground_before_the_mast_is_not_mapped_until_two_metres_were_driven() -> None:
     goal = np.array([7.0, 0.0])
-    terrain = _mapped(0.0, (70.0, 110.0), ())
+    terrain = _is_mapped(0.0, (70.0, 110.0), ())
     outcomes = {
         east: navigate(terrain, _pose(east, 0.0), goal, 0.5, OPTIONS).outcome for east in (0.0, 1.0, 2.0, 2.6, 3.0)
     }
@@ -150,14 +150,14 @@ def test_the_ground_before_the_mast_is_not_mapped_until_two_metres_were_driven()
 
 
 def test_paths_keep_to_mapped_ground() -> None:
-    terrain = _mapped(-2.6, (90.0,), ())
+    terrain = _is_mapped(-2.6, (90.0,), ())
     beside = navigate(terrain, _pose(0.0, 0.0), np.array([2.2, 2.2]), 0.5, OPTIONS)
     assert beside.outcome is NavigationOutcome.NO_PATH
 
 
 def test_only_rocks_in_a_wedge_are_seen_and_twice_is_once() -> None:
     ahead, beside = _rock(5.0, 0.0, name="ahead"), _rock(0.0, 5.0, name="beside")
-    terrain = _mapped(0.0, (90.0,), (ahead, beside))
+    terrain = _is_mapped(0.0, (90.0,), (ahead, beside))
     assert [rock.name for rock in terrain.obstacles] == ["ahead"]
     moved = _rock(5.2, 0.1, name="ahead")
     again = terrain.sensed(terrain.wedges[0], (moved,))

@@ -1,4 +1,4 @@
-"""Compiled correlation; `marsyard.algorithms.image.normalized` and `.correlation` say what it is and check what they
+"""Compiled correlation; `marsyard.algorithms.image.correlation` and `.correlation` say what it is and check what they
 are given.
 
 Images of the normalised one are float32, so that a vector register holds eight values; sums that are subtracted from

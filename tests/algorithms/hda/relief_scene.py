@@ -96,7 +96,7 @@ def ground_along(height: Height, origin: np.ndarray, rays: np.ndarray) -> np.nda
         low, high = np.where(above, s, low), np.where(above, high, s)
         if n > 6 and float(np.max(np.abs(p[..., 2] - height(p[..., 0], p[..., 1])))) < 1e-7:
             break
-    return origin + s[..., None] * rays
+    return np.asarray(origin + s[..., None] * rays)
 
 
 @dataclass(frozen=True)

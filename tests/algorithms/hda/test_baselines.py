@@ -10,13 +10,12 @@ from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.hda.baselines import (
     SemiGlobalEstimator,
     essential_motion,
-    rectification,
+    rectify_views,
     semi_global_structure,
 )
 from marsyard.algorithms.hda.estimator import motion_from_tracks
-from marsyard.algorithms.hda.features import select_features
-from marsyard.algorithms.hda.sighting import Sighting, sighting
-from marsyard.algorithms.hda.tracking import track_features
+from marsyard.algorithms.hda.tracking import select_features, track_features
+from marsyard.algorithms.hda.view import LandingScene, build_scene
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
@@ -36,13 +35,13 @@ def exact() -> LandingMeasurements:
 
 
 @pytest.fixture(scope="module")
-def seen(exact: LandingMeasurements) -> Sighting:
-    return sighting(exact)
+def seen(exact: LandingMeasurements) -> LandingScene:
+    return build_scene(exact)
 
 
-def test_rectified_pictures_share_rows_and_disparity_is_inverse_depth(seen: Sighting) -> None:
+def test_rectified_pictures_share_rows_and_disparity_is_inverse_depth(seen: LandingScene) -> None:
     moved = scene().second_from_first
-    pair = rectification(seen.views, moved)
+    pair = rectify_views(seen.views, moved)
     assert pair is not None
     rng = np.random.default_rng(1)
     points = rng.uniform([-2.0, -2.0, 8.0], [2.0, 2.0, 12.0], (50, 3))
@@ -54,7 +53,7 @@ def test_rectified_pictures_share_rows_and_disparity_is_inverse_depth(seen: Sigh
     np.testing.assert_allclose(u1 - u2, pair.focal_px * pair.baseline_m / first[:, 2], rtol=1e-9)
 
 
-def test_semi_global_depths_are_those_of_the_exact_scene(seen: Sighting) -> None:
+def test_semi_global_depths_are_those_of_the_exact_scene(seen: LandingScene) -> None:
     features = select_features(seen.views[0].counts, OPTIONS)
     tracks = track_features(seen.views[0].counts, seen.views[1].counts, features, features, OPTIONS)
     motion = motion_from_tracks(seen, tracks, OPTIONS)
@@ -71,7 +70,7 @@ def test_semi_global_depths_are_those_of_the_exact_scene(seen: Sighting) -> None
     assert np.sqrt(np.mean((matches.depths - depths)[matches.accepted] ** 2)) < 0.1
 
 
-def test_the_essential_matrix_gives_the_motion_that_least_squares_gives(seen: Sighting) -> None:
+def test_the_essential_matrix_gives_the_motion_that_least_squares_gives(seen: LandingScene) -> None:
     features = select_features(seen.views[0].counts, OPTIONS)
     tracks = track_features(seen.views[0].counts, seen.views[1].counts, features, features, OPTIONS)
     found = essential_motion(seen, tracks, OPTIONS)
@@ -82,9 +81,9 @@ def test_the_essential_matrix_gives_the_motion_that_least_squares_gives(seen: Si
     assert ours @ theirs > np.cos(np.deg2rad(2.0))
 
 
-def test_motion_along_the_axis_cannot_be_rectified(seen: Sighting) -> None:
+def test_motion_along_the_axis_cannot_be_rectified(seen: LandingScene) -> None:
     ahead = rigid(Rotation.identity(), np.array([0.0, 0.0, -1.0]))
-    assert rectification(seen.views, ahead) is None
+    assert rectify_views(seen.views, ahead) is None
 
 
 def test_a_straight_descent_has_no_semi_global_structure() -> None:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import ElevationMap, HdaOptions, SurfaceFrame
 from marsyard.algorithms.hda.elevation import elevation_map
-from marsyard.algorithms.hda.surface import plane_normal, surface_from_camera, upwards, world_from_surface
+from marsyard.algorithms.hda.landing import plane_normal, surface_from_camera, up_direction, world_from_surface
 from marsyard.algorithms.hda.view import View, camera_pose
 from tests.algorithms.hda.relief_scene import camera, pose
 
@@ -32,7 +32,7 @@ def test_places_of_cells_and_back() -> None:
     ground = ElevationMap(np.zeros((4, 6)), np.array([-1.0, 2.0]), 0.5)
     # Rows run along -y, columns along x.
     np.testing.assert_allclose(
-        ground.places(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 5.0]])), [[-1, 2], [-1, 0.5], [1.5, 2]]
+        ground.places(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 5.0]])), [[-1.0, 2.0], [-1.0, 0.5], [1.5, 2.0]]
     )
     cells = np.random.default_rng(2).uniform(-3.0, 9.0, (50, 2))
     np.testing.assert_allclose(ground.cells(ground.places(cells)), cells)
@@ -47,12 +47,11 @@ def test_points_are_spread_by_bilinear_weights() -> None:
     weights = np.zeros(ground.elevation_m.shape)
     sums = np.zeros(ground.elevation_m.shape)
     for point in points:
-        for row in range(weights.shape[0]):
-            for column in range(weights.shape[1]):
-                x, y = ground.places(np.array([row, column], dtype=np.float64))
-                near = max(0.0, 1.0 - abs(point[0] - x) / cell) * max(0.0, 1.0 - abs(point[1] - y) / cell)
-                weights[row, column] += near
-                sums[row, column] += near * point[2]
+        for row, column in np.ndindex(weights.shape):
+            x, y = ground.places(np.array([row, column], dtype=np.float64))
+            near = max(0.0, 1.0 - abs(point[0] - x) / cell) * max(0.0, 1.0 - abs(point[1] - y) / cell)
+            weights[row, column] += near
+            sums[row, column] += near * point[2]
     expected = np.where(weights >= 0.1, sums / np.where(weights > 0.0, weights, 1.0), np.nan)
     np.testing.assert_allclose(ground.elevation_m, expected)
 
@@ -117,11 +116,11 @@ def test_gravity_comes_from_where_the_options_say() -> None:
     flat = cloud(500, rng, (0.0, 0.0)) + np.array([0.0, 0.0, 1.0]) * rng.normal(0.0, 0.01, (500, 1))
     flat[:150, 2] += rng.uniform(0.5, 2.0, 150)
     points = surface_from_camera(state).inv().apply(flat)
-    found = {frame: upwards(first, leaning, points, HdaOptions(surface_frame=frame)) for frame in SurfaceFrame}
+    found = {frame: up_direction(first, leaning, points, HdaOptions(surface_frame=frame)) for frame in SurfaceFrame}
     np.testing.assert_allclose(found[SurfaceFrame.INCLINOMETER], leaning)
     np.testing.assert_allclose(found[SurfaceFrame.STATE], state)
     # 350 points with 1 cm of noise over 8 m: 0.01 / (sqrt(350) 2.3 m) = 2e-4 rad; a third of them far off.
-    assert np.arccos(min(found[SurfaceFrame.PLANE] @ state, 1.0)) < 2e-3
+    assert np.arccos(min(float(found[SurfaceFrame.PLANE] @ state), 1.0)) < 2e-3
 
 
 def test_the_robust_normal_points_to_the_camera() -> None:

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import HdaEstimator, HdaOptions, Safety, SurfaceFrame, TrackSeed, hda_products
+from marsyard.algorithms.hda import (
+    Ground,
+    HdaDetails,
+    HdaEstimator,
+    HdaOptions,
+    Motion,
+    Safety,
+    SurfaceFrame,
+    TrackSeed,
+    hda_products,
+)
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
 from marsyard.sim.frames import rigid
@@ -50,14 +60,36 @@ def answer(exact: LandingMeasurements) -> SiteEstimate:
     return HdaEstimator(OPTIONS).estimate(exact)
 
 
+def details_of(answer: SiteEstimate) -> HdaDetails:
+    assert isinstance(answer.details, HdaDetails)
+    return answer.details
+
+
+def ground_of(answer: SiteEstimate) -> Ground:
+    ground = details_of(answer).ground
+    assert ground is not None
+    return ground
+
+
+def motion_of(answer: SiteEstimate) -> Motion:
+    motion = details_of(answer).motion
+    assert motion is not None
+    return motion
+
+
+def site_of(answer: SiteEstimate) -> np.ndarray:
+    assert answer.site_world is not None
+    return answer.site_world
+
+
 def map_errors(scene: Pass, answer: SiteEstimate) -> np.ndarray:
     """Elevation less truth at every known cell, metres, by the exact pose of the first camera."""
-    found = answer.details.ground
+    found = ground_of(answer)
     cells = np.argwhere(~np.isnan(found.elevation.elevation_m))
     z = found.elevation.elevation_m[tuple(cells.T)]
     points = np.column_stack([found.elevation.places(cells.astype(np.float64)), z])
     world = scene.camera(0).c + found.world_from_surface.apply(points)
-    return world[:, 2] - scene.height(world[:, 0], world[:, 1])
+    return np.asarray(world[:, 2] - scene.height(world[:, 0], world[:, 1]))
 
 
 def true_safe(scene: Pass, x: float, y: float) -> bool:
@@ -74,12 +106,12 @@ def test_the_site_is_on_the_ground_and_clear_of_boulders(name: str, scene: Pass,
     assert true_safe(scene, x, y)
     # Smooth elevation: half a percent of the height.
     assert z == pytest.approx(float(scene.height(np.array(x), np.array(y))), abs=0.05)
-    assert found.details.ground.hazards.safety[found.details.ground.site_cell] == Safety.SAFE
+    assert ground_of(found).hazards.safety[ground_of(found).site_cell] == Safety.SAFE
 
 
 def test_motion_and_map_of_an_exact_pair(scene: Pass, answer: SiteEstimate) -> None:
     # Issue 6, bar 1: 0.05 deg, 1 % of the baseline, half a percent of the height.
-    motion = answer.details.motion
+    motion = motion_of(answer)
     true = scene.second_from_first
     assert np.rad2deg((motion.second_from_first.rotation * true.rotation.inv()).magnitude()) < 0.05
     miss = np.linalg.norm(motion.second_from_first.translation - true.translation)
@@ -90,7 +122,7 @@ def test_motion_and_map_of_an_exact_pair(scene: Pass, answer: SiteEstimate) -> N
 
 
 def test_every_boulder_is_a_hazard(scene: Pass, answer: SiteEstimate) -> None:
-    found = answer.details.ground
+    found = ground_of(answer)
     for x, y, _, _ in BOULDERS:
         offset = np.array([x, y, float(scene.height(np.array(x), np.array(y)))]) - scene.camera(0).c
         row, column = np.rint(found.elevation.cells(found.world_from_surface.inv().apply(offset)[:2])).astype(int)
@@ -106,7 +138,7 @@ def test_ground_that_is_too_steep_has_no_safe_site() -> None:
     assert found.outcome is SiteOutcome.NO_SAFE_SITE
     assert found.outcome.converged
     assert found.site_world is None
-    assert np.rad2deg(np.nanmedian(found.details.ground.hazards.slope_rad)) == pytest.approx(16.7, abs=0.5)
+    assert np.rad2deg(np.nanmedian(ground_of(found).hazards.slope_rad)) == pytest.approx(16.7, abs=0.5)
 
 
 def test_gravity_from_a_plane_through_the_points_sees_no_mean_slope() -> None:
@@ -114,8 +146,8 @@ def test_gravity_from_a_plane_through_the_points_sees_no_mean_slope() -> None:
     frame = replace(OPTIONS, surface_frame=SurfaceFrame.PLANE)
     found = HdaEstimator(frame).estimate(steep)
     assert found.outcome is SiteOutcome.SAFE_SITE
-    ground = found.details.ground
-    first = found.details.views[0]
+    ground = ground_of(found)
+    first = details_of(found).views[0]
     normal = (first.world_from_camera.rotation * ground.surface_from_camera.inv()).apply(np.array([0.0, 0.0, 1.0]))
     # 3,000 points of 2 cm noise over 7 m would leave 0.01 deg; matches are not independent of their neighbours.
     assert np.rad2deg(np.arccos(normal @ np.array([-0.3, 0.0, 1.0]) / np.hypot(0.3, 1.0))) < 0.2
@@ -126,7 +158,7 @@ def test_gravity_is_the_inclinometers_unless_it_is_the_states(exact: LandingMeas
     slopes = {}
     for frame in (SurfaceFrame.INCLINOMETER, SurfaceFrame.STATE):
         found = HdaEstimator(replace(OPTIONS, surface_frame=frame)).estimate(leaning)
-        slopes[frame] = float(np.nanmedian(found.details.ground.hazards.slope_rad))
+        slopes[frame] = float(np.nanmedian(ground_of(found).hazards.slope_rad))
     assert slopes[SurfaceFrame.STATE] == pytest.approx(np.arctan(np.hypot(0.03, 0.02)), abs=0.005)
     assert abs(slopes[SurfaceFrame.INCLINOMETER] - slopes[SurfaceFrame.STATE]) > 0.05
 
@@ -138,7 +170,7 @@ def test_sites_are_handed_over_in_map_coordinates(exact: LandingMeasurements, an
     found = HdaEstimator(OPTIONS).estimate(
         replace(exact, poses=(poses[0], poses[1]), apriori_site_world=moved.apply(exact.apriori_site_world))
     )
-    np.testing.assert_allclose(found.site_world, moved.apply(answer.site_world), atol=1e-6)
+    np.testing.assert_allclose(site_of(found), moved.apply(site_of(answer)), atol=1e-6)
 
 
 def test_a_position_error_moves_the_site_by_as_much(exact: LandingMeasurements, answer: SiteEstimate) -> None:
@@ -148,15 +180,15 @@ def test_a_position_error_moves_the_site_by_as_much(exact: LandingMeasurements, 
     )
     # The a-priori site stays: it is map data, and matters for ties only.
     found = HdaEstimator(OPTIONS).estimate(replace(exact, poses=(poses[0], poses[1])))
-    np.testing.assert_allclose(found.site_world, answer.site_world + shift, atol=1e-6)
+    np.testing.assert_allclose(site_of(found), site_of(answer) + shift, atol=1e-6)
 
 
 @each
 def test_the_answer_is_a_function_of_the_measurements(name: str, exact: LandingMeasurements) -> None:
     first, second = (ESTIMATORS[name](OPTIONS).estimate(exact) for _ in range(2))
     np.testing.assert_array_equal(first.site_world, second.site_world)
-    for key, value in hda_products(first.details).items():
-        np.testing.assert_array_equal(hda_products(second.details)[key], value)
+    for key, value in hda_products(details_of(first)).items():
+        np.testing.assert_array_equal(hda_products(details_of(second))[key], value)
 
 
 def apriori(found: SiteEstimate, given: LandingMeasurements) -> bool:
@@ -257,7 +289,7 @@ def test_features_can_be_sought_by_the_poses(scene: Pass) -> None:
     given = measured(wide)
     seeded = HdaEstimator(replace(OPTIONS, track_seed=TrackSeed.POSE)).estimate(given)
     assert seeded.outcome.converged
-    assert seeded.details.motion.parallax_px > 50.0
+    assert motion_of(seeded).parallax_px > 50.0
     errors = map_errors(wide, seeded)
     assert np.sqrt(np.mean(errors**2)) < 0.005 * 10.0
     assert not HdaEstimator(OPTIONS).estimate(given).outcome.converged
@@ -269,7 +301,7 @@ def test_a_picture_that_is_not_its_cameras_size_is_refused(exact: LandingMeasure
 
 
 def test_products_hold_what_the_figures_show(scene: Pass, exact: LandingMeasurements, answer: SiteEstimate) -> None:
-    products = hda_products(answer.details)
+    products = hda_products(details_of(answer))
     accepted = products["tracks_accepted"]
     assert products["sparse_points"].shape == (accepted.sum(), 3)
     # Fig. 2's points are where the tracks' pixels see the ground.
@@ -283,10 +315,10 @@ def test_products_hold_what_the_figures_show(scene: Pass, exact: LandingMeasurem
     # Fig. 7: cells fall on the pixels that see them.
     row, column = products["site"].astype(int)
     seen = scene.ground(0, products["map_pixels"][row, column][None])[0]
-    np.testing.assert_allclose(seen[:2], answer.site_world[:2], atol=0.05)
+    np.testing.assert_allclose(seen[:2], site_of(answer)[:2], atol=0.05)
     # What was not reached is left out.
     blind = HdaEstimator(OPTIONS).estimate(replace(exact, slant_range_m=np.nan))
-    assert hda_products(blind.details) == {}
+    assert hda_products(details_of(blind)) == {}
 
 
 def test_bright_and_dark_pairs_give_the_same_map(scene: Pass, exact: LandingMeasurements) -> None:

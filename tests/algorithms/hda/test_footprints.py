@@ -5,7 +5,7 @@ import pytest
 
 from marsyard.algorithms.hda import HdaOptions, Safety
 from marsyard.algorithms.hda.elevation import ElevationMap
-from marsyard.algorithms.hda.footprints import Resolution, checked, roughness_limit_m
+from marsyard.algorithms.hda.hazards import Resolution, check_footprints, roughness_limit_m
 
 SHARP = Resolution(window_m=0.0, noise_m=0.0)
 
@@ -26,7 +26,7 @@ def test_a_curved_place_that_interpolated_planes_call_safe_is_a_hazard() -> None
     ground = ElevationMap(np.tile(-0.3 * np.abs(x), (121, 1)), np.zeros(2), 0.05)
     all_safe = np.full((121, 121), Safety.SAFE, dtype=np.uint8)
     options = HdaOptions(max_roughness_m=0.1, narrowest_hazard=100.0, max_slope_rad=float(np.radians(20.0)))
-    result = checked(all_safe, ground, SHARP, options)
+    result = check_footprints(all_safe, ground, SHARP, options)
     assert np.all(result[40:80, 58:63] == Safety.HAZARD)
     # where the footprint lies on one flank the ground is a plane
     assert np.all(result[40:80, 85:95] == Safety.SAFE)
@@ -39,5 +39,5 @@ def test_a_map_that_cannot_tell_calls_nothing_safe() -> None:
     coarse = Resolution(window_m=1.0, noise_m=0.0)
     # in the corners most of a footprint is off the map
     inside = (slice(10, 50), slice(10, 50))
-    assert np.all(checked(all_safe, ground, SHARP, options)[inside] == Safety.SAFE)
-    assert np.all(checked(all_safe, ground, coarse, options) == Safety.HAZARD)
+    assert np.all(check_footprints(all_safe, ground, SHARP, options)[inside] == Safety.SAFE)
+    assert np.all(check_footprints(all_safe, ground, coarse, options) == Safety.HAZARD)

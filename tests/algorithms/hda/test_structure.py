@@ -8,20 +8,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import Fate, HdaEstimator, HdaOptions
+from marsyard.algorithms.hda import Fate, HdaDetails, HdaEstimator, HdaOptions
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.sighting import Sighting, sighting
 from marsyard.algorithms.hda.structure import (
+    clip_to_image,
     dense_structure,
     depth_bounds,
     epipolar_segments,
     match_pixels,
     pixel_lattice,
     return_distance,
-    triangulated,
-    within,
+    triangulate,
 )
-from marsyard.algorithms.hda.view import undistorted
+from marsyard.algorithms.hda.view import LandingScene, build_scene, undistort
 from marsyard.sim.frames import rigid
 from tests.algorithms.hda.relief_scene import Pass, bumps, measured, plane, pose
 
@@ -35,23 +34,23 @@ def scene() -> Pass:
 
 
 @pytest.fixture(scope="module")
-def seen(scene: Pass) -> Sighting:
-    return sighting(measured(scene))
+def seen(scene: Pass) -> LandingScene:
+    return build_scene(measured(scene))
 
 
 def true_depths(scene: Pass, pixels: np.ndarray) -> np.ndarray:
     one = scene.camera(0)
-    return (scene.ground(0, pixels) - one.c) @ one.a
+    return np.asarray((scene.ground(0, pixels) - one.c) @ one.a)
 
 
-def test_the_poses_motion_is_the_cameras(scene: Pass, seen: Sighting) -> None:
+def test_the_poses_motion_is_the_cameras(scene: Pass, seen: LandingScene) -> None:
     np.testing.assert_allclose(seen.second_from_first.as_matrix(), scene.second_from_first.as_matrix(), atol=1e-12)
 
 
-def test_segments_hold_the_exact_match(scene: Pass, seen: Sighting) -> None:
+def test_segments_hold_the_exact_match(scene: Pass, seen: LandingScene) -> None:
     pixels = pixel_lattice((320, 240), 16, 10)
     true = scene.camera(1).project(scene.ground(0, pixels))[0]
-    places = undistorted(seen.views[0].camera, pixels)
+    places = undistort(seen.views[0].camera, pixels)
     starts, ends, room = epipolar_segments(seen.views[1], scene.second_from_first, places, (7.0, 13.0), 6)
     assert room.sum() > 100
     along = (ends - starts)[room]
@@ -64,20 +63,20 @@ def test_segments_hold_the_exact_match(scene: Pass, seen: Sighting) -> None:
     assert across.max() < 0.1
 
 
-def test_depth_is_where_on_the_segment(scene: Pass, seen: Sighting) -> None:
+def test_depth_is_where_on_the_segment(scene: Pass, seen: LandingScene) -> None:
     # At bounds that are the true depth both ends are the true match: Eqs. 6-8 through the lens are exact.
     pixels = np.array([[100.0, 80.0]])
     depth = float(true_depths(scene, pixels)[0])
     true = scene.camera(1).project(scene.ground(0, pixels))[0]
-    places = undistorted(seen.views[0].camera, pixels)
+    places = undistort(seen.views[0].camera, pixels)
     starts, ends, _ = epipolar_segments(seen.views[1], scene.second_from_first, places, (depth, depth), 6)
     np.testing.assert_allclose(starts, true, atol=1e-6)
     np.testing.assert_allclose(ends, true, atol=1e-6)
 
 
-def test_pixels_whose_segment_leaves_the_picture_are_dropped(scene: Pass, seen: Sighting) -> None:
+def test_pixels_whose_segment_leaves_the_picture_are_dropped(scene: Pass, seen: LandingScene) -> None:
     pixels = pixel_lattice((320, 240), 8, 6)
-    places = undistorted(seen.views[0].camera, pixels)
+    places = undistort(seen.views[0].camera, pixels)
     starts, ends, room = epipolar_segments(seen.views[1], scene.second_from_first, places, (7.0, 13.0), 6)
     both = np.concatenate([starts, ends], axis=1)
     inside = np.all((both >= 6.0) & (both <= np.array([313.0, 233.0, 313.0, 233.0])), axis=1)
@@ -99,7 +98,7 @@ def test_the_least_sum_of_differences_is_found() -> None:
     assert matching.absolute_differences(first, second, 25, 30, 25, 33, 5, 2**62) == total
 
 
-def test_matches_and_depths_are_those_of_the_exact_scene(scene: Pass, seen: Sighting) -> None:
+def test_matches_and_depths_are_those_of_the_exact_scene(scene: Pass, seen: LandingScene) -> None:
     depths = true_depths(scene, pixel_lattice((320, 240), 16, 6))
     matches = dense_structure(seen.views, scene.second_from_first, (depths.min(), depths.max()), OPTIONS)
     true = scene.camera(1).project(scene.ground(0, matches.first))[0]
@@ -112,7 +111,7 @@ def test_matches_and_depths_are_those_of_the_exact_scene(scene: Pass, seen: Sigh
     assert np.sqrt(np.mean(misses**2)) < 0.005 * 10.0
 
 
-def test_a_wrong_picture_gives_few_matches(scene: Pass, seen: Sighting) -> None:
+def test_a_wrong_picture_gives_few_matches(scene: Pass, seen: LandingScene) -> None:
     noise = np.random.default_rng(2).integers(500, 2500, (240, 320)).astype(np.uint16)
     views = (seen.views[0], replace(seen.views[1], counts=noise))
     matches = dense_structure(views, scene.second_from_first, (9.0, 11.0), OPTIONS)
@@ -126,16 +125,16 @@ def test_triangulation_is_exact_and_as_precise_as_the_parallax() -> None:
     moved = rigid(Rotation.from_rotvec([0.02, -0.03, 0.05]), np.array([1.0, 0.0, 0.0]))
     points = moved.apply(np.column_stack([places, np.ones(2000)]) * depths[:, None])
     second = points[:, :2] / points[:, 2:]
-    np.testing.assert_allclose(triangulated(places, second, moved), depths, rtol=1e-10)
+    np.testing.assert_allclose(triangulate(places, second, moved), depths, rtol=1e-10)
     noise = 1e-4
-    noisy = triangulated(places, second + rng.normal(0.0, noise, second.shape), moved)
+    noisy = triangulate(places, second + rng.normal(0.0, noise, second.shape), moved)
     # dz = z^2 / baseline times the error along the epipolar line; rotation and view change that by some percent.
     assert np.std((noisy - depths) / depths**2) == pytest.approx(noise, rel=0.1)
 
 
 def test_lines_of_sight_that_do_not_meet_have_no_depth() -> None:
     places = np.array([[0.1, 0.2]])
-    assert np.isnan(triangulated(places, places, rigid(Rotation.identity(), np.array([1.0, 0.0, 0.0])))[0])
+    assert np.isnan(triangulate(places, places, rigid(Rotation.identity(), np.array([1.0, 0.0, 0.0])))[0])
 
 
 def test_bounds_of_depth_are_widened_both_ways() -> None:
@@ -153,13 +152,15 @@ def test_the_grid_lies_in_the_middle_and_keeps_from_the_border() -> None:
 def test_all_lengths_follow_the_altimeter(factor: float, scene: Pass) -> None:
     exact = measured(scene)
     answer = HdaEstimator(OPTIONS).estimate(replace(exact, slant_range_m=factor * exact.slant_range_m))
+    assert isinstance(answer.details, HdaDetails)
     motion = answer.details.motion
+    assert motion is not None
     # Issue 6, bar 1: 1 % of the baseline, the scale by the altimeter exact.
     expected = factor * scene.second_from_first.translation
     assert np.linalg.norm(motion.second_from_first.translation - expected) < 0.01 * np.linalg.norm(expected)
 
 
-def test_matches_that_do_not_find_their_way_back_are_dropped_and_counted(scene: Pass, seen: Sighting) -> None:
+def test_matches_that_do_not_find_their_way_back_are_dropped_and_counted(scene: Pass, seen: LandingScene) -> None:
     # Half of the second picture shows something else, and no correlation is too low: what is found there is chance.
     counts = seen.views[1].counts.copy()
     counts[:, 160:] = np.random.default_rng(2).integers(500, 2500, (240, 160))
@@ -187,9 +188,9 @@ def test_matches_that_do_not_find_their_way_back_are_dropped_and_counted(scene: 
     assert len(checked.points) == checked.accepted.sum()
 
 
-def test_right_matches_find_their_way_back(scene: Pass, seen: Sighting) -> None:
+def test_right_matches_find_their_way_back(scene: Pass, seen: LandingScene) -> None:
     pixels = pixel_lattice((320, 240), 16, 6)
-    places = undistorted(seen.views[0].camera, pixels)
+    places = undistort(seen.views[0].camera, pixels)
     _, _, room = epipolar_segments(seen.views[1], scene.second_from_first, places, (7.0, 13.0), 6)
     pixels, places = pixels[room].astype(np.int64), places[room]
     true = np.rint(scene.camera(1).project(scene.ground(0, pixels.astype(np.float64)))[0]).astype(np.int64)
@@ -201,7 +202,7 @@ def test_right_matches_find_their_way_back(scene: Pass, seen: Sighting) -> None:
 def test_ends_of_segments_are_cut_at_the_border() -> None:
     inside = np.array([[50.0, 50.0], [50.0, 50.0], [10.0, 10.0], [50.0, 50.0]])
     ends = np.array([[60.0, 40.0], [110.0, 80.0], [0.0, 20.0], [np.nan, 10.0]])
-    cut = within((100, 80), inside, ends, 10.0)
+    cut = clip_to_image((100, 80), inside, ends, 10.0)
     np.testing.assert_allclose(
         cut, [[60.0, 40.0], [50.0 + 39.0 * 19.0 / 30.0 * 60.0 / 39.0, 69.0], [10.0, 10.0], [50.0, 10.0]]
     )

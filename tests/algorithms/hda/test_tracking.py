@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.hda import HdaOptions
-from marsyard.algorithms.hda.features import eigenvalue_test, select_features
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.pyramid import LevelSize, level_sizes, pyramid, reach_px
-from marsyard.algorithms.hda.tracking import track_features
-from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
-from marsyard.algorithms.image.peak import biquadratic_offset, highest_peak
+from marsyard.algorithms.hda.tracking import (
+    LevelSize,
+    eigenvalue_test,
+    level_sizes,
+    pyramid,
+    select_features,
+    template_reach_px,
+    track_features,
+)
+from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, pseudo_normalized_correlation
 from tests.algorithms.hda.relief_scene import Pass, bumps, camera, picture, plane, pose
 
 OPTIONS = HdaOptions(block_px=32)
@@ -56,7 +61,7 @@ def test_one_feature_a_block_its_best_within_the_border() -> None:
     counts = np.random.default_rng(3).integers(0, 256, (150, 200)).astype(np.uint16)
     options = HdaOptions(block_px=40, window_half_px=8)
     features = select_features(counts, options)
-    border = reach_px(options)
+    border = template_reach_px(options)
     interest = eigenvalue_test(counts.astype(np.float32), 11, options.min_eigenvalue)
     expected = []
     for top in range(0, 150, 40):

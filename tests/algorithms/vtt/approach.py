@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import TargetUpdate
-from marsyard.algorithms.vtt.details import VttDetails
 from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.tracker import VttDetails
 from marsyard.sim.measurements import RoverTarget
 from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, Sphere, pose, waves
 

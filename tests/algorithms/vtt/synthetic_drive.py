@@ -104,7 +104,7 @@ class Sphere:
         b = np.sum(offset * directions, axis=-1)
         gap = b * b - np.sum(offset * offset, axis=-1) + self.radius**2
         with np.errstate(invalid="ignore"):
-            return -b - np.sqrt(gap)
+            return np.asarray(-b - np.sqrt(gap))
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Scene:
         origins, directions = camera.rays(pixels)
         ranges = np.stack([body.ranges(origins, directions) for body in self.bodies])
         nearest = np.where(np.isnan(ranges), np.inf, ranges).min(axis=0)
-        return origins + np.where(np.isinf(nearest), np.nan, nearest)[..., None] * directions
+        return np.asarray(origins + np.where(np.isinf(nearest), np.nan, nearest)[..., None] * directions)
 
     def picture(
         self, camera: CameraModel, box: PixelBox, noise: np.random.Generator | None = None, noise_dn: float = 8.0

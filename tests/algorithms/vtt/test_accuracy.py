@@ -10,7 +10,7 @@ from marsyard.algorithms.vtt.accuracy import (
     StereoDesign,
     accuracy_row,
     drift_error_m,
-    printed,
+    round_half_up,
     stereo_range_error_m,
     table_1,
     tracked_approach_error_m,
@@ -28,8 +28,8 @@ def test_table_1_to_the_printed_digit() -> None:
 def test_an_extreme_drift_of_ten_pixels_as_in_the_text() -> None:
     # "Even with an extreme 10-pixel drift, ... 0.7 cm for pancam and 2.3 cm with navcam."
     pancam, navcam = table_1()
-    assert printed(pancam.tracked_cm(10.0), 1) == 0.7
-    assert printed(navcam.tracked_cm(10.0), 1) == 2.3
+    assert round_half_up(pancam.tracked_cm(10.0), 1) == 0.7
+    assert round_half_up(navcam.tracked_cm(10.0), 1) == 2.3
 
 
 def test_the_digits_need_the_specified_pixel() -> None:
@@ -51,4 +51,4 @@ def test_laws_of_the_errors() -> None:
     [(38.75, 1, 38.8), (38.749999999999993, 1, 38.8), (1.55, 1, 1.6), (0.155, 2, 0.16), (-0.25, 1, -0.3)],
 )
 def test_halves_are_printed_away_from_zero(value: float, digits: int, expected: float) -> None:
-    assert printed(value, digits) == expected
+    assert round_half_up(value, digits) == expected

@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.vtt.appearance import horizontal_axis, lever_pixels, magnification, roll_angle
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, mast_angles, middle
-from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, searched_ranges, triangulated
-from marsyard.algorithms.vtt.target import bearing_rad, designated_position_world, predicted_position
+from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, search_ranges, triangulated
+from marsyard.algorithms.vtt.target import (
+    bearing_rad,
+    designated_position_world,
+    horizontal_axis,
+    lever_pixels,
+    magnification,
+    predicted_position,
+    roll_angle,
+)
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget, RoverTarget, SiteTarget
@@ -233,12 +240,12 @@ def test_the_epipolar_curve_goes_through_the_points_of_the_ray(mast: MastCalibra
 
 def test_searched_ranges_are_disparities_apart() -> None:
     left, right = navcam().left, navcam().right
-    near, far = searched_ranges(left, right, 5.0, 20.0)
+    near, far = search_ranges(left, right, 5.0, 20.0)
     scale = disparity_px_m(left, right)
     assert scale == pytest.approx(1222.5 * 0.2)
     assert scale / near - scale / 5.0 == pytest.approx(20.0)
     assert scale / 5.0 - scale / far == pytest.approx(20.0)
-    assert searched_ranges(left, right, 30.0, 20.0)[1] > 1e5  # to infinity and no further
+    assert search_ranges(left, right, 30.0, 20.0)[1] > 1e5  # to infinity and no further
 
 
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
@@ -246,6 +253,7 @@ def test_triangulation_inverts_projection(mast: MastCalibration) -> None:
     rng = np.random.default_rng(4)
     for point in rng.uniform([2.0, -0.15, -0.15], [12.0, 0.15, 0.15], (20, 3)):
         found = triangulated(mast.left, mast.right, mast.left.project(point)[0], mast.right.project(point)[0])
+        assert found is not None
         np.testing.assert_allclose(found, point, atol=1e-6)
 
 

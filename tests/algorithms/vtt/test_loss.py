@@ -9,7 +9,7 @@ import pytest
 
 from marsyard.algorithms.interface import TargetLoss, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.handoff import GoalReached, HandOffOutcome, hand_off
-from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, losses, next_state, tolerances
+from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.sim.measurements import MastCalibration
 from tests.algorithms.vtt.synthetic_drive import navcam, pancam
@@ -34,12 +34,12 @@ ALLOWED = Tolerances(distance_m=0.2, position_m=0.4)
     ],
 )
 def test_each_criterion_stands_alone(changed: str, value: float, expected: TargetLoss | None) -> None:
-    found = losses(Evidence(**(GOOD | {changed: value})), ALLOWED, OPTIONS)
+    found = find_losses(Evidence(**(GOOD | {changed: value})), ALLOWED, OPTIONS)
     assert found == (() if expected is None else (expected,))
 
 
 def test_all_criteria_are_reported() -> None:
-    assert losses(Evidence(0.1, 0.1, 9.0, 9.0), ALLOWED, OPTIONS) == (
+    assert find_losses(Evidence(0.1, 0.1, 9.0, 9.0), ALLOWED, OPTIONS) == (
         TargetLoss.LOW_MATCH_SCORE,
         TargetLoss.LOW_STEREO_SCORE,
         TargetLoss.DISTANCE_JUMP,

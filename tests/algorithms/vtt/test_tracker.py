@@ -283,7 +283,7 @@ def test_lucas_kanade_follows_in_the_same_loop() -> None:
     target = np.array([6.0, 0.1, 0.2])
     tracker: TargetTracker = lucas_kanade_tracker(SMALL)
     drive = Drive(scene_of(slanted(1, target), target, 1), navcam(), tracker)
-    assert tracker.state is TrackingState.NO_TARGET
+    assert [tracker.state] == [TrackingState.NO_TARGET]
     true, last = approach(drive, target, 0.1)[-1]
     assert last.found
     assert tracker.state is TrackingState.NORMAL

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from marsyard.algorithms.image.frame_transfer import without_frame_transfer
+from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.sim.sensor import Detector, DetectorParameters
 from marsyard.sim.sensor.detector import BurstParameters, DefectParameters, dark_seconds
 from marsyard.sim.sensor.optics import OpticsParameters
@@ -94,7 +94,7 @@ def test_smear_is_undone_by_dimes() -> None:
     exposed = delivered(scene * np.float32(p.responsivity_e_s * p.exposure_s))
     assert np.abs(smeared - exposed).max() > 0.2 * p.full_scale_dn
     assert smeared.max() < p.full_scale_dn
-    error = without_frame_transfer(smeared, detector.calibration, 4) - exposed
+    error = remove_frame_transfer(smeared, detector.calibration, 4) - exposed
     # bar 4: 0.2 % of full scale; rows that differ within a delivered row are what is left
     assert np.abs(error).max() < 0.002 * p.full_scale_dn
 
