@@ -1,4 +1,4 @@
-"""What tables of a user's own are held against, row by row: pictures to ingest, answers to score."""
+"""Read and validate CSV tables of a user row by row: pictures to ingest, answers to score."""
 
 from __future__ import annotations
 
@@ -12,12 +12,9 @@ from marsyard.sim.files import check_regular
 
 
 def read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Names of the columns of a table, and its lines that are not empty with their numbers.
+    """Read the column names and the non-empty lines with their numbers.
 
-    Raises
-    ------
-    ValueError
-        Where the file cannot be read, is no table with commas, or has too many rows.
+    Raises ValueError where the file is unreadable, is no table with commas, or has too many rows.
     """
     try:
         check_regular(path)
@@ -37,8 +34,8 @@ def read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, li
     return header, lines
 
 
-def header_problems(header: Sequence[str], needed: Sequence[str], allowed: Sequence[str], said: str) -> Iterator[str]:
-    """What is wrong with the columns' names: none at all, missing, unknown, twice. `said` tells what is allowed."""
+def header_problems(header: Sequence[str], needed: Sequence[str], allowed: Sequence[str], hint: str) -> Iterator[str]:
+    """Yield missing, unknown and repeated columns; `hint` states the allowed ones."""
     if not header:
         yield "it is empty"
         return
@@ -48,21 +45,21 @@ def header_problems(header: Sequence[str], needed: Sequence[str], allowed: Seque
     for name in dict.fromkeys(header):
         if name not in allowed:
             near = difflib.get_close_matches(name, allowed, n=1, cutoff=0.6)
-            hint = f" (did you mean '{near[0]}'?)" if near else ""
-            yield f"unknown column '{name}'{hint}; {said}"
+            suggestion = f" (did you mean '{near[0]}'?)" if near else ""
+            yield f"unknown column '{name}'{suggestion}; {hint}"
         if header.count(name) > 1:
             yield f"the column '{name}' stands there twice"
 
 
 def cells_by_column(header: Sequence[str], cells: Sequence[str]) -> dict[str, str]:
-    """A row's cells by their columns. Raises ValueError where there are more or fewer than columns."""
+    """Return a row's cells by column. Raises ValueError for another number of cells than columns."""
     if len(cells) != len(header):
         raise ValueError(f"it has {len(cells)} cells; the first line has {len(header)}")
     return dict(zip(header, cells, strict=True))
 
 
 def finite_number(name: str, text: str, otherwise: str = "") -> float:
-    """The number in a cell. Raises ValueError where it is none or not finite; `otherwise` says what else may be."""
+    """Parse a finite number. Raises ValueError, whose message ends with `otherwise`."""
     try:
         value = float(text)
     except ValueError:
@@ -73,9 +70,9 @@ def finite_number(name: str, text: str, otherwise: str = "") -> float:
 
 
 def check_together(groups: Iterable[Sequence[str]], given: Mapping[str, float]) -> None:
-    """Raises ValueError where of columns that go together some are given and some are not."""
+    """Raise ValueError where a group of columns is filled in part."""
     for names in groups:
-        there = [name for name in names if name in given]
-        lacking = [name for name in names if name not in given]
-        if there and lacking:
-            raise ValueError(f"{there[0]} is given, but {lacking[0]} is not")
+        filled = [name for name in names if name in given]
+        missing = [name for name in names if name not in given]
+        if filled and missing:
+            raise ValueError(f"{filled[0]} is given, but {missing[0]} is not")

@@ -1,4 +1,4 @@
-"""Pictures of a body camera: rendering, light at the lens, and samples with the truth of their pixels."""
+"""Render and expose pictures of a body camera; assemble samples with the truth of their pixels."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from marsyard.sim.terrain import Environment
 def render_state(
     backend: Backend, scene: Scene, optics: Optics, state: State, mounting: RigidTransform | None = None
 ) -> tuple[Frame, ImageMotion]:
-    """Render what a camera at the body's origin sees, and how the picture moves during its exposure.
+    """Render the view of a camera at the body's origin, and compute the image motion during its exposure.
 
-    `mounting` turns the camera in the body.
+    `mounting` rotates the camera in the body.
     """
     pose = state.world_from_body if mounting is None else state.world_from_body * mounting
     frame = process_renderer(backend).render(scene, optics.rays, pose, state.time_s)
@@ -33,7 +33,7 @@ def render_state(
 
 
 def sunlight_ratio(air: Environment, elevation_rad: float, detector: DetectorParameters) -> float:
-    """Sunlight at the ground over that for which the detector's responsivity is stated."""
+    """Return the ratio of the sunlight at the ground to the reference of the detector's responsivity."""
     return air.direct_share(elevation_rad) * air.solar_irradiance / detector.sunlight
 
 
@@ -45,7 +45,7 @@ def pixel_sample(
     about: Mapping[str, Any],
     hazard: UInt8[np.ndarray, "rows columns"] | None = None,
 ) -> Sample:
-    """A picture with the truth of its pixels; `camera` is that of the delivered picture."""
+    """Assemble a picture and the truth of its pixels; `camera` is that of the delivered picture."""
     rows = summed_rows(detector.rows_summed)
     return Sample(
         image=counts,

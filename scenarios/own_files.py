@@ -1,4 +1,4 @@
-"""A user's own files: a campaign knows one again by the hash of its contents; what is wrong with one is listed."""
+"""Files of a user: parameters that name a file with its hash, and lists of the problems of a file."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from pydantic import BaseModel, Field, model_validator
 
 from marsyard.sim.parameters import Parameters
 
-#: Problems of a file that are told at once.
-_TOLD = 20
+#: Maximum number of problems of a file in one message.
+_MAX_PROBLEMS = 20
 
 
 @runtime_checkable
 class NamesFiles(Protocol):
-    """Parameters that name files; a user's own options may have the method, too."""
+    """Parameters that name files; options of a user's algorithm may have the method as well."""
 
     def input_files(self) -> Sequence[str]:
-        """Paths of the files, as stated."""
+        """Return the paths of the files, as stated."""
         ...
 
 
 def input_files(parameters: Any) -> tuple[str, ...]:
-    """The files that a scenario's parameters name, anywhere in their tree; each once."""
+    """Return the distinct files that parameters name anywhere in their tree."""
     return tuple(dict.fromkeys(_files_in(parameters)))
 
 
@@ -44,35 +44,35 @@ def _files_in(value: Any) -> Iterator[str]:
 
 
 class OwnFile(Parameters):
-    """A file that a campaign is made from. The hash is filled in when the campaign is read; each case checks it."""
+    """A file with its hash, which is added when the campaign is read and checked in each case."""
 
     file: Annotated[str, Field(description="path of the file")]
     sha256: Annotated[str | None, Field(description="of the file; filled in")] = None
 
     def input_files(self) -> tuple[str, ...]:
-        """The file."""
+        """Return the file."""
         return (self.file,)
 
     @classmethod
     @abstractmethod
     def hash_of(cls, file: str) -> str:
-        """SHA-256 of a file's contents. Raises ValueError, naming it, where it cannot be used."""
+        """Return the SHA-256 of a usable file. Raises ValueError, which names the file."""
 
     @model_validator(mode="before")
     @classmethod
-    def _with_its_hash(cls, stated: Any) -> Any:
+    def _add_hash(cls, stated: Any) -> Any:
         if isinstance(stated, Mapping) and isinstance(stated.get("file"), str) and stated.get("sha256") is None:
             return {**stated, "sha256": cls.hash_of(stated["file"])}
         return stated
 
     @model_validator(mode="after")
-    def _is_as_it_was(self) -> OwnFile:
+    def _check_hash(self) -> OwnFile:
         if self.sha256 != self.hash_of(self.file):
             raise ValueError(f"{self.file}: has changed since the campaign was made from it")
         return self
 
 
 def listed(file: Path, problems: Sequence[str]) -> str:
-    """What is wrong with a file as one message, the first problems of very many."""
-    more = [f"... and {len(problems) - _TOLD} more"] if len(problems) > _TOLD else []
-    return "\n  ".join([f"{file}:", *problems[:_TOLD], *more])
+    """Format the problems of a file as one message, with a maximum number of them."""
+    more = [f"... and {len(problems) - _MAX_PROBLEMS} more"] if len(problems) > _MAX_PROBLEMS else []
+    return "\n  ".join([f"{file}:", *problems[:_MAX_PROBLEMS], *more])

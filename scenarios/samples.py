@@ -1,4 +1,4 @@
-"""Pictures with the truth of their pixels, for learning: what scenarios that have it give, sample by sample."""
+"""Samples for learning: pictures with the truth of their pixels."""
 
 from __future__ import annotations
 
@@ -16,26 +16,15 @@ from marsyard.sim.streams import Streams
 
 @dataclass(frozen=True)
 class Sample:
-    """A picture and what is true of each of its pixels.
+    """A picture and the truth of each pixel.
 
-    Attributes
-    ----------
-    image
-        Counts as delivered, of `bits` bits.
-    bits
-        Of a count.
-    range_m
-        Distance along the pixel's ray to what it sees; infinite for the sky.
-    normal
-        Unit normal of the surface seen, world axes.
-    rocks
-        1 where the pixel sees a rock or another body, 0 where ground.
-    hazard
-        What a lander would stand on there: 0 safe, 1 not, 255 not all in sight; None where no lander is asked about.
-    camera
-        In the body's axes.
-    about
-        The pose, the sun, and whatever else is to be told; plain data.
+    - image: counts of `bits` bits, as delivered
+    - range_m: distance along the pixel's ray to the surface; infinite for the sky
+    - normal: unit normal of the surface, world axes
+    - rocks: 1 for a rock or another body, 0 for ground
+    - hazard: footprint hazard of a lander: 0 safe, 1 hazard, 255 not completely visible; None without a lander
+    - camera: in the body's axes
+    - about: pose, sun and other metadata; plain data
     """
 
     image: UInt16[np.ndarray, "rows columns"]
@@ -49,14 +38,14 @@ class Sample:
 
 
 def summed_rows(rows_summed: int) -> slice:
-    """The rows of a frame whose truth stands for that of a picture's rows: the middle one of each that are summed."""
+    """Select the frame's rows with the truth of a picture's rows: the middle one of each that are summed."""
     return slice(rows_summed // 2, None, rows_summed)
 
 
 @runtime_checkable
 class GivesSamples(Protocol):
-    """A scenario whose cases are pictures to learn from."""
+    """A scenario that provides samples for learning."""
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """The pictures of one case, those that `run` gives to its algorithms."""
+        """Yield the pictures of one case that `run` gives to its algorithms."""
         ...

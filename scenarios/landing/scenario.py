@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from marsyard.algorithms.answers import checked_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.base import TerrainScenario, judged_attempt
+from marsyard.scenarios.conditions import rendered
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import pixel_sample
 from marsyard.scenarios.interface import CaseResult, Scalar
@@ -21,7 +22,6 @@ from marsyard.scenarios.landing.truth import RenderedFlight
 from marsyard.scenarios.landing.world import KEPT_GROUNDS
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredLanding, scored
-from marsyard.scenarios.provenance import rendered
 from marsyard.scenarios.samples import Sample, summed_rows
 from marsyard.scenarios.trial import Judged, attempted_with, case_result
 from marsyard.sim.frames import rigid
