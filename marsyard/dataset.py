@@ -23,8 +23,8 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.running.inputs import plan_inputs
+from marsyard.scenarios.exposure import GivesSamples, Sample
 from marsyard.scenarios.registry import scenario, scenario_names
-from marsyard.scenarios.samples import GivesSamples, Sample
 
 MANIFEST = "dataset.json"
 

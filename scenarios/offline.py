@@ -21,8 +21,14 @@ from marsyard.algorithms.answers import checked_site, checked_velocity
 from marsyard.algorithms.exchange import write_case
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
-from marsyard.scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems, read_lines
-from marsyard.scenarios.own_files import listed
+from marsyard.scenarios.own_files import (
+    cells_by_column,
+    check_together,
+    finite_number,
+    header_problems,
+    listed,
+    read_lines,
+)
 from marsyard.sim.files import check_regular
 from marsyard.sim.measurements import LandingMeasurements
 

@@ -32,13 +32,12 @@ from marsyard.scenarios.descent.score import (
 )
 from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.estimators import VELOCITY
-from marsyard.scenarios.exposure import pixel_sample
+from marsyard.scenarios.exposure import Sample, pixel_sample
 from marsyard.scenarios.faults import faulty_detector
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.optics import Optics
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredDescent, scored
-from marsyard.scenarios.samples import Sample
 from marsyard.scenarios.trial import Judged, case_result
 from marsyard.scenarios.velocity import (
     Horizontal,

@@ -14,9 +14,15 @@ from jaxtyping import Float64
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.csv_rows import cells_by_column, check_together, finite_number, header_problems, read_lines
 from marsyard.scenarios.own_axes import RecordedAxes
-from marsyard.scenarios.own_files import listed
+from marsyard.scenarios.own_files import (
+    cells_by_column,
+    check_together,
+    finite_number,
+    header_problems,
+    listed,
+    read_lines,
+)
 from marsyard.sim.files import check_regular
 from marsyard.sim.frames import direction
 from marsyard.sim.parameters import Parameters

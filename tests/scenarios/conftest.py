@@ -27,7 +27,8 @@ def _unstated(row: Any, stated: StatedColumns, own: tuple[str, ...]) -> list[str
 def _checked(run: Callable[..., CaseResult], stated: StatedColumns) -> Callable[..., CaseResult]:
     def checked(self: Any, parameters: Any, streams: Any) -> CaseResult:
         result = run(self, parameters, streams)
-        named = [one.name for one in getattr(parameters, stated.named_flags)] if stated.named_flags else []
+        entries: Any = getattr(parameters, stated.named_flags, ()) if stated.named_flags else ()
+        named = [one.name for one in entries]
         # columns of a user's own scores begin with the function's name
         specs = getattr(parameters, "scores", None) or getattr(getattr(parameters, "drive", None), "scores", ())
         own = (*named, *(f"{spec.rpartition(':')[2]}_" for spec in specs))
