@@ -54,16 +54,10 @@ def load_campaign(
 ) -> Campaign:
     """Load and validate a campaign. Raises `marsyard.campaigns.errors.CampaignError`.
 
-    Parameters
-    ----------
-    name_or_path
-        A name of `catalogue`, or the path of a TOML file.
-    changes
-        Parameters by dotted path that replace the file's; they are not dispersed.
-    cases, seed
-        Replace the file's.
-    algorithms
-        Replace the file's: the algorithm under test, then the compared ones.
+    - name_or_path: a name of `catalogue`, or the path of a TOML file
+    - changes: parameters by dotted path that replace the file's; they are not dispersed
+    - cases, seed: replace the file's
+    - algorithms: replace the file's: the algorithm under test, then the compared ones
     """
     overrides = [f"{path}={_toml(value)}" for path, value in (changes or {}).items()]
     return loading.load_campaign(str(name_or_path), overrides, cases, seed, algorithms)
@@ -137,15 +131,10 @@ def score(campaign: Campaign, rows: Sequence[CaseResult], metric: str) -> pd.Ser
 def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True, **shot: Any) -> list[Picture]:
     """Render a camera's view of a site: one picture, or the left and right one of a pair. Raises ValueError.
 
-    Parameters
-    ----------
-    site, camera
-        Names, as of `sites` and `marsyard render`; for the site also the path of a DTM (.tif, .npz).
-    detector
-        Whether to expose a detector; otherwise a picture has its radiance alone (`Picture.frame`).
-    **shot
-        Options of `marsyard render`: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
-        sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction.
+    - site, camera: names as in `sites` and `marsyard render`; for the site also the path of a DTM (.tif, .npz)
+    - detector: whether to expose a detector; otherwise a picture has its radiance alone (`Picture.frame`)
+    - shot: options of `marsyard render`: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
+      sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction
     """
     from marsyard.cli.render import Shot, take
 
