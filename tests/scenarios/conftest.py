@@ -27,10 +27,10 @@ def _unstated(row: Any, stated: StatedColumns, own: tuple[str, ...]) -> list[str
 def _checked(run: Callable[..., CaseResult], stated: StatedColumns) -> Callable[..., CaseResult]:
     def checked(self: Any, parameters: Any, streams: Any) -> CaseResult:
         result = run(self, parameters, streams)
-        entries: Any = getattr(parameters, stated.named_flags, ()) if stated.named_flags else ()
-        named = [one.name for one in entries]
+        named = [one.name for one in getattr(parameters, stated.named_flags, ())] if stated.named_flags else []
         # columns of a user's own scores begin with the function's name
-        specs = getattr(parameters, "scores", None) or getattr(getattr(parameters, "drive", None), "scores", ())
+        holder = parameters if getattr(parameters, "scores", ()) else getattr(parameters, "drive", None)
+        specs: tuple[str, ...] = getattr(holder, "scores", ())
         own = (*named, *(f"{spec.rpartition(':')[2]}_" for spec in specs))
         unstated = _unstated(result.row, stated, own)
         assert not unstated, f"columns that scenarios/columns.toml does not state for {self.name}: {unstated}"
