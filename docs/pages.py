@@ -75,7 +75,9 @@ def real_pictures_page() -> str:
         f"| `{key}` | {_kind(field)} | {_default(field)} | {field.description or ''} |"
         for key, field in _fields(IngestFile)
     ]
-    columns = [f"| `{one.name}` | {', '.join(one.tasks)} | {one.needed or 'no'} | {one.what} |" for one in COLUMNS]
+    columns = [
+        f"| `{one.name}` | {', '.join(one.tasks)} | {one.required or 'no'} | {one.description} |" for one in COLUMNS
+    ]
     return "\n".join(
         [
             "# Keys and columns of real pictures",

@@ -1,6 +1,6 @@
-"""Marsyard, a virtual Mars Yard: runs vision software through rendered, truth-known cases and says whether it holds.
+"""Marsyard, a virtual Mars Yard: tests vision software on rendered cases with known truth.
 
-What a notebook needs is here by name, and imported when it is first asked for (`marsyard.api` documents it).
+The names of `marsyard.api` are available here, and imported on first use.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Loads the API with the first of its names, so that the command line starts at once."""
+    """Import the API on first use: the command line starts without it."""
     if name not in __all__:
         raise AttributeError(f"module 'marsyard' has no attribute {name!r}; it has {', '.join(__all__)}")
     from marsyard import api
@@ -57,5 +57,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The API's names."""
+    """Return the names of the module and of the API."""
     return sorted([*globals(), *__all__])

@@ -1,13 +1,13 @@
-"""What a notebook needs: campaigns, cases, views, algorithms and results, in a dozen names. See docs/examples/.
+"""The Python API for notebooks: campaigns, cases, views and results. See docs/examples/.
 
 import marsyard
 
 campaign = marsyard.load_campaign("dimes-smoke", {"terrain.samples": 1024})
-marsyard.draw(campaign, 3)                      # what case 3 draws
-marsyard.run_case(campaign, 3).row              # runs it, here
+marsyard.draw(campaign, 3)                      # the draws of case 3
+marsyard.run_case(campaign, 3).row              # runs the case in this process
 folder = marsyard.run_campaign(campaign, "runs/mine", jobs=2)
 marsyard.results(folder)                        # its rows, a pandas frame
-marsyard.verdicts(folder)                       # its requirements, judged
+marsyard.verdicts(folder)                       # the verdicts on its requirements
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
 
 
 def catalogue() -> list[str]:
-    """Names of the campaigns that ship with Marsyard."""
+    """Return the names of the campaigns that ship with Marsyard."""
     return list(shipped.catalogue())
 
 
 def sites() -> dict[str, str]:
-    """What each site is, by its name."""
-    from marsyard.sim.terrain import sites as known
+    """Return the descriptions of the sites by name."""
+    from marsyard.sim.terrain import sites as presets
 
-    return {name: one.description for name, one in known().items()}
+    return {name: one.description for name, one in presets().items()}
 
 
 def load_campaign(
@@ -52,55 +52,41 @@ def load_campaign(
     seed: int | None = None,
     algorithms: Sequence[str] = (),
 ) -> Campaign:
-    """A campaign of the catalogue, or of a TOML file, checked whole.
+    """Load and validate a campaign. Raises `marsyard.campaigns.errors.CampaignError`.
 
-    Parameters
-    ----------
-    name_or_path
-        A name of `catalogue`, or the path of a file.
-    changes
-        Parameters by their dotted paths, instead of the file's; one that is set so is not dispersed.
-    cases, seed
-        Instead of the file's.
-    algorithms
-        Instead of the file's: the one that is judged, then those that are compared with it.
-
-    Raises
-    ------
-    marsyard.campaigns.errors.CampaignError
-        Where there is none, or something in it is wrong; the message says what, where and what is allowed.
+    - name_or_path: a name of `catalogue`, or the path of a TOML file
+    - changes: parameters by dotted path that replace the file's; they are not dispersed
+    - cases, seed: replace the file's
+    - algorithms: replace the file's: the algorithm under test, then the compared ones
     """
-    stated = [f"{path}={_toml(value)}" for path, value in (changes or {}).items()]
-    return loading.load_campaign(str(name_or_path), stated, cases, seed, algorithms)
+    overrides = [f"{path}={_toml(value)}" for path, value in (changes or {}).items()]
+    return loading.load_campaign(str(name_or_path), overrides, cases, seed, algorithms)
 
 
 def draw(campaign: Campaign, case: int) -> dict[str, Any]:
-    """What each dispersion draws for a case, by the path of its parameter."""
+    """Return the draws of a case by the path of the dispersed parameter."""
     return campaign.draws(case)
 
 
 def draws(campaign: Campaign, cases: int) -> pd.DataFrame:
-    """What the first cases draw: a row each."""
+    """Return the draws of the first cases, one row per case."""
     import pandas as pd
 
     return pd.DataFrame([campaign.draws(case) for case in range(cases)]).rename_axis("case")
 
 
 def run_case(campaign: Campaign, case: int) -> CaseResult:
-    """Runs one case in this process: its outcome, its row, and its pictures and intermediate results (`products`).
+    """Run one case in this process; return its outcome, row, and pictures and intermediate results (`products`).
 
-    The row is that which `run_campaign` stores for it. A terrain that is not on the disk is built first.
+    The row equals the one that `run_campaign` stores. A terrain that is not on the disk is built first.
     """
     return campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
 
 
 def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) -> Path:
-    """Runs a whole campaign into a new folder, with its report, and returns the folder.
+    """Run a whole campaign into a new folder, write its report, and return the folder.
 
-    Raises
-    ------
-    marsyard.campaigns.errors.CampaignError
-        Where the folder is there already, or cannot be written.
+    Raises `marsyard.campaigns.errors.CampaignError` where the folder exists or cannot be written.
     """
     from rich.console import Console
 
@@ -118,7 +104,7 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
 
 
 def results(directory: str | Path) -> pd.DataFrame:
-    """The rows of a campaign that was run: one for each case, with its outcome, errors and what it drew."""
+    """Return the rows of a finished campaign: outcome, errors and draws, one row per case."""
     from marsyard.campaigns.store.table import refresh_table
     from marsyard.cli.outcome import read_frame
 
@@ -127,7 +113,7 @@ def results(directory: str | Path) -> pd.DataFrame:
 
 
 def verdicts(directory: str | Path) -> Sequence[Verdict]:
-    """The requirements of a campaign that was run, judged on its rows."""
+    """Evaluate the requirements of a finished campaign."""
     from marsyard.campaigns.store.table import refresh_table
     from marsyard.reports.evaluation import judged
 
@@ -136,29 +122,19 @@ def verdicts(directory: str | Path) -> Sequence[Verdict]:
 
 
 def score(campaign: Campaign, rows: Sequence[CaseResult], metric: str) -> pd.Series[Any]:
-    """One column of the rows of cases that were run, NaN where a case has none."""
+    """Return one column of the rows of finished cases; NaN where a case does not have it."""
     import pandas as pd
 
     return pd.Series([one.row.get(metric, float("nan")) for one in rows], name=metric).rename_axis("case")
 
 
 def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True, **shot: Any) -> list[Picture]:
-    """What a camera sees of a site: the picture, or the left and the right one of a pair.
+    """Render a camera's view of a site: one picture, or the left and right one of a pair. Raises ValueError.
 
-    Parameters
-    ----------
-    site, camera
-        Names, as of `sites` and `marsyard render`; for the site also the path of a DTM (.tif, .npz).
-    detector
-        Whether to expose a detector; without, a picture has its radiance alone (`Picture.frame`).
-    **shot
-        As `marsyard render` takes them: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
-        sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction.
-
-    Raises
-    ------
-    ValueError
-        For a name that is not known, or a value that cannot be.
+    - site, camera: names as in `sites` and `marsyard render`; for the site also the path of a DTM (.tif, .npz)
+    - detector: whether to expose a detector; otherwise a picture has its radiance alone (`Picture.frame`)
+    - shot: options of `marsyard render`: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
+      sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction
     """
     from marsyard.cli.render import Shot, take
 
@@ -166,7 +142,7 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
 
 
 def _toml(value: Any) -> str:
-    """A value in TOML's notation, of which JSON's scalars and lists are part."""
+    """Format a value in TOML's notation."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{json.dumps(str(key))} = {_toml(inner)}" for key, inner in value.items()) + " }"
     if isinstance(value, list | tuple):

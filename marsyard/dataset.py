@@ -1,10 +1,9 @@
-"""Data sets for learning: a campaign's pictures and their truth, in shards that any WebDataset reader takes.
+"""Write data sets for learning: a campaign's pictures with their truth, as shards in the WebDataset format.
 
-A shard is a tar of whole cases. Of each picture it holds, under one key, the 16-bit picture (`image.png`), range
-(`range.npy`, m), normals (`normal.npy`, world axes), masks (`rocks.png`; of landings `hazard.png`: 0 safe, 1 not, 255
-not known),
-the camera (`cahvor`) and all else (`json`). A shard that is there is whole, and never written again: a data set that
-was interrupted is gone on with, and the same campaign makes the same bytes.
+A shard is a tar file of whole cases. Per picture it holds, under one key, the 16-bit picture (`image.png`), range
+(`range.npy`, m), normals (`normal.npy`, world axes), masks (`rocks.png`; for landings `hazard.png`: 0 safe, 1 hazard,
+255 unknown), the camera (`cahvor`) and metadata (`json`). Existing shards are complete and not written again: an
+interrupted data set continues, and the same campaign gives the same bytes.
 """
 
 from __future__ import annotations
@@ -24,25 +23,22 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.running.inputs import plan_inputs
+from marsyard.scenarios.exposure import GivesSamples, Sample
 from marsyard.scenarios.registry import scenario, scenario_names
-from marsyard.scenarios.samples import GivesSamples, Sample
 
 MANIFEST = "dataset.json"
 
 
 def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: int) -> list[Path]:
-    """Writes the shards that are not there yet; returns all.
+    """Write the missing shards; return the paths of all.
 
-    Raises
-    ------
-    CampaignError
-        Where the scenario gives no samples, the folder holds another data set, or cannot be written.
+    Raises CampaignError where the scenario gives no samples, or the folder holds another data set or is not writable.
     """
     if not isinstance(campaign.scenario, GivesSamples):
-        named = campaign.configuration.scenario
+        name = campaign.configuration.scenario
         allowed = ", ".join(name for name in scenario_names() if isinstance(scenario(name), GivesSamples))
-        raise CampaignError(f"the scenario '{named}' gives no samples to learn from; allowed: {allowed}")
-    _claim(campaign, folder, cases_per_shard)
+        raise CampaignError(f"the scenario '{name}' gives no samples to learn from; allowed: {allowed}")
+    _write_manifest(campaign, folder, cases_per_shard)
     total = campaign.configuration.total_cases
     starts = range(0, total, cases_per_shard)
     paths = [folder / f"shard-{number:06d}.tar" for number in range(len(starts))]
@@ -54,16 +50,22 @@ def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: 
     if missing:
         from joblib import Parallel, delayed
 
-        # before the processes start, so that none builds what another does
-        _prepare(campaign, itertools.chain.from_iterable(cases for _, cases in missing))
+        # before the processes start, which would each build them
+        _prepare_inputs(campaign, itertools.chain.from_iterable(cases for _, cases in missing))
         Parallel(n_jobs=jobs)(delayed(_write_shard)(campaign, path, cases) for path, cases in missing)
     return paths
 
 
-def _claim(campaign: Campaign, folder: Path, cases_per_shard: int) -> None:
-    """Notes what the folder's data set is, or raises StoreError where it is another."""
+def _prepare_inputs(campaign: Campaign, cases: Iterable[int]) -> None:
+    base = campaign.base_parameters()
+    for number in plan_inputs(campaign, cases).to_prepare:
+        campaign.scenario.prepare(base, number)
+
+
+def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int) -> None:
+    """Write the manifest of the data set. Raises StoreError where the folder holds another data set."""
     configuration = campaign.configuration
-    told = {
+    manifest = {
         "campaign": configuration.name,
         "cases_per_shard": cases_per_shard,
         "configuration_sha256": configuration_hash(configuration),
@@ -75,41 +77,34 @@ def _claim(campaign: Campaign, folder: Path, cases_per_shard: int) -> None:
         if path.exists():
             before = json.loads(path.read_text(encoding="utf-8"))
             for key in ("configuration_sha256", "cases_per_shard"):
-                if before.get(key) != told[key]:
+                if before.get(key) != manifest[key]:
                     raise StoreError(f"{folder} holds another data set ({key} differs); choose another folder")
             return
-        path.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
     except (OSError, ValueError) as error:
         raise StoreError(f"{path}: cannot be used: {error}") from error
 
 
-def _prepare(campaign: Campaign, cases: Iterable[int]) -> None:
-    """Builds the shared inputs that cases use."""
-    base = campaign.base_parameters()
-    for number in plan_inputs(campaign, cases).to_prepare:
-        campaign.scenario.prepare(base, number)
-
-
 def _write_shard(campaign: Campaign, path: Path, cases: range) -> None:
-    """One shard, under its own name only when it is whole."""
+    """Write one shard under a temporary name, and rename it when it is complete."""
     part = path.with_suffix(".part")
     with tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as shard:
         for case in cases:
             for name, contents in _files(campaign, case):
-                about = tarfile.TarInfo(name)
-                about.size = len(contents)
-                shard.addfile(about, io.BytesIO(contents))
+                entry = tarfile.TarInfo(name)
+                entry.size = len(contents)
+                shard.addfile(entry, io.BytesIO(contents))
     part.replace(path)
 
 
 def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of a case's files."""
+    """Yield names and contents of a case's files."""
     scenario = campaign.scenario
-    assert isinstance(scenario, GivesSamples)  # noqa: S101  (said by who calls)
+    assert isinstance(scenario, GivesSamples)  # noqa: S101  (checked by `write_dataset`)
     drawn = campaign.draws(case)
     for number, sample in enumerate(scenario.samples(campaign.parameters(case), campaign.streams(case))):
         key = f"{case:07d}-{number}"
-        told = {"campaign": campaign.configuration.name, "case": case, "picture": number, "drawn": drawn}
+        metadata = {"campaign": campaign.configuration.name, "case": case, "picture": number, "drawn": drawn}
         yield f"{key}.image.png", _png(sample.image * np.uint16(2 ** (16 - sample.bits)))
         yield f"{key}.range.npy", _npy(sample.range_m)
         yield f"{key}.normal.npy", _npy(sample.normal)
@@ -117,14 +112,14 @@ def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
         if sample.hazard is not None:
             yield f"{key}.hazard.png", _png(sample.hazard)
         yield f"{key}.cahvor", _camera(sample)
-        yield f"{key}.json", json.dumps({**told, "bits": sample.bits, **sample.about}, indent=1).encode()
+        yield f"{key}.json", json.dumps({**metadata, "bits": sample.bits, **sample.about}, indent=1).encode()
 
 
 def _png(values: np.ndarray[Any, Any]) -> bytes:
     import cv2
 
-    done, encoded = cv2.imencode(".png", values)
-    if not done:
+    written, encoded = cv2.imencode(".png", values)
+    if not written:
         raise ValueError("a picture could not be written as PNG")
     return encoded.tobytes()
 

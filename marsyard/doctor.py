@@ -1,7 +1,7 @@
-"""``marsyard doctor``: whether a campaign can run here, and how to mend what is amiss.
+"""``marsyard doctor``: check that a campaign can run on this machine, and name the remedy of each fault.
 
-Whatever may end a process (a driver, a broken library) is tried in a process of its own. Nothing of Marsyard but the
-probe is imported before it is known to be ours: this is what people run when imports fail.
+Drivers and libraries, which may crash the process, are tested in separate processes. Of Marsyard only the probe is
+imported at first: users run this command when imports fail.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ PROBE_LIMIT_S = 30.0
 
 
 class Verdict(Enum):
-    """What a check came to; only FAIL keeps a campaign from running."""
+    """Result of a check; only FAIL prevents a campaign from running."""
 
     OK = "green"
     WARN = "yellow"
@@ -61,35 +61,35 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the examination: what was looked at, what was found, and how to mend it where it is amiss."""
+    """One check: its name, the finding, and the remedy of a fault."""
 
     name: str
-    found: str
+    finding: str
     verdict: Verdict = Verdict.OK
-    mend: str = ""
+    remedy: str = ""
 
 
 def run(console: Console, *, as_json: bool = False) -> int:
-    """Examines the machine and the installation, and prints a table or JSON; 0 if a campaign can run here, else 1."""
+    """Print all checks as a table or JSON; return 0 if a campaign can run here, else 1."""
     checks = list(examine())
     failed = [check.name for check in checks if check.verdict is Verdict.FAIL]
     if as_json:
-        told = {"version": importlib.metadata.version("marsyard"), "root": str(ROOT), "can_run": not failed}
-        plain = [
-            {"check": check.name, "found": check.found, "verdict": check.verdict.name.lower(), "mend": check.mend}
+        summary = {"version": importlib.metadata.version("marsyard"), "root": str(ROOT), "can_run": not failed}
+        rows = [
+            {"check": check.name, "found": check.finding, "verdict": check.verdict.name.lower(), "mend": check.remedy}
             for check in checks
         ]
-        console.print(json.dumps({**told, "checks": plain}, indent=2), markup=False, highlight=False, soft_wrap=True)
+        console.print(json.dumps({**summary, "checks": rows}, indent=2), markup=False, highlight=False, soft_wrap=True)
         return 1 if failed else 0
     table = Table(title=f"Marsyard {importlib.metadata.version('marsyard')} in {ROOT}", title_justify="left")
     for heading in ("check", "found", "verdict"):
         table.add_column(heading, overflow="fold")
     for check in checks:
-        table.add_row(Text(check.name), Text(check.found), Text(check.verdict.name.lower(), check.verdict.value))
+        table.add_row(Text(check.name), Text(check.finding), Text(check.verdict.name.lower(), check.verdict.value))
     console.print(table)
     for check in checks:
-        if check.mend:
-            console.print(Text(f"{check.name}: {check.mend}"), soft_wrap=True)
+        if check.remedy:
+            console.print(Text(f"{check.name}: {check.remedy}"), soft_wrap=True)
     if failed:
         console.print(Text(f"A campaign cannot run here: {', '.join(failed)}.", "red"), soft_wrap=True)
         return 1
@@ -98,7 +98,7 @@ def run(console: Console, *, as_json: bool = False) -> int:
 
 
 def examine() -> Iterator[Check]:
-    """All checks, in the order of the table; the slow ones run side by side."""
+    """Run all checks, in the order of the table; the slow ones run in parallel."""
     with ThreadPoolExecutor() as pool:
         rendering = {backend: pool.submit(probe_backend, backend) for backend in BACKENDS}
         imports = pool.submit(import_failures, _dependency_modules())
@@ -114,33 +114,30 @@ def examine() -> Iterator[Check]:
     yield from check_systems()
 
 
-# --- Python and its packages ------------------------------------------------------------------------------------------
-
-
 def check_python() -> Check:
-    """Interpreter and operating system."""
-    found = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    """Check the interpreter and the operating system."""
+    finding = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
     wanted = importlib.metadata.metadata("marsyard")["Requires-Python"]
     if platform.python_version() not in SpecifierSet(wanted):
-        return Check("python", f"{found}; {wanted} is needed", Verdict.FAIL, f"install Python {wanted}")
+        return Check("python", f"{finding}; {wanted} is needed", Verdict.FAIL, f"install Python {wanted}")
     if sys.platform != "linux":
-        return Check("python", found, Verdict.WARN, "Marsyard is tested on Linux only")
-    return Check("python", found)
+        return Check("python", finding, Verdict.WARN, "Marsyard is tested on Linux only")
+    return Check("python", finding)
 
 
 def check_optimisation(assertions: bool) -> Check:
-    """Whether `assert` statements run: pyrender makes GL calls inside them."""
+    """Check that `assert` statements run: pyrender makes GL calls inside them."""
     if assertions:
         return Check("assertions", "on")
     return Check("assertions", "off (python -O)", Verdict.FAIL, "run Python without -O and unset PYTHONOPTIMIZE")
 
 
 def check_shadowing() -> Iterator[Check]:
-    """Whether Python imports this package, and no distribution is installed over another."""
+    """Check that Python imports this package, and that no distribution is installed over another."""
     origin = _origin(PACKAGE)
     if origin != ROOT / PACKAGE:
-        mend = "uninstall what brought it, unset PYTHONPATH, or leave the folder that holds it; then " + REINSTALL
-        yield Check("package shadowing", f"another package comes first: {PACKAGE} from {origin}", Verdict.FAIL, mend)
+        remedy = "uninstall what brought it, unset PYTHONPATH, or leave the folder that holds it; then " + REINSTALL
+        yield Check("package shadowing", f"another package comes first: {PACKAGE} from {origin}", Verdict.FAIL, remedy)
     else:
         yield Check("package shadowing", f"{PACKAGE} is imported from {origin}")
     owners = importlib.metadata.packages_distributions().get(PACKAGE, [])
@@ -163,7 +160,7 @@ def check_shadowing() -> Iterator[Check]:
 
 
 def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
-    """Versions of the dependencies against pyproject.toml and constraints.txt; `failures` by module, from importing."""
+    """Check the versions against pyproject.toml and constraints.txt; `failures` are those of `import_failures`."""
     pins = _pins()
     sound, unpinned = 0, []
     for requirement in _requirements():
@@ -185,16 +182,16 @@ def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
 
 
 def import_failures(modules: Iterable[str]) -> dict[str, str]:
-    """What went wrong with importing each module in a process of its own, by module; sound ones are left out."""
+    """Import modules in a separate process; return the errors by module."""
     waiting = list(modules)
     failures: dict[str, str] = {}
     while waiting:
-        ended = _child("-c", _IMPORT_ALL, *waiting)
+        ended = _run_python("-c", _IMPORT_ALL, *waiting)
         reached = [json.loads(line) for line in ended.stdout.splitlines()]
         failures |= {name: fault for name, fault in reached if fault}
         waiting = waiting[len(reached) :]
-        if waiting:  # this one took the process with it
-            failures[waiting.pop(0)] = _last_words(ended)
+        if waiting:  # this one crashed the process
+            failures[waiting.pop(0)] = _failure_reason(ended)
     return failures
 
 
@@ -211,13 +208,13 @@ for name in sys.argv[1:]:
 
 
 def _requirements() -> list[Requirement]:
-    """What the installed distribution needs, extras left out."""
+    """Return the requirements of the installed distribution without extras."""
     requirements = [Requirement(text) for text in importlib.metadata.requires("marsyard") or []]
     return [r for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
 
 
 def _pins() -> dict[str, str]:
-    """The versions of constraints.txt by canonical name; none where there is no checkout."""
+    """Return the versions of constraints.txt by canonical name; empty without a checkout."""
     file = ROOT / "constraints.txt"
     lines = file.read_text().split() if file.is_file() else []
     return {canonicalize_name(name): version for name, _, version in (line.partition("==") for line in lines)}
@@ -228,7 +225,7 @@ def _module(distribution: str) -> str:
 
 
 def _dependency_modules() -> list[str]:
-    """Modules to import; pyrender is left to the rendering of a frame, as it loads a GL library at once."""
+    """Return the modules to import, without pyrender: it loads a GL library at import, which `probe_backend` tests."""
     names = (_module(canonicalize_name(requirement.name)) for requirement in _requirements())
     return [name for name in names if name != "pyrender"]
 
@@ -241,37 +238,34 @@ def _version(distribution: str) -> str | None:
 
 
 def _origin(package: str) -> Path | None:
-    """The folder that Python would import a top-level package from."""
+    """Return the folder from which Python imports a top-level package."""
     spec = importlib.util.find_spec(package)
     if spec is None:
         return None
     if spec.origin is not None:
         return Path(spec.origin).resolve().parent
-    return next((Path(place).resolve() for place in spec.submodule_search_locations or ()), None)
-
-
-# --- rendering --------------------------------------------------------------------------------------------------------
+    return next((Path(folder).resolve() for folder in spec.submodule_search_locations or ()), None)
 
 
 @dataclass(frozen=True)
 class Probe:
-    """How rendering a frame with one backend ended: what was measured, or why there is nothing."""
+    """Measurements of a frame rendered with one backend, or the reason for the failure."""
 
     measured: Mapping[str, Any] | None
     fault: str = ""
 
 
 def probe_backend(backend: str) -> Probe:
-    """Renders a frame with this backend in a process of its own."""
-    ended = _child("-P", str(Path(gl_probe.__file__)), backend)
+    """Render a frame with a backend in a separate process."""
+    ended = _run_python("-P", str(Path(gl_probe.__file__)), backend)
     try:
         return Probe(json.loads(ended.stdout.splitlines()[-1]))
     except (IndexError, ValueError):
-        return Probe(None, _last_words(ended))
+        return Probe(None, _failure_reason(ended))
 
 
 def check_rendering(probes: Mapping[str, Probe]) -> Iterator[Check]:
-    """One line a backend, and one for the backend that a campaign would use."""
+    """Check each backend, and the one that a campaign would use."""
     sound = []
     for backend, probe in probes.items():
         check = _check_backend(backend, probe)
@@ -285,110 +279,106 @@ def check_rendering(probes: Mapping[str, Probe]) -> Iterator[Check]:
     elif wanted in sound:
         yield Check("GL backend in use", wanted)
     elif sound:
-        mend = f"export MARSYARD_GL={sound[0]}, or install {BACKENDS[wanted]}"
-        yield Check("GL backend in use", f"{wanted}, which does not work; {sound[0]} does", Verdict.WARN, mend)
+        remedy = f"export MARSYARD_GL={sound[0]}, or install {BACKENDS[wanted]}"
+        yield Check("GL backend in use", f"{wanted}, which does not work; {sound[0]} does", Verdict.WARN, remedy)
     else:
         yield Check("GL backend in use", "none works", Verdict.FAIL, f"sudo apt-get install {BACKENDS[wanted]}")
 
 
 def _check_backend(backend: str, probe: Probe) -> Check:
     name = f"GL: {backend}"
-    mend = f"sudo apt-get install {BACKENDS[backend]}"
+    remedy = f"sudo apt-get install {BACKENDS[backend]}"
     if probe.measured is None:
-        return Check(name, probe.fault, Verdict.WARN, mend)
+        return Check(name, probe.fault, Verdict.WARN, remedy)
     measured = probe.measured
-    found = f"{measured['renderer']}, {measured['version']}"
+    finding = f"{measured['renderer']}, {measured['version']}"
     error_m, offset = measured["depth_error_m"], measured["offset_px"]
     if not measured["lit"] or error_m > gl_probe.DEPTH_TOLERANCE_M:
         fault = f"; wrong picture: depth of a known plane off by {error_m:.3g} m"
-        return Check(name, found + fault, Verdict.WARN, "use the other backend, or another driver")
-    found += f"; depth right to {error_m * 1e3:.2g} mm at {gl_probe.DISTANCE_M:.0f} m"
+        return Check(name, finding + fault, Verdict.WARN, "use the other backend, or another driver")
+    finding += f"; depth right to {error_m * 1e3:.2g} mm at {gl_probe.DISTANCE_M:.0f} m"
     if max(map(abs, offset)) > gl_probe.OFFSET_TOLERANCE_PX:
-        found += (
+        finding += (
             f"; pyrender alone samples it ({offset[0]:+.3f}, {offset[1]:+.3f}) px off-centre, Marsyard at the centre"
         )
-    return Check(name, found)
-
-
-# --- the machine ------------------------------------------------------------------------------------------------------
+    return Check(name, finding)
 
 
 def check_numba_cache() -> Check:
-    """Whether compiled kernels can be kept; where not, every process compiles them anew."""
+    """Check that compiled kernels can be cached; otherwise every process compiles them again."""
     with contextlib.suppress(ImportError):
-        importlib.import_module("marsyard.sim")  # which sets numba's folder, unless the user has
-    place = Path(os.environ.get("NUMBA_CACHE_DIR", Path.home() / ".cache" / "numba"))
-    if _writable(place):
-        return Check("numba cache", f"{place} is writable")
+        importlib.import_module("marsyard.sim")  # sets numba's folder, unless the user has
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR", Path.home() / ".cache" / "numba"))
+    if _is_writable(folder):
+        return Check("numba cache", f"{folder} is writable")
     return Check(
-        "numba cache", f"cannot write to {place}", Verdict.WARN, "export NUMBA_CACHE_DIR=FOLDER, one you may write to"
+        "numba cache", f"cannot write to {folder}", Verdict.WARN, "export NUMBA_CACHE_DIR=FOLDER, one you may write to"
     )
 
 
 def check_disk() -> Iterator[Check]:
-    """Room where campaigns are written, and where terrains are kept."""
-    yield _check_room("disk, this folder", Path.cwd(), "free some, or run campaigns elsewhere with --out")
-    mend = "export MARSYARD_CACHE=FOLDER, one with room that you may write to"
+    """Check the disk space for campaigns and for terrains."""
+    yield _check_disk_space("disk, this folder", Path.cwd(), "free some, or run campaigns elsewhere with --out")
+    remedy = "export MARSYARD_CACHE=FOLDER, one with room that you may write to"
     try:
         from marsyard.sim.cache import cache_directory
 
         cache = cache_directory("terrain")
     except (ImportError, OSError) as error:
-        yield Check("disk, cache", str(error), Verdict.FAIL, mend)
+        yield Check("disk, cache", str(error), Verdict.FAIL, remedy)
         return
-    yield _check_room("disk, cache", cache, mend)
+    yield _check_disk_space("disk, cache", cache, remedy)
 
 
-def _check_room(name: str, folder: Path, mend: str) -> Check:
+def _check_disk_space(name: str, folder: Path, remedy: str) -> Check:
     free = shutil.disk_usage(folder).free // MEBI
-    found = f"{free} MiB free in {folder}"
-    if not _writable(folder):
-        return Check(name, f"cannot write to {folder}", Verdict.FAIL, mend)
-    if free < 100:
-        return Check(name, found, Verdict.FAIL, mend)
-    return Check(name, found, Verdict.WARN if free < 1024 else Verdict.OK, mend if free < 1024 else "")
+    finding = f"{free} MiB free in {folder}"
+    if not _is_writable(folder):
+        return Check(name, f"cannot write to {folder}", Verdict.FAIL, remedy)
+    if free >= 1024:
+        return Check(name, finding)
+    return Check(name, finding, Verdict.FAIL if free < 100 else Verdict.WARN, remedy)
 
 
 def check_machine() -> Check:
-    """Cores and memory; a worker needs about half a GiB."""
+    """Check cores and memory; a worker needs about half a GiB."""
     cores, memory = _cores(), _memory_mib()
-    found = f"{cores} cores, {memory} MiB of memory"
+    finding = f"{cores} cores, {memory} MiB of memory"
     if memory < 512 * cores:
-        return Check("cores and memory", found, Verdict.WARN, f"run with --jobs {max(1, memory // 512)}")
-    return Check("cores and memory", found)
+        return Check("cores and memory", finding, Verdict.WARN, f"run with --jobs {max(1, memory // 512)}")
+    return Check("cores and memory", finding)
 
 
 def check_threads(environment: Mapping[str, str], cores: int) -> Check:
-    """Thread counts asked for by the environment: more than cores only makes workers wait for each other."""
-    asked = {name: environment[name] for name in THREAD_VARIABLES if environment.get(name)}
-    found = ", ".join(f"{name}={value}" for name, value in asked.items()) or "left to the libraries"
-    if any(not value.isdigit() or int(value) > cores for value in asked.values()):
-        return Check("threads", found, Verdict.WARN, f"unset {' '.join(asked)}")
-    return Check("threads", found)
+    """Check the thread counts of the environment: more threads than cores slow the workers down."""
+    counts = {name: environment[name] for name in THREAD_VARIABLES if environment.get(name)}
+    finding = ", ".join(f"{name}={value}" for name, value in counts.items()) or "left to the libraries"
+    if any(not value.isdigit() or int(value) > cores for value in counts.values()):
+        return Check("threads", finding, Verdict.WARN, f"unset {' '.join(counts)}")
+    return Check("threads", finding)
 
 
 def check_systems() -> Iterator[Check]:
-    """The systems under test: those of Marsyard and of other packages, and those that are left out."""
+    """Check the systems under test of Marsyard and of other packages."""
     try:
         from marsyard.scenarios.systems import BUILT_IN, registry
 
-        found = registry()
+        systems = registry()
     except ImportError as error:
         yield Check("systems", f"cannot be read: {error}", Verdict.FAIL, REINSTALL)
         return
-    others = ", ".join(one.name for one in found.systems[len(BUILT_IN) :])
+    others = ", ".join(one.name for one in systems.systems[len(BUILT_IN) :])
     yield Check("systems", f"{len(BUILT_IN)} of Marsyard; of other packages: {others or 'none'}")
-    for problem in found.problems:
+    for problem in systems.problems:
         yield Check("systems", problem, Verdict.WARN, "correct or uninstall the package that has the system")
 
 
 def _cores() -> int:
-    """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _memory_mib() -> int:
-    """Memory of the machine, or of the control group where that has less."""
+    """Return the memory of the machine, or of the control group if that is smaller."""
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     group = Path("/sys/fs/cgroup/memory.max")
     if group.is_file() and (text := group.read_text().strip()).isdigit():
@@ -396,7 +386,7 @@ def _memory_mib() -> int:
     return min(limits) // MEBI
 
 
-def _writable(folder: Path) -> bool:
+def _is_writable(folder: Path) -> bool:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -405,11 +395,8 @@ def _writable(folder: Path) -> bool:
         return False
 
 
-# --- processes --------------------------------------------------------------------------------------------------------
-
-
-def _child(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Runs this Python with these arguments; a process that hangs is ended and counts as failed."""
+def _run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run this Python with arguments; a process that hangs is stopped and counts as failed."""
     command = [sys.executable, *arguments]
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=PROBE_LIMIT_S, check=False)  # noqa: S603
@@ -418,7 +405,7 @@ def _child(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(command, -1, printed, f"no answer within {PROBE_LIMIT_S:.0f} s")
 
 
-def _last_words(ended: subprocess.CompletedProcess[str]) -> str:
-    """The last line that a failed process wrote, or how it ended."""
+def _failure_reason(ended: subprocess.CompletedProcess[str]) -> str:
+    """Return the last line that a failed process wrote, or its exit status."""
     lines = [line.strip() for line in ended.stderr.splitlines() if line.strip()]
     return lines[-1] if lines else f"the process ended with status {ended.returncode}"

@@ -1,8 +1,7 @@
-"""Renders one small frame with one GL backend and checks its depth: ``python -P gl_probe.py osmesa``.
+"""Render a small frame with one GL backend and check its depth: ``python -P gl_probe.py osmesa``.
 
-A program of its own, because a backend is chosen by the environment before PyOpenGL is first imported, and because a
-broken driver ends the process it runs in. It imports nothing of Marsyard: set-up runs it too. The result is one line of
-JSON on standard output.
+A separate program: PyOpenGL reads the backend from the environment at import, and a broken driver crashes its process.
+It imports nothing of Marsyard, as set-up runs it too. The result is one line of JSON on standard output.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ FOCAL_PX = 96.0
 NEAR_M, FAR_M = 40.0, 400.0
 #: The planes ``z = -DISTANCE_M + TILT x`` and ``z = -DISTANCE_M + TILT y`` before a camera that looks along -z.
 DISTANCE_M, TILT = 100.0, 0.5
-#: Depth may be wrong by this much, metres: 24 bits between near and far resolve 1e-5 m here.
+#: Tolerance of the depth, metres: 24 bits between near and far resolve 1e-5 m here.
 DEPTH_TOLERANCE_M = 2e-3
-#: A backend that samples the depth farther than this from the pixel's centre is reported to do so, pixels.
+#: Tolerance of the offset of the depth sample from the pixel's centre, pixels; larger offsets are reported.
 OFFSET_TOLERANCE_PX = 0.01
 
 
 def probe(backend: str) -> dict[str, Any]:
-    """Renders two tilted planes with the backend and compares the depth of every pixel with their equations."""
+    """Render two tilted planes with the backend and compare the depth of every pixel with their equations."""
     os.environ["PYOPENGL_PLATFORM"] = backend
     import numpy as np
     import trimesh
@@ -33,7 +32,7 @@ def probe(backend: str) -> dict[str, Any]:
         import pyrender
         from OpenGL import GL
     except (AttributeError, ImportError) as error:
-        # PyOpenGL notices a missing library only when it looks for a function in it
+        # PyOpenGL detects a missing library only when it looks up a function in it
         raise SystemExit(f"its libraries do not load ({error})") from None
 
     x, y = (axis.ravel() for axis in np.meshgrid([-400.0, 400.0], [-400.0, 400.0]))
@@ -50,18 +49,18 @@ def probe(backend: str) -> dict[str, Any]:
             scene.add(pyrender.Mesh.from_trimesh(plane, smooth=False))
             scene.add(camera, pose=np.eye(4))
             colour, depth = renderer.render(scene)
-            # where on the plane the depth was taken: a sample beside the pixel's centre sees another place
+            # position on the plane at which the depth was sampled, which may be off the pixel's centre
             sampled = (DISTANCE_M / depth - 1.0) * FOCAL_PX / TILT
             offset = float(np.mean(sampled - pixels))
             offsets_px.append(offset)
             errors_m.append(float(np.abs(depth - DISTANCE_M / (1.0 + TILT * (pixels + offset) / FOCAL_PX)).max()))
             lit = lit and bool(colour.any())
-        found = {name: GL.glGetString(getattr(GL, f"GL_{name}")).decode() for name in ("RENDERER", "VERSION")}
+        strings = {name: GL.glGetString(getattr(GL, f"GL_{name}")).decode() for name in ("RENDERER", "VERSION")}
     finally:
         renderer.delete()
     return {
-        "renderer": found["RENDERER"],
-        "version": found["VERSION"],
+        "renderer": strings["RENDERER"],
+        "version": strings["VERSION"],
         "depth_error_m": max(errors_m),
         "offset_px": [offsets_px[0], -offsets_px[1]],
         "lit": lit,

@@ -1,1 +1,1 @@
-"""World, trajectory, instruments and score joined into cases; the catalogue of campaigns as data files."""
+"""Scenarios combine world, trajectory, instruments and score into cases; the catalogue of campaigns as data files."""

@@ -1,4 +1,4 @@
-"""What scenarios share: the check of their parameters' type, and shared inputs that are terrains of a bank."""
+"""Base classes of scenarios: typed parameters, and terrains of a bank as shared inputs."""
 
 from __future__ import annotations
 
@@ -14,42 +14,35 @@ from marsyard.scenarios.trial import Attempt, Judged
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.terrain import Site, TerrainBank, TerrainParameters
 
-Stated = TypeVar("Stated", bound=BaseModel)
+ParametersType = TypeVar("ParametersType", bound=BaseModel)
 
 #: Loads terrain `number` of the bank of a site: site, terrain, seed of the bank, number.
 LoadGround = Callable[[Site, TerrainParameters, int, int], SiteGround]
 
 
-class BaseScenario(Generic[Stated]):
-    """A scenario whose parameters are of one type. Subclasses state `name` and `parameters_type`."""
+class BaseScenario(Generic[ParametersType]):
+    """A scenario with one type of parameters. Subclasses define `name` and `parameters_type`."""
 
     name: str
-    parameters_type: type[Stated]
+    parameters_type: type[ParametersType]
 
-    def checked(self, parameters: BaseModel) -> Stated:
-        """Return the parameters. Raises TypeError where they are another scenario's."""
+    def checked(self, parameters: BaseModel) -> ParametersType:
+        """Return the parameters with their type. Raises TypeError for those of another scenario."""
         if not isinstance(parameters, self.parameters_type):
-            expected, found = self.parameters_type.__name__, type(parameters).__name__
-            raise TypeError(f"the scenario {self.name} takes {expected}, not {found}")
+            expected, given = self.parameters_type.__name__, type(parameters).__name__
+            raise TypeError(f"the scenario {self.name} takes {expected}, not {given}")
         return parameters
 
 
-class TerrainScenario(BaseScenario[Stated], ABC):
-    """A scenario whose shared inputs are terrains.
+class TerrainScenario(BaseScenario[ParametersType], ABC):
+    """A scenario whose shared inputs are terrains; keeps the most recently used grounds in memory."""
 
-    Parameters
-    ----------
-    grounds
-        Grounds that are kept in memory, the least recently used ones dropped first. A ground is a function of its
-        key: which ones are kept changes no result.
-    """
-
-    def __init__(self, grounds: int = 0) -> None:
-        self.load_ground: LoadGround = lru_cache(maxsize=grounds)(SiteGround.from_bank)
+    def __init__(self, cached_grounds: int = 0) -> None:
+        self.load_ground: LoadGround = lru_cache(maxsize=cached_grounds)(SiteGround.from_bank)
 
     @abstractmethod
-    def input_terrain(self, p: Stated, shared_input: int) -> tuple[TerrainBank, int]:
-        """The bank of a shared input, and the number of its terrain there."""
+    def input_terrain(self, p: ParametersType, shared_input: int) -> tuple[TerrainBank, int]:
+        """Return the bank of a shared input, and the number of its terrain there."""
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Build one terrain into the cache on disk."""
@@ -57,7 +50,7 @@ class TerrainScenario(BaseScenario[Stated], ABC):
         bank.terrain(number)
 
     def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
-        """Bytes of a terrain that is not on disk."""
+        """Return the bytes of a terrain that is not on disk."""
         bank, number = self.input_terrain(self.checked(parameters), shared_input)
         return bank.missing_bytes(number)
 
@@ -65,7 +58,7 @@ class TerrainScenario(BaseScenario[Stated], ABC):
 def judged_attempt(
     attempt: Attempt[Any], answered: bool, row: Mapping[str, Scalar], products: Mapping[str, Any]
 ) -> Judged:
-    """An algorithm's answer, or its failure to give one, with its columns and products."""
+    """Combine an algorithm's answer or failure with its columns and products."""
     return Judged(
         outcome=attempt.outcome(lambda answer: str(answer.outcome.name)),
         answered=answered,

@@ -1,4 +1,4 @@
-"""The parameters by which a campaign chooses its algorithms."""
+"""Parameters that select the algorithms of a campaign."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marsyard.scenarios.estimators import Task, check_chosen
 
 
 class ChosenAlgorithms(BaseModel):
-    """What the parameters of every scenario hold that lets algorithms be chosen; subclasses add `algorithm` itself."""
+    """Parameters of scenarios with selectable algorithms; subclasses define the field `algorithm`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -27,23 +27,23 @@ class ChosenAlgorithms(BaseModel):
 
     @property
     def algorithms(self) -> tuple[str, ...]:
-        """All of them, the one that is judged first."""
+        """All algorithms; the first is the one under test."""
         return (self.algorithm, *self.compared)
 
     @field_validator("algorithm")
     @classmethod
-    def _algorithm_is_there(cls, name: str) -> str:
+    def _check_algorithm(cls, name: str) -> str:
         cls.task.check(name)
         return name
 
     @field_validator("compared")
     @classmethod
-    def _compared_are_there(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_compared(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         check_chosen(cls.task, names)
         return names
 
     @model_validator(mode="after")
-    def _are_told_apart(self) -> ChosenAlgorithms:
+    def _check_distinct(self) -> ChosenAlgorithms:
         if self.algorithm in self.compared:
             raise ValueError(f"the algorithm '{self.algorithm}' is named twice")
         return self

@@ -1,16 +1,22 @@
-"""Columns that the rows of several scenarios have: what a case was like, read from the simulated objects."""
+"""Columns of a case: conditions computed from the simulated objects, and provenance of the pictures."""
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable
+
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt16
 
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.dynamics import State
+from marsyard.sim.processor import processor_features
+from marsyard.sim.render import process_renderer
+from marsyard.sim.render.backend import Backend
 
 
 def sun_columns(direction: Float64[np.ndarray, "3"]) -> dict[str, Scalar]:
-    """Azimuth of the sun, clockwise from north, and its elevation, from its direction in world axes."""
+    """Return the sun's azimuth, clockwise from north, and elevation from its direction in world axes."""
     return {
         "sun_azimuth_deg": float(np.degrees(np.arctan2(direction[0], direction[1])) % 360.0),
         "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(direction[2], -1.0, 1.0)))),
@@ -18,10 +24,28 @@ def sun_columns(direction: Float64[np.ndarray, "3"]) -> dict[str, Scalar]:
 
 
 def off_nadir_deg(state: State) -> float:
-    """Angle between the body's axis, along which the camera looks, and nadir."""
+    """Return the angle between the body's camera axis and nadir."""
     return float(np.degrees(np.arccos(np.clip(state.attitude.as_matrix()[2, 2], -1.0, 1.0))))
 
 
 def attitude_rate_deg_s(state: State) -> float:
-    """Length of the body rate."""
+    """Return the magnitude of the body rate."""
     return float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
+
+
+def rendered(backend: Backend, pictures: Iterable[UInt16[np.ndarray, "rows columns"]]) -> dict[str, Scalar]:
+    """Return the columns of pictures that a backend rendered."""
+    digest = hashlib.sha256()
+    for counts in pictures:
+        digest.update(np.ascontiguousarray(counts).tobytes())
+    return rendered_as(backend, digest.hexdigest())
+
+
+def rendered_as(backend: Backend, image_hash: str) -> dict[str, Scalar]:
+    """Return the same columns for a given hash of the pictures."""
+    return {
+        "image_hash": image_hash,
+        "gl_backend": backend,
+        "gl_version": process_renderer(backend).description(),
+        "processor_features": processor_features(),
+    }

@@ -1,4 +1,4 @@
-"""What a dotted path names: ``module:name``, in an installed package or in a module of the current folder."""
+"""Import objects by path, ``module:name``, from installed packages or modules of the current folder."""
 
 from __future__ import annotations
 
@@ -14,28 +14,23 @@ _FORMER = ("sim", "algorithms", "scenarios", "campaigns", "reports")
 
 
 def current_module(module: str) -> str:
-    """The name under which a module is imported, also where a stored campaign or an older file has its former name.
+    """Return the current name of a module that a stored campaign or an older file names by its former one.
 
-    ``algorithms.dimes`` is ``marsyard.algorithms.dimes``; names that Marsyard does not have stay as they are.
+    ``algorithms.dimes`` becomes ``marsyard.algorithms.dimes``; names of other packages are returned unchanged.
     """
     if module.partition(".")[0] not in _FORMER:
         return module
     try:
-        known = importlib.util.find_spec(f"marsyard.{module}") is not None
+        exists = importlib.util.find_spec(f"marsyard.{module}") is not None
     except ImportError:
-        known = False
-    return f"marsyard.{module}" if known else module
+        exists = False
+    return f"marsyard.{module}" if exists else module
 
 
 def found_at(path: str) -> Any:
-    """What stands at ``module:name``.
+    """Import the object at ``module:name``. Raises ImportError with the reason.
 
-    The current folder is searched last, so that a file in it never stands in for an installed package.
-
-    Raises
-    ------
-    ImportError
-        Where nothing does, or the module cannot be loaded; the message says why.
+    The current folder is searched last: a file in it never shadows an installed package.
     """
     module, _, name = path.partition(":")
     here = str(Path.cwd())
@@ -50,20 +45,20 @@ def found_at(path: str) -> Any:
 
 
 def sources_at(path: str) -> Iterator[tuple[str, Path]]:
-    """The sources of the package, or the module, that ``module:name`` lies in: their names and files."""
+    """Yield names and files of the sources of the package or module that contains ``module:name``."""
     parts = current_module(path.partition(":")[0]).split(".")
     top = ".".join(parts[:2] if parts[0] == "marsyard" else parts[:1])
-    found = importlib.util.find_spec(top)
-    if found is None or found.origin is None:
+    spec = importlib.util.find_spec(top)
+    if spec is None or spec.origin is None:
         return
-    origin = Path(found.origin)
-    if found.submodule_search_locations:
+    origin = Path(spec.origin)
+    if spec.submodule_search_locations:
         yield from relative_to(origin.parent.parent, sorted(origin.parent.rglob("*.py")))
     else:
         yield origin.name, origin
 
 
 def relative_to(base: Path, paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
-    """Files by their names below a folder."""
+    """Yield files with their names relative to a folder."""
     for path in paths:
         yield path.relative_to(base).as_posix(), path

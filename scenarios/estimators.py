@@ -1,19 +1,18 @@
-"""The algorithms under test: those that ship with Marsyard, those installed by other packages, and a user's own.
+"""Algorithms under test: those of Marsyard, of installed packages, and of the user.
 
 An algorithm is named by
 
-- a name that ships with Marsyard (`dimes`), or that an installed package gives it in the entry point group
-  `marsyard.algorithms`; where both have it Marsyard's own is meant;
-- ``module:Class``, or ``module:function``: what is found there is called without arguments and gives the algorithm. The
-  module may lie in the current folder;
-- ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: a program of its own (docs/own-algorithms.md);
+- a name of Marsyard (`dimes`) or, if it has none, of the entry point group `marsyard.algorithms` of other packages;
+- ``module:Class`` or ``module:function``, called without arguments; the module may lie in the current folder;
+- ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: an external program (docs/own-algorithms.md);
   ``exec-stream:`` or ``serve-stream:`` one that takes pictures one by one;
-- ``answers:FILE.csv``: one that was run elsewhere (`marsyard.scenarios.offline`).
+- ``answers:FILE.csv``: answers computed outside of Marsyard (`marsyard.scenarios.offline`).
 """
 
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -23,18 +22,9 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
+from marsyard.algorithms import exchange
 from marsyard.algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
-from marsyard.algorithms.exchange import (
-    PREFIXES,
-    Command,
-    ExecutableLimits,
-    ExecutableSiteEstimator,
-    ExecutableTargetTracker,
-    ExecutableVelocityEstimator,
-    ExecutableVelocityStream,
-    command_of,
-)
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
@@ -53,26 +43,16 @@ Options = TypeVar("Options")
 
 @dataclass(frozen=True)
 class Task(Generic[Algorithm, Options]):
-    """What a system's algorithms do, and the algorithms that there are for it.
+    """A task of a system and its algorithms.
 
-    Attributes
-    ----------
-    name
-        As the command line and the exchange with programs have it.
-    what
-        An algorithm for it, in words.
-    methods
-        What an algorithm for it must have.
-    shipped
-        How each algorithm that ships is made from the options of the paper's own.
-    options
-        The options of the published algorithm.
-    executable
-        How a program becomes one; None where programs are not accepted.
-    offline
-        How its answers stand in a table; None where each answer decides what is seen next.
-    streamed
-        Makes an algorithm of one that takes pictures one by one; None where there is no such thing.
+    - name: name on the command line and in the exchange with programs
+    - what: noun phrase for its algorithms
+    - methods: required methods of an algorithm
+    - shipped: constructors of Marsyard's algorithms from the options of the published one
+    - options: options of the published algorithm
+    - executable: wraps a program; None where programs are not accepted
+    - offline: form of the answers in a table; None where an answer decides the next inputs
+    - streamed: wraps an algorithm that takes pictures one by one; None where these are not accepted
     """
 
     name: str
@@ -80,15 +60,15 @@ class Task(Generic[Algorithm, Options]):
     methods: tuple[str, ...]
     shipped: Mapping[str, Callable[[Options], Algorithm]]
     options: type[Options]
-    executable: Callable[[Command, ExecutableLimits], Algorithm] | None = None
+    executable: Callable[[exchange.Command, exchange.ExecutableLimits], Algorithm] | None = None
     offline: OfflineForm[Any] | None = None
     streamed: Callable[[Any], Algorithm] | None = None
 
     def check(self, spec: str) -> None:
-        """Raises ValueError where there is no algorithm of this name for the task; the message says what is allowed."""
+        """Raise ValueError where the task has no algorithm of this name; the message states the allowed ones."""
         if spec in self.shipped:
             return
-        command = command_of(spec)
+        command = exchange.command_of(spec)
         if command is not None:
             if self.executable is None:
                 raise ValueError(f"'{spec}': a {self.what} cannot be a program; allowed: a name, module:Class")
@@ -98,48 +78,48 @@ class Task(Generic[Algorithm, Options]):
         if is_offline(spec):
             check_offline(spec, self._form(spec))
             return
-        found = self._class(spec)
-        methods = STREAM_METHODS if self._is_stream(found) else self.methods
-        missing = [method for method in methods if not hasattr(found, method)]
-        if not callable(found):
-            raise ValueError(f"'{spec}' is no {self.what}: it is a {type(found).__name__}, not a class or function")
-        if missing and isinstance(found, type):
+        factory = self._import(spec)
+        methods = STREAM_METHODS if self._is_stream(factory) else self.methods
+        missing = [method for method in methods if not hasattr(factory, method)]
+        if not callable(factory):
+            raise ValueError(f"'{spec}' is no {self.what}: it is a {type(factory).__name__}, not a class or function")
+        if missing and isinstance(factory, type):
             raise ValueError(f"'{spec}' is no {self.what}: it has no {', '.join(missing)}")
 
-    def make(self, spec: str, options: Options, limits: ExecutableLimits, case: int = 0) -> Algorithm:
-        """The algorithm of a name. Raises ValueError where there is none, and whatever making a user's own raises.
+    def make(self, spec: str, options: Options, limits: exchange.ExecutableLimits, case: int = 0) -> Algorithm:
+        """Create the algorithm of a name. Raises ValueError, and the exceptions of a user's constructor.
 
-        `case` is the case's number, of which only the tables of algorithms that are run elsewhere know.
+        The case's number selects the answer of algorithms that run outside of Marsyard.
         """
         if spec in self.shipped:
             return self.shipped[spec](options)
         if is_offline(spec):
             return cast(Algorithm, made_offline(spec, self._form(spec), case))
-        command = command_of(spec)
+        command = exchange.command_of(spec)
         if command is not None and self.executable is not None:
             return self.executable(command, limits)
-        made = self._class(spec)()
-        if self.streamed is not None and self._is_stream(made):
-            return self.streamed(made)
-        return cast(Algorithm, made)
+        algorithm = self._import(spec)()
+        if self.streamed is not None and self._is_stream(algorithm):
+            return self.streamed(algorithm)
+        return cast(Algorithm, algorithm)
 
     def takes_stream(self, spec: str) -> bool | None:
-        """Whether an algorithm takes any number of pictures; None where only making it tells. Raises as `check`."""
+        """Return whether an algorithm takes any number of pictures; None if unknown before its creation."""
         if spec in self.shipped:
             return False
-        command = command_of(spec)
+        command = exchange.command_of(spec)
         if command is not None:
             return command.stream
         if is_offline(spec):
             return True
-        found = self._class(spec)
-        return self._is_stream(found) if isinstance(found, type) else None
+        factory = self._import(spec)
+        return self._is_stream(factory) if isinstance(factory, type) else None
 
-    def _is_stream(self, thing: object) -> bool:
-        """Whether a class or an object is one that takes pictures one by one, be it with a method lacking."""
-        whole = all(hasattr(thing, method) for method in STREAM_METHODS)
-        begun = hasattr(thing, "picture") and not any(hasattr(thing, method) for method in self.methods)
-        return self.streamed is not None and (whole or begun)
+    def _is_stream(self, algorithm: object) -> bool:
+        """Return whether a class or object takes pictures one by one; methods may be missing."""
+        is_complete = all(hasattr(algorithm, method) for method in STREAM_METHODS)
+        is_partial = hasattr(algorithm, "picture") and not any(hasattr(algorithm, method) for method in self.methods)
+        return self.streamed is not None and (is_complete or is_partial)
 
     def _form(self, spec: str) -> OfflineForm[Any]:
         if self.offline is None:
@@ -148,38 +128,30 @@ class Task(Generic[Algorithm, Options]):
             )
         return self.offline
 
-    def _class(self, spec: str) -> Any:
-        """What stands under a name of another package, or at a path."""
+    def _import(self, spec: str) -> Any:
+        """Import the class or function of another package's name, or of a path."""
         if ":" in spec:
             try:
                 return found_at(spec)
             except ImportError as error:
                 raise ValueError(f"no algorithm at '{spec}': {error}") from error
         if spec not in installed():
-            raise ValueError(self._unknown(spec))
+            allowed = [*self.shipped, *installed()]
+            near = difflib.get_close_matches(spec, allowed, n=1)
+            hint = f" (did you mean '{near[0]}'?)" if near else ""
+            own = "your own as 'module:Class' or 'exec:./program'"
+            raise ValueError(f"unknown algorithm '{spec}'{hint}; allowed: {', '.join(allowed)}, or {own}")
         try:
             return installed()[spec].load()
         except (ImportError, AttributeError) as error:
             raise ValueError(f"algorithm '{spec}' cannot be loaded from {installed()[spec].value}: {error}") from error
 
-    def _unknown(self, name: str) -> str:
-        known = [*self.shipped, *installed()]
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        own = "your own as 'module:Class' or 'exec:./program'"
-        return f"unknown algorithm '{name}'{hint}; allowed: {', '.join(known)}, or {own}"
 
-
-def _pure_ncc(options: VttOptions) -> TargetTracker:
-    """The paper's baseline: without scale, roll and warp, whatever the options say of them."""
-    return VisualTargetTracker(replace(options, scale=PURE_NCC.scale, roll=PURE_NCC.roll, warp=PURE_NCC.warp))
-
-
-def _executable_velocity(command: Command, limits: ExecutableLimits) -> VelocityEstimator:
-    """A program that gets three pictures at once, or as many as there are one by one."""
+def _executable_velocity(command: exchange.Command, limits: exchange.ExecutableLimits) -> VelocityEstimator:
+    """Wrap a program that gets three pictures at once, or all pictures one by one."""
     if command.stream:
-        return StreamedEstimator(ExecutableVelocityStream(command, limits))
-    return ExecutableVelocityEstimator(command, limits)
+        return StreamedEstimator(exchange.ExecutableVelocityStream(command, limits))
+    return exchange.ExecutableVelocityEstimator(command, limits)
 
 
 VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
@@ -201,8 +173,15 @@ TRACKING: Task[TargetTracker, VttOptions] = Task(
     name="tracking",
     what="target tracker",
     methods=("designate", "aim", "update", "clear", "state"),
-    shipped={"vtt": VisualTargetTracker, "pure-ncc": _pure_ncc, "lucas-kanade": lucas_kanade_tracker},
-    executable=ExecutableTargetTracker,
+    shipped={
+        "vtt": VisualTargetTracker,
+        # the paper's baseline: without scale, roll and warp
+        "pure-ncc": lambda options: VisualTargetTracker(
+            replace(options, scale=PURE_NCC.scale, roll=PURE_NCC.roll, warp=PURE_NCC.warp)
+        ),
+        "lucas-kanade": lucas_kanade_tracker,
+    },
+    executable=exchange.ExecutableTargetTracker,
     options=VttOptions,
 )
 
@@ -211,18 +190,18 @@ LANDING: Task[SiteEstimator, HdaOptions] = Task(
     what="estimator of landing sites",
     methods=("estimate",),
     shipped={"hda": HdaEstimator, "essential-matrix": EssentialMatrixEstimator, "semi-global": SemiGlobalEstimator},
-    executable=ExecutableSiteEstimator,
+    executable=exchange.ExecutableSiteEstimator,
     options=HdaOptions,
     offline=SITE_FORM,
 )
 
-#: The tasks that have a conformance suite, by their names.
+#: Tasks with a conformance suite, by name.
 TASKS: Mapping[str, Task[Any, Any]] = {task.name: task for task in (VELOCITY, TRACKING, LANDING)}
 
 
 @cache
 def shipped_names() -> frozenset[str]:
-    """Names of the algorithms that the systems bring with them."""
+    """Return the names of the systems' own algorithms."""
     names: set[str] = set()
     for path in dict.fromkeys(path for system in systems() for path in system.tasks):
         with suppress(ImportError):  # the system's own campaigns report it
@@ -232,19 +211,19 @@ def shipped_names() -> frozenset[str]:
 
 @cache
 def installed() -> Mapping[str, EntryPoint]:
-    """Algorithms that installed packages name, in the order of their names."""
+    """Return the algorithms of installed packages, sorted by name."""
     return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
 
 
 def sources_of(spec: str) -> list[tuple[str, Path]]:
-    """The sources of an algorithm of one's own in Python, by their names; none of one that ships, or of a program."""
+    """Return the source files of a user's algorithm in Python by name; empty for all others."""
     path = installed()[spec].value if spec in installed() else spec
-    elsewhere = is_offline(spec) or spec.startswith(tuple(PREFIXES))
-    return list(sources_at(path)) if ":" in path and not elsewhere and spec not in shipped_names() else []
+    is_external = is_offline(spec) or spec.startswith(tuple(exchange.PREFIXES))
+    return list(sources_at(path)) if ":" in path and not is_external and spec not in shipped_names() else []
 
 
 def check_chosen(task: Task[Any, Any], specs: Sequence[str]) -> None:
-    """Raises ValueError where one of several algorithms is not there, or one is named twice."""
+    """Raise ValueError where an algorithm does not exist or is named twice."""
     for place, spec in enumerate(specs):
         task.check(spec)
         if spec in specs[:place]:
@@ -252,25 +231,17 @@ def check_chosen(task: Task[Any, Any], specs: Sequence[str]) -> None:
 
 
 def labels(specs: Sequence[str]) -> tuple[str, ...]:
-    """Short names of algorithms, told apart: what stands before the point in the columns of a row.
+    """Return unique short names of algorithms, the prefixes of their columns.
 
     >>> labels(["dimes", "phase-correlation", "mypkg.velocity:Estimator", "exec:./mine --fast", "exec:./mine"])
     ('dimes', 'phase_correlation', 'Estimator', 'mine', 'mine_2')
     """
-    given: list[str] = []
+    labels: list[str] = []
     for spec in specs:
-        short = _short(spec)
-        number, label = 1, short
-        while label in given:
-            number += 1
-            label = f"{short}_{number}"
-        given.append(label)
-    return tuple(given)
-
-
-def _short(spec: str) -> str:
-    """The last part of a name, as an identifier."""
-    program = re.match(r"(?:(?:exec|serve)(?:-stream)?|answers|export):\s*(\S+)", spec)
-    last = Path(program[1]).stem if program else spec.rpartition(":")[2]
-    label = re.sub(r"\W", "_", last, flags=re.ASCII)
-    return label if label[:1].isalpha() else f"a_{label}"
+        program = re.match(r"(?:(?:exec|serve)(?:-stream)?|answers|export):\s*(\S+)", spec)
+        last = Path(program[1]).stem if program else spec.rpartition(":")[2]
+        short = re.sub(r"\W", "_", last, flags=re.ASCII)
+        short = short if short[:1].isalpha() else f"a_{short}"
+        candidates = itertools.chain([short], (f"{short}_{number}" for number in itertools.count(2)))
+        labels.append(next(label for label in candidates if label not in labels))
+    return tuple(labels)

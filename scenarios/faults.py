@@ -1,6 +1,6 @@
-"""What faults of all systems have in common: each has a name and a size, 0 for none. Ailing detectors, lost pictures.
+"""Faults of all systems, each with a name and a size, 0 for none: detector defects and lost pictures.
 
-A campaign of faults draws one a case: ``"faults" = { distribution = "choice", values = [{}, { haze = 1.0 }, ...] }``.
+A campaign of faults draws one per case: ``"faults" = { distribution = "choice", values = [{}, { haze = 1.0 }, ...] }``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 
 class SizedFaults(Parameters):
-    """Faults by name, each with its size. A size of 0 is no fault."""
+    """Sizes of the faults by name; a size of 0 is no fault."""
 
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
     bad_pixels: Annotated[
@@ -29,7 +29,7 @@ class SizedFaults(Parameters):
 
     @property
     def name_and_size(self) -> tuple[str, float]:
-        """The fault and its size; "none" and 0 without one, "several" and NaN where there are more."""
+        """The fault and its size; "none" and 0 without a fault, "several" and NaN with more than one."""
         present = [(name, float(size)) for name, size in self.model_dump().items() if size]
         if len(present) > 1:
             return "several", float("nan")
@@ -42,7 +42,7 @@ class SizedFaults(Parameters):
         return {"fault": name, "fault_size": size}
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
-        """Parameters of a detector that the faults change, by the detector's tables; empty tables change nothing."""
+        """Return the changed parameters of the detector by its tables; empty tables change nothing."""
         return {
             "optics": {"dust_discs": self.dust_discs} if self.dust_discs else {},
             "defects": {"dead_share": self.bad_pixels, "hot_share": self.bad_pixels} if self.bad_pixels else {},
@@ -50,7 +50,7 @@ class SizedFaults(Parameters):
 
 
 def faulty_detector(faults: SizedFaults, detector: DetectorParameters) -> DetectorParameters:
-    """The detector with what the faults change."""
+    """Apply the faults to a detector."""
     changes = {
         table: getattr(detector, table).model_copy(update=dict(changed))
         for table, changed in faults.detector_changes().items()
@@ -60,23 +60,18 @@ def faulty_detector(faults: SizedFaults, detector: DetectorParameters) -> Detect
 
 
 def deliver(pictures: Pictures, repeated: int, black: int, lost_rows: float = 0.0) -> list[np.ndarray]:
-    """The pictures as they arrive.
+    """Apply transmission faults to the pictures.
 
-    Parameters
-    ----------
-    repeated
-        Number, from 1, of the picture in place of which the one before it is delivered again; 0: none.
-    black
-        Number of the picture that is delivered black; 0: none.
-    lost_rows
-        Fraction of the second picture's rows that is lost, from below.
+    - repeated: number, from 1, of the picture that is replaced by the one before it; 0: none
+    - black: number of the picture that is delivered black; 0: none
+    - lost_rows: fraction of the second picture's rows that is lost, from below
     """
-    arrived = [one.copy() for one in pictures]
+    delivered = [one.copy() for one in pictures]
     if repeated > 1:
-        arrived[repeated - 1] = arrived[repeated - 2].copy()
+        delivered[repeated - 1] = delivered[repeated - 2].copy()
     if black:
-        arrived[black - 1][:] = 0
-    lost = round(lost_rows * len(arrived[1])) if lost_rows else 0
+        delivered[black - 1][:] = 0
+    lost = round(lost_rows * len(delivered[1])) if lost_rows else 0
     if lost:
-        arrived[1][-lost:] = 0
-    return arrived
+        delivered[1][-lost:] = 0
+    return delivered

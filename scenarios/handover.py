@@ -1,4 +1,4 @@
-"""Inputs handed to an algorithm: its own read-only copy, which is compared after it has answered."""
+"""Give each algorithm a read-only copy of its inputs, and check afterwards that the copy is unchanged."""
 
 from __future__ import annotations
 
@@ -17,20 +17,14 @@ Given = TypeVar("Given")
 
 
 class Handover(Generic[Given]):
-    """One algorithm's copy of its inputs: data classes, arrays and poses. The original stays unchanged for the others.
-
-    Attributes
-    ----------
-    given
-        The copy; its arrays are read-only.
-    """
+    """One algorithm's read-only copy `given` of its inputs: data classes, arrays and poses."""
 
     def __init__(self, original: Given) -> None:
         self.given = handed_copy(original)
         self._fingerprint = fingerprint(self.given)
 
     def check(self) -> None:
-        """Raises AlgorithmError (BAD_ANSWER) if the algorithm changed its copy, pictures included."""
+        """Raise AlgorithmError (BAD_ANSWER) if the algorithm changed its copy, pictures included."""
         if fingerprint(self.given) != self._fingerprint:
             raise AlgorithmError(
                 Fault.BAD_ANSWER, "it changed the measurements that it was given; allowed: to read them, or copies"
@@ -38,21 +32,20 @@ class Handover(Generic[Given]):
 
 
 def handed_copy(original: Given, *, writable: bool = False) -> Given:
-    """A deep copy whose arrays are read-only, or writable to detect what is written.
+    """Return a deep copy whose arrays are read-only, or writable to detect changes.
 
-    Single rotations and transforms cannot be changed and stay the same objects: a copy of them would be normalised
-    again and differ in its last digits.
+    Rotations and transforms are immutable and not copied: a copy would be normalised again, with other last digits.
     """
     poses = {id(part): part for part in _parts(original) if isinstance(part, Rotation | RigidTransform)}
-    made = copy.deepcopy(original, dict(poses))
-    for part in _parts(made):
+    copied = copy.deepcopy(original, dict(poses))
+    for part in _parts(copied):
         if isinstance(part, np.ndarray):
             part.flags.writeable = writable
-    return made
+    return copied
 
 
 def fingerprint(value: Any, leave: tuple[str, ...] = ()) -> str:
-    """SHA-256 of all values, bit for bit, in arrays, poses and data classes; fields named in `leave` are left out."""
+    """Compute the SHA-256 of all values in arrays, poses and data classes, without the fields in `leave`."""
     digest = hashlib.sha256()
     for part in _parts(value, leave):
         if isinstance(part, np.ndarray):
@@ -68,7 +61,7 @@ def fingerprint(value: Any, leave: tuple[str, ...] = ()) -> str:
 
 
 def _parts(value: Any, leave: tuple[str, ...] = ()) -> Iterator[Any]:
-    """The arrays, poses and other values in data classes, lists and tuples, and the names of their types."""
+    """Yield the arrays, poses and other values in data classes, lists and tuples, and the names of the types."""
     if is_dataclass(value) and not isinstance(value, type):
         yield type(value).__name__
         for field in fields(value):

@@ -1,4 +1,4 @@
-"""What a campaign knows of a scenario: its parameters, what it prepares once, and how one case runs."""
+"""The interface between campaigns and scenarios: parameters, shared inputs, and running one case."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from marsyard.scenarios.estimators import Task
     from marsyard.scenarios.parts.named import Kind
 
-#: A value that can stand in a column of the results.
+#: A value in a column of the results.
 Scalar = float | int | str | bool
 
 
@@ -24,15 +24,10 @@ _recorder: ContextVar[Callable[[Mapping[str, Scalar]], None] | None] = ContextVa
 
 
 def record_conditions(columns: Mapping[str, Scalar]) -> None:
-    """Records columns of the running case that depend on no algorithm; to be called before an algorithm runs.
+    """Record columns of the running case that depend on no algorithm, before an algorithm runs.
 
-    The engine stores them also where the case then raises or its process is killed, so that it is known to which
-    populations the case belongs. A case may call this several times. Outside of a campaign it does nothing.
-
-    Parameters
-    ----------
-    columns
-        As in `CaseResult.row`, which must hold them again.
+    The engine stores them also if the case raises or its process is killed: they decide the populations of the case.
+    `CaseResult.row` must contain them as well. A case may call this several times; no effect outside of a campaign.
     """
     recorder = _recorder.get()
     if recorder is not None:
@@ -41,7 +36,7 @@ def record_conditions(columns: Mapping[str, Scalar]) -> None:
 
 @contextmanager
 def conditions_recorded_by(recorder: Callable[[Mapping[str, Scalar]], None]) -> Iterator[None]:
-    """Gives the columns of `record_conditions` to a recorder."""
+    """Pass the columns of `record_conditions` to a recorder."""
     token = _recorder.set(recorder)
     try:
         yield
@@ -51,14 +46,10 @@ def conditions_recorded_by(recorder: Callable[[Mapping[str, Scalar]], None]) -> 
 
 @dataclass(frozen=True)
 class Failure:
-    """How the algorithm under test failed to answer, where it did no more than that: the case itself is whole.
+    """Failure of the algorithm under test in an otherwise valid case.
 
-    Attributes
-    ----------
-    outcome
-        A name of `marsyard.algorithms.faults.Fault`.
-    error, trace
-        What is stored as `error` and `traceback`.
+    - outcome: a name of `marsyard.algorithms.faults.Fault`
+    - error, trace: stored as `error` and `traceback`
     """
 
     outcome: str
@@ -70,19 +61,12 @@ class Failure:
 class CaseResult:
     """One case, run and scored.
 
-    Attributes
-    ----------
-    outcome
-        The name of the outcome: a member of the estimate's enumeration, or the failure's.
-    answered
-        Whether the algorithm under test reported an answer (the population `valid` of requirements).
-    row
-        What is stored of the case: scored errors (NaN where nothing was reported) and the drawn values as read back
-        from the simulated objects. Columns that may differ between two runs of one case have `time` in their name.
-    products
-        Arrays and texts from which the case's figures are drawn; kept only for cases that the campaign retains.
-    failure
-        How the algorithm under test failed to answer; None where it did not.
+    - outcome: a member of the estimate's enumeration, or the name of the failure
+    - answered: whether the algorithm under test reported an answer (the population `valid` of requirements)
+    - row: scored errors (NaN without an answer) and the drawn values as read back from the simulated objects. Columns
+      that may differ between two runs of one case have `time` in their name.
+    - products: arrays and texts for the case's figures; stored only for cases that the campaign retains
+    - failure: None if the algorithm under test answered
     """
 
     outcome: str
@@ -93,71 +77,64 @@ class CaseResult:
 
 
 class Scenario(Protocol):
-    """A family of cases. Implementations are stateless: everything a case depends on is in its arguments."""
+    """A family of cases. Implementations are stateless: a case depends on its arguments alone."""
 
     @property
     def name(self) -> str:
-        """The name by which campaign files ask for the scenario."""
+        """Name in campaign files."""
         ...
 
     @property
     def parameters_type(self) -> type[BaseModel]:
-        """The model (pydantic, extra keys forbidden, frozen) of every value that a campaign may set or disperse."""
+        """Model (pydantic, extra keys forbidden, frozen) of the values that a campaign may set or disperse."""
         ...
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Numbers of the inputs that many cases share and that `prepare` builds once (the terrains of a bank)."""
+        """Return the numbers of the inputs shared by cases that `prepare` builds once (the terrains of a bank)."""
         ...
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """Builds one shared input into the cache on disk; does nothing if it is there. Safe to call in parallel."""
+        """Build one shared input into the cache on disk if it is missing. Safe to call in parallel."""
         ...
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """Runs one case with its parameters (dispersions already drawn into them) and its random streams.
-
-        Columns that depend on no algorithm should be recorded first (`record_conditions`).
-        """
+        """Run one case with its drawn parameters and its random streams; see `record_conditions`."""
         ...
 
 
 @runtime_checkable
 class SelectsInputs(Protocol):
-    """A scenario that states which shared inputs a case uses: only those of a campaign's own cases are prepared."""
+    """A scenario that states the shared inputs of a case: only those of a campaign's cases are prepared."""
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """Numbers, out of `shared_inputs`, of the inputs that a case with these drawn parameters uses."""
+        """Return the numbers, out of `shared_inputs`, of the inputs of a case with these drawn parameters."""
         ...
 
     def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
-        """Bytes on disk that preparing an input would add to the cache; 0 where the input is there."""
+        """Return the bytes that preparing an input would add to the cache; 0 if it is there."""
         ...
 
 
 @runtime_checkable
 class TakesAlgorithms(Protocol):
-    """A scenario whose algorithms under test a campaign chooses.
-
-    Among its parameters are `algorithm` (the one that is judged), `compared` (further ones, run on the same case) and
-    `executable` (limits of those that are programs).
-    """
+    """A scenario with selectable algorithms; its parameters contain those of `marsyard.scenarios.chosen`."""
 
     @property
     def task(self) -> Task[Any, Any]:
-        """What the algorithms do."""
+        """Task of the algorithms."""
         ...
 
     @property
     def algorithm_table(self) -> tuple[str, ...]:
-        """The table in the parameters that holds the three; empty where they stand at its top."""
+        """Table of the parameters with the selection; empty for the top level."""
         ...
 
 
 @runtime_checkable
 class TakesParts(Protocol):
-    """A scenario whose cases can be made of a user's own parts (`marsyard.scenarios.parts`)."""
+    """A scenario whose cases may use parts of a user (`marsyard.scenarios.parts`)."""
 
     @property
     def part_keys(self) -> Mapping[str, Kind]:
-        """The parameters that name parts, by their dotted paths, each a name or a list of names; their kinds."""
+        """Kinds of the parts by the dotted path of the parameter that names them, one name or a list."""
         ...

@@ -1,7 +1,7 @@
-"""Own meshes on the ground: rocks, landers, landmarks, from any file that trimesh reads.
+"""Meshes of a user on the ground (rocks, landers, landmarks), from the formats of trimesh.
 
-They stand in pictures with their shadows and in the truth (range, bodies, and in landings the ground that a lander
-would stand on), once on the periodic terrain.
+They appear once on the periodic terrain: in pictures with their shadows, and in the truth (range, bodies, landing site
+truth).
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, expanded_bytes
 from marsyard.sim.render import Objects, Scene
 from marsyard.sim.terrain import Surface
 
-#: Largest file, and most triangles, that are read.
+#: Maximum size of a file, and maximum number of triangles.
 MOST_BYTES, MOST_FACES = 1 << 28, 1_000_000
-#: Archives of any files, which are not read; and formats that are zip archives themselves.
+#: Archives, which are not read; and formats that are zip archives themselves.
 _ARCHIVES = frozenset({"zip", "bz2", "gz", "tar.gz", "tar.bz2"})
 _ZIPPED = frozenset({"3mf", "3dxml", "zae"})
 #: Numbers in an element of a glTF accessor.
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-#: Number given to the first mesh where bodies have names; rocks of a field count from 0.
+#: Body number of meshes; rocks of a field count from 0.
 FIRST_NAME = 1 << 30
-#: Albedo where it is not stated: a rock's, painted structure, a bright target.
+#: Default albedo: rock, painted structure, bright target.
 _ALBEDO = {"rock": 0.15, "lander": 0.5, "landmark": 0.6}
 
 
 class MeshFileError(ValueError):
-    """A mesh that cannot be used; the message names the file, the fault, and what is allowed."""
+    """An unusable mesh; the message names the file, the fault, and the allowed values."""
 
 
 class MeshParameters(OwnFile):
-    """A mesh on the ground, of a file that trimesh reads: its lowest point stands there, sunk in by `sink_m`."""
+    """A mesh whose lowest point is `sink_m` below the ground."""
 
     kind: Annotated[Literal["rock", "lander", "landmark"], Field(description="what it is: rocks are smooth")] = "rock"
     east_m: Annotated[float, Field(allow_inf_nan=False, description="where its origin stands, on the terrain")] = 0.0
@@ -61,23 +61,23 @@ class MeshParameters(OwnFile):
 
     @classmethod
     def hash_of(cls, file: str) -> str:
-        """SHA-256 of the mesh's file, which is checked."""
+        """Return the SHA-256 of a valid mesh file."""
         return read_mesh(file).sha256
 
     def standing(self, surface: Surface, near: tuple[float, float]) -> Objects:
-        """The mesh on the ground, at that of its repetitions that is nearest to a place."""
+        """Place the mesh on the ground, at its repetition nearest to a point (x, y)."""
         mesh = read_mesh(self.file)
         corners = _upright(self.up).apply(mesh.triangles.reshape(-1, 3))
         extent = float(np.ptp(corners[:, :2], axis=0).max())
         corners = corners * (self.scale if self.size_m is None else self.size_m / extent)
-        turn = Rotation.from_rotvec(np.radians(-self.heading_deg) * np.array([0.0, 0.0, 1.0]))
-        corners = turn.apply(corners)
-        normals = turn.apply(_upright(self.up).apply(mesh.normals.reshape(-1, 3)))
+        heading = Rotation.from_rotvec(np.radians(-self.heading_deg) * np.array([0.0, 0.0, 1.0]))
+        corners = heading.apply(corners)
+        normals = heading.apply(_upright(self.up).apply(mesh.normals.reshape(-1, 3)))
         period = surface.levels[0].shape[0] * surface.spacing_m
-        place = np.array([self.east_m, self.north_m])
-        place = place + period * np.round((np.array(near) - place) / period)
-        ground = float(surface.height(place[0], place[1]))
-        corners = corners + np.array([*place, ground - self.sink_m - float(corners[:, 2].min())])
+        position = np.array([self.east_m, self.north_m])
+        position = position + period * np.round((np.array(near) - position) / period)
+        ground = float(surface.height(position[0], position[1]))
+        corners = corners + np.array([*position, ground - self.sink_m - float(corners[:, 2].min())])
         if self.kind != "rock":
             normals = np.repeat(_face_normals(corners.reshape(-1, 3, 3)), 3, axis=0)
         faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
@@ -87,16 +87,10 @@ class MeshParameters(OwnFile):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh as its file has it.
+    """A mesh in the axes and unit of its file.
 
-    Attributes
-    ----------
-    sha256
-        Of the file.
-    triangles
-        Corners, in the file's unit and axes, counter-clockwise seen from outside.
-    normals
-        Smooth outward normals at the corners.
+    - triangles: corners, counter-clockwise seen from outside
+    - normals: smooth outward normals at the corners
     """
 
     sha256: str
@@ -105,26 +99,26 @@ class Mesh:
 
 
 def standing(meshes: Sequence[MeshParameters], surface: Surface, near: tuple[float, float]) -> Objects:
-    """All meshes on the ground, each at its repetition nearest to a place (x, y)."""
+    """Place all meshes on the ground, each at its repetition nearest to a point (x, y)."""
     return Objects.joined([one.standing(surface, near) for one in meshes]) if meshes else Objects.none()
 
 
 def with_meshes(scene: Scene, meshes: Sequence[MeshParameters], near: tuple[float, float]) -> Scene:
-    """The scene with meshes on its ground; see `standing`."""
+    """Add meshes to a scene; see `standing`."""
     if not meshes:
         return scene
     return scene.with_objects(Objects.joined([scene.objects, standing(meshes, scene.surface, near)]))
 
 
 def read_mesh(path: str) -> Mesh:
-    """A mesh, checked; kept while its file does not change. Raises MeshFileError."""
+    """Read and check a mesh; cached while its file does not change. Raises MeshFileError."""
     try:
-        about = check_regular(path)
+        status = check_regular(path)
     except OSError as fault:
         raise MeshFileError(f"{path}: cannot be read ({fault.strerror})") from fault
-    if about.st_size > MOST_BYTES:
+    if status.st_size > MOST_BYTES:
         raise MeshFileError(f"{path}: is larger than {MOST_BYTES >> 20} MiB; make the mesh coarser")
-    return _read(path, about.st_mtime_ns)
+    return _read(path, status.st_mtime_ns)
 
 
 @lru_cache(maxsize=16)
@@ -136,13 +130,13 @@ def _read(path: str, _changed_ns: int) -> Mesh:
         raise MeshFileError(f"{path}: '.{kind}' is no format of meshes; allowed: {', '.join(_formats())}")
     _check_expanded(path, kind)
     try:
-        found = trimesh.load(path, force="mesh", process=False)
+        loaded = trimesh.load(path, force="mesh", process=False)
         digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except Exception as fault:  # each format's reader raises its own
-        said = " ".join(str(fault).split())[:200] or type(fault).__name__
-        raise MeshFileError(f"{path}: cannot be read as a mesh ({said})") from fault
+        reason = " ".join(str(fault).split())[:200] or type(fault).__name__
+        raise MeshFileError(f"{path}: cannot be read as a mesh ({reason})") from fault
     # trimesh's own arrays are read-only, which rotations refuse
-    triangles = np.array(getattr(found, "triangles", np.zeros((0, 3, 3))), dtype=np.float64)
+    triangles = np.array(getattr(loaded, "triangles", np.zeros((0, 3, 3))), dtype=np.float64)
     if len(triangles) == 0:
         raise MeshFileError(f"{path}: holds no triangle")
     if len(triangles) > MOST_FACES:
@@ -151,7 +145,9 @@ def _read(path: str, _changed_ns: int) -> Mesh:
         raise MeshFileError(f"{path}: holds a corner that is not finite")
     if not np.ptp(triangles.reshape(-1, 3), axis=0).all():
         raise MeshFileError(f"{path}: is flat; a body with an extent along all axes is needed")
-    merged = trimesh.Trimesh(*_merged(triangles), process=False)
+    # equal corners become one vertex: normals are then smooth over a file of loose triangles
+    vertices, numbers = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    merged = trimesh.Trimesh(vertices, numbers.reshape(-1, 3), process=False)
     return Mesh(digest, triangles, np.array(merged.vertex_normals, dtype=np.float64)[np.array(merged.faces)])
 
 
@@ -162,7 +158,7 @@ def _formats() -> list[str]:
 
 
 def _check_expanded(path: str, kind: str) -> None:
-    """Raises MeshFileError where a small file makes a mesh that is too large, before it does."""
+    """Raise MeshFileError where a small file expands to a mesh that is too large, before expanding it."""
     try:
         if kind in _ZIPPED:
             size = expanded_bytes(path)
@@ -177,7 +173,7 @@ def _check_expanded(path: str, kind: str) -> None:
 
 
 def _accessor_bytes(contents: bytes, kind: str) -> int:
-    """Bytes of all accessors of a glTF file, whose buffers may be left out and are then zeros."""
+    """Return the bytes of all accessors of a glTF file; missing buffers expand to zeros."""
     if kind == "glb":
         (length,) = struct.unpack("<I", contents[12:16])
         contents = contents[20 : 20 + length]
@@ -186,14 +182,8 @@ def _accessor_bytes(contents: bytes, kind: str) -> int:
     return sum(4 * _COMPONENTS.get(one.get("type"), 16) * int(one.get("count", 0)) for one in accessors)
 
 
-def _merged(triangles: Float64[np.ndarray, "faces 3 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces with equal corners made one, so that normals are smooth over a file of loose triangles."""
-    vertices, numbers = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
-    return vertices, numbers.reshape(-1, 3)
-
-
 def _upright(up: str) -> Rotation:
-    """Turns a file's axes so that this one points up."""
+    """Return the rotation that makes an axis of the file point up."""
     return {
         "x": Rotation.from_euler("y", -90.0, degrees=True),
         "y": Rotation.from_euler("x", 90.0, degrees=True),

@@ -1,4 +1,4 @@
-"""A camera with what follows from its design alone, and the same camera as calibrated."""
+"""Camera optics (rays and lens fall-off), and calibrated cameras with the errors of their calibration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marsyard.sim.sensor import natural_fall_off
 
 @dataclass(frozen=True)
 class Optics:
-    """A camera in the body frame, the rays of its pixels and the fall-off of its lens: shared by a worker's cases."""
+    """A camera in the body frame, the rays of its pixels and the fall-off of its lens."""
 
     camera: CameraModel
     rays: PixelRays
@@ -26,20 +26,20 @@ class Optics:
 
     @classmethod
     def of(cls, camera: CameraModel) -> Optics:
-        """The optics of a camera."""
+        """Compute the optics of a camera."""
         return cls(camera, PixelRays.of(camera), natural_fall_off(camera))
 
 
 @lru_cache(maxsize=8)
 def camera_optics(camera: CameraModel) -> Optics:
-    """The optics of a camera in the body frame; kept, as the cases of a process share cameras."""
+    """Return the cached optics of a camera in the body frame."""
     return Optics.of(camera)
 
 
 class CalibrationParameters(Parameters):
-    """How far the calibrated camera, which an algorithm is given, is off the true one.
+    """Errors of the calibrated camera that an algorithm is given.
 
-    Assumed: the spreads of the descent camera's calibration, in pixels and as a fraction of the focal length.
+    Assumed: those of the descent camera's calibration, in pixels and as a fraction of the focal length.
     """
 
     focal_error: Annotated[
@@ -59,18 +59,11 @@ def calibrated(
     centre_error_px: tuple[float, float],
     distortion_error_px: float,
 ) -> CameraModel:
-    """A camera as calibrated, with the errors of its calibration.
+    """Return a camera with errors of its calibration.
 
-    Parameters
-    ----------
-    camera
-        The true one.
-    focal_error
-        Relative, of the focal length.
-    centre_error_px
-        Of the image centre, (columns, rows).
-    distortion_error_px
-        By how much the corners are taken to lie further outwards.
+    - focal_error: relative error of the focal length
+    - centre_error_px: error of the image centre, (columns, rows)
+    - distortion_error_px: outward displacement of the corners
     """
     moved = camera.magnified(1.0 + focal_error).recentred(*centre_error_px)
     if isinstance(moved, Cahv):
@@ -83,7 +76,7 @@ def calibrated(
 
 
 def draw_calibrated(camera: CameraModel, p: CalibrationParameters, rng: np.random.Generator) -> CameraModel:
-    """A camera as calibrated, the errors of its calibration drawn from normal distributions."""
+    """Draw a calibrated camera with normally distributed errors."""
     focal, column, row, distortion = rng.standard_normal(4)
     centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))
     return calibrated(camera, p.focal_error * focal, centre, p.distortion_error_px * distortion)

@@ -1,4 +1,4 @@
-"""What a file of poses leaves unsaid: its world axes, whose axes its attitudes are of, and where the camera is."""
+"""Conventions of recorded poses: world axes, axes of the attitudes, and mounting of the camera."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 from marsyard.sim.frames import SITE_FROM_WORLD
 from marsyard.sim.parameters import Parameters
 
-#: Rotations from a file's world axes to ours, which are east, north, up.
+#: Rotations from a file's world axes to east, north, up.
 _WORLD = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}
-#: OpenCV's camera axes (x right, y down, z forward) in the body's, whose camera looks along -z, its columns along x.
+#: OpenCV's camera axes (x right, y down, z forward) in the body's: camera along -z, columns along x.
 _CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
 class RecordedAxes(Parameters):
-    """The axes of recorded poses, and the camera's place in what was recorded."""
+    """Axes of recorded poses, and mounting of the camera in the recorded vehicle."""
 
     axes: Annotated[Literal["enu", "ned"], Field(description="world axes: east, north, up; or north, east, down")]
     attitude_of: Annotated[
@@ -35,21 +35,21 @@ class RecordedAxes(Parameters):
     ] = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
-    def _mounting_is_a_rotation(self) -> RecordedAxes:
+    def _check_mounting(self) -> RecordedAxes:
         if abs(float(np.linalg.norm(self.mounting)) - 1.0) > 1e-3:
             raise ValueError(f"mounting {list(self.mounting)} is no quaternion of length 1")
         return self
 
     @property
     def world(self) -> Rotation:
-        """From the file's world axes to ours."""
+        """Rotation from the file's world axes to east, north, up."""
         return _WORLD[self.axes]
 
     def bodies(self, world_from_vehicle: Rotation) -> Rotation:
-        """Attitudes of our body from the recorded vehicle's, world axes on both sides being ours."""
+        """Convert attitudes of the recorded vehicle to those of the body, both relative to east, north, up."""
         attitudes = world_from_vehicle * Rotation.from_quat(np.array(self.mounting))
         return attitudes * _CAMERA_IN_BODY.inv() if self.attitude_of == "camera" else attitudes
 
     def levers(self, world_from_vehicle: Rotation) -> Float64[np.ndarray, "*batch 3"]:
-        """From the recorded vehicle's places to the camera's, our world axes, m."""
+        """Return the offsets from the recorded vehicle to the camera in east, north, up."""
         return np.asarray(world_from_vehicle.apply(np.array(self.lever_m)))

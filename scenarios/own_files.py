@@ -1,31 +1,35 @@
-"""A user's own files: a campaign knows one again by the hash of its contents; what is wrong with one is listed."""
+"""Files of a user: parameters that name a file with its hash, CSV tables, and lists of problems."""
 
 from __future__ import annotations
 
+import csv
+import difflib
+import math
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 from pydantic import BaseModel, Field, model_validator
 
+from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters
 
-#: Problems of a file that are told at once.
-_TOLD = 20
+#: Maximum number of problems of a file in one message.
+_MAX_PROBLEMS = 20
 
 
 @runtime_checkable
 class NamesFiles(Protocol):
-    """Parameters that name files; a user's own options may have the method, too."""
+    """Parameters that name files; options of a user's algorithm may have the method as well."""
 
     def input_files(self) -> Sequence[str]:
-        """Paths of the files, as stated."""
+        """Return the paths of the files, as stated."""
         ...
 
 
 def input_files(parameters: Any) -> tuple[str, ...]:
-    """The files that a scenario's parameters name, anywhere in their tree; each once."""
+    """Return the distinct files that parameters name anywhere in their tree."""
     return tuple(dict.fromkeys(_files_in(parameters)))
 
 
@@ -44,35 +48,102 @@ def _files_in(value: Any) -> Iterator[str]:
 
 
 class OwnFile(Parameters):
-    """A file that a campaign is made from. The hash is filled in when the campaign is read; each case checks it."""
+    """A file with its hash, which is added when the campaign is read and checked in each case."""
 
     file: Annotated[str, Field(description="path of the file")]
     sha256: Annotated[str | None, Field(description="of the file; filled in")] = None
 
     def input_files(self) -> tuple[str, ...]:
-        """The file."""
+        """Return the file."""
         return (self.file,)
 
     @classmethod
     @abstractmethod
     def hash_of(cls, file: str) -> str:
-        """SHA-256 of a file's contents. Raises ValueError, naming it, where it cannot be used."""
+        """Return the SHA-256 of a usable file. Raises ValueError, which names the file."""
 
     @model_validator(mode="before")
     @classmethod
-    def _with_its_hash(cls, stated: Any) -> Any:
+    def _add_hash(cls, stated: Any) -> Any:
         if isinstance(stated, Mapping) and isinstance(stated.get("file"), str) and stated.get("sha256") is None:
             return {**stated, "sha256": cls.hash_of(stated["file"])}
         return stated
 
     @model_validator(mode="after")
-    def _is_as_it_was(self) -> OwnFile:
+    def _check_hash(self) -> OwnFile:
         if self.sha256 != self.hash_of(self.file):
             raise ValueError(f"{self.file}: has changed since the campaign was made from it")
         return self
 
 
 def listed(file: Path, problems: Sequence[str]) -> str:
-    """What is wrong with a file as one message, the first problems of very many."""
-    more = [f"... and {len(problems) - _TOLD} more"] if len(problems) > _TOLD else []
-    return "\n  ".join([f"{file}:", *problems[:_TOLD], *more])
+    """Format the problems of a file as one message, with a maximum number of them."""
+    more = [f"... and {len(problems) - _MAX_PROBLEMS} more"] if len(problems) > _MAX_PROBLEMS else []
+    return "\n  ".join([f"{file}:", *problems[:_MAX_PROBLEMS], *more])
+
+
+def read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Read the column names and the non-empty lines with their numbers.
+
+    Raises ValueError where the file is unreadable, is no table with commas, or has too many rows.
+    """
+    try:
+        check_regular(path)
+        with path.open(newline="", encoding="utf-8-sig") as text:
+            reader = csv.reader(text)
+            header = [name.strip() for name in next(reader, [])]
+            lines = []
+            for cells in reader:
+                if any(cell.strip() for cell in cells):
+                    lines.append((reader.line_num, [cell.strip() for cell in cells]))
+                if len(lines) > max_rows:
+                    raise ValueError(f"{path}: has more than {max_rows} rows; divide it")
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: is no table with commas: {error}") from error
+    return header, lines
+
+
+def header_problems(header: Sequence[str], needed: Sequence[str], allowed: Sequence[str], hint: str) -> Iterator[str]:
+    """Yield missing, unknown and repeated columns; `hint` states the allowed ones."""
+    if not header:
+        yield "it is empty"
+        return
+    for name in needed:
+        if name not in header:
+            yield f"the column '{name}' is missing"
+    for name in dict.fromkeys(header):
+        if name not in allowed:
+            near = difflib.get_close_matches(name, allowed, n=1, cutoff=0.6)
+            suggestion = f" (did you mean '{near[0]}'?)" if near else ""
+            yield f"unknown column '{name}'{suggestion}; {hint}"
+        if header.count(name) > 1:
+            yield f"the column '{name}' stands there twice"
+
+
+def cells_by_column(header: Sequence[str], cells: Sequence[str]) -> dict[str, str]:
+    """Return a row's cells by column. Raises ValueError for another number of cells than columns."""
+    if len(cells) != len(header):
+        raise ValueError(f"it has {len(cells)} cells; the first line has {len(header)}")
+    return dict(zip(header, cells, strict=True))
+
+
+def finite_number(name: str, text: str, otherwise: str = "") -> float:
+    """Parse a finite number. Raises ValueError, whose message ends with `otherwise`."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{name} is '{text}'; allowed: a finite number{otherwise}")
+    return value
+
+
+def check_together(groups: Iterable[Sequence[str]], given: Mapping[str, float]) -> None:
+    """Raise ValueError where a group of columns is filled in part."""
+    for names in groups:
+        filled = [name for name in names if name in given]
+        missing = [name for name in names if name not in given]
+        if filled and missing:
+            raise ValueError(f"{filled[0]} is given, but {missing[0]} is not")

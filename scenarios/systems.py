@@ -1,17 +1,19 @@
-"""The registry of systems: those of Marsyard, and those of installed packages.
+"""Registry of the systems of Marsyard and of installed packages.
 
-A package names a system of its own by an entry point of the group `marsyard.systems`::
+A package adds a system by an entry point of the group `marsyard.systems`::
 
     [project.entry-points."marsyard.systems"]
     altitude = "mypackage.system:SYSTEM"
 
-A system that cannot be used is left out, with one message in `problems`; the others are not affected.
+An unusable system is left out, with one message in `problems`.
 """
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
@@ -21,7 +23,7 @@ from marsyard.scenarios.system import System
 #: Entry points of other packages' systems.
 GROUP = "marsyard.systems"
 
-#: The systems that are part of Marsyard. Cases of recorded data come first: their products are also those of others.
+#: The systems of Marsyard. Recorded pictures come first: their products are also those of others.
 BUILT_IN = (
     "marsyard.scenarios.measured.system:MEASURED",
     "marsyard.scenarios.descent.system:DIMES",
@@ -33,7 +35,7 @@ BUILT_IN = (
 
 @dataclass(frozen=True)
 class Registry:
-    """The systems in order, and one message for each that was left out."""
+    """The systems in order, and one message for each that is left out."""
 
     systems: tuple[System, ...]
     problems: tuple[str, ...]
@@ -41,45 +43,44 @@ class Registry:
 
 @cache
 def registry() -> Registry:
-    """The systems of this installation, read once a process."""
-    known: list[System] = [found_at(path) for path in BUILT_IN]
+    """Read the systems of this installation, once per process."""
+    usable: list[System] = [found_at(path) for path in BUILT_IN]
     problems: list[str] = []
     for point in sorted(entry_points(group=GROUP), key=lambda one: (one.name, one.value)):
         try:
-            known.append(_loaded(point, known))
+            usable.append(_load(point, usable))
         except ValueError as error:
             problems.append(f"system '{point.name}' ({point.value}) is left out: {error}")
-    return Registry(tuple(known), tuple(problems))
+    return Registry(tuple(usable), tuple(problems))
 
 
 def systems() -> tuple[System, ...]:
-    """All systems: those of Marsyard first, then those of other packages by their names."""
+    """Return all systems: those of Marsyard first, then those of other packages by name."""
     return registry().systems
 
 
 def problems() -> tuple[str, ...]:
-    """One message for each system of another package that was left out."""
+    """Return one message for each system of another package that is left out."""
     return registry().problems
 
 
 def scenario_paths() -> Mapping[str, str]:
-    """The class of each scenario as ``module:Class``, by the scenario's name."""
+    """Return the classes of the scenarios as ``module:Class`` by scenario."""
     return {name: path for system in systems() for name, path in system.scenarios.items()}
 
 
 def template_paths() -> Mapping[str, str]:
-    """The templates of `marsyard new` as ``module:NAME``, by the names of its option ``--system``."""
+    """Return the templates of `marsyard new` as ``module:NAME`` by value of its option ``--system``."""
     return {name: path for system in systems() for name, path in system.templates.items()}
 
 
 def system_of(scenario: str) -> System | None:
-    """The system that has a scenario of this name, or of this ``module:Class``; None where no system has it."""
-    found = (one for one in systems() if scenario in one.scenarios or scenario in one.scenarios.values())
-    return next(found, None)
+    """Return the system with a scenario of this name or ``module:Class``; None without one."""
+    return next((one for one in systems() if scenario in {*one.scenarios, *one.scenarios.values()}), None)
 
 
-def _loaded(point: EntryPoint, known: list[System]) -> System:
-    """The system of an entry point. Raises ValueError where it cannot be used next to those known."""
+def _load(point: EntryPoint, others: list[System]) -> System:
+    """Load the system of an entry point. Raises ValueError where it is unusable or conflicts with the others."""
     try:
         system = found_at(point.value)
     except ImportError as error:
@@ -91,7 +92,7 @@ def _loaded(point: EntryPoint, known: list[System]) -> System:
         missing.append(str(system.catalogue))
     if missing:
         raise ValueError(f"it names what is not there: {', '.join(missing)}")
-    for other in known:
+    for other in others:
         shared = next(_shared_names(system, other), None)
         if shared is not None:
             raise ValueError(f"the system '{other.name}' already has the {shared}")
@@ -99,10 +100,48 @@ def _loaded(point: EntryPoint, known: list[System]) -> System:
 
 
 def _shared_names(system: System, other: System) -> Iterator[str]:
-    """Names that two systems may not share but do."""
+    """Yield the names that two systems share."""
     if system.name == other.name:
         yield f"name '{system.name}'"
     for kind in ("scenarios", "campaigns", "templates"):
         for name in getattr(system, kind):
             if name in getattr(other, kind):
                 yield f"{kind.removesuffix('s')} '{name}'"
+
+
+@dataclass(frozen=True)
+class StatedColumns:
+    """Columns of a scenario's rows; a star in `flags` and `numbers` matches any text.
+
+    - flags: columns of true and false
+    - numbers: columns of numbers
+    - named_flags: a list among the parameters whose entries' `name` are further columns of true and false; empty for
+      none
+    """
+
+    flags: tuple[str, ...]
+    numbers: tuple[str, ...]
+    named_flags: str = ""
+
+    def has_flag(self, name: str) -> bool:
+        """Return whether a column of true and false may have this name."""
+        return any(fnmatchcase(name, pattern) for pattern in self.flags)
+
+    def has_number(self, name: str) -> bool:
+        """Return whether a column of numbers may have this name."""
+        return any(fnmatchcase(name, pattern) for pattern in self.numbers)
+
+
+@cache
+def stated_columns(scenario: str) -> StatedColumns | None:
+    """Return the columns of a scenario; None where its system does not state them. Raises ValueError for a bad file."""
+    system = system_of(scenario)
+    if system is None or system.columns is None:
+        return None
+    try:
+        stated = tomllib.loads(system.columns.read_text(encoding="utf-8")).get(scenario)
+        if stated is None:
+            return None
+        return StatedColumns(tuple(stated["flags"]), tuple(stated["numbers"]), stated.get("named_flags", ""))
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise ValueError(f"{system.columns}: states no columns: {type(error).__name__}: {error}") from error

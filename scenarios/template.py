@@ -1,4 +1,4 @@
-"""Templates of new campaigns, one for each system: `marsyard new` writes a commented file from them."""
+"""Templates of campaign files: `marsyard new` writes a commented file from them."""
 
 from __future__ import annotations
 
@@ -13,26 +13,19 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from marsyard.scenarios.system import SCENARIOS_FOLDER
 
-#: Terrains of a new campaign's bank: enough for cases that are appended, and as many as a bank may have.
+#: Number of terrains of a new campaign's bank: enough for appended cases, and the maximum of a bank.
 MIN_TERRAINS, MAX_TERRAINS = 10_000, 100_000
 
 
 @dataclass(frozen=True)
 class Choices:
-    """What a new campaign is made from.
+    """A user's choices for a new campaign.
 
-    Attributes
-    ----------
-    name, site
-        The campaign's name, and the terrain's site.
-    camera, detector, flight
-        Files of the user, or empty.
-    axes
-        World axes of the flight's file.
-    bound
-        Maximum error, or minimum fraction, that the requirement states.
-    cases
-        Number of cases.
+    - name, site: the campaign's name, and the terrain's site
+    - camera, detector, flight: files of the user, or empty
+    - axes: world axes of the flight's file
+    - bound: maximum error, or minimum fraction, that the requirement states
+    - cases: number of cases
     """
 
     name: str
@@ -47,25 +40,16 @@ class Choices:
 
 @dataclass(frozen=True)
 class CampaignTemplate:
-    """A campaign file with places for a user's choices.
+    """A Jinja template of a campaign file.
 
-    Attributes
-    ----------
-    file
-        The file in Jinja's language. It gets the fields of `Choices`, `bank` (number of terrains) and what `values`
-        adds; the filter ``toml`` writes a value in TOML's notation. It may extend ``campaign.toml.j2``.
-    scale
-        The attribute of a site's terrain that it needs: ``descent`` or ``ground``.
-    site, bound
-        Defaults.
-    bound_text
-        What the bound is, for the dialogue.
-    max_bound
-        The bound is below this.
-    refused
-        Why an option (``camera``, ``detector``, ``flight``) is not accepted, by the option.
-    values
-        Further values for the file. Raises ValueError where a user's file cannot be used.
+    - file: gets the fields of `Choices`, `bank` (number of terrains) and the entries of `values`; the filter ``toml``
+      formats a value as TOML. It may extend ``campaign.toml.j2``.
+    - scale: scale of the site's terrain, ``descent`` or ``ground``
+    - site, bound: defaults
+    - bound_text: meaning of the bound, for the dialogue
+    - max_bound: upper limit of the bound, exclusive
+    - refused: reasons why options (``camera``, ``detector``, ``flight``) are not accepted
+    - values: further values for the file. Raises ValueError where a user's file cannot be used.
     """
 
     file: Path
@@ -78,7 +62,7 @@ class CampaignTemplate:
     values: Callable[[Choices], Mapping[str, Any]] = lambda _: {}
 
     def text(self, choices: Choices) -> str:
-        """The campaign file. Raises ValueError where an option is not accepted."""
+        """Return the text of the campaign file. Raises ValueError where an option is not accepted."""
         refusal = next((why for option, why in self.refused.items() if getattr(choices, option)), None)
         if refusal is not None:
             raise ValueError(refusal)
@@ -88,7 +72,7 @@ class CampaignTemplate:
 
 
 def toml_environment(*folders: Path) -> Environment:
-    """Templates of TOML files in folders; the filter ``toml`` writes a value in TOML's notation."""
+    """Return the environment of TOML templates in folders; the filter ``toml`` formats a value as TOML."""
     environment = Environment(
         loader=FileSystemLoader(folders),
         undefined=StrictUndefined,

@@ -1,59 +1,59 @@
-"""Own terrain looked at before it is used: a file that cannot be meant is refused by its header, at once.
+"""Validate terrain files of a user by their headers before `marsyard.sim.terrain` reads them.
 
-`marsyard.sim.terrain` reads what passes here. A GeoTIFF must state a projection in metres (or another length, by which
-it is scaled) that keeps lengths, square cells with grid north up, a value that means no data where it has any, and
-heights in metres. An .npz archive is checked in the same way, from its headers before anything is expanded.
+A GeoTIFF must have a projection in metres (or another length, by which it is scaled) that preserves lengths, square
+cells with grid north up, a no-data value if it has gaps, and heights in metres. An .npz archive is checked likewise.
 """
 
 from __future__ import annotations
 
+import os
 import warnings
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
-from marsyard.scenarios.map_projection import map_scale
 from marsyard.sim.files import ARCHIVE_ERRORS, ArrayHeader, check_regular, npz_headers
 from marsyard.sim.terrain import TerrainParameters
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, read_rasters
 
-#: Most posts of a DTM and pixels of a picture along a side: what the largest terrain holds, and what memory does.
-MOST_POSTS, MOST_PIXELS = 5461, 8192
-#: By how much a projection may stretch lengths where the file lies.
-MOST_STRETCH = 0.02
-#: Heights that no ground of Earth, Moon or Mars has: Mariana Trench to Olympus Mons.
+#: Maximum posts of a DTM and pixels of a picture along a side: limits of the largest terrain and of memory.
+_MAX_POSTS, _MAX_PIXELS = 5461, 8192
+#: Maximum relative distortion of lengths by the projection.
+_MAX_STRETCH = 0.02
+#: Range of heights on Earth, Moon and Mars: Mariana Trench to Olympus Mons.
 HEIGHTS_M = (-11_500.0, 22_000.0)
 _METRES = ("", "m", "metre", "metres", "meter", "meters")
-#: Arrays of an .npz, and how many dimensions each has.
+#: Arrays of an .npz archive and their dimensions.
 _ARRAYS = {"dem": 2, "dem_gsd": 0, "ortho": 2, "ortho_gsd": 0, "ortho_valid": 2}
 
 
 def check_terrain(terrain: TerrainParameters) -> None:
-    """Raises TerrainFileError where a terrain's files cannot be used; the message names file and fault."""
+    """Raise TerrainFileError where a terrain's files are unusable."""
     if terrain.source is not None:
         check_source(terrain.source)
 
 
 def check_source(source: RealTerrain) -> None:
-    """Raises TerrainFileError where these files cannot be used; the message names file and fault."""
+    """Raise TerrainFileError where files are unusable; the message names file and fault."""
     paths = [path for path in (source.dtm, source.ortho) if path is not None]
-    _check(source, tuple(_present(path).stat().st_mtime_ns for path in paths))
+    _check(source, tuple(_check_present(path).st_mtime_ns for path in paths))
 
 
 @lru_cache(maxsize=16)
 def _check(source: RealTerrain, _changed_ns: tuple[int, ...]) -> None:
-    """Looked at once: a campaign's cases all ask."""
     dtm = source.dtm
     if dtm.suffix == ".npz":
         _check_npz(source)
         dtm_crs = None
     else:
-        dtm_crs = _check_geotiff(dtm, MOST_POSTS, heights_of=source)
+        dtm_crs = _check_geotiff(dtm, _MAX_POSTS, heights_of=source)
     if source.ortho is None:
         return
-    ortho_crs = _check_geotiff(source.ortho, MOST_PIXELS)
+    ortho_crs = _check_geotiff(source.ortho, _MAX_PIXELS)
     if dtm_crs is not None and ortho_crs != dtm_crs:
         raise TerrainFileError(
             f"{source.ortho}: its projection is not that of {source.dtm}; bring it there with "
@@ -61,20 +61,20 @@ def _check(source: RealTerrain, _changed_ns: tuple[int, ...]) -> None:
         )
 
 
-def _present(path: Path) -> Path:
+def _check_present(path: Path) -> os.stat_result:
     try:
-        about = check_regular(path)
+        status = check_regular(path)
     except FileNotFoundError:
         raise TerrainFileError(f"{path}: no such file") from None
     except OSError as fault:
         raise TerrainFileError(f"{path}: {fault.strerror}") from fault
-    if about.st_size == 0:
+    if status.st_size == 0:
         raise TerrainFileError(f"{path}: is empty (0 bytes)")
-    return path
+    return status
 
 
 def _check_npz(source: RealTerrain) -> None:
-    """Checks the headers of an archive, and then its heights."""
+    """Check the headers of an archive, and then its heights."""
     path = source.dtm
     try:
         headers = npz_headers(path)
@@ -99,7 +99,7 @@ def _check_npz(source: RealTerrain) -> None:
 
 
 def _check_array(path: Path, name: str, header: ArrayHeader) -> None:
-    """Checks what the header of an archive's array says, before the array is expanded."""
+    """Check the header of an archive's array before the array is expanded."""
     shape, dtype = header
     if dtype.kind not in "biuf":
         raise TerrainFileError(f"{path}: {name} holds values of type {dtype}; allowed: real numbers")
@@ -107,26 +107,26 @@ def _check_array(path: Path, name: str, header: ArrayHeader) -> None:
         if np.prod(shape, dtype=np.float64) != 1:
             raise TerrainFileError(f"{path}: {name} has the shape {shape}; one number is needed")
         return
-    most = MOST_POSTS if name == "dem" else MOST_PIXELS
-    if len(shape) != 2 or min(shape) < 4 or max(shape) > most:
+    limit = _MAX_POSTS if name == "dem" else _MAX_PIXELS
+    if len(shape) != 2 or min(shape) < 4 or max(shape) > limit:
         raise TerrainFileError(
-            f"{path}: {name} has a grid of shape {shape}; two dimensions of 4 to {most} values are needed"
+            f"{path}: {name} has a grid of shape {shape}; two dimensions of 4 to {limit} values are needed"
         )
 
 
-def _check_geotiff(path: Path, most: int, *, heights_of: RealTerrain | None = None) -> Any:
-    """Checks what the header says and, of a DTM, its heights; returns the projection."""
-    with _opened(path) as file:
-        _check_grid(path, file, most)
+def _check_geotiff(path: Path, max_side: int, *, heights_of: RealTerrain | None = None) -> Any:
+    """Check the header and, of a DTM, the heights; return the projection."""
+    with _open(path) as file:
+        _check_grid(path, file, max_side)
         _check_projection(path, file)
         if heights_of is not None:
             _check_heights(path, file, heights_of)
         return file.crs
 
 
-def _opened(path: Path) -> Any:
-    """A GeoTIFF, open. Raises TerrainFileError."""
-    _present(path)
+def _open(path: Path) -> Any:
+    """Open a GeoTIFF. Raises TerrainFileError."""
+    _check_present(path)
     try:
         import rasterio
     except ImportError as error:
@@ -139,12 +139,12 @@ def _opened(path: Path) -> Any:
             raise TerrainFileError(f"{path}: is no GeoTIFF ({fault})") from fault
 
 
-def _check_grid(path: Path, file: Any, most: int) -> None:
+def _check_grid(path: Path, file: Any, max_side: int) -> None:
     if min(file.width, file.height) < 4:
         raise TerrainFileError(f"{path}: has {file.width} x {file.height} values; at least 4 x 4 are needed")
-    if max(file.width, file.height) > most:
+    if max(file.width, file.height) > max_side:
         raise TerrainFileError(
-            f"{path}: has {file.width} x {file.height} values; at most {most} along a side are used: cut a part "
+            f"{path}: has {file.width} x {file.height} values; at most {max_side} along a side are used: cut a part "
             "out with rio clip --bounds, or make it coarser with rio warp --res"
         )
     cell = file.transform
@@ -165,24 +165,24 @@ def _check_projection(path: Path, file: Any) -> None:
     if not crs.is_projected:
         raise TerrainFileError(f"{path}: its coordinates are no map projection's; project it with rio warp --dst-crs")
     scale = map_scale(file)
-    if scale is None:  # a projection whose inverse is not known is believed
+    if scale is None:  # a projection without a known inverse is accepted
         return
-    if max(scale.largest - 1.0, 1.0 - scale.smallest) > MOST_STRETCH:
+    if max(scale.largest - 1.0, 1.0 - scale.smallest) > _MAX_STRETCH:
         raise TerrainFileError(
             f"{path}: its projection stretches lengths by {scale.smallest:.3f} to {scale.largest:.3f}, depending on "
-            f"their direction; allowed: within {MOST_STRETCH:g} of 1: project it about its own middle with "
+            f"their direction; allowed: within {_MAX_STRETCH:g} of 1: project it about its own middle with "
             "rio warp --dst-crs"
         )
 
 
 def grid_north_deg(path: Path) -> float | None:
-    """Azimuth of a GeoTIFF's grid north in its middle, clockwise from true north, degrees; None where it is not known.
+    """Return the azimuth of a GeoTIFF's grid north in its middle, clockwise from true north; None if unknown.
 
     Raises TerrainFileError where the file cannot be opened.
     """
     if path.suffix == ".npz":
         return None
-    with _opened(path) as file:
+    with _open(path) as file:
         scale = map_scale(file)
     return None if scale is None else scale.grid_north_deg
 
@@ -206,7 +206,7 @@ def _check_heights(path: Path, file: Any, source: RealTerrain) -> None:
 
 
 def _check_values(path: Path, values: np.ndarray, source: RealTerrain, advice: str) -> None:
-    """Checks heights, NaN where there is none: how many are missing, and that the others can be some."""
+    """Check the number of missing heights (NaN) and the range of the others."""
     check_holes(source, values)
     valid = values[np.isfinite(values)]
     low, high = float(valid.min()), float(valid.max())
@@ -215,3 +215,74 @@ def _check_values(path: Path, values: np.ndarray, source: RealTerrain, advice: s
         raise TerrainFileError(
             f"{path}: holds heights of {wrong:g} m; allowed: {HEIGHTS_M[0]:g} to {HEIGHTS_M[1]:g} m; {advice}"
         )
+
+
+#: Distance from a pole, in cells, below which the direction of true north is undefined.
+_POLE_CELLS = 2.0
+
+
+@dataclass(frozen=True)
+class MapScale:
+    """Scale of a map projection at a point.
+
+    - smallest, largest: extreme ratios of lengths on the map to those on the ground over all directions: the singular
+      values of the projection's derivative (Snyder 1987, Map Projections: A Working Manual, section 4)
+    - grid_north_deg: grid convergence: azimuth of the columns' upward direction, clockwise from true north, -180 to
+      180; None at a pole
+    """
+
+    smallest: float
+    largest: float
+    grid_north_deg: float | None
+
+
+def map_scale(file: Any) -> MapScale | None:
+    """Compute the scale of a rasterio dataset's projection in its middle; None without a known inverse."""
+    from rasterio.errors import RasterioError
+
+    try:
+        east, north, normal, radius = _derivative(file)
+    except (RasterioError, ValueError):
+        return None
+    gram = np.array([[east @ east, east @ north], [east @ north, north @ north]])
+    if not np.all(np.isfinite(gram)) or np.linalg.det(gram) <= 0.0:
+        return None
+    ground = np.sqrt(np.linalg.eigvalsh(gram))
+    return MapScale(1.0 / float(ground[1]), 1.0 / float(ground[0]), _azimuth_deg(north, normal, radius, file))
+
+
+def _derivative(
+    file: Any,
+) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]:
+    """Compute ground lengths per map length along x and y, the body's unit normal, and the distance from its axis.
+
+    Central differences of body-centred positions, which have no singularity at the poles; body-fixed axes.
+    """
+    from rasterio.crs import CRS
+    from rasterio.warp import transform
+
+    terms = file.crs.to_dict()
+    body = {name: terms[name] for name in ("a", "b", "R", "ellps", "datum", "rf") if name in terms}
+    centred = CRS.from_dict({"proj": "geocent", **body, "units": "m", "no_defs": True})
+    cell = file.transform
+    x, y = cell.c + 0.5 * file.width * cell.a, cell.f + 0.5 * file.height * cell.e
+    # large compared with rounding, small compared with the projection's curvature
+    step = max(abs(cell.a), 1.0)
+    xs, ys = [x - step, x + step, x, x], [y, y, y - step, y + step]
+    positions = np.array(transform(file.crs, centred, xs, ys, [0.0] * 4), dtype=np.float64).T
+    length = 2.0 * step * float(file.crs.linear_units_factor[1])
+    east, north = (positions[1] - positions[0]) / length, (positions[3] - positions[2]) / length
+    normal = np.cross(east, north)
+    radius = float(np.hypot(*positions.mean(axis=0)[:2]))
+    return east, north, normal / max(float(np.linalg.norm(normal)), 1e-300), radius
+
+
+def _azimuth_deg(
+    along: Float64[np.ndarray, "3"], normal: Float64[np.ndarray, "3"], radius_m: float, file: Any
+) -> float | None:
+    """Return the azimuth of a direction on the ground, clockwise from true north; None at a pole."""
+    if radius_m < _POLE_CELLS * abs(file.transform.a) * float(file.crs.linear_units_factor[1]):
+        return None
+    true_east = np.cross([0.0, 0.0, 1.0], normal)
+    true_north = np.cross(normal, true_east)
+    return float(np.degrees(np.arctan2(along @ true_east, along @ true_north)))

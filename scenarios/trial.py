@@ -1,8 +1,7 @@
-"""Algorithms under test in a case: each is tried on its own, and what it does wrong is its own.
+"""Run the algorithms of a case separately: a failure of one does not affect the others.
 
-The first of a campaign's algorithms is the one that is judged: its columns stand in the row as they are. Those of every
-further one stand behind, after its label and a point (`homography.velocity_error_m_s`), with its own `outcome`,
-`answered` and `error`.
+The first algorithm of a campaign is under test: its columns have no prefix. Those of the compared ones have their label
+as a prefix (`homography.velocity_error_m_s`), with their own `outcome`, `answered` and `error`.
 """
 
 from __future__ import annotations
@@ -21,22 +20,17 @@ from marsyard.scenarios.interface import CaseResult, Failure, Scalar, record_con
 
 Answer = TypeVar("Answer")
 
-#: The column that names the algorithm under test, and that of what a program wrote to its standard error.
+#: Columns of the algorithm under test, and of a program's standard error.
 ALGORITHM, STDERR = "algorithm", "stderr"
 
 
 @dataclass(frozen=True)
 class Attempt(Generic[Answer]):
-    """What came of asking an algorithm.
+    """The answer or failure of an algorithm.
 
-    Attributes
-    ----------
-    answer
-        Its answer, valid by the interface; None where it failed to give one.
-    failure
-        How it failed; None where it did not.
-    row
-        The time that it took (processor; of a program, wall-clock), and what a program wrote to its standard error.
+    - answer: valid answer; None for a failure
+    - failure: None for an answer
+    - row: computation time (processor; of a program, wall-clock), and a program's standard error
     """
 
     answer: Answer | None
@@ -44,28 +38,28 @@ class Attempt(Generic[Answer]):
     row: Mapping[str, Scalar]
 
     def outcome(self, of_answer: Callable[[Answer], str]) -> str:
-        """The outcome's name: the answer's own, or the fault's."""
+        """Return the name of the answer's outcome, or of the fault."""
         if self.answer is not None:
             return of_answer(self.answer)
         return self.failure.outcome if self.failure is not None else Fault.CRASHED.name
 
 
 def attempted(ask: Callable[[], object], check: Callable[[object], Answer]) -> Attempt[Answer]:
-    """Asks an algorithm, and holds its answer against the interface; whatever it raises is a failure of its own."""
+    """Run an algorithm and validate its answer; all exceptions become failures of the algorithm."""
     started = time.process_time()
     try:
         raw = ask()
         taken = time.process_time() - started
         answer = check(raw)
     except AlgorithmError as error:
-        said = {STDERR: error.stderr} if error.stderr else {}
-        return Attempt(None, Failure(error.fault.name, str(error), ""), {**_time(started), **said})
-    except MemoryError as error:
-        failure = Failure(Fault.OUT_OF_MEMORY.name, describe_error(error), traceback.format_exc())
-        return Attempt(None, failure, _time(started))
+        columns: dict[str, Scalar] = {"estimation_time_s": time.process_time() - started}
+        if error.stderr:
+            columns[STDERR] = error.stderr
+        return Attempt(None, Failure(error.fault.name, str(error), ""), columns)
     except Exception as error:
-        failure = Failure(Fault.CRASHED.name, describe_error(error), traceback.format_exc())
-        return Attempt(None, failure, _time(started))
+        fault = Fault.OUT_OF_MEMORY if isinstance(error, MemoryError) else Fault.CRASHED
+        failure = Failure(fault.name, describe_error(error), traceback.format_exc())
+        return Attempt(None, failure, {"estimation_time_s": time.process_time() - started})
     row: dict[str, Scalar] = {"estimation_time_s": answer_time_s(answer, taken)}
     details = getattr(answer, "details", None)
     if isinstance(details, ProgramDetails):
@@ -76,7 +70,7 @@ def attempted(ask: Callable[[], object], check: Callable[[object], Answer]) -> A
 def attempted_with(
     ask: Callable[[Given], object], check: Callable[[object], Answer], measurements: Given
 ) -> Attempt[Answer]:
-    """As `attempted`, of an algorithm that is given its own copy of measurements, and is not to change it."""
+    """Run an algorithm on its own copy of the measurements, which it may not change; see `attempted`."""
     handover = Handover(measurements)
 
     def check_both(answer: object) -> Answer:
@@ -87,18 +81,14 @@ def attempted_with(
 
 
 def answer_time_s(answer: object, taken_s: float) -> float:
-    """The time that an answer took: processor time, measured around it; of a program, the wall-clock time it tells."""
+    """Return the computation time: the measured processor time; of a program, the wall-clock time that it reports."""
     details = getattr(answer, "details", None)
     return details.time_s if isinstance(details, ProgramDetails) else taken_s
 
 
-def _time(started: float) -> dict[str, Scalar]:
-    return {"estimation_time_s": time.process_time() - started}
-
-
 @dataclass(frozen=True)
 class Judged:
-    """What one algorithm made of a case, scored. See `CaseResult`."""
+    """Scored result of one algorithm; see `CaseResult`."""
 
     outcome: str
     answered: bool
@@ -110,16 +100,11 @@ class Judged:
 def case_result(
     algorithms: Sequence[str], judge: Callable[[str], Judged], conditions: Mapping[str, Scalar]
 ) -> CaseResult:
-    """A case's result with every algorithm judged in it; its conditions are recorded before any is asked.
+    """Run all algorithms, the first under test, and combine their results; record the conditions before.
 
-    Parameters
-    ----------
-    algorithms
-        Their names, the first the one that is judged.
-    judge
-        Asks one of them, and scores its answer.
-    conditions
-        What the case was like: columns that do not depend on any algorithm.
+    - algorithms: names of the algorithms
+    - judge: runs one of them and scores its answer
+    - conditions: columns that do not depend on any algorithm
     """
     record_conditions(conditions)
     names = labels(algorithms)

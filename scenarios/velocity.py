@@ -1,4 +1,4 @@
-"""How scenarios ask velocity estimators, and what they store of an answer: errors, their consistency, and products."""
+"""Run velocity estimators, and compute the columns and products of their answers."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from marsyard.scenarios.trial import Attempt, attempted
 from marsyard.sim.measurements import DescentMeasurements
 
 Horizontal = Float64[np.ndarray, "2"]
-#: Begin and end, as time tags, of what a velocity is the mean of; equal for that of an instant.
+#: Time tags of the start and end of the interval of a mean velocity; equal for an instantaneous one.
 Span = tuple[float, float]
-#: Places of three pictures among all, from 0.
+#: Indices of three pictures.
 Triple = tuple[int, int, int]
 
 _THREE: Triple = (0, 1, 2)
@@ -29,10 +29,9 @@ _THREE: Triple = (0, 1, 2)
 def asked(
     make: Callable[[], VelocityEstimator], measurements: DescentMeasurements, triple: Triple | None = _THREE
 ) -> Attempt[VelocityEstimate]:
-    """What came of asking an estimator about a descent; a velocity states its span.
+    """Run an estimator on a descent; the answer states its span.
 
-    A stream is given all pictures, as is what writes them down for others; an estimator of three pictures these three,
-    and where there are none it fails.
+    Streams and recorders get all pictures. Other estimators get three of them, and fail without.
     """
     handover = Handover(measurements)
     tags = measurements.tags_s
@@ -42,7 +41,9 @@ def asked(
         estimator = make()
         if isinstance(estimator, StreamedEstimator | Recorder | Answered):
             return estimator.estimate(handover.given)
-        three = _three_of(handover.given, triple)
+        if triple is None:
+            raise ValueError(f"it takes three pictures, and {len(measurements.images)} are taken")
+        three = handover.given if len(measurements.images) == len(triple) else handover.given.chosen(triple)
         tags = three.tags_s
         return estimator.estimate(three)
 
@@ -53,14 +54,8 @@ def asked(
     return attempted(answer, check)
 
 
-def _three_of(measurements: DescentMeasurements, triple: Triple | None) -> DescentMeasurements:
-    if triple is None:
-        raise ValueError(f"it takes three pictures, and {len(measurements.images)} are taken")
-    return measurements if len(measurements.images) == len(triple) else measurements.select(triple)
-
-
 def checked_last_interval(answer: object, measurements: DescentMeasurements) -> VelocityEstimate:
-    """The answer, if it is valid and of the last interval, where truth is known of that alone; else AlgorithmError."""
+    """Validate an answer for the last interval, the only one with known truth. Raises AlgorithmError."""
     estimate = spanned(answer, measurements.tags_s)
     if estimate.span_s not in (None, measurements.last_interval_s):
         raise AlgorithmError(
@@ -71,9 +66,9 @@ def checked_last_interval(answer: object, measurements: DescentMeasurements) -> 
 
 
 def stream_row(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, Scalar]:
-    """What a stream knew after each of its pictures: errors, NaN where it reported nothing; nothing of others.
+    """Return the errors of a stream after each picture, NaN without a velocity; empty for other estimators.
 
-    `answered_after` is the number of pictures after which it first reported a velocity, 0 where it did after none.
+    `answered_after` is the number of pictures before the first velocity, 0 if there is none.
     """
     if estimate is None or not estimate.after_pictures:
         return {}
@@ -90,17 +85,17 @@ def _error_m_s(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizo
 
 
 def velocity_row(name: str, estimated: Horizontal | None, true: Horizontal) -> dict[str, Scalar]:
-    """A velocity's error (m/s) with the two velocities; NaN where none was reported."""
-    given = np.full(2, np.nan) if estimated is None else estimated
-    error = given - true
+    """Return a velocity's error with the estimated and true velocity; NaN without an estimate."""
+    reported = np.full(2, np.nan) if estimated is None else estimated
+    error = reported - true
     row: dict[str, Scalar] = {f"{name}_error_m_s": float(np.hypot(*error))}
-    for kind, values in (("error", error), ("estimated", given), ("true", true)):
+    for kind, values in (("error", error), ("estimated", reported), ("true", true)):
         row |= {f"{name}_{kind}_{axis}_m_s": float(value) for axis, value in zip("xy", values, strict=True)}
     return row
 
 
 def consistency_row(estimate: VelocityEstimate | None, true: Horizontal) -> dict[str, Scalar]:
-    """The error against the covariance that came with it; nothing where none did.
+    """Return the error relative to the reported covariance; empty without a covariance.
 
     `velocity_nees` is the error squared in units of the covariance P, e' P^-1 e: for a consistent estimator of a normal
     error it is distributed as chi-square with 2 degrees of freedom (Bar-Shalom, Li & Kirubarajan, "Estimation with
@@ -124,28 +119,28 @@ def consistency_row(estimate: VelocityEstimate | None, true: Horizontal) -> dict
 def velocity_products(
     pictures: Sequence[UInt16[np.ndarray, "rows columns"]], estimate: VelocityEstimate | None, true: Horizontal
 ) -> dict[str, object]:
-    """Arrays from which a case's figures are drawn."""
-    kept: dict[str, object] = {f"image_{number}": counts for number, counts in enumerate(pictures, start=1)}
+    """Return the arrays for a case's figures."""
+    arrays: dict[str, object] = {f"image_{number}": counts for number, counts in enumerate(pictures, start=1)}
     if estimate is not None and isinstance(estimate.details, DimesDetails):
-        kept.update(dimes_products(estimate.details))
-    kept["velocity_true_m_s"] = true
+        arrays.update(dimes_products(estimate.details))
+    arrays["velocity_true_m_s"] = true
     if estimate is not None and estimate.velocity_m_s is not None:
-        kept["velocity_estimated_m_s"] = estimate.velocity_m_s
-    return kept
+        arrays["velocity_estimated_m_s"] = estimate.velocity_m_s
+    return arrays
 
 
 def stream_products(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, object]:
-    """What a stream answered after each picture, with the truth of it, NaN where it reported nothing; else nothing."""
+    """Return a stream's answers after each picture with the truth, NaN without an answer; empty for others."""
     if estimate is None or not estimate.after_pictures:
         return {}
-    nothing = (np.nan, np.nan)
-    told = [
-        (nothing, nothing, nothing)
+    missing = (np.nan, np.nan)
+    answers = [
+        (missing, missing, missing)
         if one is None or one.velocity_m_s is None or one.span_s is None
         else (one.span_s, one.velocity_m_s, truth(one.span_s))
         for one in estimate.after_pictures
     ]
-    spans, velocities, true = zip(*told, strict=True)
+    spans, velocities, true = zip(*answers, strict=True)
     return {
         "after_spans_s": np.array(spans),
         "after_velocities_m_s": np.array(velocities),

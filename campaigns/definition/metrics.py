@@ -10,10 +10,10 @@ from marsyard.campaigns.definition.campaign import Campaign, value_at
 from marsyard.campaigns.definition.configuration import POPULATIONS, Key
 from marsyard.campaigns.definition.identity import chosen_algorithms
 from marsyard.campaigns.errors import not_allowed
-from marsyard.scenarios.columns import StatedColumns, stated_columns
 from marsyard.scenarios.estimators import labels
 from marsyard.scenarios.interface import TakesParts
 from marsyard.scenarios.parts.named import SCORE
+from marsyard.scenarios.systems import StatedColumns, stated_columns
 
 #: Columns that the engine writes.
 _ENGINE_FLAGS, _ENGINE_NUMBERS = ("answered",), ("wall_time_s", "cpu_time_s")

@@ -38,7 +38,7 @@ from marsyard.campaigns.store.retention import ProductStore, keep_while_running
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, write_table
 from marsyard.campaigns.store.worst import showcase_case, worst_cases
-from marsyard.scenarios.columns import StatedColumns, stated_columns
+from marsyard.scenarios.systems import StatedColumns, stated_columns
 from marsyard.sim.kernel_cache import note_ready
 
 #: What a requirement without a bound, and a population, ask a column to be.

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from marsyard.scenarios.base import TerrainScenario, judged_attempt
+from marsyard.scenarios.conditions import rendered
 from marsyard.scenarios.descent.exposure import take_exposures
 from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
@@ -36,8 +37,6 @@ from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.optics import Optics
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredDescent, scored
-from marsyard.scenarios.provenance import rendered
-from marsyard.scenarios.samples import Sample
 from marsyard.scenarios.trial import Judged, case_result
 from marsyard.scenarios.velocity import (
     Horizontal,

@@ -1,6 +1,6 @@
-"""Where the sun stands on Earth: Meeus, "Astronomical Algorithms" (1998), chapter 25, low accuracy.
+"""Direction to the sun on Earth: Meeus, "Astronomical Algorithms" (1998), chapter 25, low accuracy.
 
-Good to 0.01 deg in this century. Refraction (0.02 deg at 45 deg of elevation) and parallax (0.002 deg) are left out.
+Accurate to 0.01 deg in this century. Neglects refraction (0.02 deg at 45 deg of elevation) and parallax (0.002 deg).
 """
 
 from __future__ import annotations
@@ -18,25 +18,15 @@ _TT_LESS_UT_S = 64.3
 
 
 def sun_direction(time: datetime, latitude_deg: float, longitude_deg: float) -> Float64[np.ndarray, "3"]:
-    """Unit vector to the sun's centre in the local level frame (east, north, up).
+    """Compute the unit vector to the sun's centre in the local level frame (east, north, up).
 
-    Parameters
-    ----------
-    time
-        Instant, with its time zone.
-    latitude_deg, longitude_deg
-        Geodetic latitude and longitude, east positive.
-
-    Raises
-    ------
-    ValueError
-        If the time has no time zone.
+    Latitude is geodetic, longitude positive to the east. Raises ValueError for a time without a time zone.
     """
     if time.tzinfo is None:
         raise ValueError(f"the time {time} has no time zone; one is needed, as in 2002-10-15T12:00-07:00")
     days = (time - _J2000).total_seconds() / 86400.0
     right_ascension, declination = _equatorial((days + _TT_LESS_UT_S / 86400.0) / 36525.0)
-    # mean sidereal time at Greenwich (Meeus 12.4); nutation, at most 0.005 deg, is left out
+    # mean sidereal time at Greenwich (Meeus 12.4); nutation, at most 0.005 deg, is neglected
     sidereal = np.radians((280.46061837 + 360.98564736629 * days + longitude_deg) % 360.0)
     hour = sidereal - right_ascension
     latitude = np.radians(latitude_deg)
@@ -49,7 +39,7 @@ def sun_direction(time: datetime, latitude_deg: float, longitude_deg: float) -> 
 
 
 def _equatorial(centuries: float) -> tuple[float, float]:
-    """Apparent right ascension and declination of the sun, radians, given Julian centuries since J2000."""
+    """Compute the sun's apparent right ascension and declination, radians, from Julian centuries since J2000."""
     t = centuries
     mean_longitude = 280.46646 + 36000.76983 * t + 0.0003032 * t**2
     anomaly = np.radians(357.52911 + 35999.05029 * t - 0.0001537 * t**2)

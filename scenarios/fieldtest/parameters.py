@@ -1,13 +1,13 @@
-"""Everything that a field test campaign may set."""
+"""Parameters of field test campaigns."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 from pydantic import AwareDatetime, Field, field_validator, model_validator
 
 from marsyard.scenarios.chosen import ChosenAlgorithms
-from marsyard.scenarios.estimators import VELOCITY, Task
+from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.optics import CalibrationParameters
 from marsyard.scenarios.parts.scores import OwnScores, ScoredFlight
 from marsyard.sim.dynamics.helicopter import HelicopterParameters
@@ -27,7 +27,7 @@ CAMERA = "mer-descent-field"
 
 
 class RunParameters(Parameters):
-    """One run: where and when it was flown, and how many triples of each category were made of it."""
+    """A run: site, time, and number of triples of each category."""
 
     name: Annotated[str, Field(min_length=1, description="what the report calls the run")]
     site: Annotated[str, Field(description="preset of terrain and light")]
@@ -41,24 +41,23 @@ class RunParameters(Parameters):
 
     @field_validator("site")
     @classmethod
-    def _site_has_a_terrain(cls, name: str) -> str:
-        known = [one.name for one in sites().values() if one.descent is not None]
-        if name not in known:
-            raise ValueError(f"no site for a flight is called '{name}'; allowed: {', '.join(known)}")
+    def _check_site(cls, name: str) -> str:
+        allowed = [one.name for one in sites().values() if one.descent is not None]
+        if name not in allowed:
+            raise ValueError(f"no site for a flight is called '{name}'; allowed: {', '.join(allowed)}")
         return name
 
     @property
     def triples(self) -> int:
-        """Triples of all categories."""
+        """Number of triples of all categories."""
         return self.short_time + self.same_direction + self.opposite_direction
 
 
 class DriftParameters(Parameters):
-    """How the gyros' bias drifts with the temperature of the inertial unit, which the air cools on the passes.
+    """Drift of the gyro bias with the temperature of the inertial unit, which the air cools on the passes.
 
-    The paper lays the spread of the opposite-direction triples to "temperature variations in the IMU which negated the
-    constant bias assumption". How large they were it does not say: the drift is a calibration, chosen so that some of
-    those triples pass 5 m/s.
+    The paper explains the spread of the opposite-direction triples by "temperature variations in the IMU which negated
+    the constant bias assumption", without their size. The drift is calibrated: some of those triples pass 5 m/s.
     """
 
     across_deg_h_k: Annotated[
@@ -71,7 +70,7 @@ class DriftParameters(Parameters):
 
 
 class TargetParameters(Parameters):
-    """The surveyed targets and how well they are seen (paper, III.D.2)."""
+    """The surveyed targets and the errors of their sightings (paper, III.D.2)."""
 
     placed: Annotated[int, Field(ge=3, le=1000, description="targets on the ground")] = 11
     used: Annotated[int, Field(ge=3, le=1000, description="targets used for attitude")] = 9
@@ -81,14 +80,14 @@ class TargetParameters(Parameters):
     survey_m: Annotated[NonNegative, Field(description="error of the survey per axis, m (assumed)")] = 0.02
 
     @model_validator(mode="after")
-    def _used_are_there(self) -> TargetParameters:
+    def _check_used(self) -> TargetParameters:
         if self.used > self.placed:
             raise ValueError(f"{self.used} targets are used, but {self.placed} placed")
         return self
 
 
 class ElevationParameters(Parameters):
-    """The elevation model that is taken off the GPS height: of the class of SRTM (paper, III.D.1)."""
+    """The elevation model subtracted from the GPS height: of the class of SRTM (paper, III.D.1)."""
 
     posting_m: Annotated[Positive, Field(description="distance of its posts, m")] = 30.0
     error_m: Annotated[NonNegative, Field(description="error of its posts, m")] = 6.0
@@ -97,7 +96,7 @@ class ElevationParameters(Parameters):
 
 
 class PictureParameters(Parameters):
-    """When pictures are taken: often enough for 20 of them in less than 2 min (paper, III.D.2)."""
+    """Times of the pictures: 20 of them in less than 2 min (paper, III.D.2)."""
 
     interval_s: Annotated[Positive, Field(le=60.0, description="time between pictures, s (assumed)")] = 3.0
     clock: Annotated[ClockParameters, Field(description="errors of their time tags (assumed)")] = ClockParameters(
@@ -106,7 +105,7 @@ class PictureParameters(Parameters):
 
 
 class TripleParameters(Parameters):
-    """How triples are made of a run's pictures (paper, III.D and IV)."""
+    """Selection of triples from a run's pictures (paper, III.D and IV)."""
 
     virtual_interval_s: Annotated[
         Positive, Field(le=60.0, description="time that is put between two pictures, s: that of the landings")
@@ -122,9 +121,9 @@ class TripleParameters(Parameters):
 
 
 class FieldTestParameters(ChosenAlgorithms, OwnScores):
-    """A field test: its runs and what is common to them. Case i is a triple of one of the runs."""
+    """A field test: its runs and their common settings. Case i is a triple of one of the runs."""
 
-    task: ClassVar[Task[Any, Any]] = VELOCITY
+    task = VELOCITY
     scored = ScoredFlight
 
     algorithm: Annotated[
@@ -150,7 +149,7 @@ class FieldTestParameters(ChosenAlgorithms, OwnScores):
     )
 
     @model_validator(mode="after")
-    def _runs_are_told_apart(self) -> FieldTestParameters:
+    def _check_run_names(self) -> FieldTestParameters:
         names = [run.name for run in self.runs]
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:

@@ -1,9 +1,9 @@
-"""The field test as a scenario: case i is one triple of one run, its measurements, an estimator's answer, the score."""
+"""The field test as a scenario: simulate, measure, estimate and score one triple of one run."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -11,51 +11,46 @@ from jaxtyping import Float64, UInt16
 from pydantic import BaseModel
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.base import TerrainScenario, judged_attempt
-from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, sun_columns
+from marsyard.scenarios.base import LoadGround, TerrainScenario, judged_attempt
+from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, rendered, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
+from marsyard.scenarios.exposure import render_state, sunlight_ratio
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
-from marsyard.scenarios.fieldtest.pictures import cloud_transmittances, first_light, ground_of, take_picture
-from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera, work_out
+from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera, simulate_run
 from marsyard.scenarios.fieldtest.triples import Category, Triple
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.optics import camera_optics, draw_calibrated
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredFlight, scored
-from marsyard.scenarios.provenance import rendered
 from marsyard.scenarios.trial import Judged, attempted_with, case_result
 from marsyard.scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
+from marsyard.sim.render import Scene, Sun
 from marsyard.sim.sensor import Detector
 from marsyard.sim.sensor.ranging import height_above_ground
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import Surface, TerrainBank
+from marsyard.sim.terrain import Surface, TerrainBank, site
 
-PICTURES = 3
-#: Grounds, runs and their scenes that a process keeps: at least those of the paper, among which cases take turns.
-KEPT_GROUNDS, KEPT_RUNS, KEPT_SCENES = 3, 16, 5
+#: Spacing of the pixels whose ground points are kept.
+GRID_PX = 32
+#: Grounds, runs and their scenes in a process's caches: at least those of the paper, among which cases alternate.
+_CACHED_GROUNDS, _CACHED_RUNS, _CACHED_SCENES = 3, 16, 5
 
 
 @dataclass(frozen=True)
 class Case:
-    """A triple of a run, with what is true of its pictures."""
+    """A triple of a run, and the true states at its pictures."""
 
     run: Run
     triple: Triple
     states: tuple[State, State, State]
 
-    @classmethod
-    def of(cls, run: Run, place: int) -> Case:
-        """The triple at a place among a run's."""
-        triple = run.triples[place]
-        first, second, third = (run.flight.state(float(time)) for time in run.truth.times_s[list(triple.pictures)])
-        return cls(run, triple, (first, second, third))
-
 
 class FieldTestScenario(TerrainScenario[FieldTestParameters]):
-    """Triples of pictures of a helicopter's flights, measured as the paper did and given to an estimator: DIMES."""
+    """Triples of pictures of a helicopter, measured as in the paper and given to a velocity estimator."""
 
     name = "fieldtest"
     parameters_type = FieldTestParameters
@@ -64,47 +59,50 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
     part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def __init__(self) -> None:
-        super().__init__(KEPT_GROUNDS)
-        self._run = lru_cache(maxsize=KEPT_RUNS)(work_out)
-        self._first_light = lru_cache(maxsize=KEPT_SCENES)(
-            lambda key: first_light(self._run(key), ground_of(key, self.load_ground))
+        super().__init__(_CACHED_GROUNDS)
+        self._simulate_run = lru_cache(maxsize=_CACHED_RUNS)(simulate_run)
+        self._start_scene = lru_cache(maxsize=_CACHED_SCENES)(
+            lambda key: build_start_scene(self._simulate_run(key), run_ground(key, self.load_ground))
         )
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Numbers of the sites."""
+        """Return the numbers of the sites."""
         return tuple(range(len(self.checked(parameters).site_names)))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """The site of the case's run. Raises ValueError where the runs have no triple of this number."""
+        """Return the site of the case's run. Raises ValueError for a case beyond the runs' triples."""
         p = self.checked(parameters)
-        number, _ = _run_and_place(p, case)
+        number, _ = _find_triple(p, case)
         return (p.site_names.index(p.runs[number].site),)
 
     def input_terrain(self, p: FieldTestParameters, shared_input: int) -> tuple[TerrainBank, int]:
-        """The terrain of a site."""
+        """Return the bank and number of a site's terrain."""
         return TerrainBank(p.terrain(p.site_names[shared_input]), p.bank_seed), 0
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """One triple."""
+        """Run one triple."""
         p = self.checked(parameters)
-        number, place = _run_and_place(p, streams.case)
+        number, index = _find_triple(p, streams.case)
         key = RunKey(p, number, streams.seed, streams.campaign)
-        case, ground = Case.of(self._run(key), place), ground_of(key, self.load_ground)
+        run, ground = self._simulate_run(key), run_ground(key, self.load_ground)
+        triple = run.triples[index]
+        first, second, third = (run.flight.state(float(time)) for time in run.truth.times_s[list(triple.pictures)])
+        case = Case(run, triple, (first, second, third))
         # one camera took all pictures
         response = Streams(streams.seed, streams.campaign, 0).generator("detector response")
         detector = Detector.drawn(camera_optics(field_camera()).fall_off, p.detector, response)
-        noise, scene = streams.generator("detector noise"), self._first_light(key)
-        taken = [take_picture(case.run, scene, ground, state, detector, noise) for state in case.states]
+        noise, scene = streams.generator("detector noise"), self._start_scene(key)
+        taken = [take_picture(run, scene, ground, state, detector, noise) for state in case.states]
         pictures = [one.counts for one in taken]
+        truth = truth_velocities(p, case)[1, :2]
         measurements = measure(p, case, pictures, detector, calibrated_camera(p, streams))
-        known = {
+        conditions = {
             **_conditions(p, case, measurements, ground.surface),
-            **_clouding(case, taken[1].ground_m),
+            **_cloud_conditions(case, taken[1].ground_m),
             **rendered(p.backend, pictures),
         }
 
         def judge(algorithm: str) -> Judged:
-            truth = truth_velocities(p, case)[1, :2]
             attempt = attempted_with(
                 lambda given: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(given),
                 lambda answer: checked_last_interval(answer, measurements),
@@ -114,27 +112,27 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
             velocity = None if estimate is None else estimate.velocity_m_s
             row = {**velocity_row("velocity", velocity, truth), **consistency_row(estimate, truth), **attempt.row}
             if estimate is not None:
-                flown = ScoredFlight(
+                scored_flight = ScoredFlight(
                     measurements=measurements,
                     answer=estimate,
                     true_velocity_m_s=truth,
                     states=case.states,
-                    motion=case.run.flight,
+                    motion=run.flight,
                 )
-                row |= scored(p.scores, flown, {*row, *known})
+                row |= scored(p.scores, scored_flight, {*row, *conditions})
             return judged_attempt(attempt, velocity is not None, row, velocity_products(pictures, estimate, truth))
 
-        return case_result(p.algorithms, judge, known)
+        return case_result(p.algorithms, judge, conditions)
 
 
 def calibrated_camera(p: FieldTestParameters, streams: Streams) -> CameraModel:
-    """The camera of the delivered pictures as calibrated before the field test: the same in all cases."""
+    """Return the calibrated camera of the delivered pictures, the same in all cases."""
     rng = Streams(streams.seed, streams.campaign, 0).generator("camera calibration")
     return draw_calibrated(field_camera(), p.calibration, rng).binned(columns=1, rows=p.detector.rows_summed)
 
 
-def _run_and_place(p: FieldTestParameters, case: int) -> tuple[int, int]:
-    """The run of a case and its place among the run's triples. Raises ValueError where there is no such triple."""
+def _find_triple(p: FieldTestParameters, case: int) -> tuple[int, int]:
+    """Return the run of a case and its index among the run's triples. Raises ValueError where there is none."""
     total = sum(run.triples for run in p.runs)
     if case >= total:
         raise ValueError(f"case {case} is asked for, but the runs state {total} triples; allowed: 0 to {total - 1}")
@@ -142,7 +140,7 @@ def _run_and_place(p: FieldTestParameters, case: int) -> tuple[int, int]:
 
 
 def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
-    """Run and place in it of each case, spread evenly: the first cases already show every kind in proportion."""
+    """Return run and triple of each case: any first cases contain all runs and categories in proportion."""
     cells = []
     for number, run in enumerate(p.runs):
         start = 0
@@ -153,13 +151,12 @@ def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
 
 
 def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, "2 3"]:
-    """The paper's truth velocities: differences of GPS positions over the virtual interval, world axes, m/s.
+    """Compute the paper's truth velocities, GPS differences over the virtual interval, world axes (III.D.3).
 
-    The "biased IMU velocities" are made of the same differences (III.D.3 and III.D.5).
+    The "biased IMU velocities" are the same differences (III.D.5).
     """
     fixes = case.run.pictures.position_m[list(case.triple.pictures)]
-    velocities: Float64[np.ndarray, "2 3"] = np.diff(fixes, axis=0) / p.triples.virtual_interval_s
-    return velocities
+    return np.asarray(np.diff(fixes, axis=0) / p.triples.virtual_interval_s)
 
 
 def measure(
@@ -169,21 +166,15 @@ def measure(
     detector: Detector,
     camera: CameraModel,
 ) -> DescentMeasurements:
-    """What DIMES is given of a triple (paper, III.D); pictures are tagged a virtual interval apart.
-
-    `camera` is the calibrated one, of the delivered pictures.
-    """
-    tags = [number * p.triples.virtual_interval_s for number in range(PICTURES)]
-    numbers = case.triple.pictures
-    images = [DetectorImage(one, tag, camera, detector.calibration) for one, tag in zip(pictures, tags, strict=True)]
-    attitudes = [AttitudeMeasurement(case.run.attitudes[k], tag) for k, tag in zip(numbers, tags, strict=True)]
-    altitudes = [
-        AltitudeMeasurement(float(case.run.pictures.altitude_m[k]), tag) for k, tag in zip(numbers, tags, strict=True)
-    ]
+    """Return the inputs of an estimator, with tags a virtual interval apart and the calibrated camera (III.D)."""
+    tags = [number * p.triples.virtual_interval_s for number in range(len(pictures))]
+    tagged = list(zip(case.triple.pictures, tags, strict=True))
     return DescentMeasurements(
-        images=tuple(images),
-        attitudes=tuple(attitudes),
-        altitudes=tuple(altitudes),
+        images=tuple(
+            DetectorImage(one, tag, camera, detector.calibration) for one, tag in zip(pictures, tags, strict=True)
+        ),
+        attitudes=tuple(AttitudeMeasurement(case.run.attitudes[k], tag) for k, tag in tagged),
+        altitudes=tuple(AltitudeMeasurement(float(case.run.pictures.altitude_m[k]), tag) for k, tag in tagged),
         interval_velocities_m_s=truth_velocities(p, case),
         sun_direction=case.run.sun(case.states[1].time_s),
     )
@@ -192,7 +183,6 @@ def measure(
 def _conditions(
     p: FieldTestParameters, case: Case, measurements: DescentMeasurements, surface: Surface
 ) -> dict[str, Scalar]:
-    """What the case was like, read from the simulated objects."""
     run, numbers = case.run, list(case.triple.pictures)
     true_altitudes = height_above_ground(surface, np.stack([state.position_m for state in case.states]))
     row: dict[str, Scalar] = {
@@ -226,12 +216,70 @@ def _conditions(
     return row
 
 
-def _clouding(case: Case, ground_m: Float64[np.ndarray, "m n 3"]) -> dict[str, Scalar]:
-    """How clouds lit the middle picture's ground at each picture, and how much that changed in each pair."""
-    passed = cloud_transmittances(case.run, ground_m, [state.time_s for state in case.states])
-    row: dict[str, Scalar] = {
-        f"cloud_transmittance_{number}": float(np.nanmean(one)) for number, one in enumerate(passed, start=1)
+def _cloud_conditions(case: Case, ground_m: Float64[np.ndarray, "m n 3"]) -> dict[str, Scalar]:
+    """Average the clouds' transmittance over the middle picture's ground at each picture, and its changes."""
+    light = cloud_transmittances(case.run, ground_m, [state.time_s for state in case.states])
+    changes = np.abs(np.diff(light, axis=0))
+    return {
+        **{f"cloud_transmittance_{number}": float(np.nanmean(one)) for number, one in enumerate(light, start=1)},
+        **{f"cloud_change_{pair}": float(np.nanmean(one)) for pair, one in enumerate(changes, start=1)},
     }
-    for pair in (1, 2):
-        row[f"cloud_change_{pair}"] = float(np.nanmean(np.abs(passed[pair] - passed[pair - 1])))
-    return row
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Counts of the detector, and the ground points of a coarse grid of pixels in world axes."""
+
+    counts: UInt16[np.ndarray, "rows columns"]
+    ground_m: Float64[np.ndarray, "m n 3"]
+
+
+def take_picture(
+    run: Run, start_scene: Scene, ground: SiteGround, state: State, detector: Detector, rng: np.random.Generator
+) -> Picture:
+    """Render and expose the picture of a state of the flight."""
+    p, scene = run.key.field_test, scene_at(run, start_scene, ground, state.time_s)
+    frame, motion = render_state(p.backend, scene, camera_optics(field_camera()), state)
+    brightness = sunlight_ratio(ground.site.environment, float(np.arcsin(scene.sun.direction[2])), p.detector)
+    counts = detector.expose(frame.radiance * np.float32(brightness), rng, motion)
+    return Picture(counts, frame.points_world(GRID_PX))
+
+
+def cloud_transmittances(
+    run: Run, ground_m: Float64[np.ndarray, "m n 3"], times_s: Sequence[float]
+) -> Float64[np.ndarray, "times m n"]:
+    """Compute the fraction of the direct sunlight that clouds transmit to points of the ground."""
+    layer = run.clouds
+    if layer is None:
+        return np.ones((len(times_s), *ground_m.shape[:2]))
+    return np.stack([layer.transmittance(ground_m, sun_at(run, time), time) for time in times_s])
+
+
+def sun_at(run: Run, time_s: float) -> Sun:
+    """Return the sun over a run's site at a time of the run."""
+    return Sun(run.sun(time_s), site(run.parameters.site).environment.sun_radius_rad)
+
+
+def scene_at(run: Run, start_scene: Scene, ground: SiteGround, time_s: float) -> Scene:
+    """Return the run's scene with the sun of a time.
+
+    The sun is updated for every picture: shadows of clouds 2.5 km up move by a third of a metre a second with it, and
+    would jump if it were held.
+    """
+    sun = sun_at(run, time_s)
+    return replace(start_scene, sun=sun, photometry=ground.photometry(sun))
+
+
+def run_ground(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> SiteGround:
+    """Load the ground of a run."""
+    p = key.field_test
+    name = p.runs[key.number].site
+    return load_ground(site(name), p.terrain(name), p.bank_seed, 0)
+
+
+def build_start_scene(run: Run, ground: SiteGround) -> Scene:
+    """Build a run's scene with the sun of its start; the objects are kept as the sun moves."""
+    east, north, _ = run.flight.origin_m.tolist()
+    pixel_rad = camera_optics(field_camera()).rays.pixel_rad
+    eye = Eye(east, north, run.key.field_test.helicopter.lowest_m, pixel_rad)
+    return replace(site_scene(ground, eye, sun_at(run, 0.0)), clouds=run.clouds)

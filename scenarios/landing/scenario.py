@@ -10,8 +10,9 @@ from pydantic import BaseModel
 from marsyard.algorithms.answers import checked_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.base import TerrainScenario, judged_attempt
+from marsyard.scenarios.conditions import rendered
 from marsyard.scenarios.estimators import LANDING
-from marsyard.scenarios.exposure import pixel_sample
+from marsyard.scenarios.exposure import Sample, pixel_sample, summed_rows
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.landing.descent import landing_row
 from marsyard.scenarios.landing.measurement import measure
@@ -21,8 +22,6 @@ from marsyard.scenarios.landing.truth import RenderedFlight
 from marsyard.scenarios.landing.world import KEPT_GROUNDS
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredLanding, scored
-from marsyard.scenarios.provenance import rendered
-from marsyard.scenarios.samples import Sample, summed_rows
 from marsyard.scenarios.trial import Judged, attempted_with, case_result
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements

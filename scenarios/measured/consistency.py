@@ -1,11 +1,10 @@
-"""How well pictures and measured poses agree: features matched between pictures, held against where poses put them.
+"""Compare pictures with measured poses by feature matches and their distance from the epipolar lines.
 
-Features are SIFT's (Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 60, 2004), matched by the
-ratio of the nearest to the second nearest and by asking back. Those that no rigid motion between the two cameras
-explains (essential matrix by RANSAC over the rays, which knows nothing of the poses) are wrong matches and left out.
-What is left is held against the poses: by them a feature of the earlier picture lies on a curve of the later one, from
-the direction of the earlier camera to the feature's own direction at infinity; the offset is what parts the match from
-the nearest place of that curve. Of two pictures taken from one place the curve is a point.
+SIFT features (Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 60, 2004) are matched by the
+ratio test and a cross check. Matches that no rigid motion explains (essential matrix by RANSAC, independent of the
+poses) are outliers and left out. By the poses, a feature of the earlier picture lies on an epipolar curve of the later
+one, from the direction of the earlier camera to the feature's own direction at infinity. The offset is the distance of
+the match from the nearest point of that curve, which is a single point for pictures from one position.
 """
 
 from __future__ import annotations
@@ -24,15 +23,15 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import DetectorImage
 
-#: Features of a picture, the strongest; the ratio of Lowe's Fig. 11.
-_MOST_FEATURES, _RATIO = 4000, 0.8
-#: Matches off an essential matrix by more than this are wrong, pixels; its probability of a clean sample.
-_MOST_OFF_PX, _CLEAN = 2.0, 0.9999
-#: Fewer matches than this say nothing of poses: an essential matrix passes through five.
-LEAST_MATCHES = 15
-#: Distance that stands for infinity, m.
+#: Maximum number of features of a picture; the ratio of Lowe's Fig. 11.
+_MAX_FEATURES, _RATIO = 4000, 0.8
+#: RANSAC: maximum distance of an inlier from its epipolar line, pixels, and probability of a clean sample.
+_MAX_DISTANCE_PX, _CONFIDENCE = 2.0, 0.9999
+#: Minimum number of matches: an essential matrix passes through any five.
+MIN_MATCHES = 15
+#: Distance of a point at infinity, m.
 _FAR_M = 1e7
-#: Quantiles of the counts that are drawn as black and white.
+#: Quantiles of the counts that become black and white.
 _STRETCH = (0.005, 0.995)
 
 
@@ -40,29 +39,19 @@ _STRETCH = (0.005, 0.995)
 class PairMatches:
     """Features matched between two pictures.
 
-    Attributes
-    ----------
-    pixels
-        In the earlier and in the later picture, (u, v) as delivered, shape (2, n, 2).
-    right
-        Which of them some rigid motion explains, shape (n,).
+    - pixels: (u, v) as delivered, in the earlier and in the later picture
+    - inliers: matches that a rigid motion explains
     """
 
     pixels: Float64[np.ndarray, "2 n 2"]
-    right: Bool[np.ndarray, "n"]
+    inliers: Bool[np.ndarray, "n"]
 
 
 @dataclass(frozen=True, eq=False)
 class PairAgreement:
-    """How the matches of two pictures agree with poses.
+    """The matches of two pictures and their offsets from the positions that poses predict.
 
-    Attributes
-    ----------
-    matches
-        The matches.
-    offsets
-        From where the poses put a match to where it is in the later picture, pixels, shape (n, 2); NaN where the later
-        camera cannot see that place.
+    - offsets: in the later picture, pixels; NaN where the later camera cannot see the predicted point
     """
 
     matches: PairMatches
@@ -70,31 +59,26 @@ class PairAgreement:
 
     @cached_property
     def residuals_px(self) -> Float64[np.ndarray, "k"]:
-        """Lengths of the offsets of the right matches; none where they are too few to tell."""
-        if np.count_nonzero(self.matches.right) < LEAST_MATCHES:
+        """Lengths of the inliers' offsets; empty with fewer than `MIN_MATCHES` inliers."""
+        if np.count_nonzero(self.matches.inliers) < MIN_MATCHES:
             return np.empty(0)
-        lengths = np.hypot(*self.offsets[self.matches.right].T)
+        lengths = np.hypot(*self.offsets[self.matches.inliers].T)
         return np.asarray(np.where(np.isfinite(lengths), lengths, np.inf))
 
-    @property
-    def median_px(self) -> float:
-        """Median of the residuals; NaN where there are none."""
-        return float(np.median(self.residuals_px)) if self.residuals_px.size else float("nan")
 
-
-def matched(images: Sequence[DetectorImage]) -> list[PairMatches]:
-    """Features of each picture, found again in the next."""
-    features = [_features(image) for image in images]
+def match_images(images: Sequence[DetectorImage]) -> list[PairMatches]:
+    """Match the features of each picture with those of the next."""
+    features = [_detect_features(image) for image in images]
     return [
-        _pair(images[place], images[place + 1], *_nearest(features[place], features[place + 1]))
-        for place in range(len(images) - 1)
+        _select_inliers(first, second, *_match_features(*pair))
+        for (first, second), pair in zip(itertools.pairwise(images), itertools.pairwise(features), strict=True)
     ]
 
 
-def agreements(
+def compare_with_poses(
     images: Sequence[DetectorImage], pairs: Sequence[PairMatches], poses: Sequence[RigidTransform]
 ) -> list[PairAgreement]:
-    """The matches of a case's pictures, held against the body's pose at each."""
+    """Compare the matches of a case's pictures with the body's pose at each picture."""
     cameras = [image.camera.moved(pose) for image, pose in zip(images, poses, strict=True)]
     return [
         PairAgreement(one, offsets_px(before, after, one.pixels[0], one.pixels[1]))
@@ -103,59 +87,50 @@ def agreements(
 
 
 def agreement_row(pairs: Sequence[PairAgreement]) -> dict[str, Scalar]:
-    """What is stored of a case's pairs: matches, residuals of all, and the worst pair's median."""
+    """Return the columns of a case: matches, residuals of all pairs, and the worst pair's median; NaN without any."""
+    nan = float("nan")
     residuals = np.concatenate([pair.residuals_px for pair in pairs])
-    told = residuals.size > 0
+    inliers = np.concatenate([pair.matches.inliers for pair in pairs])
+    medians = [float(np.median(pair.residuals_px)) for pair in pairs if pair.residuals_px.size]
     return {
-        "matches": sum(int(pair.matches.right.sum()) for pair in pairs),
-        "matches_wrong_share": 1.0 - float(np.concatenate([pair.matches.right for pair in pairs]).mean())
-        if any(pair.matches.right.size for pair in pairs)
-        else float("nan"),
-        "pairs_matched": sum(pair.residuals_px.size > 0 for pair in pairs),
-        "residual_median_px": float(np.median(residuals)) if told else float("nan"),
-        "residual_90_percent_px": float(np.quantile(residuals, 0.9, method="higher")) if told else float("nan"),
-        "residual_worst_pair_px": max(
-            (pair.median_px for pair in pairs if pair.residuals_px.size), default=float("nan")
-        ),
+        "matches": int(inliers.sum()),
+        "matches_wrong_share": 1.0 - float(inliers.mean()) if inliers.size else nan,
+        "pairs_matched": len(medians),
+        "residual_median_px": float(np.median(residuals)) if medians else nan,
+        "residual_90_percent_px": float(np.quantile(residuals, 0.9, method="higher")) if medians else nan,
+        "residual_worst_pair_px": max(medians, default=nan),
     }
 
 
 def agreement_products(images: Sequence[DetectorImage], pairs: Sequence[PairAgreement]) -> dict[str, object]:
-    """Arrays for figures: `image_<k>`, and of each pair of pictures k and k + 1 `matches_<k>` (u, v of the earlier,
-    u, v of the later picture, offset in u and v, 1 where right).
+    """Return arrays for figures: `image_<k>`, and `matches_<k>` of each pair of pictures k and k + 1.
+
+    The columns of `matches_<k>` are u and v in the earlier and in the later picture, the offset in u and v, and 1 for
+    inliers.
     """
     products: dict[str, object] = {f"image_{number}": image.counts for number, image in enumerate(images, start=1)}
     for number, pair in enumerate(pairs, start=1):
-        columns = [*pair.matches.pixels, pair.offsets, pair.matches.right[:, None].astype(np.float64)]
+        columns = [*pair.matches.pixels, pair.offsets, pair.matches.inliers[:, None].astype(np.float64)]
         products[f"matches_{number}"] = np.concatenate(columns, axis=1)
     return products
 
 
-@dataclass(frozen=True, eq=False)
-class _Features:
-    """Features of a picture: (u, v) as delivered, shape (n, 2), and descriptors."""
-
-    pixels: Float64[np.ndarray, "n 2"]
-    descriptors: np.ndarray
-
-
-def _features(image: DetectorImage) -> _Features:
-    """SIFT on the picture with its flat field divided out, and pixels binned to be about square."""
+def _detect_features(image: DetectorImage) -> tuple[Float64[np.ndarray, "n 2"], np.ndarray]:
+    """Detect SIFT features on about square pixels, without the flat field; return pixels as delivered, descriptors."""
     fu, fv = image.camera.focal_lengths
     rows, columns = image.counts.shape
     across, down = _binning(fu / fv, columns), _binning(fv / fu, rows)
-    known = image.calibration
-    signal = (image.counts - known.offset_dn) / known.flat_field
+    signal = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
     square = signal.reshape(rows // down, down, columns // across, across).mean(axis=(1, 3))
-    points, descriptors = cv2.SIFT.create(nfeatures=_MOST_FEATURES).detectAndCompute(_eight_bits(square), None)
+    points, descriptors = cv2.SIFT.create(nfeatures=_MAX_FEATURES).detectAndCompute(_eight_bits(square), None)
     if descriptors is None:
-        return _Features(np.empty((0, 2)), np.empty((0, 128), dtype=np.float32))
+        return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
     binned = np.array([point.pt for point in points], dtype=np.float64)
-    return _Features((binned + 0.5) * np.array([across, down]) - 0.5, descriptors)
+    return (binned + 0.5) * np.array([across, down]) - 0.5, descriptors
 
 
 def _binning(ratio: float, extent: int) -> int:
-    """Pixels to average along a side that is sampled so many times as finely as the other."""
+    """Return the number of pixels to average along a side whose sampling is finer than the other's by `ratio`."""
     factor = max(round(ratio), 1)
     return factor if extent % factor == 0 else 1
 
@@ -165,49 +140,46 @@ def _eight_bits(signal: Float64[np.ndarray, "rows columns"]) -> UInt8[np.ndarray
     return np.asarray(np.clip((signal - low) / max(high - low, 1e-9) * 255.0, 0.0, 255.0).astype(np.uint8))
 
 
-def _nearest(first: _Features, second: _Features) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]:
-    """Pixels of features that are each other's nearest, and nearer than the second nearest by the ratio."""
-    none = np.empty((0, 2))
-    if len(first.pixels) < 2 or len(second.pixels) < 2:
-        return none, none
+def _match_features(
+    first: tuple[Float64[np.ndarray, "n 2"], np.ndarray], second: tuple[Float64[np.ndarray, "m 2"], np.ndarray]
+) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "k 2"]]:
+    """Return the pixels of features that are mutual nearest neighbours and pass the ratio test."""
+    (pixels, descriptors), (later_pixels, later_descriptors) = first, second
+    if len(pixels) < 2 or len(later_pixels) < 2:
+        return np.empty((0, 2)), np.empty((0, 2))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    back = {one.queryIdx: one.trainIdx for (one,) in matcher.knnMatch(second.descriptors, first.descriptors, k=1)}
-    pairs = [
-        (best.queryIdx, best.trainIdx)
-        for best, next_best in matcher.knnMatch(first.descriptors, second.descriptors, k=2)
-        if best.distance < _RATIO * next_best.distance and back.get(best.trainIdx) == best.queryIdx
-    ]
+    back = {one.queryIdx: one.trainIdx for (one,) in matcher.knnMatch(later_descriptors, descriptors, k=1)}
     # one feature of several orientations is one match
-    kept = list({tuple(first.pixels[a].tolist()): (a, b) for a, b in pairs}.values())
-    if not kept:
-        return none, none
-    ours, theirs = (list(places) for places in zip(*kept, strict=True))
-    return np.asarray(first.pixels[ours]), np.asarray(second.pixels[theirs])
+    matches = {
+        tuple(pixels[best.queryIdx].tolist()): (best.queryIdx, best.trainIdx)
+        for best, next_best in matcher.knnMatch(descriptors, later_descriptors, k=2)
+        if best.distance < _RATIO * next_best.distance and back.get(best.trainIdx) == best.queryIdx
+    }
+    indices = np.array(list(matches.values()), dtype=np.intp).reshape(-1, 2)
+    return pixels[indices[:, 0]], later_pixels[indices[:, 1]]
 
 
-def _pair(
-    first: DetectorImage, second: DetectorImage, ours: Float64[np.ndarray, "n 2"], theirs: Float64[np.ndarray, "n 2"]
+def _select_inliers(
+    first: DetectorImage,
+    second: DetectorImage,
+    pixels: Float64[np.ndarray, "n 2"],
+    later_pixels: Float64[np.ndarray, "n 2"],
 ) -> PairMatches:
-    return PairMatches(np.stack([ours, theirs]), _explained(first.camera, second.camera, ours, theirs))
+    """Select the matches that one rigid motion between the two cameras explains, independent of the poses."""
+    inliers = np.zeros(len(pixels), dtype=np.bool_)
+    if len(pixels) >= MIN_MATCHES:
+        cameras = first.camera, second.camera
+        points = [_normalise(camera, some) for camera, some in zip(cameras, (pixels, later_pixels), strict=True)]
+        focal = 0.5 * sum(float(np.sqrt(np.prod(camera.focal_lengths))) for camera in cameras)
+        _, mask = cv2.findEssentialMat(
+            points[0], points[1], np.eye(3), method=cv2.RANSAC, prob=_CONFIDENCE, threshold=_MAX_DISTANCE_PX / focal
+        )
+        inliers = inliers if mask is None else np.asarray(mask).ravel() > 0
+    return PairMatches(np.stack([pixels, later_pixels]), inliers)
 
 
-def _explained(
-    first: CameraModel, second: CameraModel, ours: Float64[np.ndarray, "n 2"], theirs: Float64[np.ndarray, "n 2"]
-) -> Bool[np.ndarray, "n"]:
-    """Which matches one rigid motion between the two cameras explains; knows the lenses, and nothing of poses."""
-    none = np.zeros(len(ours), dtype=np.bool_)
-    if len(ours) < LEAST_MATCHES:
-        return none
-    planes = [_on_plane(first, ours), _on_plane(second, theirs)]
-    focal = 0.5 * sum(float(np.sqrt(np.prod(camera.focal_lengths))) for camera in (first, second))
-    _, mask = cv2.findEssentialMat(
-        planes[0], planes[1], np.eye(3), method=cv2.RANSAC, prob=_CLEAN, threshold=_MOST_OFF_PX / focal
-    )
-    return none if mask is None else np.asarray(mask).ravel() > 0
-
-
-def _on_plane(camera: CameraModel, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 2"]:
-    """Where the rays of pixels meet the plane at unit distance before the camera."""
+def _normalise(camera: CameraModel, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 2"]:
+    """Return normalised image coordinates: the rays' intersections with the plane at unit distance."""
     directions = camera.rays(pixels)[1]
     axes = np.stack([camera.right, camera.down, camera.a])
     x, y, z = (directions @ axes.T).T
@@ -215,45 +187,42 @@ def _on_plane(camera: CameraModel, pixels: Float64[np.ndarray, "n 2"]) -> Float6
 
 
 def offsets_px(
-    first: CameraModel, second: CameraModel, ours: Float64[np.ndarray, "n 2"], theirs: Float64[np.ndarray, "n 2"]
+    first: CameraModel,
+    second: CameraModel,
+    pixels: Float64[np.ndarray, "n 2"],
+    later_pixels: Float64[np.ndarray, "n 2"],
 ) -> Float64[np.ndarray, "n 2"]:
-    """From the nearest place where a feature of the first picture can lie in the second, to where it was found.
+    """Return the offsets of matches from the nearest points of their epipolar curves in the second picture, pixels.
 
-    Parameters
-    ----------
-    first, second
-        Cameras in one frame.
-    ours, theirs
-        Pixels of the matches in the two pictures.
-
-    Returns
-    -------
-    Offsets in the second picture, pixels; NaN where the second camera cannot see the place.
+    The cameras are in one frame. NaN where the second camera cannot see the point.
     """
-    origins, directions = first.rays(ours)
-    eyes, sights = second.rays(theirs)
-    distances = _nearest_m(origins - eyes, directions, sights)
-    pixels, _ = second.project(origins + distances[:, None] * directions)
-    return np.asarray(theirs - pixels)
+    origins, directions = first.rays(pixels)
+    later_origins, later_directions = second.rays(later_pixels)
+    distances = _nearest_m(origins - later_origins, directions, later_directions)
+    predicted, _ = second.project(origins + distances[:, None] * directions)
+    return np.asarray(later_pixels - predicted)
 
 
 def _nearest_m(
-    between: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"], sights: Float64[np.ndarray, "n 3"]
+    baselines: Float64[np.ndarray, "n 3"],
+    directions: Float64[np.ndarray, "n 3"],
+    later_directions: Float64[np.ndarray, "n 3"],
 ) -> Float64[np.ndarray, "n"]:
-    """How far along the first camera's rays they come nearest, in angle, to the second camera's sights.
+    """Return the distances along the first camera's rays of the points nearest, in angle, to the second camera's rays.
 
-    Seen from the second camera a ray sweeps the arc from the first camera, `between`, to its own direction. The place
-    sought is where the sight, brought into the arc's plane, meets it: p with ``p x (between + s direction) = 0``.
+    From the second camera, a ray of the first spans the arc from the direction of the first camera, `baseline`, to the
+    ray's own direction. The point is where the second camera's ray, projected onto the plane of the arc, meets the
+    first's: p with ``p x (baseline + s direction) = 0``.
     """
-    normals = np.cross(between, directions)
+    normals = np.cross(baselines, directions)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
-    inside = sights - np.sum(sights * normals, axis=1, keepdims=True) * normals
-    from_first, along = np.cross(inside, between), np.cross(inside, directions)
+    projected = later_directions - np.sum(later_directions * normals, axis=1, keepdims=True) * normals
+    from_first, along = np.cross(projected, baselines), np.cross(projected, directions)
     scale = np.sum(along * along, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         distances = -np.sum(from_first * along, axis=1) / scale
-    ahead = np.sum((between + distances[:, None] * directions) * inside, axis=1) > 0.0
+    ahead = np.sum((baselines + distances[:, None] * directions) * projected, axis=1) > 0.0
     reached = np.isfinite(distances) & (distances > 0.0) & ahead & (lengths[:, 0] > 0.0)
-    # beyond the arc's ends the end at infinity is the nearer one: nobody stands before the first camera's lens
+    # outside the arc the end at infinity is taken: no ground lies in front of the first camera's lens
     return np.asarray(np.where(reached, np.minimum(distances, _FAR_M), _FAR_M))

@@ -1,18 +1,28 @@
-"""The folder that `marsyard ingest` reads: `ingest.toml`, `pictures.csv`, the pictures (docs/real-pictures.md)."""
+"""Read `ingest.toml` and `pictures.csv`, the inputs of `marsyard ingest` (docs/real-pictures.md)."""
 
 from __future__ import annotations
 
+import itertools
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 from pydantic import Field, ValidationError
+from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.own_axes import RecordedAxes
+from marsyard.scenarios.own_files import (
+    cells_by_column,
+    check_together,
+    finite_number,
+    header_problems,
+    listed,
+    read_lines,
+)
 from marsyard.sim.files import check_regular
 from marsyard.sim.frames import direction
 from marsyard.sim.parameters import Parameters
@@ -23,7 +33,7 @@ INGEST_FILE, TABLE_FILE = "ingest.toml", "pictures.csv"
 VELOCITY, LANDING, MATCHING = "velocity", "landing", "matching"
 TaskName = Literal["velocity", "landing", "matching"]
 
-#: Pictures of a case, least and most.
+#: Minimum and maximum number of pictures of a case.
 PICTURES = {VELOCITY: (3, 3), LANDING: (2, 2), MATCHING: (2, 50)}
 
 
@@ -32,11 +42,11 @@ class IngestError(ValueError):
 
 
 class CameraTable(Parameters):
-    """The camera of all pictures that name none of their own."""
+    """The camera of the pictures whose rows name none."""
 
-    file: Annotated[str | None, Field(description="camera file; none needed for PDS3 products, whose labels are")] = (
-        None
-    )
+    file: Annotated[
+        str | None, Field(description="camera file; not needed for PDS3 products, whose labels hold the camera")
+    ] = None
     number: Annotated[int, Field(ge=0, description="which of a file's cameras, from 0")] = 0
     placed: Annotated[
         bool,
@@ -51,7 +61,7 @@ class CameraTable(Parameters):
 
 
 class DetectorTable(Parameters):
-    """What is known of the detector."""
+    """Settings of the detector."""
 
     bits: Annotated[int, Field(ge=1, le=16, description="of a count; the largest count is 2^bits - 1")]
     offset_dn: Annotated[float, Field(ge=0.0, le=65535.0, description="counts delivered for no light")] = 0.0
@@ -76,7 +86,7 @@ class DetectorTable(Parameters):
 
 
 class SunTable(Parameters):
-    """Where the sun stands, for all cases whose rows do not say."""
+    """Direction to the sun for the cases whose rows do not state it."""
 
     azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")]
     elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="above the horizon")]
@@ -88,7 +98,7 @@ class SunTable(Parameters):
 
 
 class IngestFile(Parameters):
-    """`ingest.toml`: what holds for the whole folder."""
+    """`ingest.toml`: settings of the whole folder."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100, description="of the campaign")]
     task: Annotated[
@@ -102,13 +112,7 @@ class IngestFile(Parameters):
 
 
 def read_ingest_file(folder: Path) -> IngestFile:
-    """The folder's `ingest.toml`.
-
-    Raises
-    ------
-    IngestError
-        Where it is missing, no TOML, or states what is not allowed; all that is wrong is told, by key.
-    """
+    """Read the folder's `ingest.toml`. Raises IngestError, which lists all problems by key."""
     path = folder / INGEST_FILE
     try:
         check_regular(path)
@@ -120,9 +124,8 @@ def read_ingest_file(folder: Path) -> IngestFile:
     try:
         file = IngestFile.model_validate(stated)
     except ValidationError as error:
-        raise IngestError(
-            "\n".join(f"{path}: {_said(dict(one))}" for one in error.errors(include_url=False))
-        ) from error
+        problems = (_key_problem(dict(one)) for one in error.errors(include_url=False))
+        raise IngestError("\n".join(f"{path}: {problem}" for problem in problems)) from error
     if file.camera.placed and file.poses is not None and file.poses.attitude_of != "body":
         raise IngestError(
             f'{path}: camera.placed: the file places the camera in the body, so poses.attitude_of must be "body"'
@@ -130,85 +133,132 @@ def read_ingest_file(folder: Path) -> IngestFile:
     return file
 
 
-def _said(detail: Mapping[str, Any]) -> str:
-    """A key of the file, and what is wrong there."""
+def _key_problem(detail: Mapping[str, Any]) -> str:
     key = ".".join(str(part) for part in detail["loc"])
     kinds = {"missing": "required, but missing", "extra_forbidden": "unknown key; see docs/real-pictures.md"}
     message = str(detail["msg"]).removeprefix("Value error, ")
     return f"{key}: " + kinds.get(detail["type"], f"{message}, got {detail['input']!r}")
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column of `pictures.csv`.
-
-    Attributes
-    ----------
-    name
-        Its name, which ends with its unit.
-    tasks
-        Those that read it; others refuse it.
-    needed
-        Where it must be filled: in `every` row, in none (`""`), or as said.
-    what
-        What stands in it.
-    """
+class Column(NamedTuple):
+    """A column of `pictures.csv` as `pictures.toml` states it."""
 
     name: str
     tasks: tuple[str, ...]
-    needed: str
-    what: str
-
-
-_ALL = (VELOCITY, LANDING, MATCHING)
-_QUATERNION = "unit quaternion, scalar part last, from the axes of `poses.attitude_of` to those of `poses.axes`"
-_LABELLED = "unless a PDS3 label states it"
-
-
-def _columns(names: str, tasks: tuple[str, ...], needed: str, what: str) -> list[Column]:
-    return [Column(name, tasks, needed, what) for name in names.split()]
+    required: str
+    description: str
 
 
 #: All columns, in the order of the documentation.
-COLUMNS: tuple[Column, ...] = (
-    Column("case", _ALL, "every", "name of the case; its rows stand in the order of time"),
-    Column("file", _ALL, "every", "the picture: PNG, PGM or TIFF of 8 or 16 bits and one band, or a PDS3 product"),
-    Column("camera", _ALL, "", "camera file of this picture, in place of `camera.file`"),
-    Column("flat_field", _ALL, "", "flat field of this picture, in place of `detector.flat_field`"),
-    Column("time_s", _ALL, _LABELLED, "middle of the exposure"),
-    Column("exposure_s", _ALL, "", "exposure time, in place of `detector.exposure_s`"),
-    *_columns("qx qy qz qw", _ALL, _LABELLED, _QUATERNION),
-    *_columns(
-        "x_m y_m z_m",
-        _ALL,
-        "landing",
-        "measured position, from any origin; matching without it takes pictures as from one place",
-    ),
-    Column("altitude_m", (VELOCITY,), "every", "measured altitude above the ground"),
-    Column("altitude_time_s", (VELOCITY,), "", "its time tag, if it is not the picture's"),
-    *_columns(
-        "vx_m_s vy_m_s vz_m_s",
-        (VELOCITY,),
-        "unless there are positions",
-        "mean velocity since the picture before, by the inertial unit; empty at a case's first picture",
-    ),
-    *_columns("sun_azimuth_deg sun_elevation_deg", (VELOCITY,), "", "at a case's first picture, in place of `[sun]`"),
-    Column("slant_range_m", (LANDING,), "", "at a case's first picture: the altimeter's range along the optical axis"),
-    *_columns(
-        "site_x_m site_y_m site_z_m",
-        (LANDING,),
-        "without a slant range",
-        "at a case's first picture: the a-priori site; by default the ground on the optical axis",
-    ),
-    *_columns(
-        "true_vx_m_s true_vy_m_s",
-        (VELOCITY,),
-        "",
-        "truth, at a case's third picture: mean velocity since the second; or by true positions",
-    ),
-    *_columns("true_x_m true_y_m true_z_m", (VELOCITY, LANDING), "", "truth: position"),
-    *_columns("true_qx true_qy true_qz true_qw", (LANDING,), "", "truth: attitude, as the measured one"),
+COLUMNS = tuple(
+    Column(name, tuple(group["tasks"]), group["required"], group["description"])
+    for group in tomllib.loads(Path(__file__).with_name("pictures.toml").read_text(encoding="utf-8"))["columns"]
+    for name in group["names"].split()
 )
+_TEXT_COLUMNS = ("case", "file", "camera", "flat_field")
+_POSITIVE_COLUMNS = ("altitude_m", "slant_range_m")
+#: Columns of which all or none are filled in a row.
+_COLUMN_GROUPS = (
+    ("qx", "qy", "qz", "qw"),
+    ("x_m", "y_m", "z_m"),
+    ("vx_m_s", "vy_m_s", "vz_m_s"),
+    ("sun_azimuth_deg", "sun_elevation_deg"),
+    ("site_x_m", "site_y_m", "site_z_m"),
+    ("true_vx_m_s", "true_vy_m_s"),
+    ("true_x_m", "true_y_m", "true_z_m"),
+    ("true_qx", "true_qy", "true_qz", "true_qw"),
+)
+#: Largest deviation of a quaternion's length from 1: quaternions may be written with three digits.
+_QUATERNION_TOLERANCE = 5e-3
+#: More rows would take days to match.
+_MAX_ROWS = 200_000
 
-#: Names that hold text.
-TEXTS = ("case", "file", "camera", "flat_field")
+
+@dataclass(frozen=True)
+class PictureRow:
+    """One row of `pictures.csv`: its line, and its filled cells by column."""
+
+    line: int
+    texts: Mapping[str, str]
+    numbers: Mapping[str, float]
+
+    def error(self, message: str) -> IngestError:
+        """Return an error that names the row's line."""
+        return IngestError(f"line {self.line}: {message}")
+
+    def vector(self, *names: str) -> Float64[np.ndarray, "n"] | None:
+        """Return the numbers of columns that are filled together; None where they are empty."""
+        return np.array([self.numbers[name] for name in names]) if names[0] in self.numbers else None
+
+    def rotation(self, prefix: str = "") -> Rotation | None:
+        """Return the rotation of the columns `qx` to `qw`; None where they are empty."""
+        quaternion = self.vector(*(f"{prefix}q{axis}" for axis in "xyzw"))
+        return None if quaternion is None else Rotation.from_quat(quaternion)
+
+
+def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
+    """Read the rows of `pictures.csv` by case, in the order of the cases' first rows.
+
+    Raises IngestError, which lists all problems by line.
+    """
+    allowed = [column.name for column in COLUMNS if task in column.tasks]
+    required = [column.name for column in COLUMNS if task in column.tasks and column.required == "every"]
+    try:
+        header, lines = read_lines(path, _MAX_ROWS)
+    except ValueError as error:
+        raise IngestError(str(error)) from error
+    problems = list(header_problems(header, required, allowed, f"allowed for {task}: {', '.join(allowed)}"))
+    if problems:
+        raise IngestError(listed(path, problems))
+    cases: dict[str, list[PictureRow]] = {}
+    for line, cells in lines:
+        try:
+            row = _parse_row(line, header, cells)
+        except ValueError as error:
+            problems.append(f"line {line}: {error}")
+        else:
+            cases.setdefault(row.texts["case"], []).append(row)
+    if not problems:
+        problems = [problem for name, rows in cases.items() for problem in _case_problems(name, rows, task, required)]
+        if not cases:
+            problems = ["it has no rows; at least one case is needed"]
+    if problems:
+        raise IngestError(listed(path, problems))
+    return cases
+
+
+def _parse_row(line: int, header: Sequence[str], cells: Sequence[str]) -> PictureRow:
+    filled = {name: cell for name, cell in cells_by_column(header, cells).items() if cell}
+    numbers = {name: finite_number(name, cell) for name, cell in filled.items() if name not in _TEXT_COLUMNS}
+    row = PictureRow(line, {name: filled[name] for name in _TEXT_COLUMNS if name in filled}, numbers)
+    for name in _POSITIVE_COLUMNS:
+        if numbers.get(name, 1.0) <= 0.0:
+            raise ValueError(f"{name} is {filled[name]}; allowed: above 0")
+    for name in ("case", "file"):
+        if name not in filled:
+            raise ValueError(f"{name} is empty")
+    check_together(_COLUMN_GROUPS, numbers)
+    for prefix in ("", "true_"):
+        quaternion = row.vector(*(f"{prefix}q{axis}" for axis in "xyzw"))
+        length = 1.0 if quaternion is None else float(np.linalg.norm(quaternion))
+        if abs(length - 1.0) > _QUATERNION_TOLERANCE:
+            raise ValueError(
+                f"the quaternion {prefix}qx to {prefix}qw has the length {length:.4g}; "
+                f"allowed: 1 to {_QUATERNION_TOLERANCE:g}"
+            )
+    return row
+
+
+def _case_problems(name: str, rows: Sequence[PictureRow], task: str, required: Sequence[str]) -> Iterator[str]:
+    low, high = PICTURES[task]
+    if not low <= len(rows) <= high:
+        allowed = str(low) if low == high else f"{low} to {high}"
+        yield f"line {rows[0].line}: case '{name}' has {len(rows)} pictures; allowed for {task}: {allowed}"
+    for before, row in itertools.pairwise(rows):
+        first, second = before.numbers.get("time_s"), row.numbers.get("time_s")
+        if first is not None and second is not None and second <= first:
+            yield f"line {row.line}: time goes from {first:g} to {second:g} s; allowed: times that increase"
+    for row in rows:
+        for column in required:
+            if column not in row.texts and column not in row.numbers:
+                yield f"line {row.line}: {column} is empty"

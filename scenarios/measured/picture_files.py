@@ -1,6 +1,4 @@
-"""Pictures as they come: PNG, PGM and TIFF of one band with 8 or 16 bits. PDS3 products are read by
-`marsyard.sim.camera`.
-"""
+"""Read pictures (PNG, PGM and TIFF of one band with 8 or 16 bits) and flat fields."""
 
 from __future__ import annotations
 
@@ -10,22 +8,26 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt16
+from jaxtyping import Float64, UInt16
 
 from marsyard.scenarios.measured.layout import IngestError
-from marsyard.sim.files import open_regular
+from marsyard.sim.files import npy_header, open_regular
 
-#: A header of a PGM with comments is shorter.
-_HEAD = 4096
+#: Bytes that hold the header of a PGM file with comments.
+_HEADER_BYTES = 4096
+#: Largest number of pixels along a side of a flat field.
+_MAX_SIDE = 16384
+#: Largest relative response: noise makes that of the brightest pixel a little more than 1.
+_MAX_RESPONSE = 1.5
 _PGM = re.compile(rb"\AP[25]\s+(?:#[^\n]*\n\s*)*(\d+)\s+(?:#[^\n]*\n\s*)*(\d+)\s")
 _ALLOWED = "allowed: PNG, PGM or TIFF of one band with 8 or 16 bits, or a PDS3 product"
 
 
 def file_head(path: Path) -> bytes:
-    """The file's first bytes. Raises IngestError where it is not there, empty, or cannot be read."""
+    """Read the file's first bytes. Raises IngestError where the file is missing, empty or unreadable."""
     try:
         with open_regular(path) as file:
-            head = file.read(_HEAD)
+            head = file.read(_HEADER_BYTES)
     except OSError as error:
         raise IngestError(f"{path}: {error.strerror or error}") from error
     if not head:
@@ -34,17 +36,14 @@ def file_head(path: Path) -> bytes:
 
 
 def read_counts(path: Path, size: tuple[int, int]) -> UInt16[np.ndarray, "rows columns"]:
-    """The counts of a picture that must have a size (columns, rows); looked at by its header before it is decoded.
+    """Decode a picture after its header has confirmed the size (columns, rows).
 
-    Raises
-    ------
-    IngestError
-        Where it cannot be read, is of another kind, or of another size.
+    Raises IngestError where the file is unreadable, or of another format or size.
     """
-    found = picture_size(path)
-    if found != size:
+    columns, rows = picture_size(path)
+    if (columns, rows) != size:
         raise IngestError(
-            f"{path}: has {found[0]} x {found[1]} pixels; its camera has {size[0]} x {size[1]} (columns x rows)"
+            f"{path}: has {columns} x {rows} pixels; its camera has {size[0]} x {size[1]} (columns x rows)"
         )
     counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if counts is None:
@@ -57,7 +56,7 @@ def read_counts(path: Path, size: tuple[int, int]) -> UInt16[np.ndarray, "rows c
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """(columns, rows) as the header states them. Raises IngestError where it is no picture that is read."""
+    """Read (columns, rows) from the header. Raises IngestError for other formats."""
     head = file_head(path)
     if head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) >= 24:
         return struct.unpack(">II", head[16:24])
@@ -70,7 +69,7 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def _tiff_size(path: Path, order: str) -> tuple[int, int]:
-    """From the first directory: tags 256 (width) and 257 (length), each a number of 16 or 32 bits."""
+    """Read tags 256 (width) and 257 (length) of the first directory, each a number of 16 or 32 bits."""
     extents: dict[int, int] = {}
     try:
         with path.open("rb") as file:
@@ -80,11 +79,29 @@ def _tiff_size(path: Path, order: str) -> tuple[int, int]:
             for _ in range(entries):
                 tag, kind, _count, value = struct.unpack(f"{order}HHI4s", file.read(12))
                 if tag in (256, 257):
-                    extents[tag] = (
-                        struct.unpack(f"{order}H", value[:2])[0] if kind == 3 else struct.unpack(f"{order}I", value)[0]
-                    )
+                    (extents[tag],) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", value)
     except (OSError, struct.error) as error:
         raise IngestError(f"{path}: is a damaged TIFF: {error}") from error
     if len(extents) != 2:
         raise IngestError(f"{path}: is a damaged TIFF: its first directory states no size")
     return extents[256], extents[257]
+
+
+def read_flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
+    """Read a relative response: an array as it is, a picture divided by its largest count. Raises IngestError."""
+    head = file_head(path)
+    try:
+        if head.startswith(b"\x93NUMPY"):
+            with path.open("rb") as file:
+                shape, kind = npy_header(file)
+            if len(shape) != 2 or max(shape) > _MAX_SIDE or kind.kind not in "iuf":
+                raise ValueError(f"holds an array of shape {shape} and type {kind}")
+            response = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+        else:
+            counts = read_counts(path, picture_size(path))
+            response = counts / max(int(counts.max()), 1)
+    except (ValueError, EOFError) as error:
+        raise IngestError(f"{path}: is no flat field: {error}") from error
+    if not np.all(np.isfinite(response)) or response.min() <= 0.0 or response.max() > _MAX_RESPONSE:
+        raise IngestError(f"{path}: is no flat field; allowed: two dimensions, numbers above 0, about 1 at the largest")
+    return response

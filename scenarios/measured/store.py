@@ -1,6 +1,6 @@
-"""Ingested cases on disk: `cases.json`, and beside it pictures, cameras and flat fields that it names with hashes.
+"""Store ingested cases: `cases.json` and the pictures, cameras and flat fields that it names with their hashes.
 
-Everything is in our conventions: world axes east, north, up; attitudes are the body's; times in seconds.
+World axes are east, north, up; attitudes are the body's.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
-class Named(Parameters):
+class StoredFile(Parameters):
     """A file next to `cases.json`, and the hash of its contents."""
 
     file: str
@@ -49,13 +49,13 @@ class Named(Parameters):
 
 
 class StoredPicture(Parameters):
-    """One picture, its size (columns, rows), and what was measured when it was taken."""
+    """A picture, its size (columns, rows), and the measurements taken with it."""
 
     source: str
     size: tuple[int, int]
-    counts: Named
-    camera: Named
-    flat_field: Named | None = None
+    counts: StoredFile
+    camera: StoredFile
+    flat_field: StoredFile | None = None
     time_s: float
     exposure_s: float
     world_from_body_xyzw: Quaternion
@@ -64,21 +64,13 @@ class StoredPicture(Parameters):
     altitude_time_s: float | None = None
 
     @property
-    def attitude(self) -> Rotation:
-        """Of the body, in world axes."""
-        return Rotation.from_quat(np.array(self.world_from_body_xyzw))
+    def pose(self) -> RigidTransform:
+        """The body's measured pose; at the origin where no position was measured."""
+        return body_pose(self.position_m or (0.0, 0.0, 0.0), self.world_from_body_xyzw)
 
 
 class StoredTruth(Parameters):
-    """What is known beyond what was measured.
-
-    Attributes
-    ----------
-    velocity_m_s
-        Of the camera from the second to the third picture, east and north.
-    poses
-        Of the body at each picture: position, attitude.
-    """
+    """Truth: the camera's mean velocity from the second to the third picture (east, north), and the body's poses."""
 
     velocity_m_s: tuple[float, float] | None = None
     poses: tuple[tuple[Vector, Quaternion], ...] | None = None
@@ -97,7 +89,7 @@ class StoredCase(Parameters):
 
 
 class StoredDetector(Parameters):
-    """What is known of the detector of all pictures."""
+    """Settings of the detector of all pictures."""
 
     offset_dn: float
     full_scale_dn: int
@@ -119,35 +111,30 @@ class StoredCases(Parameters):
 
 
 class CasesFile(OwnFile):
-    """What `marsyard ingest` wrote: all measurements, and the hash of every picture."""
+    """The `cases.json` of `marsyard ingest`: all measurements, and the hash of every picture."""
 
     @classmethod
     def hash_of(cls, file: str) -> str:
         """SHA-256 of `cases.json`, which is checked."""
-        return _read(*_version(file))[1]
+        return _load(file)[1]
 
     @property
     def stored(self) -> StoredCases:
-        """The cases."""
-        return _read(*_version(self.file))[0]
-
-    @property
-    def folder(self) -> Path:
-        """Where the files lie that it names."""
-        return Path(self.file).parent
+        """The contents of the file."""
+        return _load(self.file)[0]
 
 
-def _version(file: str) -> tuple[str, int, int]:
+def _load(file: str) -> tuple[StoredCases, str]:
+    """Read the cases and the hash of the file; cached while the file does not change."""
     try:
-        about = check_regular(file)
+        status = check_regular(file)
     except OSError as error:
         raise ValueError(f"{file}: {error.strerror or error}; marsyard ingest writes it") from error
-    return file, about.st_mtime_ns, about.st_size
+    return _read(file, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=4)
 def _read(file: str, _changed_ns: int, _size: int) -> tuple[StoredCases, str]:
-    """The cases and the file's hash: read once, as all of a campaign's cases ask."""
     try:
         contents = Path(file).read_bytes()
         stored = StoredCases.model_validate_json(contents)
@@ -163,54 +150,48 @@ def _read(file: str, _changed_ns: int, _size: int) -> tuple[StoredCases, str]:
 
 
 def write_cases(folder: Path, stored: StoredCases) -> Path:
-    """Writes `cases.json`; returns its path. Raises OSError where that fails."""
+    """Write `cases.json` and return its path. Raises OSError."""
     path = folder / CASES_FILE
     text = json.dumps(stored.model_dump(mode="json", exclude_defaults=True), indent=1, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
     return path
 
 
-def put_file(folder: Path, kind: str, name: str, write: Callable[[Path], object]) -> Named:
+def write_file(folder: Path, kind: str, name: str, write: Callable[[Path], object]) -> StoredFile:
     """Write a file next to `cases.json`, in the folder of its kind (`pictures`, `cameras`, `flat_fields`)."""
     path = folder / kind / name
     path.parent.mkdir(exist_ok=True)
     write(path)
-    return Named(file=path.relative_to(folder).as_posix(), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+    return StoredFile(file=path.relative_to(folder).as_posix(), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
 
 
-def put_camera(folder: Path, number: int, camera: CameraModel) -> Named:
+def write_camera(folder: Path, number: int, camera: CameraModel) -> StoredFile:
     """Write a camera next to `cases.json`; its file states the body frame."""
-    return put_file(
+    return write_file(
         folder, "cameras", f"{number:06d}.cahvor", lambda path: write_cahvor(camera, path, frame=BODY_FRAME)
     )
 
 
-def _unchanged(folder: Path, named: Named) -> Path:
-    """The file's path. Raises ValueError where it is gone, or not as it was written."""
+def _unchanged(folder: Path, named: StoredFile) -> Path:
+    """Return the file's path. Raises ValueError where the file is missing or has changed."""
     path = folder / named.file
     try:
-        found = hashlib.sha256(path.read_bytes()).hexdigest()
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror or error}; ingest again") from error
-    if found != named.sha256:
+    if sha256 != named.sha256:
         raise ValueError(f"{path}: has changed since it was ingested")
     return path
 
 
-def images_of(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]:
-    """The pictures of a case with their cameras in the body frame.
-
-    Raises
-    ------
-    ValueError
-        Where a file has changed or cannot be read.
-    """
-    detector, folder = cases.stored.detector, cases.folder
+def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]:
+    """Load the pictures of a case with their cameras in the body frame. Raises ValueError where a file has changed."""
+    detector, folder = cases.stored.detector, Path(cases.file).parent
     images = []
     for picture in case.pictures:
         counts = read_picture(_unchanged(folder, picture.counts))
         flat = picture.flat_field
-        known = DetectorCalibration(
+        calibration = DetectorCalibration(
             flat_field=np.ones(counts.shape) if flat is None else np.load(_unchanged(folder, flat), allow_pickle=False),
             exposure_s=picture.exposure_s,
             transfer_row_s=detector.transfer_row_s,
@@ -219,14 +200,14 @@ def images_of(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]:
             offset_dn=detector.offset_dn,
             full_scale_dn=detector.full_scale_dn,
         )
-        camera = read_cahvor(_unchanged(folder, picture.camera))
-        images.append(DetectorImage(counts, picture.time_s, camera, known))
+        images.append(
+            DetectorImage(counts, picture.time_s, read_cahvor(_unchanged(folder, picture.camera)), calibration)
+        )
     return tuple(images)
 
 
 def descent_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> DescentMeasurements:
-    """What a velocity estimator is given."""
-    attitudes = [AttitudeMeasurement(one.attitude, one.time_s) for one in case.pictures]
+    """Return the inputs of a velocity estimator."""
     altitudes = [
         AltitudeMeasurement(
             math.nan if one.altitude_m is None else one.altitude_m,
@@ -236,28 +217,29 @@ def descent_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) ->
     ]
     return DescentMeasurements(
         images=images,
-        attitudes=tuple(attitudes),
+        attitudes=tuple(
+            AttitudeMeasurement(Rotation.from_quat(np.array(one.world_from_body_xyzw)), one.time_s)
+            for one in case.pictures
+        ),
         altitudes=tuple(altitudes),
         interval_velocities_m_s=np.array(case.interval_velocities_m_s, dtype=np.float64),
         sun_direction=np.array(case.sun_direction, dtype=np.float64),
     )
 
 
-def pose_of(position_m: Vector, xyzw: Quaternion) -> RigidTransform:
-    """A body's pose in the world."""
+def body_pose(position_m: Vector, xyzw: Quaternion) -> RigidTransform:
+    """Return the pose of a body in the world."""
     return rigid(Rotation.from_quat(np.array(xyzw)), np.array(position_m))
 
 
 def landing_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> LandingMeasurements:
-    """What an estimator of landing sites is given."""
-    poses = [
-        PoseMeasurement(pose_of(one.position_m or (0.0, 0.0, 0.0), one.world_from_body_xyzw), one.time_s)
-        for one in case.pictures
-    ]
+    """Return the inputs of an estimator of landing sites."""
+    first, second = (PoseMeasurement(one.pose, one.time_s) for one in case.pictures)
+    attitude = Rotation.from_quat(np.array(case.pictures[0].world_from_body_xyzw))
     return LandingMeasurements(
         images=(images[0], images[1]),
-        poses=(poses[0], poses[1]),
+        poses=(first, second),
         slant_range_m=math.nan if case.slant_range_m is None else case.slant_range_m,
-        up_body=case.pictures[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0])),
+        up_body=attitude.inv().apply(np.array([0.0, 0.0, 1.0])),
         apriori_site_world=np.array(case.site_m, dtype=np.float64),
     )

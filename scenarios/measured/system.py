@@ -9,12 +9,12 @@ MEASURED = System(
     title="Recorded pictures",
     summary="Algorithms on real pictures, compared with the measured poses.",
     scenarios={
-        "measured-velocity": "marsyard.scenarios.measured.descent:MeasuredVelocityScenario",
-        "measured-landing": "marsyard.scenarios.measured.landing:MeasuredLandingScenario",
-        "measured-matching": "marsyard.scenarios.measured.matching:MatchingScenario",
+        "measured-velocity": "marsyard.scenarios.measured.scenarios:MeasuredVelocityScenario",
+        "measured-landing": "marsyard.scenarios.measured.scenarios:MeasuredLandingScenario",
+        "measured-matching": "marsyard.scenarios.measured.scenarios:MatchingScenario",
     },
     tasks=("marsyard.scenarios.estimators:VELOCITY", "marsyard.scenarios.estimators:LANDING"),
     columns=SCENARIOS_FOLDER / "columns.toml",
-    ingest="marsyard.scenarios.measured.campaign:ingest_campaign",
+    ingest="marsyard.scenarios.measured.ingest:ingest_campaign",
     report="marsyard.reports.measured.presentation:MEASURED",
 )

@@ -10,9 +10,9 @@ from jaxtyping import Float64
 
 from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
+from marsyard.scenarios.conditions import rendered_as
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
-from marsyard.scenarios.provenance import rendered_as
 from marsyard.scenarios.rover.own_shadow import shades, template_patch
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run import Run

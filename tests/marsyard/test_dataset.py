@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
-from marsyard.dataset import _prepare
+from marsyard.dataset import _prepare_inputs
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import World
 from marsyard.sim.camera import read_cahvor
@@ -63,7 +63,7 @@ def test_only_terrains_of_the_cases_are_built(tmp_path: Path, monkeypatch: pytes
     drawn = '"place.terrain" = { distribution = "integer", low = 0, high = 19, source = "any" }'
     path.write_text(CAMPAIGN.replace("bank = 1", "bank = 20").replace("samples = 512", "samples = 256") + drawn)
     campaign = load_campaign(str(path))
-    _prepare(campaign, range(2))
+    _prepare_inputs(campaign, range(2))
     used = {campaign.parameters(case).model_dump()["place"]["terrain"] for case in range(2)}
     assert len(list((tmp_path / "cache" / "terrain").iterdir())) == len(used)
 
@@ -87,7 +87,7 @@ def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: P
 
     told = json.loads(files["0000001-0.json"])
     image, rocks, hazard = (
-        cv2.imdecode(np.frombuffer(files[f"0000001-0.{name}.png"], np.uint8), cv2.IMREAD_UNCHANGED)
+        np.asarray(cv2.imdecode(np.frombuffer(files[f"0000001-0.{name}.png"], np.uint8), cv2.IMREAD_UNCHANGED))
         for name in ("image", "rocks", "hazard")
     )
     distance, normal = (np.load(io.BytesIO(files[f"0000001-0.{name}.npy"])) for name in ("range", "normal"))

@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from rich.console import Console
 
-from marsyard import doctor
+from marsyard import doctor, gl_probe
 from marsyard.doctor import Check, Probe, Verdict
 
 SOUND = Probe({"renderer": "r", "version": "v", "depth_error_m": 1e-5, "offset_px": [0.0, 0.0], "lit": True})
@@ -90,7 +90,7 @@ def test_the_backend_in_use(
     monkeypatch.setenv("MARSYARD_GL", wanted)
     *_, last = doctor.check_rendering({"osmesa": osmesa, "egl": egl})
     assert last.verdict is verdict
-    assert mend in last.mend
+    assert mend in last.remedy
 
 
 def test_a_wrong_picture_is_not_a_working_backend() -> None:
@@ -111,7 +111,7 @@ def test_a_package_from_elsewhere_is_named(monkeypatch: pytest.MonkeyPatch, tmp_
     monkeypatch.setattr(importlib.util, "find_spec", found)
     check = next(doctor.check_shadowing())
     assert check.verdict is Verdict.FAIL
-    assert f"marsyard from {tmp_path / 'marsyard'}" in check.found
+    assert f"marsyard from {tmp_path / 'marsyard'}" in check.finding
 
 
 def test_a_folder_without_init_counts_as_shadow(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -119,15 +119,15 @@ def test_a_folder_without_init_counts_as_shadow(monkeypatch: pytest.MonkeyPatch,
     spec = ModuleSpec("marsyard", None, is_package=True)
     spec.submodule_search_locations = [str(tmp_path / "marsyard")]
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: spec)
-    assert str(tmp_path / "marsyard") in next(doctor.check_shadowing()).found
+    assert str(tmp_path / "marsyard") in next(doctor.check_shadowing()).finding
 
 
 def test_other_owners_of_our_names_and_rivals_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: {"marsyard": ["Sim_Games", "marsyard"]})
     monkeypatch.setattr(doctor, "_version", lambda _: "0.1.45")
     _, stranger, *rivals = doctor.check_shadowing()
-    assert "sim-games also installs a package named marsyard" in stranger.found
-    assert any("pip uninstall -y pyrender pyrender2" in rival.mend for rival in rivals)
+    assert "sim-games also installs a package named marsyard" in stranger.finding
+    assert any("pip uninstall -y pyrender pyrender2" in rival.remedy for rival in rivals)
 
 
 def test_every_dependency_is_looked_for_under_the_name_it_imports_by() -> None:
@@ -151,8 +151,8 @@ def test_dependencies_that_are_absent_old_or_broken(monkeypatch: pytest.MonkeyPa
         "dependencies": Verdict.OK,
         "pinned versions": Verdict.WARN,
     }
-    assert "truncated" in checks["joblib"].found
-    assert "rich 14.0 (pinned 15.0.0)" in checks["pinned versions"].found
+    assert "truncated" in checks["joblib"].finding
+    assert "rich 14.0 (pinned 15.0.0)" in checks["pinned versions"].finding
 
 
 def test_a_module_that_ends_the_process_does_not_hide_the_others(
@@ -187,6 +187,6 @@ def test_a_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 
 def test_the_probe_stands_alone() -> None:
-    source = Path(doctor.gl_probe.__file__).read_text()
+    source = Path(str(gl_probe.__file__)).read_text()
     packages = [line.split()[1].split(".")[0] for line in source.splitlines() if line.startswith(("import ", "from "))]
     assert set(packages) <= set(sys.stdlib_module_names)

@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from marsyard.scenarios.columns import StatedColumns, stated_columns
 from marsyard.scenarios.dotted import found_at
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.systems import scenario_paths
+from marsyard.scenarios.systems import StatedColumns, scenario_paths, stated_columns
 
 
 def _unstated(row: Any, stated: StatedColumns, own: tuple[str, ...]) -> list[str]:
@@ -30,7 +29,8 @@ def _checked(run: Callable[..., CaseResult], stated: StatedColumns) -> Callable[
         result = run(self, parameters, streams)
         named = [one.name for one in getattr(parameters, stated.named_flags, ())] if stated.named_flags else []
         # columns of a user's own scores begin with the function's name
-        specs = getattr(parameters, "scores", None) or getattr(getattr(parameters, "drive", None), "scores", ())
+        holder = parameters if getattr(parameters, "scores", ()) else getattr(parameters, "drive", None)
+        specs: tuple[str, ...] = getattr(holder, "scores", ())
         own = (*named, *(f"{spec.rpartition(':')[2]}_" for spec in specs))
         unstated = _unstated(result.row, stated, own)
         assert not unstated, f"columns that scenarios/columns.toml does not state for {self.name}: {unstated}"

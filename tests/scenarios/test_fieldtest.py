@@ -13,12 +13,17 @@ import pytest
 
 from marsyard import scenarios
 from marsyard.algorithms.interface import VelocityOutcome
-from marsyard.scenarios.fieldtest import pictures
-from marsyard.scenarios.fieldtest.elevation import ElevationModel
 from marsyard.scenarios.fieldtest.ephemeris import sun_direction
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters
-from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera, work_out
-from marsyard.scenarios.fieldtest.scenario import FieldTestScenario, case_order
+from marsyard.scenarios.fieldtest.run import ElevationModel, Run, RunKey, field_camera, simulate_run
+from marsyard.scenarios.fieldtest.scenario import (
+    FieldTestScenario,
+    build_start_scene,
+    case_order,
+    run_ground,
+    scene_at,
+    sun_at,
+)
 from marsyard.scenarios.fieldtest.triples import Category
 from marsyard.scenarios.optics import camera_optics
 from marsyard.scenarios.parts import ScoredFlight
@@ -39,7 +44,7 @@ def stated(**changes: Any) -> FieldTestParameters:
 
 
 def ivanpah(**changes: Any) -> Run:
-    return work_out(RunKey(stated(**changes), 4, 5, "test"))
+    return simulate_run(RunKey(stated(**changes), 4, 5, "test"))
 
 
 def attitude_errors_deg(run: Run) -> np.ndarray:
@@ -132,7 +137,7 @@ def test_cases_are_the_papers_triples_spread_evenly() -> None:
 
 def test_a_run_is_worked_out_the_same_again() -> None:
     key = RunKey(stated(), 4, 5, "test")
-    kept, again = work_out(key), work_out(key)
+    kept, again = simulate_run(key), simulate_run(key)
     assert again is not kept
     assert np.array_equal(again.attitudes.as_quat(), kept.attitudes.as_quat())
     assert again.triples == kept.triples
@@ -141,16 +146,16 @@ def test_a_run_is_worked_out_the_same_again() -> None:
 def test_the_sun_moves_over_rocks_that_stay() -> None:
     """Lava's rocks take core-seconds to build: a run builds them once, whatever its pictures' times."""
     key = RunKey(stated(), 0, 5, "test")
-    run, time_s = work_out(key), 1800.0
-    ground = pictures.ground_of(key)
-    first = pictures.first_light(run, ground)
-    early, late = (pictures.scene_at(run, first, ground, time) for time in (0.0, time_s))
+    run, time_s = simulate_run(key), 1800.0
+    ground = run_ground(key)
+    first = build_start_scene(run, ground)
+    early, late = (scene_at(run, first, ground, time) for time in (0.0, time_s))
     assert len(early.objects) > 0
     assert late.objects is early.objects
     east, north, _ = run.flight.origin_m.tolist()
     pixel_rad = camera_optics(field_camera()).rays.pixel_rad
     eye = Eye(east, north, key.field_test.helicopter.lowest_m, pixel_rad)
-    alone = site_scene(ground, eye, pictures.sun_at(run, time_s))
+    alone = site_scene(ground, eye, sun_at(run, time_s))
     assert np.array_equal(late.sun.direction, alone.sun.direction)
     assert late.photometry == alone.photometry
     assert np.array_equal(late.objects.triangles, alone.objects.triangles)
@@ -160,7 +165,7 @@ def test_the_sun_moves_over_rocks_that_stay() -> None:
 def test_too_many_triples_are_refused() -> None:
     runs = [run.model_dump() for run in stated().runs[4:]]
     with pytest.raises(ValueError, match="5000 triples 'short time' are asked for"):
-        work_out(RunKey(stated(runs=[{**runs[0], "short_time": 5000}]), 0, 5, "test"))
+        simulate_run(RunKey(stated(runs=[{**runs[0], "short_time": 5000}]), 0, 5, "test"))
 
 
 def handed(case: ScoredFlight) -> dict[str, float]:
@@ -196,17 +201,19 @@ def test_case_is_answered_and_repeats() -> None:
 def test_shadows_of_clouds_move_steadily_from_picture_to_picture() -> None:
     """A sun that is held for a while and then jumps would take the shadows of high clouds with it, past the wind."""
     key = RunKey(stated(), 3, 5, "test")
-    run = work_out(key)
+    run = simulate_run(key)
     assert run.clouds is not None
     ground = np.array([[[0.0, 0.0, 0.0]]])
     places = []
     for time_s in np.arange(1000.0, 1120.0, 3.0).tolist():
-        sun = pictures.sun_at(run, time_s)
+        sun = sun_at(run, time_s)
         _, height, east, north, _ = run.clouds.numbers(sun, time_s)
         up = (height - ground[0, 0, 2]) / sun.direction[2]
         # where in the layer the ground's point sees the sun
         places.append([up * sun.direction[0] - east, up * sun.direction[1] - north])
     moved = np.linalg.norm(np.diff(places, axis=0), axis=1) / 3.0
-    wind = np.hypot(key.field_test.runs[3].clouds.wind_east_m_s, key.field_test.runs[3].clouds.wind_north_m_s)
+    clouds = key.field_test.runs[3].clouds
+    assert clouds is not None
+    wind = np.hypot(clouds.wind_east_m_s, clouds.wind_north_m_s)
     assert np.ptp(moved) < 0.01
     assert abs(moved.mean() - wind) < 0.5

@@ -144,7 +144,7 @@ def test_answers_are_plain_numbers_before_they_are_scored() -> None:
         checked_site(SiteEstimate(SiteOutcome.SAFE_SITE, place)).site_world,
         checked_update(TargetUpdate(TrackingState.NORMAL, (), place)).position_rover,
     )
-    assert [(type(one), one.dtype) for one in checked if one is not None] == [(np.ndarray, np.float64)] * 3
+    assert len([one for one in checked if type(one) is np.ndarray and one.dtype == np.float64]) == 3
     assert [type(one) for one in checked_velocity(velocity).span_s or ()] == [float, float]
 
 

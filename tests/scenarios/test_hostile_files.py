@@ -16,11 +16,9 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
-from marsyard.scenarios.measured.ingest import _flat_field
-from marsyard.scenarios.measured.layout import VELOCITY, IngestError, read_ingest_file
-from marsyard.scenarios.measured.picture_files import read_counts
+from marsyard.scenarios.measured.layout import VELOCITY, IngestError, read_ingest_file, read_table
+from marsyard.scenarios.measured.picture_files import read_counts, read_flat_field
 from marsyard.scenarios.measured.store import CasesFile
-from marsyard.scenarios.measured.table import read_table
 from marsyard.scenarios.meshes import MOST_BYTES, MeshFileError, read_mesh
 from marsyard.scenarios.offline import VELOCITY_FORM, answers_of
 from marsyard.sim.camera import read_cameras
@@ -108,7 +106,7 @@ def test_a_flat_field_is_measured_before_it_expands(tmp_path: Path) -> None:
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)})
     with pytest.raises(IngestError, match=r"flat.npy: is no flat field: holds an array of shape \(1000000, 1000000\)"):
-        _flat_field(path)
+        read_flat_field(path)
 
 
 READERS: dict[str, Callable[[Path], object]] = {

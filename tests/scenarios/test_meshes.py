@@ -20,8 +20,8 @@ BOX = (2.0, 1.0, 0.5)
 
 @pytest.fixture(scope="module")
 def surface() -> Surface:
-    flat = {"rms_slope_deg": 0.0, "craters_per_km2": 0.0, "albedo_contrast": 0.0}
-    return synthesise(TerrainParameters(samples=64, spacing_m=1.0, **flat), np.random.default_rng(1))
+    flat = TerrainParameters(samples=64, spacing_m=1.0, rms_slope_deg=0.0, craters_per_km2=0.0, albedo_contrast=0.0)
+    return synthesise(flat, np.random.default_rng(1))
 
 
 def box(folder: Path, name: str = "box.stl", extents: tuple[float, float, float] = BOX) -> str:

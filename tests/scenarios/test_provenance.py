@@ -6,7 +6,7 @@ import hashlib
 
 import numpy as np
 
-from marsyard.scenarios.provenance import rendered
+from marsyard.scenarios.conditions import rendered
 from marsyard.sim.processor import processor_features
 from marsyard.sim.render.backend import default_backend
 

@@ -17,10 +17,9 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.doctor import Verdict, check_systems
-from marsyard.scenarios.columns import stated_columns
 from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.registry import UnknownScenarioError, scenario, scenario_names, scenario_source
-from marsyard.scenarios.systems import BUILT_IN, problems, registry, system_of, systems, template_paths
+from marsyard.scenarios.systems import BUILT_IN, problems, registry, stated_columns, system_of, systems, template_paths
 
 CACHED = (registry, stated_columns, shipped_names, requirements.shipped_requirements, requirements._stated)
 HEAD = "from pathlib import Path\nfrom marsyard.scenarios.system import System\nHERE = Path(__file__).parent\n"
@@ -86,7 +85,7 @@ def test_a_system_of_another_package_is_found_everywhere(install: Install) -> No
     stated = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
     install(
         "mine",
-        _system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.matching:MatchingScenario'"),
+        _system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
         **{"mine-one": 'scenario = "mine-case"\n', "asked": f'[[requirements]]\nid = "MINE"\n{stated}'},
         columns='[mine-case]\nflags = []\nnumbers = ["metres"]\n',
     )
@@ -137,8 +136,8 @@ def test_a_system_that_cannot_be_used_leaves_the_others_alone(install: Install, 
     assert (ended.exit_code, ended.stderr) == (0, f"warning: {message}\n")
     assert "dimes-smoke" in ended.stdout
     checks = list(check_systems())
-    assert checks[0].found.endswith("of other packages: sound")
-    assert [one.found for one in checks if one.verdict is Verdict.WARN] == [message]
+    assert checks[0].finding.endswith("of other packages: sound")
+    assert [one.finding for one in checks if one.verdict is Verdict.WARN] == [message]
     with pytest.raises(UnknownScenarioError, match="is left out"):
         scenario("unheard-of")
 
@@ -159,7 +158,7 @@ def test_a_file_of_requirements_that_is_wrong_is_named_where_one_is_missed(insta
 
 
 def test_columns_that_cannot_be_read_stop_the_systems_own_campaigns_alone(install: Install, tmp_path: Path) -> None:
-    scenario_path = "marsyard.scenarios.measured.matching:MatchingScenario"
+    scenario_path = "marsyard.scenarios.measured.scenarios:MatchingScenario"
     install("mine", _system("mine", ", columns=HERE / 'columns.toml'").replace("x:Y", scenario_path), columns="x = [")
     with pytest.raises(ValueError, match=r"columns\.toml: states no columns: TOMLDecodeError"):
         stated_columns("mine-case")

@@ -152,7 +152,8 @@ def test_a_sheared_map_is_refused(tmp_path: Path) -> None:
 
 def npz(folder: Path, **arrays: Any) -> Path:
     path = folder / "dtm.npz"
-    np.savez_compressed(path, **{"dem": np.zeros((20, 30)), "dem_gsd": 1.0} | arrays)
+    contents: dict[str, Any] = {"dem": np.zeros((20, 30)), "dem_gsd": 1.0} | arrays
+    np.savez_compressed(path, **contents)
     return path
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 
 from marsyard.algorithms.exchange.files import write_case
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.measured.store import put_camera
+from marsyard.scenarios.measured.store import write_camera
 from marsyard.sim.camera import BODY_FRAME, read_cahvor
 
 
 def test_exports_and_ingested_cases_state_the_body_frame(tmp_path: Path) -> None:
     measurements = inputs.descent()
     write_case(tmp_path, measurements)
-    put_camera(tmp_path, 0, measurements.images[0].camera)
+    write_camera(tmp_path, 0, measurements.images[0].camera)
     exported, ingested = tmp_path / "camera_1.cahvor", tmp_path / "cameras" / "000000.cahvor"
     for path in (exported, ingested):
         assert path.read_text().startswith(f"# Frame: {BODY_FRAME}\n")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,8 +14,8 @@ import pytest
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.layout import IngestError
-from marsyard.scenarios.measured.matching import MatchingScenario
-from marsyard.scenarios.measured.store import CasesFile, images_of
+from marsyard.scenarios.measured.scenarios import MatchingScenario
+from marsyard.scenarios.measured.store import CasesFile, load_images
 from marsyard.sim.streams import Streams
 from tests.scenarios.measured.folders import landing_folder, read_rows, velocity_folder, write_texts
 
@@ -63,12 +64,17 @@ def test_tables_that_cannot_be_used(tmp_path: Path, change: Callable[[Rows], Row
     assert said in refused(folder, tmp_path)
 
 
+def replace_by_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
 @pytest.mark.parametrize(
     ("write", "said"),
     [
         (lambda path: cv2.imwrite(str(path), np.zeros((480, 640), np.uint16)), "has 640 x 480 pixels; its camera has"),
         (lambda path: path.write_bytes(b""), "is empty (0 bytes)"),
-        (lambda path: (path.unlink(), os.mkfifo(path)), "is a named pipe; a regular file is needed"),
+        (replace_by_pipe, "is a named pipe; a regular file is needed"),
         (lambda path: path.write_bytes(b"GIF89a" + bytes(100)), "is no picture that is read; allowed: PNG"),
         (lambda path: cv2.imwrite(str(path), np.full((256, 1024), 5000, np.uint16)), "bits = 12 allows 4095"),
         (lambda path: cv2.imwrite(str(path), np.zeros((256, 1024, 3), np.uint8)), "has 3 bands"),
@@ -115,7 +121,7 @@ def test_other_formats_hold_the_same_counts(tmp_path: Path, suffix: str) -> None
     write_texts(folder, rows)
     (tmp_path / "out").mkdir()
     path, stored = ingest(folder, tmp_path / "out")
-    images = images_of(CasesFile(file=str(path)), stored.cases[0])
+    images = load_images(CasesFile(file=str(path)), stored.cases[0])
     for image, original in zip(images, given.images, strict=True):
         assert np.array_equal(image.counts, original.counts)
         assert image.camera == original.camera
@@ -133,7 +139,7 @@ def test_the_opportunity_frames(tmp_path: Path, shared_data: Path) -> None:
     (tmp_path / "out").mkdir()
     path, _ = ingest(folder, tmp_path / "out")
     parameters = MatchingScenario.parameters_type.model_validate({"cases": {"file": str(path)}})
-    row = MatchingScenario().run(parameters, Streams(seed=0, campaign="opportunity", case=0)).row
+    row: dict[str, Any] = dict(MatchingScenario().run(parameters, Streams(0, "opportunity", 0)).row)
     assert row["matches"] >= 80
     assert 0.2 < row["residual_median_px"] < 1.0
     assert row["residual_90_percent_px"] < 2.0
@@ -158,9 +164,9 @@ def test_the_hazcam_frame_with_the_attitude_of_its_label_looks_down(tmp_path: Pa
     path, stored = ingest(folder, tmp_path / "out")
     picture = stored.cases[0].pictures[0]
     cases = CasesFile(file=str(path))
-    image = images_of(cases, stored.cases[0])[0]
-    assert picture.attitude.apply(image.camera.boresight())[2] < -0.3
+    image = load_images(cases, stored.cases[0])[0]
+    assert picture.pose.rotation.apply(image.camera.boresight())[2] < -0.3
     parameters = MatchingScenario.parameters_type.model_validate({"cases": {"file": str(path)}})
-    row = MatchingScenario().run(parameters, Streams(seed=0, campaign="hazcam", case=0)).row
+    row: dict[str, Any] = dict(MatchingScenario().run(parameters, Streams(0, "hazcam", 0)).row)
     assert row["matches"] > 500
     assert row["residual_90_percent_px"] < 1e-3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,8 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.measured.descent import MeasuredVelocityScenario
 from marsyard.scenarios.measured.ingest import ingest
-from marsyard.scenarios.measured.landing import MeasuredLandingScenario
-from marsyard.scenarios.measured.matching import MatchingScenario
+from marsyard.scenarios.measured.scenarios import MatchingScenario, MeasuredLandingScenario, MeasuredVelocityScenario
 from marsyard.scenarios.parts import ScoredSite, ScoredVelocity
 from marsyard.sim.streams import Streams
 from tests.scenarios.measured.folders import landing_folder, read_rows, velocity_folder, write_texts
@@ -33,9 +32,10 @@ def ran(folder: Path, out: Path, **parameters: object) -> CaseResult:
 
 def descent_score(case: ScoredVelocity) -> dict[str, float | bool]:
     """A user's own score of a descent: its error where the truth is known."""
-    known = case.true_velocity_m_s is not None and case.answer.velocity_m_s is not None
-    error = np.hypot(*(case.answer.velocity_m_s - case.true_velocity_m_s)) if known else np.nan
-    return {"error_m_s": float(error), "known": known}
+    true, estimated = case.true_velocity_m_s, case.answer.velocity_m_s
+    if true is None or estimated is None:
+        return {"error_m_s": float("nan"), "known": False}
+    return {"error_m_s": float(np.hypot(*(estimated - true))), "known": True}
 
 
 def site_score(case: ScoredSite) -> dict[str, float]:
@@ -53,7 +53,7 @@ def test_descents_come_through_as_they_were_measured(tmp_path: Path, ned: bool) 
     assert expected.velocity_m_s is not None
     folder = velocity_folder(tmp_path / "in", {"drop": given}, {"drop": TRUE}, ned=ned)
     result = ran(folder, tmp_path / "out", compared=["phase-correlation"], scores=[f"{__name__}:descent_score"])
-    row = result.row
+    row: dict[str, Any] = dict(result.row)
     found = [row["velocity_estimated_x_m_s"], row["velocity_estimated_y_m_s"]]
     # what turns in rounding: the axes there and back
     assert np.allclose(found, expected.velocity_m_s, rtol=0.0, atol=1e-6)
@@ -73,7 +73,7 @@ def test_descents_come_through_as_they_were_measured(tmp_path: Path, ned: bool) 
 
 def test_without_truth_no_error_is_told(tmp_path: Path) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
-    row = dict(ran(folder, tmp_path / "out", scores=[f"{__name__}:descent_score"]).row)
+    row: dict[str, Any] = dict(ran(folder, tmp_path / "out", scores=[f"{__name__}:descent_score"]).row)
     assert row["descent_score_known"] is False
     assert np.isnan(row.pop("descent_score_error_m_s"))
     assert not [name for name in row if "error_" in name or "true_" in name]
@@ -83,14 +83,14 @@ def test_without_truth_no_error_is_told(tmp_path: Path) -> None:
 def test_positions_stand_in_for_inertial_velocities_and_for_truth(tmp_path: Path) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     rows = read_rows(folder)
-    for number, row in enumerate(rows):
+    for number, written in enumerate(rows):
         for axis in "xyz":
-            row.pop(f"v{axis}_m_s")
+            written.pop(f"v{axis}_m_s")
         place = 3.75 * number * inputs.DESCENT_VELOCITY_M_S
-        row |= {f"{axis}_m": str(value) for axis, value in zip("xyz", place, strict=True)}
-        row |= {f"true_{axis}_m": str(value) for axis, value in zip("xyz", place, strict=True)}
+        written |= {f"{axis}_m": str(value) for axis, value in zip("xyz", place, strict=True)}
+        written |= {f"true_{axis}_m": str(value) for axis, value in zip("xyz", place, strict=True)}
     write_texts(folder, rows)
-    row = ran(folder, tmp_path / "out").row
+    row: dict[str, Any] = dict(ran(folder, tmp_path / "out").row)
     assert np.isclose(row["velocity_true_x_m_s"], TRUE[0])
     assert np.isclose(row["beside_inertial_m_s"], row["velocity_error_m_s"])
     # the poses are exact: what is left is the matching of pictures with noise, rows summed by four
@@ -100,7 +100,7 @@ def test_positions_stand_in_for_inertial_velocities_and_for_truth(tmp_path: Path
 
 def test_landings_are_held_against_measured_and_true_poses(tmp_path: Path) -> None:
     folder = landing_folder(tmp_path / "in", inputs.landing(), "landing", true_poses=True)
-    row = ran(folder, tmp_path / "out", scores=[f"{__name__}:site_score"]).row
+    row: dict[str, Any] = dict(ran(folder, tmp_path / "out", scores=[f"{__name__}:site_score"]).row)
     assert row["site_reported"]
     assert row["rotation_error_deg"] == row["rotation_beside_poses_deg"]
     assert row["rotation_error_deg"] < 0.5
@@ -120,7 +120,7 @@ def test_wrong_attitudes_show(tmp_path: Path, turned_deg: float, least: float, m
     write_texts(folder, rows)
     result = ran(folder, tmp_path / "out")
     assert result.outcome == "MATCHED"
-    assert least <= result.row["residual_median_px"] <= most
+    assert least <= float(result.row["residual_median_px"]) <= most
     table = result.products["matches_1"]
     assert table.shape[1] == 7
 

@@ -1,0 +1,363 @@
+"""The scenarios of recorded pictures: velocity estimators, estimators of landing sites, and measured poses alone."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Float64
+from pydantic import BaseModel, Field, model_validator
+from scipy.spatial.transform import RigidTransform
+
+from marsyard.algorithms.answers import checked_site
+from marsyard.algorithms.dimes import DimesDetails, DimesOptions
+from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
+from marsyard.algorithms.hda.view import camera_pose
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate
+from marsyard.scenarios.base import BaseScenario, judged_attempt
+from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.descent.parameters import check_binning
+from marsyard.scenarios.estimators import LANDING, VELOCITY
+from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
+from marsyard.scenarios.landing.motion import motion_errors, solved_row
+from marsyard.scenarios.measured import store
+from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
+from marsyard.scenarios.measured.layout import TaskName
+from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.parts.scores import OwnScores, ScoredSite, ScoredVelocity, scored
+from marsyard.scenarios.trial import Attempt, Judged, attempted_with, case_result
+from marsyard.scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DescentMeasurements, DetectorImage, LandingMeasurements
+from marsyard.sim.parameters import Parameters
+from marsyard.sim.streams import Streams
+
+Answer = TypeVar("Answer")
+ParametersType = TypeVar("ParametersType", bound=BaseModel)
+
+NAN = float("nan")
+#: Outcomes of the scenario without an algorithm.
+MATCHED, TOO_FEW = "MATCHED", "TOO_FEW_MATCHES"
+
+
+class MeasuredParameters(Parameters):
+    """Parameters of all tasks; subclasses state the task that `cases.json` must have."""
+
+    task_name: ClassVar[TaskName]
+
+    cases: Annotated[store.CasesFile, Field(description="`cases.json` of `marsyard ingest`")]
+    number: Annotated[int, Field(ge=0, description="of the case in it; a grid over all")] = 0
+
+    @model_validator(mode="after")
+    def _check_case_and_task(self) -> MeasuredParameters:
+        stored = self.cases.stored
+        if self.number >= len(stored.cases):
+            raise ValueError(f"number is {self.number}; {self.cases.file} holds 0 to {len(stored.cases) - 1}")
+        if stored.task != self.task_name:
+            raise ValueError(
+                f"{self.cases.file}: its task is {stored.task}; the scenario measured-{stored.task} runs it"
+            )
+        return self
+
+    @property
+    def case(self) -> store.StoredCase:
+        """The case with this number."""
+        return self.cases.stored.cases[self.number]
+
+
+class MatchingParameters(MeasuredParameters):
+    """Pictures compared with their poses alone."""
+
+    task_name = "matching"
+
+
+class MeasuredVelocityParameters(ChosenAlgorithms, OwnScores, MeasuredParameters):
+    """Three pictures of a descent."""
+
+    task_name = "velocity"
+    task = VELOCITY
+    scored = ScoredVelocity
+
+    algorithm: Annotated[str, Field(description="the velocity estimator under test, whose answers are judged")] = (
+        "dimes"
+    )
+    dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
+
+    @model_validator(mode="after")
+    def _check_binning(self) -> MeasuredVelocityParameters:
+        if "dimes" in self.algorithms:
+            for picture in self.case.pictures:
+                check_binning(self.dimes.binned_size, picture.size)
+        return self
+
+
+class MeasuredLandingParameters(ChosenAlgorithms, OwnScores, MeasuredParameters):
+    """Two pictures of the ground."""
+
+    task_name = "landing"
+    task = LANDING
+    scored = ScoredSite
+
+    algorithm: Annotated[
+        str, Field(description="the estimator of landing sites under test, whose answers are judged")
+    ] = "hda"
+    hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions()
+
+
+class MeasuredScenario(BaseScenario[ParametersType]):
+    """A scenario whose cases are stored files: it has no shared inputs."""
+
+    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
+        """Return no inputs."""
+        return ()
+
+    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
+        """Do nothing."""
+
+
+class MatchingScenario(MeasuredScenario[MatchingParameters]):
+    """Two or more pictures compared with their measured poses, without an algorithm."""
+
+    name = "measured-matching"
+    parameters_type = MatchingParameters
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """Run one case."""
+        p = self.checked(parameters)
+        images = store.load_images(p.cases, p.case)
+        pairs = compare_with_poses(images, match_images(images), [picture.pose for picture in p.case.pictures])
+        has_matches = all(pair.residuals_px.size for pair in pairs)
+        return CaseResult(
+            outcome=MATCHED if has_matches else TOO_FEW,
+            answered=has_matches,
+            row={**_case_row(p, images), **agreement_row(pairs)},
+            products=agreement_products(images, pairs),
+        )
+
+
+class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
+    """Three pictures of a descent with measurements, given to velocity estimators."""
+
+    name = "measured-velocity"
+    parameters_type = MeasuredVelocityParameters
+    task = VELOCITY
+    algorithm_table = ()
+    part_keys: Mapping[str, Kind] = {"scores": SCORE}
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """Run one descent."""
+        p = self.checked(parameters)
+        images = store.load_images(p.cases, p.case)
+        measurements = store.descent_measurements(p.case, images)
+        matches = match_images(images)
+        conditions = {**_case_row(p, images), **_descent_conditions(p.case, measurements)}
+        record_conditions(conditions)
+        attempts = _run_algorithms(
+            p, p.dimes, measurements, lambda answer: checked_last_interval(answer, measurements), streams.case
+        )
+        true_velocity = p.case.truth.velocity_m_s
+        truth = np.array(true_velocity or (np.nan, np.nan), dtype=np.float64)
+
+        def judge(algorithm: str) -> Judged:
+            attempt = attempts[algorithm]
+            velocity = _velocity(attempt.answer)
+            pairs = compare_with_poses(images, matches, _descent_poses(p.case, measurements, velocity))
+            row = _velocity_answer_row(attempt.answer, measurements)
+            if true_velocity is not None:
+                row |= {**velocity_row("velocity", velocity, truth), **consistency_row(attempt.answer, truth)}
+            if algorithm != p.algorithm:
+                row["apart_m_s"] = _distance(velocity, _velocity(attempts[p.algorithm].answer))
+            row |= {**agreement_row(pairs), **attempt.row}
+            if attempt.answer is not None:
+                case = ScoredVelocity(
+                    measurements=measurements,
+                    answer=attempt.answer,
+                    true_velocity_m_s=None if true_velocity is None else truth,
+                )
+                row |= scored(p.scores, case, {*row, *conditions})
+            arrays = velocity_products([image.counts for image in images], attempt.answer, truth)
+            products = {**arrays, **agreement_products(images, pairs)}
+            return judged_attempt(attempt, velocity is not None, row, products)
+
+        return case_result(p.algorithms, judge, conditions)
+
+
+class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
+    """Two pictures of the ground with measured poses, given to estimators of landing sites."""
+
+    name = "measured-landing"
+    parameters_type = MeasuredLandingParameters
+    task = LANDING
+    algorithm_table = ()
+    part_keys: Mapping[str, Kind] = {"scores": SCORE}
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """Run one flight."""
+        p = self.checked(parameters)
+        images = store.load_images(p.cases, p.case)
+        measurements = store.landing_measurements(p.case, images)
+        pairs = compare_with_poses(images, match_images(images), [picture.pose for picture in p.case.pictures])
+        true_poses = None
+        if p.case.truth.poses is not None:
+            first, second = (store.body_pose(*pose) for pose in p.case.truth.poses)
+            true_poses = first, second
+        conditions: dict[str, Scalar] = {
+            **_case_row(p, images),
+            "slant_range_m": measurements.slant_range_m,
+            "truth_known": true_poses is not None,
+            **agreement_row(pairs),
+        }
+        record_conditions(conditions)
+        attempts = _run_algorithms(p, p.hda, measurements, checked_site, streams.case)
+
+        def judge(algorithm: str) -> Judged:
+            attempt = attempts[algorithm]
+            details = None if attempt.answer is None else attempt.answer.details
+            row = _site_answer_row(attempt.answer, measurements, true_poses)
+            if algorithm != p.algorithm:
+                row["apart_m"] = _distance(_site(attempt.answer), _site(attempts[p.algorithm].answer))
+            row |= attempt.row
+            if attempt.answer is not None:
+                case = ScoredSite(measurements=measurements, answer=attempt.answer, true_poses=true_poses)
+                row |= scored(p.scores, case, {*row, *conditions})
+            products = hda_products(details) if isinstance(details, HdaDetails) else {}
+            converged = attempt.answer is not None and attempt.answer.outcome.converged
+            return judged_attempt(attempt, converged, row, {**products, **agreement_products(images, pairs)})
+
+        return case_result(p.algorithms, judge, conditions)
+
+
+def _run_algorithms(
+    p: ChosenAlgorithms, options: Any, measurements: Any, check: Callable[[object], Answer], case: int
+) -> Mapping[str, Attempt[Answer]]:
+    def run(spec: str) -> Attempt[Answer]:
+        return attempted_with(
+            lambda given: p.task.make(spec, options, p.executable, case).estimate(given), check, measurements
+        )
+
+    return {spec: run(spec) for spec in p.algorithms}
+
+
+def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:
+    """Return the columns of the case: name, pictures, and the largest motion of the camera between two pictures."""
+    poses = [picture.pose * camera_pose(image.camera) for picture, image in zip(p.case.pictures, images, strict=True)]
+    digest = hashlib.sha256()
+    for image in images:
+        digest.update(np.ascontiguousarray(image.counts).tobytes())
+    steps = [before.inv() * after for before, after in itertools.pairwise(poses)]
+    has_positions = all(picture.position_m is not None for picture in p.case.pictures)
+    return {
+        "measured_case": p.case.name,
+        "pictures": len(images),
+        "lasted_s": images[-1].time_s - images[0].time_s,
+        "turned_most_deg": max(float(np.degrees(step.rotation.magnitude())) for step in steps),
+        "moved_most_m": max(float(np.linalg.norm(step.translation)) for step in steps) if has_positions else NAN,
+        "image_hash": digest.hexdigest(),
+    }
+
+
+def _distance(first: Float[np.ndarray, "n"] | None, second: Float[np.ndarray, "n"] | None) -> float:
+    """Return the distance between two answers; NaN where one is missing."""
+    return NAN if first is None or second is None else float(np.linalg.norm(first - second))
+
+
+def _velocity(estimate: VelocityEstimate | None) -> Float64[np.ndarray, "2"] | None:
+    return None if estimate is None else estimate.velocity_m_s
+
+
+def _site(estimate: SiteEstimate | None) -> Float[np.ndarray, "3"] | None:
+    """Return the site; None where the algorithm reports no safe one."""
+    return None if estimate is None or estimate.outcome is not SiteOutcome.SAFE_SITE else estimate.site_world
+
+
+def _descent_poses(
+    case: store.StoredCase, measurements: DescentMeasurements, estimated: Float64[np.ndarray, "2"] | None
+) -> list[RigidTransform]:
+    """Return the body's poses by measured positions; without these, by the inertial unit's velocities.
+
+    The inertial velocities have an unknown constant error. It is removed with the estimate: the second interval's
+    horizontal velocity is the estimate, and the first one's follows by the inertial change. The agreement of pictures
+    and poses then depends on the estimate as well.
+    """
+    velocities = measurements.interval_velocities_m_s.copy()
+    if estimated is not None:
+        velocities[:, :2] += estimated - velocities[1, :2]
+    times = np.array([image.time_s for image in measurements.images])
+    steps = velocities * np.diff(times)[:, None]
+    positions = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    measured = [picture.position_m for picture in case.pictures]
+    if all(position is not None for position in measured):
+        positions = np.array(measured, dtype=np.float64)
+    return [
+        rigid(one.world_from_body, position) for one, position in zip(measurements.attitudes, positions, strict=True)
+    ]
+
+
+def _velocity_answer_row(estimate: VelocityEstimate | None, measurements: DescentMeasurements) -> dict[str, Scalar]:
+    """Return the columns of an answer and its difference from the inertial unit's velocity.
+
+    `beside_inertial_m_s` contains the unknown error of the inertial velocity. `pair_discrepancy_m_s` does not: it
+    compares the change of velocity from the first pair of pictures to the second with the inertial unit's; only DIMES
+    reports it.
+    """
+    velocity = _velocity(estimate)
+    details = None if estimate is None else estimate.details
+    chosen = details.chosen if isinstance(details, DimesDetails) else None
+    reported = np.full(2, np.nan) if velocity is None else velocity
+    return {
+        "velocity_estimated_x_m_s": float(reported[0]),
+        "velocity_estimated_y_m_s": float(reported[1]),
+        "beside_inertial_m_s": _distance(velocity, measurements.interval_velocities_m_s[1, :2]),
+        "pair_discrepancy_m_s": NAN if chosen is None else chosen.discrepancy_m_s,
+    }
+
+
+def _descent_conditions(case: store.StoredCase, measurements: DescentMeasurements) -> dict[str, Scalar]:
+    axes = [
+        image.camera.moved(RigidTransform.from_rotation(attitude.world_from_body)).boresight()
+        for image, attitude in zip(measurements.images, measurements.attitudes, strict=True)
+    ]
+    return {
+        **{f"altitude_{number}_m": one.altitude_m for number, one in enumerate(measurements.altitudes, start=1)},
+        "off_nadir_max_deg": max(float(np.degrees(np.arccos(np.clip(-axis[2], -1.0, 1.0)))) for axis in axes),
+        "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(measurements.sun_direction[2], -1.0, 1.0)))),
+        "truth_known": case.truth.velocity_m_s is not None,
+    }
+
+
+def _site_answer_row(
+    estimate: SiteEstimate | None,
+    measurements: LandingMeasurements,
+    true_poses: tuple[RigidTransform, RigidTransform] | None,
+) -> dict[str, Scalar]:
+    """Return the columns of an answer: site, and motion compared with the measured and the true poses.
+
+    The safety of the site is not scored: it needs the true ground, which no folder of pictures holds.
+    """
+    site = _site(estimate)
+    position = np.full(3, np.nan) if site is None else site
+    outcome = SiteOutcome.NO_STRUCTURE if estimate is None else estimate.outcome
+    row: dict[str, Scalar] = {
+        "converged": outcome.converged,
+        "site_reported": outcome is SiteOutcome.SAFE_SITE,
+        **{f"site_{name}_m": float(value) for name, value in zip(("east", "north", "up"), position, strict=True)},
+    }
+    details = None if estimate is None else estimate.details
+    if not isinstance(details, HdaDetails):
+        return row
+    row |= solved_row(details)
+    if details.motion is None:
+        return row
+
+    def errors(poses: Sequence[RigidTransform]) -> dict[str, Scalar]:
+        """Compare the estimated motion from the first to the second camera's frame with poses of the body."""
+        cameras = [body * camera_pose(image.camera) for body, image in zip(poses, measurements.images, strict=True)]
+        return motion_errors(motion.second_from_first, cameras[1].inv() * cameras[0])
+
+    motion = details.motion
+    measured = errors([one.world_from_body for one in measurements.poses])
+    row |= {name.replace("_error_", "_beside_poses_"): value for name, value in measured.items()}
+    return row if true_poses is None else {**row, **errors(true_poses)}
