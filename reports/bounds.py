@@ -94,9 +94,8 @@ def _confidences(
     if looks.before is None:
         level = confidence_at(confidence, looks.share)
         return level, level
-    passing = LaterLook(1.0 - probability, 1.0 - confidence, first).risk_of_bound(n)
-    failing = LaterLook(probability, 1.0 - confidence, first).risk_of_bound(n)
-    return 1.0 - passing, 1.0 - failing
+    passing, failing = (LaterLook(p, 1.0 - confidence, first) for p in (1.0 - probability, probability))
+    return 1.0 - passing.risk_of_bound(n), 1.0 - failing.risk_of_bound(n)
 
 
 def _cases_needed(first: int, n: int, failures: int, probability: float, confidence: float, looks: Looks) -> int:

@@ -27,7 +27,7 @@ from marsyard.reports.stored import StoredRun
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import algorithms_of, evidence_of, junit_xml, verification_csv
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import number
+from marsyard.reports.wording import count, number
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
@@ -91,11 +91,13 @@ def page_context(
 ) -> dict[str, Any]:
     """Context of the page's template: statistics of the subject's cases, all else of the whole run."""
     metric, bound = subject.metric, subject.bound
+    text = f"{count(whole.crashed, 'case')} crashed: fix this before you use the verdict."
+    crashed = [text] if whole.crashed else []
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.said("description") or ""),
         "whole": whole,
-        "cautions": [*sections.cautions(whole), *sampling_cautions(run, metric)],
+        "cautions": [*crashed, *sampling_cautions(run, metric)],
         "interrupted": run.said("state") not in (None, "finished"),
         "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
         "metric": metric,
@@ -108,7 +110,7 @@ def page_context(
         "shown": shown_cases(run),
         "provenance": sections.provenance(run),
         "versions": sections.versions(run),
-        "configuration": sections.configuration_text(run),
+        "configuration": json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str),
         "algorithms": algorithms_of(run.record),
         "rerun": sections.rerun_commands(run),
         "rerun_is_stored": run.command is not None,
@@ -197,7 +199,7 @@ def _error_sections(run: StoredRun, metric: str | None, bound: float | None, pic
         "driver_plates": sections.driver_plates(run.frame, metric, bound),
         "statistics": statistics_grid(run.whole, metric),
         "worst": sections.worst_cases(run, metric, pictured),
-        "silent": sections.silent_cases(run, metric, pictured),
+        "silent": sections.unanswered_cases(run, metric, pictured),
     }
 
 

@@ -17,7 +17,7 @@ from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import NOTHING
 
 #: Cases of each kind (largest errors, no answer, random); the pictures of one take about half a megabyte of a page.
-OF_A_KIND = 2
+CASES_OF_A_KIND = 2
 #: Fixed seeds of the random choice: the same files give the same cases.
 _GALLERY_SEED, _NOTABLE_SEED = 20260301, 20260302
 
@@ -34,8 +34,7 @@ class ShownCase:
 
 def shown_cases(run: StoredRun) -> list[ShownCase]:
     """The kept cases of the page that a system can draw, as far as their products were kept."""
-    shown = (shown_case(run, case) for case in gallery_cases(run))
-    return [one for one in shown if one is not None]
+    return [shown for case in gallery_cases(run) if (shown := shown_case(run, case)) is not None]
 
 
 def gallery_cases(run: StoredRun) -> list[int]:
@@ -43,7 +42,7 @@ def gallery_cases(run: StoredRun) -> list[int]:
     kept = list(run.showcases)
     metric = primary_metric(run.frame, run.requirements)
     if len(kept) <= 1 or metric is None or "case" not in run.whole:
-        return kept[: 3 * OF_A_KIND]
+        return kept[: 3 * CASES_OF_A_KIND]
     by_error, silent = _by_error(run.whole[run.whole["case"].isin(kept)], metric)
     unanswered = [case for case in kept if case in silent]
     return _pick(kept[:1], by_error, unanswered, np.random.default_rng(_GALLERY_SEED).permutation(kept).tolist())
@@ -68,10 +67,10 @@ def _by_error(rows: pd.DataFrame, metric: str) -> tuple[list[int], list[int]]:
 
 
 def _pick(first: list[int], *kinds: list[int]) -> list[int]:
-    """The first cases, then up to `OF_A_KIND` further ones of each kind."""
+    """The first cases, then up to `CASES_OF_A_KIND` further ones of each kind."""
     chosen = list(first)
     for kind in kinds:
-        chosen += [case for case in dict.fromkeys(kind) if case not in chosen][:OF_A_KIND]
+        chosen += [case for case in dict.fromkeys(kind) if case not in chosen][:CASES_OF_A_KIND]
     return chosen
 
 

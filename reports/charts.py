@@ -117,25 +117,21 @@ def stacked_bars(names: Sequence[str], shares: Mapping[str, tuple[str, Sequence[
     return figure
 
 
-@dataclass(frozen=True)
-class Panel:
-    """x and y of cases, and of the medians of their bins."""
-
-    points: tuple[Values, Values]
-    medians: tuple[Sequence[float], Sequence[float]]
+#: The x and y of points, or of the medians of their bins.
+Points = tuple[Sequence[float] | Values, Sequence[float] | Values]
 
 
 @in_page_style
-def scatter_panels(panels: Mapping[tuple[str, str], Panel], *, logarithmic: bool = False) -> Figure:
-    """Panels by their x and y labels: a row for each y, a column for each x."""
+def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, logarithmic: bool = False) -> Figure:
+    """Panels of cases and of medians of their bins by x and y labels: a row for each y, a column for each x."""
     columns, rows = (list(dict.fromkeys(pair[k] for pair in panels)) for k in (0, 1))
     size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(rows))
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex="col", sharey="row")
-    for (x, y), panel in panels.items():
+    for (x, y), (points, medians) in panels.items():
         axes = grid[rows.index(y), columns.index(x)]
-        axes.plot(*panel.points, ".", color=SERIES[5], markersize=3, rasterized=True)
-        axes.plot(*panel.medians, "o-", color=SERIES[0], markersize=4.5)
+        axes.plot(*points, ".", color=SERIES[5], markersize=3, rasterized=True)
+        axes.plot(*medians, "o-", color=SERIES[0], markersize=4.5)
         if logarithmic:
             axes.set_yscale("log")
             # the page's style does not typeset powers of ten

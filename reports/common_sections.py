@@ -16,7 +16,7 @@ from scipy import stats
 
 from marsyard.reports import rates
 from marsyard.reports.columns import axis_columns, driver_columns, label, magnitude_label, numbers, split_unit
-from marsyard.reports.comparison import compared_names, own_frame
+from marsyard.reports.comparison import compared_names, judge_other_algorithm
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
@@ -29,7 +29,7 @@ from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
 from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.verdicts import judge_campaign
-from marsyard.reports.wording import NOTHING, coefficient, interval, number, p_text, percent, stated
+from marsyard.reports.wording import NOTHING, coefficient, interval, note_text, number, p_text, percent, stated
 
 #: Column of true and false: whether the geometry leaves a feasible overlap for the algorithm.
 ROOM = "room"
@@ -52,11 +52,7 @@ def answers_section(subject: Subject) -> Section | None:
             ),
         },
     )
-    note = (
-        "Intervals: two-sided, Clopper and Pearson for independent cases; allowing for shared terrains by an effective "
-        "number of cases, or by whole terrains where failures are too few to estimate it. Wrong answer: reported as "
-        "valid with an error beyond the bound."
-    )
+    note = note_text("common.answers")
     data = {name: asdict(one) for name, one in shares.items()}
     return Section("answers", "Answers", "Answers given and answers wrong", [Block(grid=grid, note=note)], data)
 
@@ -106,11 +102,7 @@ def scatter_section(subject: Subject) -> Section | None:
     )
     rows = [[stated(one.probability), number(one.estimate), interval(one.lower, one.upper)] for one in circles]
     grid = Grid(["Fraction of errors", f"Radius ({unit})", f"Bounds, {stated(CONFIDENCE)} each"], rows)
-    note = (
-        "Radius around the truth that holds the fraction; at 50 % it is the circular error probable. Bounds by order "
-        "statistics: of whole terrains, or of the effective number of cases, where cases share terrains. The ellipse "
-        "holds the next error with its probability; its size allows for the number of cases."
-    )
+    note = note_text("common.scatter")
     data = {"ellipse": asdict(ellipse), "circles": [asdict(one) for one in circles]}
     return Section("scatter", "Scatter", "Scatter of the errors", [Block(text=text, grid=grid, note=note)], data)
 
@@ -132,12 +124,7 @@ def drivers_section(subject: Subject) -> Section | None:
     known = {name: found for name, found in ranked.items() if found}
     if not known:
         return None
-    note = (
-        "Share: fraction of the variance of the ranks that the condition alone explains, for a curve of any shape "
-        f"(first-order index). Intervals at {stated(CONFIDENCE)} confidence, with fewer effective cases where terrains "
-        "share condition and response. p: of no effect, corrected for the number of conditions (Holm). Failure: a case "
-        "without an answer within the bound. Correlation is not causation."
-    )
+    note = note_text("common.drivers", confidence=stated(CONFIDENCE))
     blocks = [
         Block(heading=f"Drivers of {name}", grid=Grid(_RANKED_HEAD, [_ranked_row(*one) for one in found]))
         for name, found in known.items()
@@ -175,7 +162,7 @@ def _ranked_row(column: str, one: Driver, p: float) -> list[str]:
 
 
 #: Up to this ratio of the axis' ends it has ticks within its decades.
-_FEW_DECADES = 50
+_MAX_RATIO = 50
 #: Number of points of a convergence curve, spaced logarithmically, and the minimum number of cases.
 POINTS, FEWEST = 12, 8
 QUANTILE = 0.95
@@ -208,18 +195,13 @@ def convergence_section(subject: Subject) -> Section | None:
         data[f"{subject.metric}: {name}"] = [asdict(point) for point in points]
     if not plates:
         return None
-    note = (
-        "Estimates of the first cases by number; the order of random cases is arbitrary. Band: one-sided bounds at the "
-        "confidence asked; of mean and quantile at 90 %, open upwards where cases are too few for a bound. Dashed: the "
-        "requirement."
-    )
+    note = note_text("common.convergence")
     return Section("convergence", "Convergence", "Convergence", [Block(plates=plates, note=note)], data)
 
 
 def sizes(cases: int) -> list[int]:
     """Numbers of cases of the points of a curve."""
-    spread = np.geomspace(FEWEST, cases, POINTS)
-    return sorted({round(float(size)) for size in spread})
+    return sorted({round(float(size)) for size in np.geomspace(FEWEST, cases, POINTS)})
 
 
 def requirement_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]:
@@ -280,7 +262,7 @@ def curve_figure(points: Sequence[Point], name: str, asked: float | None) -> Fig
     if asked is not None and math.isfinite(asked):
         axes.axhline(asked, color=REQUIREMENT, linewidth=1.4, linestyle="--")
     axes.set(xscale="log", xlabel="cases", ylabel=name)
-    if cases[-1] < _FEW_DECADES * cases[0]:
+    if cases[-1] < _MAX_RATIO * cases[0]:
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())
@@ -312,7 +294,7 @@ def consistency(nees: Float[np.ndarray, " n"], parts: int = PARTS) -> dict[str, 
 def consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Consistency of all algorithms in the rows with covariances, by name."""
     judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "judged"
-    frames = {judged: frame, **{name: own_frame(frame, name) for name in compared_names(frame)}}
+    frames = {judged: frame, **{name: judge_other_algorithm(frame, name) for name in compared_names(frame)}}
     by_name = {name: numbers(own, NEES) for name, own in frames.items() if NEES in own}
     known = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
     return {name: consistency(nees) for name, nees in known.items() if nees.size}
@@ -329,12 +311,7 @@ def consistency_section(subject: Subject) -> Section | None:
         band = f"{number(one['lower'])} to {number(one['upper'])}"
         rows.append([name, f"{one['n']:,}", number(one["mean"]), band, inside, one["word"]])
     head = ["Algorithm", "Estimates", "Mean NEES", "95 % band", "Within 95 % ellipse", "Covariances are"]
-    note = (
-        f"NEES: squared error normalised by the stated covariance; {PARTS} on average for a correct covariance. The "
-        "band assumes independent cases and normal errors; the fraction within the ellipse has a 90 % interval. Too "
-        "sure: errors are larger than stated."
-    )
-    blocks = [Block(grid=Grid(head, rows), note=note)]
+    blocks = [Block(grid=Grid(head, rows), note=note_text("common.consistency", parts=PARTS))]
     return Section("consistency", "Consistency", "Stated covariances against errors", blocks, found)
 
 
@@ -360,10 +337,8 @@ def faults_section(subject: Subject) -> Section | None:
     """Outcomes by fault and size; None without faults or bound."""
     if subject.metric is None or subject.bound is None or not rates.is_flag(subject.frame, "answered"):
         return None
-    note = (
-        f"Valid: answered within {subject.bound:g} {split_unit(subject.metric)[1]}. Invalid: refused by the algorithm, "
-        "or crashed. Wrong: answered, but beyond the bound; with the two-sided Clopper-Pearson interval of its "
-        f"fraction of all cases at {stated(CONFIDENCE)} confidence."
+    note = note_text(
+        "common.faults", bound=f"{subject.bound:g}", unit=split_unit(subject.metric)[1], confidence=stated(CONFIDENCE)
     )
     return SectionDeclaration("faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), note=note)(subject)
 

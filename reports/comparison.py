@@ -24,7 +24,7 @@ from marsyard.reports.sampled import sampled
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of
 from marsyard.reports.statistics.changes import Sample, compared_errors, compared_successes, difference_p, holm
 from marsyard.reports.stored import StoredRun, table
-from marsyard.reports.wording import NOTHING, number, p_text, percent, stated
+from marsyard.reports.wording import NOTHING, note_text, number, p_text, percent, stated
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def compared_names(frame: pd.DataFrame) -> list[str]:
     return [name for name in names if rates.is_flag(frame, f"{name}.answered")]
 
 
-def own_frame(frame: pd.DataFrame, name: str) -> pd.DataFrame:
+def judge_other_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     """The rows with a compared algorithm in place of the judged one."""
     prefix = f"{name}."
     own = {str(column): str(column).removeprefix(prefix) for column in frame.columns if str(column).startswith(prefix)}
@@ -121,7 +121,7 @@ def comparison(
     if not names or frame.empty:
         return [], []
     judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame else "judged"
-    others = {name: own_frame(frame, name) for name in names}
+    others = {name: judge_other_algorithm(frame, name) for name in names}
     contenders = [contender(frame, judged, metric, bound)]
     contenders += [contender(own, name, metric, bound) for name, own in others.items()]
     if metric is None:
@@ -141,12 +141,7 @@ def comparison_section(subject: Subject) -> Section | None:
         return None
     grids = comparison_grids(contenders, differences, subject.metric)
     judged = contenders[0].name
-    note = (
-        f"Against {judged}, on the same cases. Only one within the bound: discordant cases; p of an exact McNemar "
-        "test. Difference: the other's error less the judged one's where both answered, its mean with a "
-        f"{stated(CONFIDENCE)} BCa bootstrap interval; p of Wilcoxon's signed ranks. The p are two-sided, corrected "
-        "for the number of algorithms (Holm). Where cases share terrains, intervals and p are of whole terrains."
-    )
+    note = note_text("common.comparison", judged=judged, confidence=stated(CONFIDENCE))
     blocks = [Block(grid=grids[0])]
     if differences:
         blocks.append(Block(heading=f"Against {judged}", grid=grids[1], note=note))

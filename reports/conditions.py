@@ -17,7 +17,7 @@ from marsyard.reports.columns import axis_columns, label, numbers, split_unit
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.wording import number, percent, plain_value, stated
+from marsyard.reports.wording import note_text, number, percent, plain_value, stated
 
 #: Prefixes of the condition columns in the order of the page; the first column of each prefix counts.
 CONDITIONS = (
@@ -25,9 +25,9 @@ CONDITIONS = (
     "sun_elevation", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "tilt_max", "pose_error_share",
 )  # fmt: skip
 #: A column with up to so many values, and so many cases per value on average, gets a row for each value.
-MOST_KINDS, CASES_PER_KIND = 12, 10
+MAX_KINDS, CASES_PER_KIND = 12, 10
 #: Other columns of numbers are cut into at least two and at most so many bins of about so many cases.
-CASES_PER_BIN, MOST_BINS = 40, 5
+CASES_PER_BIN, MAX_BINS = 40, 5
 QUANTILE = 0.99
 
 
@@ -49,12 +49,7 @@ def conditions_section(subject: Subject) -> Section | None:
             texts = [label(one["part"]), f"{one['terrains']:,}", *deviations, percent(one["share"])]
             rows.append([*texts, number(one["p_value"])])
         blocks.append(Block(heading="By terrain", grid=Grid(head, rows), note=_SPREAD_NOTE))
-    note = (
-        "Bins hold equally many cases. Answered: with its two-sided Clopper-Pearson interval at "
-        f"{stated(CONFIDENCE)} confidence, which allows for shared terrains. Mean and standard deviation are of the "
-        f"errors of the answers. Bound: upper bound of the {stated(QUANTILE)} quantile of the magnitude at "
-        f"{stated(CONFIDENCE)} confidence (order statistics); it takes 230 answers, or 230 terrains if they are shared."
-    )
+    note = note_text("common.conditions", confidence=stated(CONFIDENCE), quantile=stated(QUANTILE))
     data: dict[str, Any] = {
         column: [one | {"answered": asdict(one["answered"])} for one in bins] for column, bins in tables.items()
     }
@@ -69,7 +64,7 @@ def cuts(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.nda
         columns = [str(name) for name in frame.columns if name == start or str(name).startswith(f"{start}_")]
         for column in columns[:1]:
             kinds = frame[column].dropna().nunique()
-            if 2 <= kinds <= MOST_KINDS and len(frame) >= CASES_PER_KIND * kinds:
+            if 2 <= kinds <= MAX_KINDS and len(frame) >= CASES_PER_KIND * kinds:
                 values = sorted(frame[column].dropna().unique(), key=lambda value: (isinstance(value, str), value))
                 chosen = [frame[column].eq(value).fillna(False).to_numpy(dtype=np.bool_) for value in values]
                 yield column, list(zip(map(plain_value, values), chosen, strict=True))
@@ -77,10 +72,7 @@ def cuts(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.nda
                 yield column, _bins(numbers(frame, column))
 
 
-_SPREAD_NOTE = (
-    "Analysis of variance over the answers: standard deviation of errors within one terrain, and between the means of "
-    "terrains. A small p: terrains differ."
-)
+_SPREAD_NOTE = note_text("common.terrains")
 
 
 def terrain_spread(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
@@ -116,7 +108,7 @@ def terrain_spread(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
 
 def _bins(values: Float[np.ndarray, " n"]) -> list[tuple[str, Bool[np.ndarray, " n"]]]:
     known = values[np.isfinite(values)]
-    count = int(np.clip(known.size // CASES_PER_BIN, 2, MOST_BINS))
+    count = int(np.clip(known.size // CASES_PER_BIN, 2, MAX_BINS))
     edges = np.unique(np.quantile(known, np.linspace(0.0, 1.0, count + 1)))
     places = np.digitize(values, edges[1:-1])
     ranges = pairwise(edges.tolist())
@@ -157,7 +149,7 @@ def _grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]]) -
         of_parts = [number(value) for pair in zip(one["means"], one["sds"], strict=True) for value in pair]
         share, bound = one["answered"], one["quantile_bound"]
         ends = [number(bound) if np.isfinite(bound) else "n too small", number(one["largest"])]
-        interval = rates.range_text(share.sound_lower, share.sound_upper)
+        interval = rates.range_text(*share.sound)
         rows.append([one["name"], f"{share.n:,}", percent(share.share), interval, *of_parts, *ends])
     return Grid(head, rows)
 

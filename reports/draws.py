@@ -24,7 +24,7 @@ from marsyard.reports.wording import count
 #: Size of a marginal, height of a heading, margin of the figure, inches; minimum number of marginals in a row.
 _WIDTH, _HEIGHT, _HEAD, _MARGIN, _MIN_IN_ROW = 3.0, 1.9, 0.45, 0.15, 4
 #: Side of a pair's cell, inches, and maximum number of paired parameters.
-_SIDE, MOST_PAIRED = 0.95, 24
+_SIDE, MAX_PAIRED = 0.95, 24
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center", "color": INK}
 #: Maximum number of labelled bars, and of bins.
 _MAX_NAMED, _BINS = 8, 24
@@ -73,7 +73,7 @@ class Drawn:
 @in_page_style
 def draws_figure(title: str, drawn: Sequence[Drawn]) -> Figure:
     """Marginals of at least one parameter above, and below them all pairs of those that vary."""
-    varying = [one for one in drawn if len(set(one.numbers(one.values).tolist())) > 1][:MOST_PAIRED]
+    varying = [one for one in drawn if len(set(one.numbers(one.values).tolist())) > 1][:MAX_PAIRED]
     side = len(varying) * _SIDE if len(varying) > 1 else 0.0
     width = max(min(len(drawn), _MIN_IN_ROW) * _WIDTH, side, 2.0 * _WIDTH)
     in_row = min(len(drawn), int(width / _WIDTH))

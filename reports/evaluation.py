@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.reports.rates import crashed_cases
+from marsyard.reports.rates import engine_failed
 from marsyard.reports.sampled import INDEPENDENT, Sampled, sampled
 from marsyard.reports.statistics.clusters import ClusterMethod
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
@@ -35,7 +35,7 @@ class Overall:
 
 def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = INDEPENDENT) -> Overall:
     """The verdict of the worst requirement, in the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
-    crashed = crashed_cases(frame)
+    crashed = int(engine_failed(frame).sum())
     statuses = [verdict.status for verdict in verdicts]
     tail = f" {count(crashed, 'case')} crashed." if crashed else ""
     if not statuses:

@@ -36,9 +36,9 @@ from marsyard.reports.wording import plain_value, stated
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95
 #: Errors beyond this many times the bound are counted beyond the axis, so that they do not hide the others.
-_FARTHEST = 3.0
+_MAX_BOUNDS = 3.0
 #: If a larger fraction of the errors lies beyond the axis, the axis ends at this quantile of the errors.
-_MAX_BEYOND, _FOLLOWED = 0.25, 0.95
+_MAX_BEYOND, _EDGE_QUANTILE = 0.25, 0.95
 #: Cases of a point of a conditional curve, and minimum and maximum number of points.
 _CASES_PER_POINT, _MIN_POINTS, _MAX_POINTS = 25, 4, 16
 _BELOW: Mapping[str, Any] = {"loc": "upper center", "ncols": 2, "handletextpad": 0.2}
@@ -126,12 +126,12 @@ def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float
     largest = float(magnitudes.max())
     if bound is None or bound <= 0.0:
         return largest or 1.0
-    if float(np.mean(magnitudes > _FARTHEST * bound)) > _MAX_BEYOND:
-        return float(np.quantile(magnitudes, _FOLLOWED, method="higher"))
-    return min(max(largest, 1.1 * bound), _FARTHEST * bound)
+    if float(np.mean(magnitudes > _MAX_BOUNDS * bound)) > _MAX_BEYOND:
+        return float(np.quantile(magnitudes, _EDGE_QUANTILE, method="higher"))
+    return min(max(largest, 1.1 * bound), _MAX_BOUNDS * bound)
 
 
-def worth_a_closer_look(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
+def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
     """Whether all errors are so small against the bound that a figure of their own extent is needed."""
     magnitude = np.abs(numbers(frame, metric))
     known = magnitude[np.isfinite(magnitude)]
@@ -198,7 +198,7 @@ def note_beyond(axes: Axes, beyond: int) -> None:
 
 
 @in_page_style
-def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> Figure | None:
+def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> Figure | None:
     """Errors against a condition; None without numbers.
 
     Cases without an error are ticks on the upper edge, errors beyond the axis hollow marks below it.
@@ -209,7 +209,7 @@ def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | 
     if not (known | silent).any():
         return None
     figure, axes = new_axes(4.2, 3.2)
-    edge = _driven_edge(magnitude[known], bound)
+    edge = _scatter_edge(magnitude[known], bound)
     top = 1.12 * edge
     kinds = categories(frame, metric, bound)
     for kind in kinds:
@@ -229,7 +229,7 @@ def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | 
     return figure
 
 
-def _driven_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
+def _scatter_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
     """Largest magnitude drawn to scale; the axis includes a bound that is near."""
     edge = axis_edge(magnitudes, bound)
     largest = float(magnitudes.max()) if magnitudes.size else 0.0
@@ -237,11 +237,11 @@ def _driven_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> fl
     return edge if near or largest == 0.0 else largest
 
 
-def beyond_the_axis(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> int:
-    """Number of hollow marks of `error_against`."""
+def count_beyond_axis(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> int:
+    """Number of hollow marks of `error_scatter_against`."""
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
     known = magnitude[np.isfinite(x) & np.isfinite(magnitude)]
-    return int((known > _driven_edge(known, bound)).sum())
+    return int((known > _scatter_edge(known, bound)).sum())
 
 
 def _conditional_curves(axes: Axes, x: Float[np.ndarray, " n"], magnitude: Float[np.ndarray, " n"]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from marsyard.reports.charts import Panel, RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
+from marsyard.reports.charts import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
 from marsyard.reports.columns import label, numbers
 from marsyard.reports.rates import (
     CONFIDENCE,
@@ -401,7 +401,7 @@ class Scatter:
             return [], {}
         columns = {one.title: one.values(frame) for one in (*self.x, *self.y)}
         panels = {
-            (one.driver, one.error): Panel((columns[one.driver], columns[one.error]), (one.centres, one.medians))
+            (one.driver, one.error): ((columns[one.driver], columns[one.error]), (one.centres, one.medians))
             for one in effects
         }
         texts: dict[str, list[str]] = {}

@@ -43,9 +43,11 @@ class PaperFacts:
         facts = {one["campaign"]: one for one in read_paper(self.path)["facts"]}.get(subject.run.name)
         if facts is None or not any(row["column"] in subject.frame for row in facts["rows"]):
             return None
-        texts = {row["name"]: (row.get("paper", NOTHING), ours_text(subject.frame, row)) for row in facts["rows"]}
-        grid = Grid(["", "Paper", "Ours"], [[name, paper, ours] for name, (paper, ours) in texts.items()])
-        data: dict[str, Any] = {name: {"paper": paper, "ours": ours} for name, (paper, ours) in texts.items()}
+        data: dict[str, Any] = {
+            row["name"]: {"paper": row.get("paper", NOTHING), "ours": format_own_value(subject.frame, row)}
+            for row in facts["rows"]
+        }
+        grid = Grid(["", "Paper", "Ours"], [[name, *one.values()] for name, one in data.items()])
         blocks = [Block(grid=grid, note=f"{_MEDIANS} {facts.get('note', '')}".strip())]
         if subject.run.name in self.further:
             shown, numbers_too = self.further[subject.run.name].draw(subject.frame, subject, "paper")
@@ -57,7 +59,7 @@ class PaperFacts:
 _MEDIANS = "Ours: median over all cases, minimum to maximum in brackets. A dash: not stated by the paper."
 
 
-def ours_text(frame: Rows, row: Mapping[str, Any]) -> str:
+def format_own_value(frame: Rows, row: Mapping[str, Any]) -> str:
     """Our value of a paper's quantity."""
     chosen, column = frame[all_flags(frame, *row.get("among", ()))], row["column"]
     if row.get("statistic") == "rate":

@@ -20,11 +20,6 @@ from marsyard.reports.wording import NOTHING, number, percent
 ENGINE_FAILURES = UNFINISHED
 
 
-def crashed_cases(frame: pd.DataFrame) -> int:
-    """Number of cases that the engine could not finish."""
-    return int(engine_failed(frame).sum())
-
-
 def succeeded(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
     """Mask of the cases with |scale * metric| <= bound, or with a true metric if the bound is NaN.
 
@@ -118,14 +113,11 @@ class Share:
     shared_upper: float | None = None
 
     @property
-    def sound_lower(self) -> float:
-        """Lower end of the interval that allows for shared terrains."""
-        return self.lower if self.shared_lower is None else self.shared_lower
-
-    @property
-    def sound_upper(self) -> float:
-        """Upper end of that interval."""
-        return self.upper if self.shared_upper is None else self.shared_upper
+    def sound(self) -> tuple[float, float]:
+        """The interval that allows for shared terrains."""
+        if self.shared_lower is None or self.shared_upper is None:
+            return self.lower, self.upper
+        return self.shared_lower, self.shared_upper
 
 
 def share_of(hit: Bool[np.ndarray, " n"], frame: pd.DataFrame) -> Share:
@@ -248,7 +240,7 @@ def interval_text(share: Share, *, shared: bool = False) -> str:
     """Interval of a share for independent cases, or allowing for `shared` terrains."""
     if not share.n:
         return NOTHING
-    return range_text(share.sound_lower, share.sound_upper) if shared else range_text(share.lower, share.upper)
+    return range_text(*share.sound) if shared else range_text(share.lower, share.upper)
 
 
 def range_text(lower: float, upper: float) -> str:

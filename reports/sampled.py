@@ -88,7 +88,7 @@ class Sampled:
         """Fraction of the risk that a look at so many cases may spend."""
         return 1.0 if self.most_cases is None else spent_share(looks_of(self.most_cases), cases)
 
-    def seen_before(self, frame: pd.DataFrame, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
+    def mask_first_look(self, frame: pd.DataFrame, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
         """Mask of the chosen rows of an earlier first look; None at the first look."""
         if self.first_look is None or self.most_cases is not None or "case" not in frame:
             return None

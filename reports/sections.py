@@ -19,15 +19,14 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from marsyard.reports.columns import axis_columns, driver_columns, label, numbers
-from marsyard.reports.evaluation import Overall
 from marsyard.reports.figures import (
-    beyond_the_axis,
-    error_against,
+    count_beyond_axis,
     error_distribution,
     error_histogram,
     error_scatter,
+    error_scatter_against,
+    needs_enlarged_figure,
     outcome_bars,
-    worth_a_closer_look,
 )
 from marsyard.reports.rates import CONFIDENCE, engine_failed, members, terrain_groups
 from marsyard.reports.sampled import sampled
@@ -41,30 +40,6 @@ from marsyard.reports.wording import NOTHING, asked_text, coefficient, count, nu
 
 #: Maximum number of rows of the tables of single cases.
 _MAX_CASES = 10
-
-
-@dataclass(frozen=True)
-class Strip:
-    """A success rate's interval to scale: positions in per cent of the strip's width."""
-
-    left: str
-    lower: float
-    upper: float
-    estimate: float
-    asked: float
-
-
-@dataclass(frozen=True)
-class VerdictRow:
-    """A verdict in words, with its strip if it has bounds."""
-
-    verdict: Verdict
-    asked: str
-    evidence: Sequence[str]
-    bounds: str
-    risk: str
-    further: str
-    strip: Strip | None
 
 
 @dataclass(frozen=True)
@@ -88,32 +63,27 @@ class CaseTable:
     left_out: int = 0
 
 
-def verdict_row(verdict: Verdict) -> VerdictRow:
-    """A verdict as the page shows it."""
+def verdict_row(verdict: Verdict) -> dict[str, Any]:
+    """A verdict as the page shows it; `strip` is its interval to scale, in per cent of the strip's width."""
     bounds, strip = f"{percent(verdict.lower)} to {percent(verdict.upper)}", None
     if math.isnan(verdict.lower):
         bounds = NOTHING if math.isnan(verdict.estimate) else f"{percent(verdict.estimate)} seen"
     else:
         lowest = min(verdict.lower, verdict.probability)
         left = max(0.0, lowest - 0.25 * (1.0 - lowest))
-        rates = np.array([verdict.lower, verdict.upper, verdict.estimate, verdict.probability])
-        strip = Strip(f"{100.0 * left:.3g} %", *(100.0 / max(1.0 - left, 1e-12) * (rates - left)).tolist())
-    return VerdictRow(
-        verdict=verdict,
-        asked=asked_text(verdict, label(verdict.metric)),
-        evidence=[count(verdict.n, "case"), f"{verdict.failures:,} failed"],
-        bounds=bounds,
-        risk="" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}",
-        further=NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}",
-        strip=strip,
-    )
-
-
-def cautions(whole: Overall) -> list[str]:
-    """Warnings of the page's head: crashed cases."""
-    if not whole.crashed:
-        return []
-    return [f"{count(whole.crashed, 'case')} crashed: the campaign is not in order, whatever its verdict."]
+        rates = {"estimate": verdict.estimate, "asked": verdict.probability}
+        rates |= {"lower": verdict.lower, "upper": verdict.upper}
+        scale = 100.0 / max(1.0 - left, 1e-12)
+        strip = {"left": f"{100.0 * left:.3g} %"} | {name: scale * (rate - left) for name, rate in rates.items()}
+    return {
+        "verdict": verdict,
+        "asked": asked_text(verdict, label(verdict.metric)),
+        "evidence": [count(verdict.n, "case"), f"{verdict.failures:,} failed"],
+        "bounds": bounds,
+        "risk": "" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}",
+        "further": NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}",
+        "strip": strip,
+    }
 
 
 def outcome_grid(frame: pd.DataFrame) -> Grid:
@@ -131,10 +101,9 @@ def worst_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> 
     return _case_table(run, order.tolist(), columns, metric, known.size - order.size, pictured)
 
 
-def silent_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
+def unanswered_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
     """Completed cases without an error."""
-    silent = ~np.isfinite(numbers(run.whole, metric)) & members(run.whole, "completed")
-    order = np.flatnonzero(silent)
+    order = np.flatnonzero(~np.isfinite(numbers(run.whole, metric)) & members(run.whole, "completed"))
     return _case_table(run, order[:_MAX_CASES].tolist(), [], metric, max(0, order.size - _MAX_CASES), pictured)
 
 
@@ -208,11 +177,6 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
 def versions(run: StoredRun) -> list[tuple[str, str]]:
     """Packages and their versions."""
     return [(str(name), _plain(version)) for name, version in table(run.said("versions")).items()]
-
-
-def configuration_text(run: StoredRun) -> str:
-    """The configuration as run, as indented JSON."""
-    return json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str)
 
 
 def replay_command(run: StoredRun, case: str) -> str:
@@ -298,7 +262,7 @@ def error_plates(frame: pd.DataFrame, whole: pd.DataFrame, metric: str, bound: f
     scatter = "Errors of single cases; the dashed circle is the requirement. Hollow: beyond the axes, at their edge."
     histogram = "How often each magnitude of error occurred; hatched: beyond the axis."
     figures: list[tuple[str, Figure | None, str]] = [("scatter", error_scatter(frame, metric, bound), scatter)]
-    if worth_a_closer_look(frame, metric, bound):
+    if needs_enlarged_figure(frame, metric, bound):
         figures.append(("close", error_scatter(frame, metric, bound, close=True), "The same errors, enlarged."))
     figures.append(("histogram", error_histogram(whole, metric, bound), histogram))
     caption = "Fraction of cases up to each magnitude."
@@ -312,10 +276,10 @@ def driver_plates(frame: pd.DataFrame, metric: str, bound: float | None) -> list
     for k, column in enumerate(driver_columns(frame, metric)):
         found = driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
         text = f"{label(column)}." if found is None else f"{label(column)}: rank correlation {rank_text(found)}."
-        beyond = beyond_the_axis(frame, metric, column, bound)
+        beyond = count_beyond_axis(frame, metric, column, bound)
         if beyond:
             text = f"{text} {count(beyond, 'error')} beyond the axis: hollow, at its upper edge."
-        figures.append((f"driver{k}", error_against(frame, metric, column, bound), text))
+        figures.append((f"driver{k}", error_scatter_against(frame, metric, column, bound), text))
     return _plates(figures)
 
 
@@ -346,7 +310,7 @@ def explorer_data(run: StoredRun, metric: str, bound: float | None, pictured: Co
     parts = axis_columns(metric, [str(name) for name in frame.columns])[:2]
     drivers = driver_columns(frame, metric)
     names = list(dict.fromkeys([*parts, *drivers, metric]))
-    chosen = frame.iloc[points_of(frame, metric)]
+    chosen = frame.iloc[choose_points(frame, metric)]
     outcomes = chosen["outcome"].astype(str) if "outcome" in chosen else pd.Series("", index=chosen.index)
     kinds = list(dict.fromkeys(outcomes))
     cases = chosen["case"].tolist() if "case" in chosen else chosen.index.tolist()
@@ -367,7 +331,7 @@ def explorer_data(run: StoredRun, metric: str, bound: float | None, pictured: Co
     }
 
 
-def points_of(frame: pd.DataFrame, metric: str) -> Int[np.ndarray, " n"]:
+def choose_points(frame: pd.DataFrame, metric: str) -> Int[np.ndarray, " n"]:
     """Rows of the explorer: all, or of many the notable ones and the first others."""
     if len(frame) <= MAX_POINTS:
         return np.arange(len(frame))

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 from xml.etree import ElementTree as Xml
@@ -101,32 +101,14 @@ def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
     return {column: "; ".join(value for value in values if value) for column, values in cells.items()}
 
 
-#: Columns of the matrix before and after those of the algorithm; one row for each requirement and campaign.
-_REQUIREMENT: Mapping[str, Callable[[Verdict], Any]] = {
-    "requirement": lambda one: one.requirement_id,
-    "statement": lambda one: one.statement,
-    "kind": lambda one: one.kind,
-    "source": lambda one: one.source,
-}
-_EVIDENCE: Mapping[str, Callable[[Verdict], Any]] = {
-    "verdict": lambda one: str(one.status),
-    "metric": lambda one: one.metric if one.scale == 1.0 else f"{one.scale:g} * ({one.metric})",
-    "bound": lambda one: one.bound,
-    "population": lambda one: one.population,
-    "probability": lambda one: one.probability,
-    "confidence": lambda one: one.confidence,
-    "decided_by": lambda one: one.decide_by,
-    "cases": lambda one: one.n,
-    "failures": lambda one: one.failures,
-    "terrains": lambda one: one.terrains,
-    "rate": lambda one: one.estimate,
-    "lower_bound": lambda one: one.lower,
-    "upper_bound": lambda one: one.upper,
-    "design_effect": lambda one: math.nan if one.clustered is None else one.clustered.design_effect,
-    "consumer_risk": lambda one: one.consumer_risk,
-    "further_cases": lambda one: one.further_cases,
-    "note": lambda one: one.note,
-}
+#: Columns of the matrix before and after those of the algorithm, and the properties of the verdict that they hold.
+_REQUIREMENT = {"requirement": "requirement_id", "statement": "statement", "kind": "kind", "source": "source"}
+_EVIDENCE = {
+    "verdict": "status", "metric": "metric", "bound": "bound", "population": "population", "probability": "probability",
+    "confidence": "confidence", "decided_by": "decide_by", "cases": "n", "failures": "failures", "terrains": "terrains",
+    "rate": "estimate", "lower_bound": "lower", "upper_bound": "upper", "design_effect": "design_effect",
+    "consumer_risk": "consumer_risk", "further_cases": "further_cases", "note": "note",
+}  # fmt: skip
 COLUMNS = (*_REQUIREMENT, "campaign", *algorithm_cells(()), *_EVIDENCE)
 
 
@@ -135,12 +117,13 @@ def evidence_of(
 ) -> list[dict[str, Any]]:
     """Rows of the traceability matrix: the evidence of a campaign for each requirement."""
     cells = {"campaign": campaign, **algorithm_cells(algorithms)}
-    return [
-        {name: value(one) for name, value in _REQUIREMENT.items()}
-        | cells
-        | {name: value(one) for name, value in _EVIDENCE.items()}
-        for one in verdicts
-    ]
+    rows = []
+    for one in verdicts:
+        evidence = {column: getattr(one, name) for column, name in _EVIDENCE.items()}
+        evidence["verdict"] = str(one.status)
+        evidence["metric"] = one.metric if one.scale == 1.0 else f"{one.scale:g} * ({one.metric})"
+        rows.append({column: getattr(one, name) for column, name in _REQUIREMENT.items()} | cells | evidence)
+    return rows
 
 
 def verification_csv(rows: Iterable[Mapping[str, Any]]) -> str:

@@ -46,7 +46,7 @@ class Verdict:
 
     status: PASS if the lower bound reaches the probability, FAIL if the upper bound is below it, else INSUFFICIENT.
         Where the estimate decides and the bounds do not pass: FAIL if the rate is below the probability, else MET BY
-        RATE, but INSUFFICIENT for fewer cases than `fewest_cases_for_rate`
+        RATE, but INSUFFICIENT for fewer cases than `min_cases_for_rate`
     failures: cases whose metric is missing, NaN or out of bound, unfinished cases, and those of unknown membership
     estimate, lower, upper: success rate and its one-sided bounds; NaN for an empty population, bounds also for designs
     further_cases: cases that pass the requirement if none fails, on new terrains where terrains are counted; or None
@@ -92,12 +92,12 @@ class Verdict:
         """The status for independent cases; None where no terrain is shared or the estimate decides."""
         if self.clustered is None or self.decide_by == ESTIMATE:
             return None
-        return status_of(self.plain_lower, self.plain_upper, self.probability)
+        return compare_bounds(self.plain_lower, self.plain_upper, self.probability)
 
     @property
     def confident_status(self) -> Status:
         """The status by the bounds alone; INSUFFICIENT without bounds."""
-        return status_of(self.lower, self.upper, self.probability)
+        return compare_bounds(self.lower, self.upper, self.probability)
 
     @property
     def consumer_risk(self) -> float:
@@ -108,6 +108,11 @@ class Verdict:
         if shared is None:
             return consumer_risk(self.n - self.failures, self.n, self.probability)
         return consumer_risk(shared.effective_successes, shared.effective_n, self.probability)
+
+    @property
+    def design_effect(self) -> float:
+        """The design effect of shared terrains; NaN where no terrain is shared."""
+        return math.nan if self.clustered is None else self.clustered.design_effect
 
     @property
     def margin(self) -> float:
@@ -129,7 +134,7 @@ class Verdict:
         if self.status is Status.PASS:
             return f"Decided by the rate; met {at} as well."
         if self.status is Status.INSUFFICIENT:
-            return f"Decided by the rate, which takes {count(fewest_cases_for_rate(self.probability), 'case')} or more."
+            return f"Decided by the rate, which takes {count(min_cases_for_rate(self.probability), 'case')} or more."
         return f"Decided by the rate; {at} it would be {self.confident_status}."
 
     def _sharing(self) -> str:
@@ -218,9 +223,9 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, frame: pd.Data
         reason = f"Decided by the rate of these cases. {how.no_probability}" if by_rate else how.no_probability
         status = _status_by_rate(rate, n, verdict.probability) if by_rate else verdict.status
         return replace(counted, status=status, reason=reason)
-    looks = Looks(how.seen_before(frame, chosen), how.risk_share(len(frame)))
+    looks = Looks(how.mask_first_look(frame, chosen), how.risk_share(len(frame)))
     bounds = compute_bounds(success, groups, verdict.probability, verdict.confidence, looks)
-    status = status_of(bounds.lower, bounds.upper, verdict.probability)
+    status = compare_bounds(bounds.lower, bounds.upper, verdict.probability)
     by_rate = by_rate and status is not Status.PASS
     if by_rate:
         status = _status_by_rate(rate, n, verdict.probability)
@@ -232,7 +237,7 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, frame: pd.Data
     if status is not Status.INSUFFICIENT:
         return judged
     if by_rate:
-        return replace(judged, further_cases=fewest_cases_for_rate(verdict.probability) - n)
+        return replace(judged, further_cases=min_cases_for_rate(verdict.probability) - n)
     return _advise(judged, bounds.further_cases, how)
 
 
@@ -250,16 +255,16 @@ def _advise(verdict: Verdict, further: int, how: Sampled) -> Verdict:
 def _status_by_rate(rate: float, n: int, probability: float) -> Status:
     if rate < probability:
         return Status.FAIL
-    return Status.MET_BY_RATE if n >= fewest_cases_for_rate(probability) else Status.INSUFFICIENT
+    return Status.MET_BY_RATE if n >= min_cases_for_rate(probability) else Status.INSUFFICIENT
 
 
-def fewest_cases_for_rate(probability: float) -> int:
+def min_cases_for_rate(probability: float) -> int:
     """Minimum number of cases for MET BY RATE: 1 / (1 - probability), of which one may fail."""
     # the tolerance keeps 1 / (1 - 0.9), which is 10.000000000000002, at 10
     return math.ceil(1.0 / (1.0 - probability) - 1e-9)
 
 
-def status_of(lower: float, upper: float, probability: float) -> Status:
+def compare_bounds(lower: float, upper: float, probability: float) -> Status:
     """Compare bounds of a success rate with the rate asked."""
     if lower >= probability:
         return Status.PASS

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -107,3 +111,15 @@ def count(quantity: int, noun: str) -> str:
 def plain_value(value: object) -> str:
     """A stored value as text, whole numbers without a decimal point."""
     return str(int(value)) if isinstance(value, float | np.floating) and value.is_integer() else str(value)
+
+
+@cache
+def _notes() -> Mapping[str, Mapping[str, str]]:
+    with (Path(__file__).parent / "templates" / "notes.toml").open("rb") as file:
+        return tomllib.load(file)
+
+
+def note_text(key: str, **values: object) -> str:
+    """A text of `templates/notes.toml` by ``table.key``, with its values."""
+    table, name = key.split(".")
+    return _notes()[table][name].format(**values)

@@ -26,20 +26,12 @@ from marsyard.reports.presentation import (
 )
 from marsyard.reports.section import plate
 from marsyard.reports.svg import INK, MARKERS, MUTED, SERIES, draw_pictures, in_page_style
-from marsyard.reports.wording import number
+from marsyard.reports.wording import note_text, number
 
 #: Columns of the tracks that the page shows elsewhere or has no width for.
 _NOT_SHOWN = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
-_LEGEND = (
-    "Below, the pictures as delivered, columns binned: squares mark templates (red) and tracked positions (green), not "
-    "their size; dotted yellow outlines the overlap, a yellow cross the zero-phase spot. Above, both pictures of a "
-    "pair rectified to one nadir camera, north up, with templates, search windows (blue) and tracked positions to "
-    "scale. Between, templates and windows as they are correlated. Dashed: a validity check failed."
-)
-_PLAIN_LEGEND = (
-    "Pictures as delivered, columns binned. Tracks and templates are drawn of algorithms whose answers have the "
-    "details of DIMES (docs/own-algorithms.md)."
-)
+_LEGEND = note_text("dimes.legend")
+_PLAIN_LEGEND = note_text("dimes.plain_legend")
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
@@ -79,10 +71,7 @@ def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 #: Pictures in a row of a stream's figure.
 _MAX_IN_ROW = 10
-_STREAM_LEGEND = (
-    "The pictures as delivered, in their order. Below, the estimated velocity after each picture (marks, at the centre "
-    "of its time span; bars: that span) and the true one of the same span (lines)."
-)
+_STREAM_LEGEND = note_text("dimes.stream_legend")
 
 
 def _stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"] | None:

@@ -22,7 +22,7 @@ from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Plate, Section, Subject, grid_of, plate
 from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.svg import MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
-from marsyard.reports.wording import NOTHING, count, number, percent, stated
+from marsyard.reports.wording import NOTHING, count, note_text, number, percent, stated
 
 #: Rows of the paper's Fig. 11 by (category, run).
 FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {
@@ -61,10 +61,7 @@ def field_test_section(subject: Subject) -> Section | None:
     if plates:
         note = ""
         if bound is not None and subject.metric is not None:
-            note = (
-                f"As the paper's Fig. 10: errors of the valid triples; the dashed circle is {bound:g} "
-                f"{split_unit(subject.metric)[1]}. East is x, north is y."
-            )
+            note = note_text("dimes.errors", bound=f"{bound:g}", unit=split_unit(subject.metric)[1])
         blocks.append(Block(heading="Errors by category", plates=plates, note=note))
     data = {"cells": [one | {"valid": asdict(one["valid"])} for one in found]}
     return Section("field-test", "Field test", "Runs and categories, next to the paper's Fig. 11", blocks, data)
@@ -102,10 +99,7 @@ def _difference_text(points: float) -> str:
 
 def _field_note(found: Sequence[Mapping[str, Any]]) -> str:
     """Definitions, the paper's misprints, and cells that differ."""
-    definitions = (
-        "Difference: ours less the paper's, in percentage points (pp). Intervals: two-sided, Clopper and Pearson, as "
-        "for independent triples; triples of a run share its pictures and are correlated."
-    )
+    definitions = note_text("dimes.field_test")
     if not any(one["paper_percent"] is not None for one in found):
         return definitions
     odd = [
@@ -236,10 +230,7 @@ def _speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Drawn:
         "largest_loss_m_s": float(change.max()),
     }
     gain, loss = number(data["largest_gain_m_s"]), number(data["largest_loss_m_s"])
-    note = (
-        "The same descents with and without the answer. Intervals: two-sided, Clopper and Pearson, at "
-        f"{stated(CONFIDENCE)} confidence; they allow for shared terrains. Largest gain, loss: {gain}, {loss} m/s."
-    )
+    note = note_text("dimes.landing", confidence=stated(CONFIDENCE), gain=gain, loss=loss)
     return [Block(heading="Horizontal speed at touchdown", grid=Grid(["", "With", "Without"], rows), note=note)], data
 
 
@@ -293,17 +284,13 @@ def sensitivity_section(subject: Subject) -> Section | None:
     had much less of an effect on DIMES performance when compared to altitude and attitude rates".
     """
     metric = subject.metric
-    drivers = [] if metric is None else analyse(subject, metric)
+    drivers = [] if metric is None else rank_effects(subject, metric)
     if metric is None or not drivers:
         return None
     unit = split_unit(metric)[1]
     caption = f"Change of the mean {magnitude_label(metric)} from the 5 % to the 95 % quantile of each condition."
     drawn = plate(effect_figure(drivers, unit), "sensitivity", caption)
-    note = (
-        f"Regression of {magnitude_label(metric)} on all conditions, for cases with an answer. Intervals: "
-        f"{stated(CONFIDENCE)}, by bootstrap over terrains where cases share them, else over cases. Effect: from the "
-        "5 % to the 95 % quantile of the condition, with the others constant."
-    )
+    note = note_text("dimes.sensitivity", metric=magnitude_label(metric), confidence=stated(CONFIDENCE))
     rows = [
         [label(one.column), f"{number(one.low)} to {number(one.high)}"]
         + ["{} ({} to {})".format(*map(number, value)) for value in (one.rank_correlation, one.coefficient, one.effect)]
@@ -315,7 +302,7 @@ def sensitivity_section(subject: Subject) -> Section | None:
     return Section("sensitivity", "Sensitivity", "Drivers of the error", blocks, data)
 
 
-def analyse(subject: Subject, metric: str) -> list[Driver]:
+def rank_effects(subject: Subject, metric: str) -> list[Driver]:
     """The drivers, the paper's first; empty unless these vary and errors suffice."""
     frame = subject.frame
     magnitude = np.abs(numbers(frame, metric))
@@ -330,8 +317,8 @@ def analyse(subject: Subject, metric: str) -> list[Driver]:
     groups = rates.terrain_groups(frame[finite])
     weights = rates.bootstrap_weights(np.arange(y.size) if groups is None else groups, np.random.default_rng(_SEED))
     low, high = np.quantile(x, (0.05, 0.95), axis=0)
-    slopes = regressions(x / x.std(axis=0), y, weights)
-    ranks = weighted_correlations(stats.rankdata(x, axis=0), stats.rankdata(y), weights)
+    slopes = regress_weighted(x / x.std(axis=0), y, weights)
+    ranks = correlate_weighted(stats.rankdata(x, axis=0), stats.rankdata(y), weights)
     # the sample's own value, then the interval over the resamples
     values = [ranks, slopes / y.std(), slopes / x.std(axis=0) * (high - low)]
     found = []
@@ -341,7 +328,7 @@ def analyse(subject: Subject, metric: str) -> list[Driver]:
     return found
 
 
-def regressions(
+def regress_weighted(
     x: Float[np.ndarray, "n k"], y: Float[np.ndarray, " n"], weights: Float[np.ndarray, "b n"]
 ) -> Float[np.ndarray, "b k"]:
     """Slopes of weighted least squares of y on all columns of x with a constant, for every row of weights."""
@@ -352,7 +339,7 @@ def regressions(
     return np.asarray(np.einsum("bij,bj->bi", np.linalg.pinv(normal, hermitian=True), right)[:, 1:])
 
 
-def weighted_correlations(
+def correlate_weighted(
     x: Float[np.ndarray, "n k"], y: Float[np.ndarray, " n"], weights: Float[np.ndarray, "b n"]
 ) -> Float[np.ndarray, "b k"]:
     """Correlations of y with each column of x, for every row of weights; of ranks, ranked once in the whole sample."""

@@ -19,7 +19,7 @@ from marsyard.reports.kinds import Drawn, Rows
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag, pooled_rate, rate_text
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
 from marsyard.reports.svg import MUTED, REQUIREMENT, in_page_style
-from marsyard.reports.wording import NOTHING, percent, stated
+from marsyard.reports.wording import NOTHING, note_text, percent, stated
 from marsyard.scenarios.landing.confusion import CLASS_NAMES, CLASSES
 
 
@@ -57,12 +57,7 @@ RATES: Mapping[str, tuple[str, str]] = {
     "such hazards, called safe": ("gross_called_safe", "gross"),
     "such hazards, with no hazard of the map under them": ("gross_unflagged", "gross"),
 }
-_CLASSES_NOTE = (
-    "Footprint: the ground under a lander at a lattice point, a tenth of a diameter apart; footprints of a flight "
-    f"overlap. Its roughness is the height of its highest hazard. Intervals: {stated(CONFIDENCE)}, by bootstrap over "
-    "flights, or terrains where flights share them; none if no flight has a hit. Flagged: a cell under the lander is a "
-    "hazard before growth. Called safe: after growth, border and holes."
-)
+_CLASSES_NOTE = note_text("hda.classes", confidence=stated(CONFIDENCE))
 
 
 def hazard_classes(frame: Rows) -> list[HazardClass]:
@@ -127,7 +122,7 @@ def class_figure(classes: Sequence[HazardClass]) -> Figure:
 GOOD = 0.9
 #: Changes below this fraction of the paper's limit count as none.
 _NONE = 0.02
-_FEWEST_SIZES = 3
+_MIN_SIZES = 3
 
 
 @dataclass(frozen=True)
@@ -175,10 +170,6 @@ def limits_section(subject: Subject) -> Section | None:
     found = [] if frame is None else curves(frame)
     if not found:
         return None
-    text = (
-        "The paper (section II.A): features can be tracked when the change of attitude is less than 10 deg in roll "
-        "about the optical axis and less than 20 deg in pitch and yaw, and that of altitude less than 20 %."
-    )
     knees = grid_of(
         found,
         {
@@ -199,14 +190,10 @@ def limits_section(subject: Subject) -> Section | None:
             "Flights with 90 %": lambda pair: f"{pair[1].good:,}",
         },
     )
-    note = (
-        "Knee: the largest change with an interpolated share of at least 90 %; '>' if it never falls below. Correctly "
-        "tracked: accepted, and within 1 px of the true position."
-    )
     caption = "Correctly tracked features, of those in both pictures; red: the paper's limits; grey: 90 %."
     blocks = [
-        Block(text=text, plates=[plate(limits_figure(found), "limits", caption, wide=True)]),
-        Block(heading="Knees", grid=knees, note=note),
+        Block(text=note_text("hda.limits_text"), plates=[plate(limits_figure(found), "limits", caption, wide=True)]),
+        Block(heading="Knees", grid=knees, note=note_text("hda.limits")),
         Block(heading="By size", grid=by_size),
     ]
     data = {"curves": [asdict(one) for one in found]}
@@ -228,7 +215,7 @@ def curves(frame: pd.DataFrame) -> list[Curve]:
     for one, size, changed in zip(changes, sizes, present, strict=True):
         chosen = flown & (changed | still)
         rounded = np.where(changed, np.round(size, 1), 0.0)
-        if np.unique(rounded[chosen]).size >= _FEWEST_SIZES:
+        if np.unique(rounded[chosen]).size >= _MIN_SIZES:
             points = []
             for value in np.unique(rounded[chosen]):
                 flights = frame[chosen & (rounded == value)]

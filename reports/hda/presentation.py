@@ -15,7 +15,7 @@ from marsyard.reports.kinds import Distribution, MadeBy, RateTable, SectionDecla
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import plate
 from marsyard.reports.svg import draw_pictures
-from marsyard.reports.wording import number
+from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {
     "fig2-motion": "Fig. 2: motion and structure from three sides.",
@@ -26,18 +26,9 @@ _CAPTIONS: Mapping[str, str] = {
 }
 #: Its pictures are those of Fig. 3: only `marsyard replay` draws it.
 _LEFT_OUT = "fig1-tracks"
-_LEGEND = (
-    "As the paper's Figs. 2 to 5 and 7; marsyard replay draws Fig. 1 as well. Elevation: dark is high, bright is low. "
-    "Roughness and slope: green well below the limit, yellow near it, red beyond; the scale ends at twice the limit, "
-    "grey is unknown. Safe landing map: green safe, red hazard (hatched), yellow unknown; a black X marks the a-priori "
-    "site, a purple plus the safe site. The truth is of a lander's footprint centred there, without growth by its "
-    "diameter; yellow: the footprint is not completely visible in both pictures."
-)
+_LEGEND = note_text("hda.legend")
 
-_PLAIN_LEGEND = (
-    "Pictures as delivered. Stages are drawn of algorithms whose answers have the details of the paper's "
-    "(docs/own-algorithms.md)."
-)
+_PLAIN_LEGEND = note_text("hda.plain_legend")
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:

@@ -16,14 +16,14 @@ from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
-from marsyard.reports.wording import NOTHING, count, number, stated
+from marsyard.reports.wording import NOTHING, count, note_text, number, stated
 from marsyard.scenarios.landing.parameters import LanderParameters
 
 PAPER = read_paper(Path(__file__).with_name("paper.toml"))
 #: Columns of every row of a landing case.
 _OWN = ("site_safe", "site_reported", "no_site_reported", "truly_safe_share")
 #: Minimum number of cases with a map for the section on map errors.
-FEWEST_MAPS = 8
+MIN_MAPS = 8
 
 
 def landing_rows(subject: Subject) -> pd.DataFrame | None:
@@ -81,26 +81,10 @@ THRESHOLD = kinds.SectionDeclaration(
     ),
 )
 
-#: Faults in words with the unit of their size; None for faults without sizes.
-FAULT_NAMES: Mapping[str, tuple[str, str | None]] = {
-    "none": ("none", None),
-    "black_picture": ("picture delivered black", "number"),
-    "repeated_picture": ("first picture delivered again", None),
-    "lost_rows": ("rows of the second picture lost", "share"),
-    "lost_pictures": ("pictures of the flight lost", "share"),
-    "laser_silent": ("altimeter silent", None),
-    "laser_stuck": ("altimeter stuck at a height greater by", "share"),
-    "gps_outage_s": ("no GPS from before the pictures on", "s"),
-    "bad_pixels": ("dead pixels, and as many hot ones", "share"),
-    "listed_bad_pixels": ("the same, listed and filled", "share"),
-    "dust_discs": ("specks of dust on the lens", "number"),
-    "own_shadow_m": ("own shadow in view", "m"),
-    "several": ("several", None),
-}
-
 
 def _fault_words(fault: str, size: float) -> tuple[str, str]:
-    name, unit = FAULT_NAMES.get(fault, (fault.replace("_", " "), "number"))
+    known = PAPER["fault_names"].get(fault, {"name": fault.replace("_", " "), "unit": "number"})
+    name, unit = known["name"], known.get("unit")
     if unit is None or math.isnan(size):
         return name, ""
     if unit == "share":
@@ -144,9 +128,7 @@ FAULT_OUTCOMES = kinds.OutcomesBySize(
         ("Sinking (m/s)", "sink_m_s", lambda rows: _median(rows, "touchdown_sink_m_s"), _two_digits),
     ),
     caption="Full: a truly safe site. Hatched: no safe site. Dotted: not converged. Crossed: a site that is not safe.",
-    note="Not converged: reported as such; the a-priori site remains. Wrong: an unsafe site was reported as safe, with "
-    f"the interval of its share at {stated(CONFIDENCE)}. 'No safe site' may be right. Touchdown off: median distance "
-    "of the true touchdown from the site; sinking: median speed at touchdown.",
+    note=note_text("hda.faults", confidence=stated(CONFIDENCE)),
 )
 FAULTS = kinds.SectionDeclaration("landing-faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), rows=landing_rows)
 
@@ -162,7 +144,7 @@ def map_rows(subject: Subject) -> pd.DataFrame | None:
         "altimeter_share": np.abs(numbers(frame, "range_error_m")) / numbers(frame, "range_m"),
     }
     mapped = pd.DataFrame(frame.assign(**shares)[np.isfinite(shares["rms_share"])])
-    return mapped if len(mapped) >= FEWEST_MAPS else None
+    return mapped if len(mapped) >= MIN_MAPS else None
 
 
 #: Errors of the map; columns of `map_rows`.
@@ -195,9 +177,7 @@ MAP_ERRORS = kinds.SectionDeclaration(
             _MAP_ERRORS,
             {"5 %": 0.05, "Median": 0.5, "95 %": 0.95},
             heading="Errors of the maps",
-            note="Against exact heights averaged over each cell. The rms error includes the effect of altimeter, "
-            "vertical and motion on the whole map; without its plane the map's noise remains, which affects roughness. "
-            "Errors as applied in the case: of the vertical from the inclinometers, of the altimeter from its reading.",
+            note=note_text("hda.map"),
             data="maps",
         ),
         MAP_EFFECTS,
@@ -243,11 +223,7 @@ def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> kinds.Drawn:
             off = [f"{each.mean():.2f}" if each.size else NOTHING for each in deviations.values()]
             rows.append([f"ours, {one.title}", f"{int(finite.sum()):,}", text, spread, *off, run_time])
     head = ["", "Landings", "Position error (m)", "90 % of errors (m)", "Northing dev. (m)", "Easting dev. (m)"]
-    note = (
-        "By averaged GPS: distance between the receiver's averaged positions after landing and the site's coordinates, "
-        "as in the paper. By truth: distance of the true touchdown from these coordinates, corrected by the navigation "
-        f"error at the first picture. Deviations: the receiver's own. Intervals of means: {stated(CONFIDENCE)}."
-    )
+    note = note_text("hda.touchdown", confidence=stated(CONFIDENCE))
     data = {
         "landings": len(landed),
         "mean_m": means,
@@ -328,10 +304,7 @@ def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.Draw
     """Outcomes of the search by the truth of the ground."""
     counts = outcome_counts(frame)
     rows = [[ground, *(f"{of_answer[name]:,}" for name in ANSWERS)] for ground, of_answer in counts.items()]
-    note = (
-        "Flights by the truth of the ground in both pictures. Wide: all positions within a lander's radius are safe "
-        "too. Without convergence the a-priori site remains; it is reported as such."
-    )
+    note = note_text("hda.outcomes")
     block = Block(heading="By true ground", grid=Grid(["The pictures show", *ANSWERS], rows), note=note)
     return [block], {"outcomes": counts}
 
@@ -381,11 +354,6 @@ def run_times_section(subject: Subject) -> Section | None:
         rows.append([stage["name"], *times, stage["parameters"], text])
     rows.append(["Together", f"{paper:.2f}", f"{1e3 * ours:.1f}", NOTHING, f"{ours * factor:.2f}", NOTHING, NOTHING])
     head = ["Stage", "Paper (s)", "Here, median (ms)", "95 %", "Scaled (s)", "Paper's parameters", "Parameters here"]
-    note = (
-        f"Processor time of {count(cases, 'case')} that reached a map. The paper's processor is a 400 MHz R12000. "
-        f"Scaled: times {number(factor)}, so that the sums agree, because no benchmark covers both processors: it "
-        "compares the distribution over stages, not the speed. Our elevation map is part of the hazards stage, the "
-        "scale part of the motion stage. Stages with the paper's exact parameters, on an idle machine: make bench."
-    )
+    note = note_text("hda.run_times", cases=count(cases, "case"), factor=number(factor))
     block, data_of_section = Block(grid=Grid(head, rows), note=note), {"factor": factor, "cases": cases, "stages": data}
     return Section("run-times", "Run time", "Run time by stage, next to Table I", [block], data_of_section)

@@ -15,7 +15,7 @@ from marsyard.reports.kinds import Distribution, Drawn, MadeBy, Rows, SectionDec
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Subject, grid_of
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.wording import NOTHING, number, stated
+from marsyard.reports.wording import NOTHING, note_text, number, stated
 
 #: Columns of every row of a tracking case.
 _TRACKING_COLUMNS = ("tracked", "drift_px", "position_error_m", "losses")
@@ -113,21 +113,14 @@ def _draw_cameras(runs: Rows, subject: Subject, key: str) -> Drawn:
             f"Drift, {stated(QUANTILE)} quantile (px)": lambda one: number(one["drift_quantile_px"]),
         },
     )
-    note = (
-        "Selectable: the designated point is lit and off the rock's edge. False track: an update reports the target "
-        "farther than the stated pixels from the designated point's true projection. Intervals: two-sided, Clopper and "
-        f"Pearson, at {stated(CONFIDENCE)} confidence."
-    )
+    note = note_text("vtt.goal", confidence=stated(CONFIDENCE))
     blocks = [
         Block(heading="Runs at selectable targets", grid=of_runs, note=note),
         Block(heading="Errors at the goal", grid=of_errors, note=_expected_errors()),
     ]
     lost = losses_grid(runs)
     if lost.rows:
-        note = (
-            "Losses: the criteria (section 4.6) of the first update that lost the target. Azimuth change: the largest "
-            "between two sightings. With clouds: runs with any clouds. A replay shows the cause of a loss."
-        )
+        note = note_text("vtt.losses")
         blocks.append(Block(heading="Runs that lost the target", grid=lost, note=note))
     data = [one | {rate: vars(one[rate]) for rate in _RATES.values()} for one in found]
     return blocks, {"cameras": data}

@@ -18,7 +18,7 @@ from marsyard.reports.vtt.sections import (
     terrains_section,
     updates_section,
 )
-from marsyard.reports.wording import NOTHING, number
+from marsyard.reports.wording import NOTHING, note_text, number
 
 #: Maximum number of stops whose pictures the page shows.
 _MAX_STOPS = 8
@@ -27,12 +27,7 @@ _QUANTITIES = (
     "range_m", "azimuth_deg", "elevation_deg", "magnification", "roll_change_deg", "azimuth_change_deg", "match_score",
     "stereo_score", "correction_px", "error_px", "position_error_m",
 )  # fmt: skip
-_LEGEND = (
-    "As the paper's Figs. 15, 17 and 16b. Of every stop: the left subframe with the search window (blue, dashed), "
-    "the target found (orange) and the designated point's true projection (white cross); next to it the target "
-    "enlarged and the right subframe. Distance is from the camera; azimuth and elevation are the mast's. Seen from "
-    "above, north is up; estimates of the target are in the rover's own world frame and include its pose error."
-)
+_LEGEND = note_text("vtt.legend")
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:

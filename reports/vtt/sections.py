@@ -23,7 +23,7 @@ from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
 from marsyard.reports.stored import table
 from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, selectable
-from marsyard.reports.wording import NOTHING, number, percent, stated
+from marsyard.reports.wording import NOTHING, note_text, number, percent, stated
 
 _PAPER_FILE = Path(__file__).with_name("paper.toml")
 PAPER = read_paper(_PAPER_FILE)
@@ -52,19 +52,9 @@ def table_1_section(subject: Subject) -> Section | None:
             "Approach with N px of drift (cm)": lambda pair: pair[1].tracked_formula,
         },
     )
-    note = (
-        "All 3 sigma. Computed by Eqs. 1 to 5 with the 4.65 µm pixel of the manufacturer, each column rounded "
-        "before the next is computed from it."
-    )
-    measured_note = (
-        f"Selectable targets of completed runs from {START_M:g} m to {GOAL_M:g} m: three times the root mean square. "
-        "Without tracker: by Eq. 3 from the measured errors of designation and pose, with any odometry that the runs "
-        "had; the paper's is visual. Table I, the same: its last column for the drift measured. The paper takes 1 "
-        "px as the disparity error of 3 sigma; next to it, the disparity error, calibration included, that gives the "
-        "measured designation error by Eq. 1."
-    )
+    measured_note = note_text("vtt.table_1_measured", start=f"{START_M:g}", goal=f"{GOAL_M:g}")
     blocks = [
-        Block(heading="Computed", grid=grid, note=note),
+        Block(heading="Computed", grid=grid, note=note_text("vtt.table_1")),
         Block(heading="Measured", grid=_measured_grid(found), note=measured_note),
     ]
     data = {
@@ -151,11 +141,7 @@ def table_4(frame: Rows, driven: Sequence[Mapping[str, Any]]) -> Grid:
 def _modes(frame: Rows, subject: Subject, key: str) -> Drawn:
     if "update_1_leg" not in frame:
         return [], {}
-    note = (
-        "The paper's 5 minutes for the first map are included in the navigator's 28, because our runs begin the map "
-        "while backing off. Ours: as above. A mode lasts from the last update before it to its own last update."
-    )
-    return [Block(heading="By operational mode", grid=table_4(frame, legs(subject)), note=note)], {}
+    return [Block(heading="By operational mode", grid=table_4(frame, legs(subject)), note=note_text("vtt.table_4"))], {}
 
 
 #: The paper's single runs next to the campaigns that repeat them.
@@ -163,15 +149,10 @@ SINGLE_RUNS = PaperFacts(_PAPER_FILE, further={CHECKOUT_3: MadeBy(_modes)})
 
 #: Numbers of an update in the table: heading, ending of the column, digits.
 QUANTITIES: tuple[tuple[str, str, int], ...] = (
-    ("Distance (m)", "range_m", 2),
-    ("Magnification", "magnification", 2),
-    ("Roll change (deg)", "roll_change_deg", 2),
-    ("Azimuth change (deg)", "azimuth_change_deg", 2),
-    ("NCC score", "match_score", 2),
-    ("Stereo score", "stereo_score", 2),
-    ("Correction (px)", "correction_px", 1),
-    ("Error (px)", "error_px", 1),
-)
+    ("Distance (m)", "range_m", 2), ("Magnification", "magnification", 2), ("Roll change (deg)", "roll_change_deg", 2),
+    ("Azimuth change (deg)", "azimuth_change_deg", 2), ("NCC score", "match_score", 2),
+    ("Stereo score", "stereo_score", 2), ("Correction (px)", "correction_px", 1), ("Error (px)", "error_px", 1),
+)  # fmt: skip
 
 
 def updates_section(subject: Subject) -> Section | None:
@@ -190,21 +171,12 @@ def updates_section(subject: Subject) -> Section | None:
             **{one[0]: _update_text(values, *one[1:]) for one in QUANTITIES},
         },
     )
-    note = (
-        "Median over all cases that reached the update; minimum to maximum in brackets. Changes are since the previous "
-        "update; roll and azimuth with their sign. Correction: found less predicted, the larger of row and column. "
-        "Error: found less true."
-    )
+    note = note_text("vtt.updates")
     blocks, title = [Block(grid=grid, note=note)], "Updates one by one"
     if subject.run.name == CHECKOUT_1:
         title = "Table III: the first checkout's updates"
-        paper_note = (
-            "The paper's number, then ours: median, and minimum to maximum in brackets, without signs, as the paper "
-            "prints them. Distances are those of Fig. 15. Path and steps are the paper's; it does not state rock, "
-            "ground and light."
-        )
         blocks = [
-            Block(heading="Comparison with the paper", grid=_table_3(values), note=paper_note),
+            Block(heading="Comparison with the paper", grid=_table_3(values), note=note_text("vtt.table_3")),
             Block(heading="All our updates", grid=grid, note=note),
         ]
     lists = {str(n): {ending: one.tolist() for ending, one in of_n.items()} for n, of_n in values.items()}
@@ -229,13 +201,7 @@ def _table_3(values: Mapping[int, Mapping[str, np.ndarray]]) -> Grid:
 
 #: Columns that distinguish the lines of a figure of steps, if they vary.
 _SERIES = ("algorithm", "search_px")
-_STEPS_NOTE = (
-    "Selectable: lit, off the rock's edge, in both pictures to the end and, where the campaign says so, on the face "
-    "that all stops see. Tracked: found in the last picture within the stated pixels of the designated point's true "
-    "projection. False track: reported beyond them at a stop. "
-    f"Intervals: two-sided, Clopper and Pearson, at {stated(CONFIDENCE)} confidence, as for independent targets; "
-    "targets of one rock share its pictures and are correlated."
-)
+_STEPS_NOTE = note_text("vtt.steps", confidence=stated(CONFIDENCE))
 #: Edges of classes of the most oblique sight, deg.
 _CLASSES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
@@ -274,11 +240,7 @@ def steps_section(subject: Subject) -> Section | None:
     blocks = [Block(text=motion["text"], plates=[plate(figure, "steps", caption)]), Block(grid=grid, note=_STEPS_NOTE)]
     oblique = None if motion["per_cent"] else _obliquity_grid(subject.frame)
     if oblique is not None:
-        note = (
-            "Lit targets in view to the end, tracked of all, by the maximum obliquity of their surface. The template "
-            "is scaled and rolled, but not foreshortened like an oblique patch that turns."
-        )
-        blocks.append(Block(grid=oblique, note=note))
+        blocks.append(Block(grid=oblique, note=note_text("vtt.obliquity")))
     keys = ("good", "all_targets", "false_tracks")
     data = [one | {name: asdict(one[name]) for name in keys} for one in found]
     return Section("steps", "Steps", motion["title"], blocks, {"cells": data})
@@ -359,7 +321,9 @@ def terrains_section(subject: Subject) -> Section | None:
     for name in ordered:
         runs = frame[frame["incline"].eq(name)]
         good, slips = selectable(runs), rates.known(runs, "slip_max")
-        counted = dict(Counter(cause_of(row) for _, row in good[~rates.flag(good, "tracked")].iterrows()).most_common())
+        counted = dict(
+            Counter(failure_cause(row) for _, row in good[~rates.flag(good, "tracked")].iterrows()).most_common()
+        )
         failed, failed_all = (rates.flag_share(one, "tracked", wanted=False) for one in (good, runs))
         slip = float(slips.max()) if slips.size else float("nan")
         row = printed.get(name)
@@ -374,17 +338,12 @@ def terrains_section(subject: Subject) -> Section | None:
         data.append({"name": name, **shares, "causes": counted, "slip_max": slip})
     head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{stated(CONFIDENCE)} interval"]
     head += ["Cause, ours", "Failures, all targets", "Maximum slip"]
-    note = (
-        "Failures: runs that do not end at the goal with the target within the stated pixels; ours of selectable "
-        "targets, and of all targets, also those in shade or on the rock's edge. Cause, the first that applies: the "
-        f"navigator or mast stopped; the azimuth changed by more than {EXCESSIVE_DEG:g} deg between two updates; "
-        "clouds passed; drift without a loss; else the criterion that lost the target."
-    )
+    note = note_text("vtt.table_2", limit=f"{EXCESSIVE_DEG:g}")
     title = "Table II: tracking with visual odometry on four kinds of ground"
     return Section("table-2", "Table II", title, [Block(grid=Grid(head, rows), note=note)], {"terrains": data})
 
 
-def cause_of(row: pd.Series) -> str:
+def failure_cause(row: pd.Series) -> str:
     """Cause of a failed run by its row."""
     outcome = str(row["outcome"])
     if outcome not in ("COMPLETED", "LOST"):

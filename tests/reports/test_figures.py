@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from marsyard.reports.figures import (
-    beyond_the_axis,
-    error_against,
+    count_beyond_axis,
     error_distribution,
     error_histogram,
     error_scatter,
+    error_scatter_against,
     outcome_bars,
 )
 from marsyard.reports.svg import svg_markup
@@ -29,7 +29,7 @@ def _all_figures(frame: pd.DataFrame, bound: float | None) -> list[Figure | None
         error_scatter(frame, METRIC, bound, close=True),
         error_histogram(frame, METRIC, bound),
         error_distribution(frame, METRIC, bound),
-        error_against(frame, METRIC, "off_nadir_max_deg", bound),
+        error_scatter_against(frame, METRIC, "off_nadir_max_deg", bound),
         outcome_bars(frame),
     ]
 
@@ -47,8 +47,8 @@ def test_figures_of_what_is_not_there(make_rows: Rows) -> None:
     silent = make_rows(5, answered=0.0)
     assert error_scatter(silent, METRIC, 5.0) is None
     assert error_histogram(silent, METRIC, 5.0) is None
-    assert error_against(silent, METRIC, "off_nadir_max_deg", 5.0) is not None
-    assert error_against(silent, METRIC, "nonesuch", 5.0) is None
+    assert error_scatter_against(silent, METRIC, "off_nadir_max_deg", 5.0) is not None
+    assert error_scatter_against(silent, METRIC, "nonesuch", 5.0) is None
     bare = pd.DataFrame({"case": [0, 1], METRIC: [1.0, 2.0]})
     assert error_scatter(bare, METRIC, 5.0) is None
     assert outcome_bars(bare) is None
@@ -140,10 +140,10 @@ def test_points_beyond_the_axes_are_hollow_and_counted(make_rows: Rows) -> None:
     legend = figure.axes[0].get_legend()
     assert legend is not None
     assert f"{count} beyond the axes" in [text.get_text() for text in legend.texts]
-    driven = error_against(frame, METRIC, "off_nadir_max_deg", 5.0)
+    driven = error_scatter_against(frame, METRIC, "off_nadir_max_deg", 5.0)
     assert driven is not None
     assert (
         _hollow_marks(driven)
-        == beyond_the_axis(frame, METRIC, "off_nadir_max_deg", 5.0)
+        == count_beyond_axis(frame, METRIC, "off_nadir_max_deg", 5.0)
         == (frame[METRIC] > 15.0).sum()
     )

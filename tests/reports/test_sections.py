@@ -14,7 +14,7 @@ import pytest
 from marsyard.reports.campaign import write_report
 from marsyard.reports.common_sections import FAULT_OUTCOMES, answer_shares, faults_section
 from marsyard.reports.conditions import conditions_section, cuts, terrain_spread
-from marsyard.reports.dimes.sections import FIRING, LANDING, analyse, sensitivity_section
+from marsyard.reports.dimes.sections import FIRING, LANDING, rank_effects, sensitivity_section
 from marsyard.reports.section import Section, Subject
 from marsyard.reports.stored import StoredRun
 
@@ -162,7 +162,7 @@ def sensitive_rows(n: int, terrains: int, seed: int = 3) -> pd.DataFrame:
 
 
 def test_sensitivity_finds_the_driver_and_bounds_the_others() -> None:
-    found = {driver.column: driver for driver in analyse(subject(sensitive_rows(600, 600)), METRIC)}
+    found = {driver.column: driver for driver in rank_effects(subject(sensitive_rows(600, 600)), METRIC)}
     effect, low, high = found["attitude_rate_max_deg_s"].effect
     assert effect == pytest.approx(1.0, abs=0.08)
     assert low < 1.0 < high
@@ -179,7 +179,7 @@ def test_sensitivity_intervals_cover_the_truth_nine_times_of_ten() -> None:
     for seed in range(40):
         (driver,) = (
             one
-            for one in analyse(subject(sensitive_rows(120, 120, seed)), METRIC)
+            for one in rank_effects(subject(sensitive_rows(120, 120, seed)), METRIC)
             if one.column == "attitude_rate_max_deg_s"
         )
         # The truth at this sample's own quantiles: 1/54 m/s for each deg/s.
