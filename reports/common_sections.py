@@ -16,7 +16,7 @@ from scipy import stats
 
 from marsyard.reports import rates
 from marsyard.reports.columns import axis_columns, driver_columns, label, magnitude_label, numbers, split_unit
-from marsyard.reports.comparison import compared_names, judge_other_algorithm
+from marsyard.reports.comparison import compared_names, select_algorithm
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
@@ -294,7 +294,7 @@ def consistency(nees: Float[np.ndarray, " n"], parts: int = PARTS) -> dict[str, 
 def consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Consistency of all algorithms in the rows with covariances, by name."""
     judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "judged"
-    frames = {judged: frame, **{name: judge_other_algorithm(frame, name) for name in compared_names(frame)}}
+    frames = {judged: frame, **{name: select_algorithm(frame, name) for name in compared_names(frame)}}
     by_name = {name: numbers(own, NEES) for name, own in frames.items() if NEES in own}
     known = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
     return {name: consistency(nees) for name, nees in known.items() if nees.size}

@@ -73,7 +73,7 @@ def compared_names(frame: pd.DataFrame) -> list[str]:
     return [name for name in names if rates.is_flag(frame, f"{name}.answered")]
 
 
-def judge_other_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
+def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     """The rows with a compared algorithm in place of the judged one."""
     prefix = f"{name}."
     own = {str(column): str(column).removeprefix(prefix) for column in frame.columns if str(column).startswith(prefix)}
@@ -121,7 +121,7 @@ def comparison(
     if not names or frame.empty:
         return [], []
     judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame else "judged"
-    others = {name: judge_other_algorithm(frame, name) for name in names}
+    others = {name: select_algorithm(frame, name) for name in names}
     contenders = [contender(frame, judged, metric, bound)]
     contenders += [contender(own, name, metric, bound) for name, own in others.items()]
     if metric is None:

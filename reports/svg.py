@@ -45,7 +45,8 @@ LARGEST_VECTOR_SAMPLE = 800
 #: Dots per inch of parts drawn as pixels: twice the size on a screen.
 RASTER_DPI = 160
 
-_STYLE = mpl.rc_params_from_file(Path(__file__).parent / "templates" / "page.mplstyle", use_default_template=False)
+_STYLE_FILE = Path(__file__).parent / "templates" / "page.mplstyle"
+_STYLE: Any = mpl.rc_params_from_file(_STYLE_FILE, use_default_template=False)
 
 
 def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:

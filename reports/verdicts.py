@@ -145,15 +145,15 @@ class Verdict:
         if math.isnan(shared.design_effect):
             worst = self.n / shared.effective_n
             effect = f", the design effect taken for {worst:.3g}: too few failures, or terrains, to estimate it"
-        said = (
+        text = (
             f"{count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} and so are not independent; "
             f"the bounds allow for that ({shared.method}, effective n {shared.effective_n:.4g}{effect})."
         )
         if self.plain_status is not None and self.plain_status is not self.status:
-            said += f" Independent cases would show at least {percent(self.plain_lower)}: {self.plain_status}."
+            text += f" Independent cases would show at least {percent(self.plain_lower)}: {self.plain_status}."
         if shared.method is ClusterMethod.TERRAIN_COUNT and self.further_cases and self.decide_by != ESTIMATE:
-            said += f" {count(self.further_cases, 'further terrain')} would do if no case fails on them."
-        return said
+            text += f" {count(self.further_cases, 'further terrain')} would do if no case fails on them."
+        return text
 
     def _look(self) -> str:
         if math.isnan(self.bounds_confidence) or self.bounds_confidence == self.upper_confidence == self.confidence:

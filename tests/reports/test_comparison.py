@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from marsyard.reports.common_sections import consistencies, consistency
-from marsyard.reports.comparison import comparison, judge_other_algorithm
+from marsyard.reports.comparison import comparison, select_algorithm
 
 
 def rows(mine: list[float], its: list[float]) -> pd.DataFrame:
@@ -46,7 +46,7 @@ def test_one_algorithm_alone_is_no_comparison() -> None:
 
 
 def test_a_frame_as_if_the_other_had_been_judged() -> None:
-    own = judge_other_algorithm(rows([1, 2], [3, 4]), "other")
+    own = select_algorithm(rows([1, 2], [3, 4]), "other")
     assert own["velocity_error_m_s"].tolist() == [3, 4]
     assert own["altitude_m"].tolist() == [1.0, 1.0]
     assert not any("." in str(name) for name in own.columns)
