@@ -146,7 +146,7 @@ def test_facts_of_single_runs() -> None:
     moved = shown["target moved, first to last estimate (cm)"]
     assert (moved["Paper"], moved["Ours"]) == ("36", "25.0 (10.0 to 40.0)")
     assert shown["tracked to the goal"]["Ours"] == "3 of 4: 75.00 %"
-    assert shown["largest correction (px)"]["Ours"] == "–"
+    assert shown["maximum correction (px)"]["Ours"] == "–"
     roll = rows(4, roll_compensated=[True, True, False, False], tracked=[True, True, True, False])
     shown = {row[""]: row for row in table(SINGLE_RUNS(subject(roll, "vtt-roll")))}
     assert shown["tracked with compensation"]["Ours"] == "2 of 2: 100 %"
