@@ -1,4 +1,4 @@
-"""A campaign's report: a page to be read, `report.html`, and its machine-readable twin, `report.json`."""
+"""A campaign's report: `report.html`, its data `report.json`, the traceability matrix and JUnit results."""
 
 from __future__ import annotations
 
@@ -14,46 +14,36 @@ import numpy as np
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from marsyard.reports import page_figures, sections
+from marsyard.reports import common_sections, sections
 from marsyard.reports.cases import shown_cases
 from marsyard.reports.columns import label, numbers, primary_metric
-from marsyard.reports.common_sections import (
-    answers_section,
-    consistency_section,
-    convergence_section,
-    drivers_section,
-    faults_section,
-    scatter_section,
-)
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Judged, Overall, judged
-from marsyard.reports.page_figures import embedded, explorer_data, script_hash
-from marsyard.reports.page_figures import script as explorer_script
 from marsyard.reports.presentation import presentations
 from marsyard.reports.sampled import sampled
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import algorithms_of, evidence_of, junit_xml, verification_csv
-from marsyard.reports.twin import SCHEMA
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import number
+from marsyard.reports.wording import count, number
 
-#: Sections of every campaign whose rows hold their columns, in the page's order; `conditions_section` ends the page.
+#: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
-    answers_section,
-    comparison_section,
-    scatter_section,
-    drivers_section,
-    convergence_section,
-    consistency_section,
-    faults_section,
-)
+    common_sections.answers_section, comparison_section, common_sections.scatter_section,
+    common_sections.drivers_section, common_sections.convergence_section, common_sections.consistency_section,
+    common_sections.faults_section,
+)  # fmt: skip
 
-#: Sites and algorithms that the twin names, at most.
-_MOST_KINDS = 24
+#: Maximum number of sites and algorithms in `report.json`.
+_MAX_KINDS = 24
 
+#: Version of the layout of `report.json`, raised by removals and changes of meaning, and its JSON Schema.
+SCHEMA = 4
+SCHEMA_FILE = Path(__file__).with_name("report.schema.json")
+#: Properties of a verdict in `report.json`.
+_DERIVED = ("note", "plain_status", "confident_status", "consumer_risk", "margin")
 PAGE_FILE = "report.html"
 TWIN_FILE = "report.json"
 VERIFICATION_FILE = "verification.csv"
@@ -61,31 +51,16 @@ JUNIT_FILE = "junit.xml"
 
 
 def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Path:
-    """Writes a campaign's report into its folder, from the files there alone.
+    """Write a campaign's report into its folder from the files there; returns the path of the self-contained page.
 
-    Parameters
-    ----------
-    directory
-        The folder of a campaign that was run.
-    requirements
-        By which it is judged; None for its own.
-
-    Returns
-    -------
-    The page's path: one file that needs no other and asks nothing of the network.
-
-    Raises
-    ------
-    marsyard.campaigns.errors.StoreError
-        Where the folder holds no rows.
-    OSError
-        Where the report cannot be written.
+    requirements: in place of the campaign's own
+    Raises StoreError if the folder holds no rows, OSError if the report cannot be written.
     """
     return write_judged(judged(directory, requirements))
 
 
 def write_judged(found: Judged) -> Path:
-    """Writes the report of a campaign that has been judged into its folder; see `write_report`."""
+    """Write the report of an evaluated campaign into its folder."""
     run, how, verdicts, whole = found.run, found.how, found.verdicts, found.whole
     directory = run.directory
     drawn = replace(run, frame=how.drawn(run.frame), whole=how.drawn(run.whole))
@@ -105,7 +80,7 @@ def write_judged(found: Judged) -> Path:
 
 
 def section_makers() -> list[SectionMaker]:
-    """The makers of all further sections, those of every campaign and of every system, in the order of the page."""
+    """Makers of the sections of every campaign and of every system, in the order of the page."""
     systems = presentations()
     first = [make for system in systems for make in system.first]
     return [*first, *COMMON_SECTIONS, *(make for system in systems for make in system.sections), conditions_section]
@@ -114,26 +89,28 @@ def section_makers() -> list[SectionMaker]:
 def page_context(
     run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], whole: Overall, further: Sequence[Section]
 ) -> dict[str, Any]:
-    """Everything that the page's template is given: statistics of the subject's cases, all else of the whole run's."""
+    """Context of the page's template: statistics of the subject's cases, all else of the whole run."""
     metric, bound = subject.metric, subject.bound
+    text = f"{count(whole.crashed, 'case')} crashed: fix this before you use the verdict."
+    crashed = [text] if whole.crashed else []
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.said("description") or ""),
         "whole": whole,
-        "cautions": [*sections.cautions(whole), *sampling_cautions(run, metric)],
+        "cautions": [*crashed, *sampling_cautions(run, metric)],
         "interrupted": run.said("state") not in (None, "finished"),
         "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
         "metric": metric,
         "bound": bound,
         "further": further,
         "outcomes": sections.outcome_grid(run.whole),
-        "outcome_plates": page_figures.outcome_plates(run.whole),
+        "outcome_plates": sections.outcome_plates(run.whole),
         "crashed": sections.crashed_rows(run),
         "dispersions": sections.dispersion_grid(subject.run),
         "shown": shown_cases(run),
         "provenance": sections.provenance(run),
         "versions": sections.versions(run),
-        "configuration": sections.configuration_text(run),
+        "configuration": json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str),
         "algorithms": algorithms_of(run.record),
         "rerun": sections.rerun_commands(run),
         "rerun_is_stored": run.command is not None,
@@ -146,35 +123,35 @@ def page_context(
 
 
 def _explorer(subject: Subject, pictured: Sequence[str]) -> dict[str, Any] | None:
-    """The points to explore; None where there is nothing to draw."""
+    """Data and script of the explorer; None without errors."""
     metric = subject.metric
     if metric is None or not np.isfinite(numbers(subject.frame, metric)).any():
         return None
-    data, script = explorer_data(subject.run, metric, subject.bound, pictured), explorer_script()
-    return {"data": data, "json": embedded(data), "script": script, "hash": script_hash(str(script))}
+    data, script = sections.explorer_data(subject.run, metric, subject.bound, pictured), sections.script()
+    return {"data": data, "json": sections.embedded(data), "script": script, "hash": sections.script_hash(script)}
 
 
 def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
-    """What a reader must know of how the cases were drawn: that they are no random draws, and which one is nominal."""
+    """Warnings about the sampling: designs without probabilities, very many cases, a nominal case."""
     how = sampled(run.configuration)
-    said = []
+    texts = []
     if not how.independent:
-        said.append(
+        texts.append(
             f"The cases are no independent random draws: {how.text}. Statistics describe these cases; intervals, "
-            "bounds and probabilities on this page, which take cases as independent draws, do not hold for them."
+            "bounds and probabilities on this page assume independent draws and do not hold for them."
         )
     if run.sampled_from is not None:
-        said.append(
+        texts.append(
             f"Verdicts, outcomes, answers, statistics and convergence are of all {run.sampled_from:,} cases; points, "
             f"conditions and drivers of the first {len(run.frame):,}, which are as random as all."
         )
     nominal = run.frame[run.frame["case"] == 0] if how.nominal and "case" in run.frame else run.frame[:0]
     if len(nominal):
-        told = str(nominal["outcome"].iloc[0]) if "outcome" in nominal else "stored"
+        result = str(nominal["outcome"].iloc[0]) if "outcome" in nominal else "stored"
         if metric is not None:
-            told += f", {label(metric)} {number(float(numbers(nominal, metric)[0]))}"
-        said.append(f"Case 0 is the nominal one ({told}); it counts in no verdict and in no statistic.")
-    return said
+            result += f", {label(metric)} {number(float(numbers(nominal, metric)[0]))}"
+        texts.append(f"Case 0 is the nominal one ({result}); it counts in no verdict and in no statistic.")
+    return texts
 
 
 def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict[str, Any]:
@@ -184,11 +161,7 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
     twin = {
         "schema": SCHEMA,
         "campaign": run.name,
-        "state": run.said("state"),
-        "seed": run.said("seed"),
-        "git_commit": run.said("git_commit"),
-        "started_utc": run.said("started_utc"),
-        "finished_utc": run.said("finished_utc"),
+        **{key: run.said(key) for key in ("state", "seed", "git_commit", "started_utc", "finished_utc")},
         "cases": len(run.whole),
         "crashed": whole.crashed,
         "sites": _kinds(run.frame, "site"),
@@ -198,17 +171,7 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
         "verdict": whole.word,
         "sentence": whole.sentence,
         "exit_code": found.exit_code,
-        "verdicts": [
-            {
-                **asdict(verdict),
-                "note": verdict.note,
-                "plain_status": verdict.plain_status,
-                "confident_status": verdict.confident_status,
-                "consumer_risk": verdict.consumer_risk,
-                "margin": verdict.margin,
-            }
-            for verdict in found.verdicts
-        ],
+        "verdicts": [asdict(one) | {name: getattr(one, name) for name in _DERIVED} for one in found.verdicts],
         "outcomes": dict(outcome_counts(run.whole)),
         "metric": metric,
         "statistics": {name: asdict(summarized) for name, summarized in summaries},
@@ -216,34 +179,32 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
         "sections": {section.key: section.data for section in further},
         "showcases": run.showcases,
     }
-    plain: dict[str, Any] = _plain(twin)
-    return plain
+    return dict(_plain(twin))
 
 
 def _kinds(frame: pd.DataFrame, column: str) -> list[str]:
-    """The texts in a column, each once, as many as a reader can choose among; none where there is none."""
+    """Distinct values of a column, at most `_MAX_KINDS`."""
     if column not in frame:
         return []
-    return [str(value) for value in frame[column].dropna().unique()[:_MOST_KINDS]]
+    return [str(value) for value in frame[column].dropna().unique()[:_MAX_KINDS]]
 
 
 def _error_sections(run: StoredRun, metric: str | None, bound: float | None, pictured: Sequence[str]) -> dict[str, Any]:
-    """What is said of the page's metric; empty where no column is one."""
+    """Figures and tables of the page's metric; empty without a metric."""
     if metric is None:
         none = sections.CaseTable((), ())
-        grid = Grid((), ())
-        return {"error_plates": [], "driver_plates": [], "statistics": grid, "worst": none, "silent": none}
+        return {"error_plates": [], "driver_plates": [], "statistics": Grid((), ()), "worst": none, "silent": none}
     return {
-        "error_plates": page_figures.error_plates(run.frame, run.whole, metric, bound),
-        "driver_plates": page_figures.driver_plates(run.frame, metric, bound),
+        "error_plates": sections.error_plates(run.frame, run.whole, metric, bound),
+        "driver_plates": sections.driver_plates(run.frame, metric, bound),
         "statistics": statistics_grid(run.whole, metric),
         "worst": sections.worst_cases(run, metric, pictured),
-        "silent": sections.silent_cases(run, metric, pictured),
+        "silent": sections.unanswered_cases(run, metric, pictured),
     }
 
 
 def page_environment() -> Environment:
-    """Jinja with escaping on for every template: what comes from files is shown as text."""
+    """Jinja environment that escapes all values."""
     return Environment(
         autoescape=True,
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
@@ -254,7 +215,7 @@ def page_environment() -> Environment:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON has it."""
+    """A value as JSON, NaN and infinities as null."""
     if isinstance(value, Mapping):
         return {str(name): _plain(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -265,8 +226,8 @@ def _plain(value: Any) -> Any:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Writes a file whole or not at all."""
+    """Write a file atomically."""
     partial = path.with_suffix(path.suffix + ".partial")
-    # Lone surrogates, which JSON can carry, cannot be written as UTF-8.
+    # lone surrogates, which JSON can hold, cannot be encoded as UTF-8
     partial.write_text(text, encoding="utf-8", errors="replace")
     partial.replace(path)

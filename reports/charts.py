@@ -1,4 +1,4 @@
-"""Figures that sections of any system draw: cumulative curves, rates against a condition, bars, scatter panels."""
+"""Charts of report sections: cumulative curves, rates against a condition, stacked bars, scatter panels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from matplotlib.ticker import LogFormatter, PercentFormatter
 
 from marsyard.reports.figures import axis_edge, note_beyond
 from marsyard.reports.rates import PooledRate, Share
-from marsyard.reports.svg import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
+from marsyard.reports.svg import BARS, MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
 
 Values = Float[np.ndarray, " n"]
 _LINES = ("-", "--", ":", "-.")
@@ -30,20 +30,11 @@ def cumulative_figure(
     bound: float | None = None,
     limits: Mapping[str, Sequence[float]] | None = None,
 ) -> Figure:
-    """Shares of cases up to each value, or from each value on.
+    """Fraction of cases up to each value, or beyond it if `falling`; curves without values are left out.
 
-    Parameters
-    ----------
-    curves
-        Values by the curve's name; a curve without values is left out.
-    labels
-        Of the x and the y axis.
-    falling
-        Whether a curve shows the share of larger values.
-    bound
-        A requirement: the x axis then ends near it, and values beyond are counted.
-    limits
-        Further vertical lines by their name.
+    labels: of the x and the y axis
+    bound: a requirement; the x axis ends near it, and values beyond are counted
+    limits: further vertical lines by name
     """
     figure, axes = new_axes(6.4, 3.4)
     every = np.concatenate([*curves.values()])
@@ -73,7 +64,7 @@ def cumulative_figure(
 
 @dataclass(frozen=True)
 class RateLine:
-    """Rates against a condition: a name, the condition's values, the rates, and a paper's rates by value."""
+    """Rates at values of a condition, and a paper's rates by value."""
 
     name: str
     x: Sequence[float]
@@ -82,7 +73,7 @@ class RateLine:
 
 
 def draw_rates(axes: Axes, lines: Sequence[RateLine], linestyle: str = "-") -> None:
-    """Draw rates with their intervals, a line each; rates of a paper are open marks."""
+    """Draw rates with their intervals; rates of a paper are open marks."""
     for place, line in enumerate(lines):
         style: dict[str, Any] = {"color": SERIES[place % len(SERIES)], "marker": MARKERS[place % len(MARKERS)]}
         shares = np.array([one.share for one in line.rates])
@@ -92,20 +83,15 @@ def draw_rates(axes: Axes, lines: Sequence[RateLine], linestyle: str = "-") -> N
         axes.errorbar(line.x, shares, spread, label=line.name or None, **bars, **style)
         if line.paper:
             name = f"{line.name}, paper" if len(lines) > 1 else "paper"
-            open_marks: dict[str, Any] = {
-                "linestyle": "",
-                "markersize": 10,
-                "markerfacecolor": "none",
-                "markeredgewidth": 1.5,
-            }
-            axes.plot([*line.paper], [*line.paper.values()], label=name, **open_marks, **style)
+            hollow: dict[str, Any] = {"markersize": 10, "markerfacecolor": "none", "markeredgewidth": 1.5}
+            axes.plot([*line.paper], [*line.paper.values()], label=name, linestyle="", **hollow, **style)
     axes.set_ylim(-0.03, 1.05)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
 
 
 @in_page_style
 def rate_figure(lines: Sequence[RateLine], labels: tuple[str, str], limit: tuple[str, float] | None = None) -> Figure:
-    """Rates against a condition; `limit` is the name and the place of a vertical line."""
+    """Rates against a condition; `limit` is the name and position of a vertical line."""
     figure, axes = new_axes(6.4, 3.7)
     draw_rates(axes, lines)
     if limit is not None:
@@ -115,18 +101,9 @@ def rate_figure(lines: Sequence[RateLine], labels: tuple[str, str], limit: tuple
     return figure
 
 
-#: How a kind of outcome is drawn; none is distinguished by its colour alone.
-BARS: Mapping[str, Mapping[str, Any]] = {
-    "full": {"color": SERIES[0]},
-    "hatched": {"color": "none", "edgecolor": SERIES[1], "hatch": "////"},
-    "dotted": {"color": "none", "edgecolor": SERIES[5], "hatch": "...."},
-    "crossed": {"color": "none", "edgecolor": REQUIREMENT, "hatch": "xxxx"},
-}
-
-
 @in_page_style
 def stacked_bars(names: Sequence[str], shares: Mapping[str, tuple[str, Sequence[float]]], xlabel: str) -> Figure:
-    """A bar for each name, of shares in per cent; `shares` has the style of `BARS` and the shares by their name."""
+    """A bar of percentages for each name; `shares` has a style of `BARS` and the percentages by outcome."""
     figure, axes = new_axes(7.4, 1.0 + 0.27 * len(names))
     places, left = np.arange(len(names)), np.zeros(len(names))
     for name, (style, values) in shares.items():
@@ -140,25 +117,21 @@ def stacked_bars(names: Sequence[str], shares: Mapping[str, tuple[str, Sequence[
     return figure
 
 
-@dataclass(frozen=True)
-class Panel:
-    """Cases as points, and medians of bins of them: the x and y of both."""
-
-    points: tuple[Values, Values]
-    medians: tuple[Sequence[float], Sequence[float]]
+#: The x and y of points, or of the medians of their bins.
+Points = tuple[Sequence[float] | Values, Sequence[float] | Values]
 
 
 @in_page_style
-def scatter_panels(panels: Mapping[tuple[str, str], Panel], *, logarithmic: bool = False) -> Figure:
-    """Panels by the labels of their x and y axes: a row for each y, a column for each x."""
+def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, logarithmic: bool = False) -> Figure:
+    """Panels of cases and of medians of their bins by x and y labels: a row for each y, a column for each x."""
     columns, rows = (list(dict.fromkeys(pair[k] for pair in panels)) for k in (0, 1))
     size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(rows))
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex="col", sharey="row")
-    for (x, y), panel in panels.items():
+    for (x, y), (points, medians) in panels.items():
         axes = grid[rows.index(y), columns.index(x)]
-        axes.plot(*panel.points, ".", color=SERIES[5], markersize=3, rasterized=True)
-        axes.plot(*panel.medians, "o-", color=SERIES[0], markersize=4.5)
+        axes.plot(*points, ".", color=SERIES[5], markersize=3, rasterized=True)
+        axes.plot(*medians, "o-", color=SERIES[0], markersize=4.5)
         if logarithmic:
             axes.set_yscale("log")
             # the page's style does not typeset powers of ten

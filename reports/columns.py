@@ -1,4 +1,4 @@
-"""What the names of stored columns say: units, axes of an error, what drove it, and how to put it into words."""
+"""Names of stored columns: units, axes of an error, conditions that may drive it, and labels for readers."""
 
 from __future__ import annotations
 
@@ -10,25 +10,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-#: Endings of column names and the unit they stand for, longest first.
-_UNITS = (
-    ("_deg_h_k", "deg/h/K"),
-    ("_m_s2", "m/s²"),
-    ("_deg_s", "deg/s"),
-    ("_rad_s", "rad/s"),
-    ("_m_s", "m/s"),
-    ("_deg", "deg"),
-    ("_rad", "rad"),
-    ("_km", "km"),
-    ("_mm", "mm"),
-    ("_cm", "cm"),
-    ("_px", "px"),
-    ("_dn", "DN"),
-    ("_ms", "ms"),
-    ("_m", "m"),
-    ("_s", "s"),
-    ("_k", "K"),
-)
+#: Suffixes of column names and their units, longest first.
+_UNITS = {
+    "_deg_h_k": "deg/h/K", "_m_s2": "m/s²", "_deg_s": "deg/s", "_rad_s": "rad/s", "_m_s": "m/s", "_deg": "deg",
+    "_rad": "rad", "_km": "km", "_mm": "mm", "_cm": "cm", "_px": "px", "_dn": "DN", "_ms": "ms", "_m": "m", "_s": "s",
+    "_k": "K",
+}  # fmt: skip
 _AXES = ("x", "y", "z")
 #: Columns that describe the run rather than the case.
 _BOOKKEEPING = re.compile(
@@ -36,29 +23,21 @@ _BOOKKEEPING = re.compile(
     r"|^firing_|^touchdown_|^room|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
     r"|\.|^algorithm$|^stderr$|^velocity_(?:nees|normalised|sd|correlation)"
 )
-#: Drivers that a review board asks for first: the worst pictures of the paper are the oblique, smeared and high ones.
+#: Prefixes of the conditions that come first.
 _FIRST_DRIVERS = (
-    "off_nadir_max",
-    "attitude_rate_max",
-    "altitude_1",
-    "wind_speed",
-    "horizontal_speed",
-    "sun_elevation",
-    "slip_mean",
-    "pose_error_share",
-    "rock_diameter",
-    "disparity_error_goal",
-)
+    "off_nadir_max", "attitude_rate_max", "altitude_1", "wind_speed", "horizontal_speed", "sun_elevation", "slip_mean",
+    "pose_error_share", "rock_diameter", "disparity_error_goal",
+)  # fmt: skip
 _LARGEST_CATEGORY = 6
 
 
 def split_unit(column: str) -> tuple[str, str]:
-    """The name without its unit, and the unit; an empty unit where the name has none.
+    """Split a column name into name and unit; the unit may be empty.
 
     >>> split_unit("attitude_rate_max_deg_s")
     ('attitude_rate_max', 'deg/s')
     """
-    for ending, unit in _UNITS:
+    for ending, unit in _UNITS.items():
         if column.endswith(ending) and len(column) > len(ending):
             return column.removesuffix(ending), unit
     return column, ""
@@ -84,34 +63,43 @@ def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
 
 
 def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> str | None:
-    """The metric that the page is about: the first requirement's, else the first error column; None without one."""
+    """The page's metric: that of the first requirement, else the first error column; None without one."""
     asked = [str(requirement.get("metric", "")) for requirement in requirements]
     errors = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
     return next((name for name in [*asked, *errors] if name in frame and _is_number(frame, name)), None)
 
 
 def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
-    """A column as float64; NaN where there is no number or no column."""
+    """A column as float64; NaN for missing numbers or a missing column."""
     if column not in frame:
         return np.full(len(frame), np.nan)
     values = pd.to_numeric(frame[column], errors="coerce")
     return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan), dtype=np.float64)
 
 
-def driver_columns(frame: pd.DataFrame, metric: str, most: int = 6) -> list[str]:
-    """Columns that may explain a metric: those a review asks for first, then those that rank with it most."""
-    candidates = [str(column) for column in frame.columns if _may_drive(frame, str(column), metric)]
+def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6) -> list[str]:
+    """Conditions that may drive a metric: fixed ones first, then by rank correlation."""
+    names = [str(name) for name in frame.columns]
+    excluded = {metric, *axis_columns(metric, names), "terrain"}
+    candidates = [
+        name
+        for name in names
+        if name not in excluded
+        and not _BOOKKEEPING.search(name)
+        and _is_number(frame, name)
+        and frame[name].nunique() > 1
+    ]
     first = [name for start in _FIRST_DRIVERS for name in candidates if name.startswith(start)]
     magnitude = np.abs(numbers(frame, metric))
     rest = sorted(
         (name for name in candidates if name not in first),
         key=lambda name: -abs(np.nan_to_num(rank_correlation(numbers(frame, name), magnitude))),
     )
-    return [*first, *rest][:most]
+    return [*first, *rest][:max_columns]
 
 
 def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:
-    """Spearman's rank correlation over the cases where both are known; NaN for fewer than four or for a constant."""
+    """Spearman's rank correlation of the known pairs; NaN for fewer than four or for a constant."""
     both = np.isfinite(x) & np.isfinite(y)
     if both.sum() < 4:
         return float("nan")
@@ -122,9 +110,10 @@ def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> 
 
 
 def category_column(frame: pd.DataFrame) -> str | None:
-    """The column that sorts cases into a few kinds (text, else few terrains); None where there is none."""
-    texts = [str(column) for column in frame.columns if _is_text(frame, str(column))]
-    names = [name for name in texts if not _BOOKKEEPING.search(name)]
+    """The column with a few kinds of cases (text, else terrains); None without one."""
+    kinds = {str(name): kind for name, kind in frame.dtypes.items() if not _BOOKKEEPING.search(str(name))}
+    is_text = (pd.api.types.is_string_dtype, pd.api.types.is_object_dtype)
+    names = [name for name, kind in kinds.items() if any(check(kind) for check in is_text)]
     names += ["terrain"] if "terrain" in frame else []
     return next((name for name in names if 2 <= frame[name].nunique() <= _LARGEST_CATEGORY), None)
 
@@ -136,15 +125,3 @@ def _words(name: str) -> str:
 def _is_number(frame: pd.DataFrame, column: str) -> bool:
     kind = frame[column].dtype
     return pd.api.types.is_numeric_dtype(kind) and not pd.api.types.is_bool_dtype(kind)
-
-
-def _is_text(frame: pd.DataFrame, column: str) -> bool:
-    kind = frame[column].dtype
-    return pd.api.types.is_string_dtype(kind) or pd.api.types.is_object_dtype(kind)
-
-
-def _may_drive(frame: pd.DataFrame, column: str, metric: str) -> bool:
-    parts = {metric, *axis_columns(metric, [str(name) for name in frame.columns])}
-    if column in parts or column == "terrain" or _BOOKKEEPING.search(column) or not _is_number(frame, column):
-        return False
-    return frame[column].nunique() > 1

@@ -1,10 +1,11 @@
-"""Sections that every campaign has where its rows hold their columns."""
+"""Sections of every campaign: answers, scatter, drivers, convergence, consistency and faults."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,12 +14,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from scipy import stats
 
+from marsyard.reports import rates
 from marsyard.reports.columns import axis_columns, driver_columns, label, magnitude_label, numbers, split_unit
-from marsyard.reports.comparison import compared_names, own_frame
+from marsyard.reports.comparison import compared_names, select_algorithm
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
-from marsyard.reports.populations import is_flag, members, succeeded, terrain_groups
-from marsyard.reports.rates import CONFIDENCE, Share, interval_text, range_text, share_of
+from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.sampled import sampled
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
 from marsyard.reports.statistics.changes import holm
@@ -28,16 +29,14 @@ from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
 from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.verdicts import judge_campaign
-from marsyard.reports.wording import NOTHING, coefficient, interval, number, p_text, percent, stated
+from marsyard.reports.wording import NOTHING, coefficient, interval, note_text, number, p_text, percent, stated
 
-#: Column of true and false that says whether a case's geometry leaves room for the algorithm to work at all.
+#: Column of true and false: whether the geometry leaves a feasible overlap for the algorithm.
 ROOM = "room"
 
 
 def answers_section(subject: Subject) -> Section | None:
-    """Shares of cases with an answer, with room, and of answers beyond the bound: availability and "do no harm"; None
-    where rows hold no answers.
-    """
+    """Availability, feasible overlap, and wrong answers; None if rows hold no answers."""
     shares = answer_shares(subject)
     if not shares:
         return None
@@ -47,45 +46,41 @@ def answers_section(subject: Subject) -> Section | None:
             "": lambda pair: pair[0],
             "Cases": lambda pair: f"{pair[1].hits:,} of {pair[1].n:,}",
             "Share": lambda pair: percent(pair[1].share),
-            f"{stated(CONFIDENCE)} interval": lambda pair: range_text(pair[1].lower, pair[1].upper),
+            f"{stated(CONFIDENCE)} interval": lambda pair: rates.range_text(pair[1].lower, pair[1].upper),
             "Allowing for shared terrains": lambda pair: (
-                NOTHING if pair[1].shared_lower is None else interval_text(pair[1], shared=True)
+                NOTHING if pair[1].shared_lower is None else rates.interval_text(pair[1], shared=True)
             ),
         },
     )
-    note = (
-        "Intervals: two-sided, Clopper and Pearson for independent cases; allowing for shared terrains by an effective "
-        "number of cases, or by whole terrains where failures are too few to estimate it. A wrong answer is one that "
-        "was reported although its error is beyond the bound: the harm that an estimator can do."
-    )
+    note = note_text("common.answers")
     data = {name: asdict(one) for name, one in shares.items()}
     return Section("answers", "Answers", "Answers given and answers wrong", [Block(grid=grid, note=note)], data)
 
 
-def answer_shares(subject: Subject) -> Mapping[str, Share]:
-    """The shares by name; only those that the rows hold."""
+def answer_shares(subject: Subject) -> Mapping[str, rates.Share]:
+    """Fractions by name, as far as the rows hold them."""
     frame = subject.whole
-    if not is_flag(frame, "answered") or frame.empty:
+    if not rates.is_flag(frame, "answered") or frame.empty:
         return {}
-    answered = members(frame, "valid")
-    shares = {"answered, of all cases": share_of(answered, frame)}
-    if is_flag(frame, ROOM):
-        room, completed = members(frame, ROOM), members(frame, "completed")
-        shares["answered, of cases whose geometry leaves room"] = share_of(answered[room], frame[room])
-        shares["geometry leaves no room, of completed cases"] = share_of(~room[completed], frame[completed])
+    answered = rates.members(frame, "valid")
+    shares = {"answered, of all cases": rates.share_of(answered, frame)}
+    if rates.is_flag(frame, ROOM):
+        room, completed = rates.members(frame, ROOM), rates.members(frame, "completed")
+        shares["answered, of cases with feasible overlap"] = rates.share_of(answered[room], frame[room])
+        shares["no feasible overlap, of completed cases"] = rates.share_of(~room[completed], frame[completed])
     if subject.metric is not None and subject.bound is not None:
-        wrong = ~succeeded(frame[answered], subject.metric, subject.bound)
+        wrong = ~rates.succeeded(frame[answered], subject.metric, subject.bound)
         name = f"wrong by more than {subject.bound:g} {split_unit(subject.metric)[1]}, of answers"
-        shares[name] = share_of(wrong, frame[answered])
+        shares[name] = rates.share_of(wrong, frame[answered])
     return shares
 
 
-#: Shares of the errors within the radii.
+#: Fractions of the errors within the radii.
 SHARES = (0.5, 0.95, 0.99)
 
 
 def scatter_section(subject: Subject) -> Section | None:
-    """Ellipse and circular errors of a metric of two parts; None where it has none, or too few cases do."""
+    """Error ellipse and circular errors of a metric with x and y parts; None without them or for too few cases."""
     metric = subject.metric
     if metric is None:
         return None
@@ -96,7 +91,7 @@ def scatter_section(subject: Subject) -> Section | None:
     ellipse = error_ellipse(errors, ELLIPSE)
     if ellipse is None:
         return None
-    groups = terrain_groups(subject.whole)
+    groups = rates.terrain_groups(subject.whole)
     circles = [circular_error(errors, share, CONFIDENCE, groups) for share in SHARES]
     unit = split_unit(metric)[1]
     x, y = (number(value) for value in ellipse.centre)
@@ -106,53 +101,47 @@ def scatter_section(subject: Subject) -> Section | None:
         f"{label(parts[0])} towards {label(parts[1])}. {percent(ellipse.inside)} of these errors lie inside."
     )
     rows = [[stated(one.probability), number(one.estimate), interval(one.lower, one.upper)] for one in circles]
-    grid = Grid(["Share of errors", f"Radius ({unit})", f"Bounds, {stated(CONFIDENCE)} each"], rows)
-    note = (
-        "Radius about the truth that holds the share; that of 50 % is the circular error probable. Bounds by order "
-        "statistics: of whole terrains, or of the effective number of cases, where cases share terrains. The ellipse "
-        "holds the next error with its probability, however few cases there are."
-    )
+    grid = Grid(["Fraction of errors", f"Radius ({unit})", f"Bounds, {stated(CONFIDENCE)} each"], rows)
+    note = note_text("common.scatter")
     data = {"ellipse": asdict(ellipse), "circles": [asdict(one) for one in circles]}
     return Section("scatter", "Scatter", "Scatter of the errors", [Block(text=text, grid=grid, note=note)], data)
 
 
-#: Conditions that are ranked, and cases that are looked at: the first ones, which are enough to rank by.
+#: Maximum number of ranked conditions, and of cases by which they are ranked.
 MAX_CONDITIONS, MAX_CASES = 12, 20_000
 
 
 def drivers_section(subject: Subject) -> Section | None:
-    """Conditions ranked by what they explain of errors and of failures; None where none can be ranked."""
+    """Conditions ranked by the variance of errors and failures that they explain; None if none can be ranked."""
     metric = subject.metric
     if metric is None:
         return None
     frame = subject.frame.head(MAX_CASES)
     responses = {"the size of errors": np.abs(numbers(frame, metric))}
     if subject.bound is not None:
-        responses["failures"] = (~succeeded(frame, metric, subject.bound)).astype(np.float64)
+        responses["failures"] = (~rates.succeeded(frame, metric, subject.bound)).astype(np.float64)
     ranked = {name: ranked_drivers(frame, metric, response) for name, response in responses.items()}
     known = {name: found for name, found in ranked.items() if found}
     if not known:
         return None
-    note = (
-        "Share: part of the variance of the ranks that the condition alone explains, for a curve of any shape "
-        f"(first-order index). Intervals at {stated(CONFIDENCE)} confidence, fewer cases taken where terrains share "
-        "condition and response. p: that it explains nothing, corrected for the number of conditions (Holm). A failure "
-        "is a case without an answer within the bound. Nothing is claimed about causes."
-    )
-    blocks = [Block(heading=f"What explains {name}", grid=_ranked_grid(found)) for name, found in known.items()]
+    note = note_text("common.drivers", confidence=stated(CONFIDENCE))
+    blocks = [
+        Block(heading=f"Drivers of {name}", grid=Grid(_RANKED_HEAD, [_ranked_row(*one) for one in found]))
+        for name, found in known.items()
+    ]
     data = {
         name: [{"condition": column, **asdict(one), "corrected_p": p} for column, one, p in found]
         for name, found in known.items()
     }
-    return Section("explained", "Explained", "What explains errors and failures", [*blocks, Block(note=note)], data)
+    return Section("explained", "Explained", "Drivers of errors and failures", [*blocks, Block(note=note)], data)
 
 
 Ranked = Sequence[tuple[str, Driver, float]]
 
 
 def ranked_drivers(frame: pd.DataFrame, metric: str, response: Float[np.ndarray, " n"]) -> Ranked:
-    """Conditions with what each explains of a response and its corrected p, those that explain most first."""
-    groups = terrain_groups(frame)
+    """Conditions with the explained variance of a response and corrected p, in falling order."""
+    groups = rates.terrain_groups(frame)
     found: Mapping[str, Driver] = {
         column: one
         for column in driver_columns(frame, metric, MAX_CONDITIONS)
@@ -163,33 +152,25 @@ def ranked_drivers(frame: pd.DataFrame, metric: str, response: Float[np.ndarray,
     return [(column, found[column], p_values[column]) for column in order]
 
 
-def _ranked_grid(ranked: Ranked) -> Grid:
-    head = ["Condition", "Cases", "Rank correlation", "Interval", "Share", "Interval", "p"]
-    rows = [
-        [
-            label(column),
-            f"{one.n:,}",
-            coefficient(one.correlation),
-            f"{coefficient(one.lower)} to {coefficient(one.upper)}",
-            percent(one.share),
-            range_text(one.share_lower, one.share_upper),
-            p_text(p),
-        ]
-        for column, one, p in ranked
-    ]
-    return Grid(head, rows)
+_RANKED_HEAD = ["Condition", "Cases", "Rank correlation", "Interval", "Share", "Interval", "p"]
 
 
-#: Up to this ratio of the most cases to the fewest an axis has ticks within its decades too.
-_FEW_DECADES = 50
-#: Numbers of cases at which figures are taken, evenly spread in their logarithm, and the least of them.
+def _ranked_row(column: str, one: Driver, p: float) -> list[str]:
+    interval_of_rank = f"{coefficient(one.lower)} to {coefficient(one.upper)}"
+    share = [percent(one.share), rates.range_text(one.share_lower, one.share_upper)]
+    return [label(column), f"{one.n:,}", coefficient(one.correlation), interval_of_rank, *share, p_text(p)]
+
+
+#: Up to this ratio of the axis' ends it has ticks within its decades.
+_MAX_RATIO = 50
+#: Number of points of a convergence curve, spaced logarithmically, and the minimum number of cases.
 POINTS, FEWEST = 12, 8
 QUANTILE = 0.95
 
 
 @dataclass(frozen=True)
 class Point:
-    """A figure of the first so many cases, and its bounds; NaN or infinite where there are none."""
+    """An estimate of the first cases with its bounds; NaN or infinite without bounds."""
 
     cases: int
     estimate: float
@@ -198,7 +179,7 @@ class Point:
 
 
 def convergence_section(subject: Subject) -> Section | None:
-    """Success rates, mean and 95 % quantile of the errors against the number of cases; None for fewer than sixteen."""
+    """Success rates, mean and 95 % quantile of the errors against the number of cases; None for fewer than 16."""
     frame = subject.whole
     if len(frame) < 2 * FEWEST:
         return None
@@ -214,22 +195,17 @@ def convergence_section(subject: Subject) -> Section | None:
         data[f"{subject.metric}: {name}"] = [asdict(point) for point in points]
     if not plates:
         return None
-    note = (
-        "Of the first so many cases, in the order of their numbers, which is no order at all. Band: one-sided bounds "
-        "at the confidence asked; of mean and quantile at 90 %, open upwards where cases are too few for a bound. "
-        "Dashed: what is asked."
-    )
+    note = note_text("common.convergence")
     return Section("convergence", "Convergence", "Convergence", [Block(plates=plates, note=note)], data)
 
 
 def sizes(cases: int) -> list[int]:
-    """The numbers of cases at which figures are taken."""
-    spread = np.geomspace(FEWEST, cases, POINTS)
-    return sorted({round(float(size)) for size in spread})
+    """Numbers of cases of the points of a curve."""
+    return sorted({round(float(size)) for size in np.geomspace(FEWEST, cases, POINTS)})
 
 
 def requirement_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]:
-    """Each requirement's name, the rate asked, and the rates of the first cases; none where it cannot be judged."""
+    """Name, rate asked and success rates of the first cases of each requirement that can be judged."""
     how = sampled(subject.run.configuration)
     frame, requirements = subject.whole, subject.run.requirements
     judged = [(size, judge_campaign(frame.head(size), requirements, how)) for size in sizes(len(frame))]
@@ -246,12 +222,10 @@ def requirement_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]
 
 
 def error_curves(frame: pd.DataFrame, metric: str | None) -> dict[str, tuple[str, str, list[Point]]]:
-    """Name, axis and points of the mean and of the 95 % quantile of the magnitudes of the first cases; none where the
-    cases are too few.
-    """
+    """Name, axis and points of mean and 95 % quantile of the magnitudes of the first cases; empty for too few."""
     if metric is None:
         return {}
-    magnitude, groups = np.abs(numbers(frame, metric)), terrain_groups(frame)
+    magnitude, groups = np.abs(numbers(frame, metric)), rates.terrain_groups(frame)
     means, quantiles = [], []
     for size in sizes(len(frame)):
         finite = np.isfinite(magnitude[:size])
@@ -271,12 +245,9 @@ def error_curves(frame: pd.DataFrame, metric: str | None) -> dict[str, tuple[str
 
 @in_page_style
 def curve_figure(points: Sequence[Point], name: str, asked: float | None) -> Figure:
-    """A figure's estimate and bounds against the number of cases."""
+    """An estimate and its bounds against the number of cases."""
     figure, axes = new_axes(4.2, 2.8)
-    cases = [point.cases for point in points]
-    estimates = np.array([point.estimate for point in points])
-    lower = np.array([point.lower for point in points])
-    upper = np.array([point.upper for point in points])
+    cases, estimates, lower, upper = np.array([(one.cases, one.estimate, one.lower, one.upper) for one in points]).T
     known = np.concatenate([estimates, lower, upper, [math.nan if asked is None else asked]])
     known = known[np.isfinite(known)]
     if known.size:
@@ -291,101 +262,60 @@ def curve_figure(points: Sequence[Point], name: str, asked: float | None) -> Fig
     if asked is not None and math.isfinite(asked):
         axes.axhline(asked, color=REQUIREMENT, linewidth=1.4, linestyle="--")
     axes.set(xscale="log", xlabel="cases", ylabel=name)
-    if cases[-1] < _FEW_DECADES * cases[0]:
+    if cases[-1] < _MAX_RATIO * cases[0]:
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())
     return figure
 
 
-#: The column, and the parts that the error behind it has.
+#: Column of the normalised estimation error squared, and its degrees of freedom.
 NEES, PARTS = "velocity_nees", 2
-#: Probability of the bands, and of the ellipse whose hits are counted.
+#: Probability of the band of the mean, and of the counted ellipse.
 BAND = 0.95
 
 
-@dataclass(frozen=True)
-class Consistency:
-    """What the covariances of one algorithm are worth.
+def consistency(nees: Float[np.ndarray, " n"], parts: int = PARTS) -> dict[str, Any]:
+    """Consistency of at least one estimate from its NEES (normalised estimation error squared) with `parts` parts.
 
-    Attributes
-    ----------
-    name
-        Its label.
-    n
-        Estimates with a covariance.
-    mean, lower, upper
-        Mean NEES, and the band in which it lies with 95 % probability if the covariances are right.
-    inside, inside_lower, inside_upper
-        Share of errors within their 95 % ellipse, and its 90 % interval (Clopper-Pearson).
-    word
-        "consistent", "too sure" (errors larger than stated) or "too cautious".
+    Keys: mean NEES with its 95 % band for correct covariances, fraction of errors `inside` their 95 % ellipse with its
+    90 % interval, and `word`: "consistent", "too sure" (errors larger than stated) or "too cautious".
     """
-
-    name: str
-    n: int
-    mean: float
-    lower: float
-    upper: float
-    inside: float
-    inside_lower: float
-    inside_upper: float
-    word: str
-
-
-def consistency(name: str, nees: Float[np.ndarray, " n"], parts: int = PARTS) -> Consistency:
-    """The consistency of estimates from their NEES, shape (n,), of errors of so many parts; n must be at least 1."""
-    n = nees.size
-    if n == 0:
-        raise ValueError("no estimate has a covariance")
+    n, mean = nees.size, float(nees.mean())
     tail = 0.5 * (1.0 - BAND)
     lower, upper = (float(stats.chi2.ppf(q, parts * n)) / n for q in (tail, 1.0 - tail))
     inside = int((nees <= stats.chi2.ppf(BAND, parts)).sum())
-    mean = float(nees.mean())
+    low, high = proportion_interval(inside, n, CONFIDENCE)
     word = "too sure" if mean > upper else "too cautious" if mean < lower else "consistent"
-    bounds = proportion_interval(inside, n, CONFIDENCE)
-    return Consistency(name, n, mean, lower, upper, inside / n, *bounds, word)
+    band = {"n": n, "mean": mean, "lower": lower, "upper": upper}
+    return band | {"inside": inside / n, "inside_lower": low, "inside_upper": high, "word": word}
 
 
-def consistencies(frame: pd.DataFrame) -> list[Consistency]:
-    """Those of all algorithms in the rows that state covariances."""
+def consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Consistency of all algorithms in the rows with covariances, by name."""
     judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "judged"
-    frames = {judged: frame, **{name: own_frame(frame, name) for name in compared_names(frame)}}
+    frames = {judged: frame, **{name: select_algorithm(frame, name) for name in compared_names(frame)}}
     by_name = {name: numbers(own, NEES) for name, own in frames.items() if NEES in own}
     known = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
-    return [consistency(name, nees) for name, nees in known.items() if nees.size]
+    return {name: consistency(nees) for name, nees in known.items() if nees.size}
 
 
 def consistency_section(subject: Subject) -> Section | None:
-    """How stated covariances agree with errors; None where no algorithm states any."""
+    """Consistency of stated covariances with errors; None if no algorithm states any."""
     found = consistencies(subject.frame)
     if not found:
         return None
-    grid = grid_of(
-        found,
-        {
-            "Algorithm": lambda one: one.name,
-            "Estimates": lambda one: f"{one.n:,}",
-            "Mean NEES": lambda one: number(one.mean),
-            "95 % band": lambda one: f"{number(one.lower)} to {number(one.upper)}",
-            "Within 95 % ellipse": lambda one: (
-                f"{percent(one.inside)} ({range_text(one.inside_lower, one.inside_upper)})"
-            ),
-            "Covariances are": lambda one: one.word,
-        },
-    )
-    note = (
-        f"NEES: the squared error in units of the stated covariance; {PARTS} on average where the covariance is right. "
-        "The band takes cases as independent and errors as normal; the share within the ellipse has a 90 % interval. "
-        "Too sure: errors are larger than stated."
-    )
-    data = {one.name: {key: value for key, value in asdict(one).items() if key != "name"} for one in found}
-    return Section(
-        "consistency", "Consistency", "Stated covariances against errors", [Block(grid=grid, note=note)], data
-    )
+    rows = []
+    for name, one in found.items():
+        inside = f"{percent(one['inside'])} ({rates.range_text(one['inside_lower'], one['inside_upper'])})"
+        band = f"{number(one['lower'])} to {number(one['upper'])}"
+        rows.append([name, f"{one['n']:,}", number(one["mean"]), band, inside, one["word"]])
+    head = ["Algorithm", "Estimates", "Mean NEES", "95 % band", "Within 95 % ellipse", "Covariances are"]
+    blocks = [Block(grid=Grid(head, rows), note=note_text("common.consistency", parts=PARTS))]
+    return Section("consistency", "Consistency", "Stated covariances against errors", blocks, found)
 
 
-#: Off-nominal cases: answers within the bound, no answers, and wrong answers, for every fault and size of fault.
+#: Off-nominal cases: valid, missing and wrong answers by fault and its size.
 FAULT_OUTCOMES = OutcomesBySize(
     outcomes=lambda rows, subject: _fault_outcomes(rows, subject),
     styles={"valid": ("valid", "full"), "invalid": ("invalid", "hatched"), "wrong": ("wrong", "crossed")},
@@ -393,32 +323,35 @@ FAULT_OUTCOMES = OutcomesBySize(
     caption="Full: answers within the bound. Hatched: no answer. Crossed: wrong answers.",
     wording=lambda fault, size: (label(fault), "" if math.isnan(size) or fault == "none" else f"{size:g}"),
     further=(
-        ("Commonest refusal", "commonest_refusal", lambda rows: commonest_refusal(rows), lambda text: text or NOTHING),
+        (
+            "Most frequent refusal",
+            "commonest_refusal",
+            lambda rows: commonest_refusal(rows),
+            lambda text: text or NOTHING,
+        ),
     ),
 )
 
 
 def faults_section(subject: Subject) -> Section | None:
-    """One table over faults and sizes; None where no row has a fault, or errors have no bound."""
-    if subject.metric is None or subject.bound is None or not is_flag(subject.frame, "answered"):
+    """Outcomes by fault and size; None without faults or bound."""
+    if subject.metric is None or subject.bound is None or not rates.is_flag(subject.frame, "answered"):
         return None
-    note = (
-        f"Valid: answered within {subject.bound:g} {split_unit(subject.metric)[1]}. Invalid: no answer, as the "
-        "algorithm said, or crashed. Wrong: answered, but beyond the bound; with the two-sided Clopper-Pearson "
-        f"interval of its share of all cases at {stated(CONFIDENCE)} confidence."
+    note = note_text(
+        "common.faults", bound=f"{subject.bound:g}", unit=split_unit(subject.metric)[1], confidence=stated(CONFIDENCE)
     )
     return SectionDeclaration("faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), note=note)(subject)
 
 
 def _fault_outcomes(rows: Rows, subject: Subject) -> dict[str, Bool[np.ndarray, " n"]]:
-    answered = members(rows, "valid")
-    within = succeeded(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
+    answered = rates.members(rows, "valid")
+    within = rates.succeeded(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
     return {"valid": answered & within, "invalid": ~answered, "wrong": answered & ~within}
 
 
 def commonest_refusal(rows: Rows) -> str:
-    """The outcome that most of the cases without an answer had; empty for none."""
-    refusals = (
-        rows.loc[~members(rows, "valid"), "outcome"].value_counts() if "outcome" in rows else pd.Series(dtype=int)
-    )
+    """The most frequent outcome of cases without an answer; empty for none."""
+    if "outcome" not in rows:
+        return ""
+    refusals = rows.loc[~rates.members(rows, "valid"), "outcome"].value_counts()
     return str(refusals.index[0]) if len(refusals) else ""

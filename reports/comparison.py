@@ -1,12 +1,9 @@
-"""Algorithms compared on the same cases, and two stored campaigns compared with each other.
+"""Comparison of algorithms on the same cases, and of two stored campaigns.
 
-Algorithms are paired: both had the same pictures, or the same draws. Whether one succeeds more often is tested by the
-cases in which just one of them does (`marsyard.reports.statistics.changes`); whose errors are smaller, by the
-differences of the cases that both answered. Where cases share terrains, whole terrains are compared. Further algorithms
-stand in the rows as `marsyard.scenarios.trial` puts them.
-
-Campaigns that ran the same draws (name, seed, dispersions) are compared in pairs as well. Otherwise terrain by terrain,
-or by whole terrains where they have none in common. The p are corrected for their number by Holm's method.
+Algorithms are paired case by case: successes are compared by discordant cases, errors by the differences of cases that
+both answered (`marsyard.reports.statistics.changes`). Campaigns with the same draws (name, seed, dispersions) are
+paired as well; others are compared terrain by terrain, or by whole terrains without common terrains. Shared
+terrains count by terrain. All p are corrected for their number by Holm's method.
 """
 
 from __future__ import annotations
@@ -20,30 +17,23 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from marsyard.reports import rates
 from marsyard.reports.columns import label, numbers, primary_metric, split_unit
-from marsyard.reports.populations import ENGINE_FAILURES, is_flag, members, succeeded, terrain_groups
-from marsyard.reports.rates import CONFIDENCE
+from marsyard.reports.rates import CONFIDENCE, succeeded
 from marsyard.reports.sampled import sampled
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of
 from marsyard.reports.statistics.changes import Sample, compared_errors, compared_successes, difference_p, holm
 from marsyard.reports.stored import StoredRun, table
-from marsyard.reports.wording import NOTHING, number, p_text, percent, stated
+from marsyard.reports.wording import NOTHING, note_text, number, p_text, percent, stated
 
 
 @dataclass(frozen=True)
 class Contender:
-    """What one algorithm did.
+    """Results of one algorithm.
 
-    Attributes
-    ----------
-    name
-        Its label.
-    cases, answered, failed
-        Cases it was run on, those that it answered, and those in which it crashed or broke a limit.
-    succeeded
-        Cases within the bound; None where the page has none.
-    median, p95
-        Of the magnitude of the metric over the cases that it answered; NaN for none.
+    failed: cases in which it crashed or broke a limit
+    succeeded: cases within the bound; None without a bound
+    median, p95: of the metric's magnitude over the answered cases
     """
 
     name: str
@@ -57,24 +47,13 @@ class Contender:
 
 @dataclass(frozen=True)
 class Difference:
-    """One algorithm against the one that is judged, on the same cases.
+    """Another algorithm against the judged one on the same cases; both p are corrected for their number (Holm).
 
-    Attributes
-    ----------
-    name
-        The other's label.
-    only_first, only_other
-        Cases in which just the judged one, or just the other, is within the bound; None where there is no bound.
-    success_p
-        Two-sided probability of so uneven a split if both succeed equally often; NaN without a bound.
-    pairs
-        Cases that both answered.
-    mean, lower, upper
-        Mean of the other's magnitude less the judged one's, with its interval; negative: the other is better.
-    error_p
-        Two-sided probability of such differences if their distribution is symmetric about zero (Wilcoxon).
-
-    Both probabilities are corrected for the number of algorithms (Holm).
+    only_first, only_other: cases in which only the judged one, or only the other, is within the bound; None without one
+    success_p: two-sided probability of so uneven a split if both succeed equally often
+    pairs: cases that both answered
+    mean, lower, upper: mean of the other's magnitude less the judged one's, with its interval
+    error_p: two-sided probability of such differences if they are symmetric about zero (Wilcoxon)
     """
 
     name: str
@@ -89,13 +68,13 @@ class Difference:
 
 
 def compared_names(frame: pd.DataFrame) -> list[str]:
-    """Labels of the algorithms that the rows hold beside the one that is judged."""
+    """Labels of the compared algorithms in the rows."""
     names = [str(column).removesuffix(".answered") for column in frame.columns if str(column).endswith(".answered")]
-    return [name for name in names if is_flag(frame, f"{name}.answered")]
+    return [name for name in names if rates.is_flag(frame, f"{name}.answered")]
 
 
-def own_frame(frame: pd.DataFrame, name: str) -> pd.DataFrame:
-    """The rows as they would be if an algorithm that was compared had been the one that is judged."""
+def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
+    """The rows with a compared algorithm in place of the judged one."""
     prefix = f"{name}."
     own = {str(column): str(column).removeprefix(prefix) for column in frame.columns if str(column).startswith(prefix)}
     kept = frame.drop(columns=[column for column in own.values() if column in frame])
@@ -103,7 +82,7 @@ def own_frame(frame: pd.DataFrame, name: str) -> pd.DataFrame:
 
 
 def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float | None) -> Contender:
-    """What the rows say of the algorithm that is judged in them."""
+    """Results of the judged algorithm in the rows."""
     magnitude = np.abs(numbers(frame, metric)) if metric is not None else np.full(len(frame), np.nan)
     known = magnitude[np.isfinite(magnitude)]
     within = None
@@ -113,7 +92,7 @@ def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float |
         name=name,
         cases=len(frame),
         answered=int(frame["answered"].eq(True).sum()),
-        failed=int(frame["outcome"].isin(ENGINE_FAILURES).sum()),
+        failed=int(frame["outcome"].isin(rates.ENGINE_FAILURES).sum()),
         succeeded=within,
         median=float(np.median(known)) if known.size else math.nan,
         p95=float(np.quantile(known, 0.95)) if known.size else math.nan,
@@ -121,9 +100,9 @@ def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float |
 
 
 def difference(first: pd.DataFrame, other: pd.DataFrame, name: str, metric: str, bound: float | None) -> Difference:
-    """One algorithm against another, from rows of the same cases in the same order."""
+    """Another algorithm against the first, from rows of the same cases in the same order."""
     mine, its = (np.abs(numbers(frame, metric)) for frame in (first, other))
-    both, groups = np.isfinite(mine) & np.isfinite(its), terrain_groups(first)
+    both, groups = np.isfinite(mine) & np.isfinite(its), rates.terrain_groups(first)
     split: tuple[int | None, int | None, float] = (None, None, math.nan)
     if bound is not None:
         split = compared_successes(mine <= bound, its <= bound, groups)
@@ -135,14 +114,14 @@ def difference(first: pd.DataFrame, other: pd.DataFrame, name: str, metric: str,
 def comparison(
     frame: pd.DataFrame, metric: str | None, bound: float | None
 ) -> tuple[list[Contender], list[Difference]]:
-    """All algorithms in the rows, the judged one first, and each other one against it; empty where there is one."""
+    """Results of all algorithms, the judged one first, and differences of the others; empty for a single algorithm."""
     names = compared_names(frame)
-    # what does not apply to a case that was ended as a whole is told elsewhere
+    # cases that ended before any algorithm ran have no answers to compare
     frame = frame[np.logical_and.reduce([frame[f"{name}.answered"].notna() for name in names])] if names else frame
     if not names or frame.empty:
         return [], []
     judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame else "judged"
-    others = {name: own_frame(frame, name) for name in names}
+    others = {name: select_algorithm(frame, name) for name in names}
     contenders = [contender(frame, judged, metric, bound)]
     contenders += [contender(own, name, metric, bound) for name, own in others.items()]
     if metric is None:
@@ -156,18 +135,13 @@ def comparison(
 
 
 def comparison_section(subject: Subject) -> Section | None:
-    """The algorithms side by side; None where there is one only."""
+    """The algorithms side by side; None for a single algorithm."""
     contenders, differences = comparison(subject.frame, subject.metric, subject.bound)
     if not contenders:
         return None
     grids = comparison_grids(contenders, differences, subject.metric)
     judged = contenders[0].name
-    note = (
-        f"Against {judged}, on the same cases. Only one within the bound: cases that tell the two apart; p of an exact "
-        "McNemar test. Difference: the other's error less that of the judged one where both answered, its mean with a "
-        f"{stated(CONFIDENCE)} BCa bootstrap interval; p of Wilcoxon's signed ranks. The p are two-sided, corrected "
-        "for the number of algorithms (Holm). Where cases share terrains, intervals and p are of whole terrains."
-    )
+    note = note_text("common.comparison", judged=judged, confidence=stated(CONFIDENCE))
     blocks = [Block(grid=grids[0])]
     if differences:
         blocks.append(Block(heading=f"Against {judged}", grid=grids[1], note=note))
@@ -182,7 +156,7 @@ def comparison_section(subject: Subject) -> Section | None:
 def comparison_grids(
     contenders: Sequence[Contender], differences: Sequence[Difference], metric: str | None
 ) -> tuple[Grid, Grid]:
-    """Tables of what each did and of the differences, as texts."""
+    """Tables of results and of differences."""
     unit = f" ({split_unit(metric)[1]})" if metric is not None and split_unit(metric)[1] else ""
     first = grid_of(
         contenders,
@@ -214,14 +188,8 @@ def comparison_grids(
 class Figure:
     """One figure of a campaign, case by case.
 
-    Attributes
-    ----------
-    name
-        What it is called, and compared by.
-    larger_is_better
-        Whether it is a rate of successes.
-    values
-        0 and 1 of a rate, or magnitudes; NaN where the case does not count, shape (n,).
+    larger_is_better: whether it is a rate of successes
+    values: 0 and 1 of a rate, or magnitudes; NaN for cases that do not count
     """
 
     name: str
@@ -231,17 +199,22 @@ class Figure:
     @property
     def text(self) -> str:
         """The rate with its cases, or median and 95 % quantile."""
-        known = self.values[np.isfinite(self.values)]
+        known = self.known
         if known.size == 0:
             return NOTHING
         if self.larger_is_better:
-            return f"{percent(float(known.mean()))} of {known.size:,}"
-        return f"{number(float(np.median(known)))}, 95 % {number(float(np.quantile(known, 0.95)))}"
+            return f"{percent(self.level)} of {known.size:,}"
+        return f"{number(self.level)}, 95 % {number(float(np.quantile(known, 0.95)))}"
+
+    @property
+    def known(self) -> Float[np.ndarray, " known"]:
+        """Values of the cases that count."""
+        return np.asarray(self.values[np.isfinite(self.values)])
 
     @property
     def level(self) -> float:
         """The rate, or the median; NaN for no cases."""
-        known = self.values[np.isfinite(self.values)]
+        known = self.known
         if known.size == 0:
             return math.nan
         return float(known.mean() if self.larger_is_better else np.median(known))
@@ -249,7 +222,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Contrast:
-    """One figure of both campaigns, and the corrected two-sided probability of such a difference by chance."""
+    """One figure of both campaigns, and the corrected two-sided p of their difference."""
 
     name: str
     first: Figure
@@ -258,54 +231,51 @@ class Contrast:
 
 
 def figures_of(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
-    """The drawn cases of a campaign, and the figures that campaigns are compared by: success by each requirement,
-    answers, cases that came to an end, and the magnitudes of the requirements' metrics.
-    """
+    """The drawn cases of a campaign, and its figures: success by requirement, answers, completion, and magnitudes."""
     frame = sampled(run.configuration).drawn(run.frame)
     found: dict[str, Figure] = {}
     metrics = dict.fromkeys([primary_metric(frame, run.requirements)])
     for asked in run.requirements:
         name, metric, bound = str(asked.get("id", "?")), str(asked.get("metric", "")), asked.get("bound")
-        if metric not in frame or not (isinstance(bound, int | float) or is_flag(frame, metric)):
+        is_bounded = isinstance(bound, int | float)
+        if metric not in frame or not (is_bounded or rates.is_flag(frame, metric)):
             continue
         try:
-            chosen = members(frame, str(asked.get("population", "all")))
+            chosen = rates.members(frame, str(asked.get("population", "all")))
         except ValueError:
             continue
-        limit, scale = (
-            float(one) if isinstance(one, int | float) else math.nan for one in (bound, asked.get("scale", 1))
-        )
+        limit, scale = (float(x) if isinstance(x, int | float) else math.nan for x in (bound, asked.get("scale", 1)))
         success = succeeded(frame, metric, limit, scale)
         found[name] = Figure(name, True, np.where(chosen, success.astype(np.float64), np.nan))
-        if isinstance(bound, int | float):
+        if is_bounded:
             metrics[metric] = None
-    for measured in metrics:
-        if measured is not None:
-            found[measured] = Figure(label(measured), False, np.abs(_finite(numbers(frame, measured))))
-    if is_flag(frame, "answered"):
-        found["answered"] = Figure("answered", True, members(frame, "valid").astype(np.float64))
-    found["came to an end"] = Figure("came to an end", True, members(frame, "completed").astype(np.float64))
+    for measured in filter(None, metrics):
+        magnitude = np.abs(numbers(frame, measured))
+        found[measured] = Figure(label(measured), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
+    if rates.is_flag(frame, "answered"):
+        found["answered"] = Figure("answered", True, rates.members(frame, "valid").astype(np.float64))
+    found["came to an end"] = Figure("came to an end", True, rates.members(frame, "completed").astype(np.float64))
     return frame, list(found.values())
 
 
 def contrasts(first: StoredRun, second: StoredRun) -> tuple[bool, list[Contrast]]:
-    """Whether the campaigns' cases are pairs, and the figures that both have."""
+    """Whether the campaigns' cases are pairs, and the contrasts of the figures that both have."""
     frames, of_each = zip(*(figures_of(run) for run in (first, second)), strict=True)
     paired = same_draws(first, second)
     theirs = {figure.name: figure for figure in of_each[1]}
     both = [(figure, theirs[figure.name]) for figure in of_each[0] if figure.name in theirs]
-    test = _paired_p if paired else _unpaired_p if same_grounds(first, second) else _apart_p
+    test = _paired_p if paired else _unpaired_p if same_grounds(first, second) else _disjoint_p
     p_values = holm([test(frames[0], mine, frames[1], other) for mine, other in both])
     return paired, [Contrast(mine.name, mine, other, p) for (mine, other), p in zip(both, p_values, strict=True)]
 
 
 def same_draws(first: StoredRun, second: StoredRun) -> bool:
-    """Whether a case of one number is the same case in both."""
+    """Whether equal case numbers are the same case in both campaigns."""
     return all(first.said(key) == second.said(key) for key in ("name", "scenario", "seed", "dispersions", "design"))
 
 
 def same_grounds(first: StoredRun, second: StoredRun) -> bool:
-    """Whether a terrain of one number is the same terrain in both: all parameters but the algorithm's are the same."""
+    """Whether equal terrain numbers are the same terrain: all parameters but the algorithm's are equal."""
     worlds = [
         {name: value for name, value in table(run.said("parameters")).items() if name != "algorithm"}
         for run in (first, second)
@@ -314,36 +284,36 @@ def same_grounds(first: StoredRun, second: StoredRun) -> bool:
 
 
 def contrast_grid(names: Sequence[str], found: Sequence[Contrast]) -> Grid:
-    """The figures side by side, as texts."""
+    """Table of the figures side by side."""
     head = ["", *names, "p"]
     return Grid(head, [[one.name, one.first.text, one.second.text, p_text(one.p_value)] for one in found])
 
 
 def contrast_data(found: Sequence[Contrast]) -> list[dict[str, Any]]:
-    """The same as plain data: a rate or a median of each campaign with its cases; None for what is not known."""
+    """The contrasts as plain data: rate or median of each campaign with its cases; None for NaN."""
+
+    def level(figure: Figure) -> dict[str, Any]:
+        cases = figure.known.size
+        return {"rate" if figure.larger_is_better else "median": figure.level if cases else None, "cases": cases}
+
     return [
         {
             "name": one.name,
-            "first": _level_data(one.first),
-            "second": _level_data(one.second),
+            "first": level(one.first),
+            "second": level(one.second),
             "p": None if math.isnan(one.p_value) else one.p_value,
         }
         for one in found
     ]
 
 
-def _level_data(figure: Figure) -> dict[str, Any]:
-    cases = int(np.isfinite(figure.values).sum())
-    return {"rate" if figure.larger_is_better else "median": figure.level if cases else None, "cases": cases}
-
-
 def sample_of(frame: pd.DataFrame, figure: Figure) -> Sample:
-    """A figure with the terrain of each case, by its name so that it is the same in other campaigns."""
-    groups = terrain_groups(frame)
+    """A figure with the stored terrain number of each case, which is comparable between campaigns."""
+    groups = rates.terrain_groups(frame)
     if groups is None:
         return Sample(figure.values, np.zeros(figure.values.size, dtype=np.int64))
     named = pd.to_numeric(frame["terrain"], errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
-    # cases of unknown terrain, and terrains that are no numbers, stand alone: below zero
+    # cases of unknown or non-numeric terrain get their own negative number
     alone = ~np.isfinite(named)
     return Sample(figure.values, np.where(alone, -1.0 - groups, np.nan_to_num(named)).astype(np.int64))
 
@@ -352,8 +322,8 @@ def _unpaired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: 
     return difference_p(sample_of(first, mine), sample_of(second, other))
 
 
-def _apart_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure) -> float:
-    """As `_unpaired_p`, of campaigns that have no terrain in common, also where they share numbers."""
+def _disjoint_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure) -> float:
+    """As `_unpaired_p`, for campaigns without common terrains: equal numbers are renumbered."""
     here, there = sample_of(first, mine), sample_of(second, other)
     if not here.terrains.size or not there.terrains.size:
         return math.nan
@@ -367,12 +337,8 @@ def _paired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Fi
     both = np.isfinite(a) & np.isfinite(b)
     if not both.any():
         return math.nan
-    groups = terrain_groups(first)
+    groups = rates.terrain_groups(first)
     shared = None if groups is None else groups[here][both]
     if mine.larger_is_better:
         return compared_successes(a[both] > 0.5, b[both] > 0.5, shared)[2]
     return compared_errors(b[both] - a[both], shared, CONFIDENCE)[3]
-
-
-def _finite(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    return np.where(np.isfinite(values), values, np.nan)

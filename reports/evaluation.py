@@ -1,4 +1,4 @@
-"""A stored campaign with its verdicts, its exit status, and whether a campaign may stop itself."""
+"""Evaluation of a stored campaign: overall verdict, exit status, and the next look of a sequential campaign."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.reports.populations import crashed_cases
+from marsyard.reports.rates import engine_failed
 from marsyard.reports.sampled import INDEPENDENT, Sampled, sampled
 from marsyard.reports.statistics.clusters import ClusterMethod
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
@@ -21,10 +21,7 @@ from marsyard.reports.wording import count
 
 @dataclass(frozen=True)
 class Overall:
-    """A campaign's verdict in one word and one sentence.
-
-    `status` is None where no requirement was asked.
-    """
+    """A campaign's verdict in one word and one sentence; `status` is None without requirements."""
 
     status: Status | None
     crashed: int
@@ -37,8 +34,8 @@ class Overall:
 
 
 def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = INDEPENDENT) -> Overall:
-    """The campaign's verdict: that of the worst requirement, by the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
-    crashed = crashed_cases(frame)
+    """The verdict of the worst requirement, in the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
+    crashed = int(engine_failed(frame).sum())
     statuses = [verdict.status for verdict in verdicts]
     tail = f" {count(crashed, 'case')} crashed." if crashed else ""
     if not statuses:
@@ -46,35 +43,24 @@ def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = IND
     order = (Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE)
     worst = next((status for status in order if status in statuses), Status.PASS)
     if not how.independent:
-        return Overall(worst, crashed, _by_rates(verdicts) + how.no_probability + tail)
+        by_rate = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
+        met = f"{by_rate.count(Status.MET_BY_RATE)} of {count(len(by_rate), 'requirement')}"
+        head = f"{met} met by the rate of these cases. " if by_rate else ""
+        return Overall(worst, crashed, head + how.no_probability + tail)
+    share = f"{statuses.count(worst)} of {count(len(statuses), 'requirement')}"
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
-        Status.MET_BY_RATE: (
-            f"{statuses.count(Status.MET_BY_RATE)} of {count(len(statuses), 'requirement')} met by the rate alone, not "
-            "at the confidence."
-        ),
-        Status.FAIL: f"{statuses.count(Status.FAIL)} of {count(len(statuses), 'requirement')} not met.",
-        Status.INSUFFICIENT: (
-            f"{statuses.count(Status.INSUFFICIENT)} of {count(len(statuses), 'requirement')} "
-            f"cannot be decided by {count(len(frame), 'case')}.{_further(verdicts)}"
-        ),
+        Status.MET_BY_RATE: f"{share} met by the rate alone, not at the confidence.",
+        Status.FAIL: f"{share} not met.",
+        Status.INSUFFICIENT: f"{share} cannot be decided by {count(len(frame), 'case')}.{_further_text(verdicts)}",
     }[worst]
     return Overall(worst, crashed, sentence + tail)
 
 
-def _by_rates(verdicts: Sequence[Verdict]) -> str:
-    """How many requirements the rates of a designed campaign's own cases meet; empty where none is decided by them."""
-    statuses = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
-    if not statuses:
-        return ""
-    met = statuses.count(Status.MET_BY_RATE)
-    return f"{met} of {count(len(statuses), 'requirement')} met by the rate of these cases. "
-
-
 def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
-    """The exit code of a campaign: 1 a requirement failed or a case crashed, 3 some are not shown, 0 otherwise.
+    """The exit code: 1 for a failed requirement or a crashed case, 3 for an undecided one, 0 otherwise.
 
-    A requirement that is MET BY RATE gives 3, unless it says `accept_rate`.
+    MET BY RATE gives 3, unless the requirement has `accept_rate`.
     """
     if crashed or any(one.status is Status.FAIL for one in verdicts):
         return 1
@@ -82,8 +68,8 @@ def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
     return 3 if by_rate or any(one.status is Status.INSUFFICIENT for one in verdicts) else 0
 
 
-def _further(verdicts: Sequence[Verdict]) -> str:
-    """How many cases would decide what is open, or what keeps more cases from it, where that can be said."""
+def _further_text(verdicts: Sequence[Verdict]) -> str:
+    """The further cases that decide all requirements, or why further cases cannot; may be empty."""
     limited = next((verdict for verdict in verdicts if verdict.advice), None)
     if limited is not None:
         return f" {limited.advice}"
@@ -98,7 +84,7 @@ def _further(verdicts: Sequence[Verdict]) -> str:
 
 @dataclass(frozen=True)
 class Judged:
-    """A stored campaign, how its cases were drawn, and its verdicts: each requirement's, and the whole one."""
+    """A stored campaign with its sampling design and its verdicts."""
 
     run: StoredRun
     how: Sampled
@@ -107,18 +93,12 @@ class Judged:
 
     @property
     def exit_code(self) -> int:
-        """The exit status that goes with the verdicts."""
+        """The exit status of the verdicts."""
         return exit_code(self.verdicts, bool(self.whole.crashed))
 
 
 def judged(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Judged:
-    """Judges a campaign's stored rows, by its own requirements or by those given.
-
-    Raises
-    ------
-    marsyard.campaigns.errors.StoreError
-        Where the folder holds no rows.
-    """
+    """Judge a campaign by its own or the given requirements; raises StoreError if the folder holds no rows."""
     run = read_run(directory, requirements)
     how = sampled(run.configuration)
     verdicts = judge_campaign(run.whole, run.requirements, how)
@@ -126,10 +106,10 @@ def judged(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
 
 
 def next_look(verdicts: Sequence[Verdict], how: Sampled, cases: int) -> int | None:
-    """The number of cases at which to look again; None where the campaign may stop.
+    """The number of cases at the next look; None if the campaign may stop.
 
-    It may stop where every requirement is met or not met, or can be neither by the last look with any results of the
-    remaining cases. Requirements that are decided by the estimate do not count.
+    It may stop if every requirement is decided, or no result of the remaining cases can decide it. Requirements that
+    are decided by the estimate do not count.
     """
     if how.most_cases is None or cases >= how.most_cases:
         return None
@@ -141,14 +121,14 @@ def next_look(verdicts: Sequence[Verdict], how: Sampled, cases: int) -> int | No
 
 
 def _open(verdict: Verdict, left: int, share: float) -> bool:
-    """Whether a requirement is undecided, and the cases left can still decide it."""
+    """Whether a requirement is undecided, and the remaining cases can decide it."""
     if verdict.status is not Status.INSUFFICIENT or verdict.decide_by == ESTIMATE:
         return False
     if not 0.0 < verdict.probability < 1.0 or not 0.0 < verdict.confidence < 1.0:
         return False
     confidence = confidence_at(verdict.confidence, share)
     succeeded, n = verdict.n - verdict.failures, verdict.n + left
-    # as for independent cases, all of the population: bounds for shared terrains are never tighter
+    # bounds for independent cases: those for shared terrains are never tighter
     may_pass = proportion_lower(succeeded + left, n, confidence) >= verdict.probability
     may_fail = proportion_upper(succeeded, n, confidence) < verdict.probability
     return may_pass or may_fail

@@ -1,4 +1,4 @@
-"""Figures of a campaign's rows: where errors lie, how often, what drives them, and how cases ended."""
+"""Figures of a campaign's rows: scatter and distribution of errors, errors against conditions, outcomes."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import MaxNLocator
 
 from marsyard.reports.columns import axis_columns, category_column, label, magnitude_label, numbers, split_unit
-from marsyard.reports.populations import ENGINE_FAILURES
+from marsyard.reports.rates import ENGINE_FAILURES
 from marsyard.reports.statistics.plane import error_ellipse
 from marsyard.reports.svg import (
+    BARS,
     INK,
     LARGEST_VECTOR_SAMPLE,
     MARKERS,
@@ -30,21 +31,22 @@ from marsyard.reports.svg import (
 )
 from marsyard.reports.tables import answered_outcomes, outcome_counts
 from marsyard.reports.wording import count as counted
-from marsyard.reports.wording import stated
+from marsyard.reports.wording import plain_value, stated
 
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95
-#: Errors beyond this many times the bound are counted beyond the axis, or one of them would hide all others.
-_FARTHEST = 3.0
-#: Where a larger fraction of the errors would lie beyond the axis, it follows the errors: to this quantile of them.
-_MAX_BEYOND, _FOLLOWED = 0.25, 0.95
-#: Cases behind a point of a conditional curve, and how many points it has at least and at most.
-_CASES_PER_POINT, _FEWEST_POINTS, _MOST_POINTS = 25, 4, 16
+#: Errors beyond this many times the bound are counted beyond the axis, so that they do not hide the others.
+_MAX_BOUNDS = 3.0
+#: If a larger fraction of the errors lies beyond the axis, the axis ends at this quantile of the errors.
+_MAX_BEYOND, _EDGE_QUANTILE = 0.25, 0.95
+#: Cases of a point of a conditional curve, and minimum and maximum number of points.
+_CASES_PER_POINT, _MIN_POINTS, _MAX_POINTS = 25, 4, 16
+_BELOW: Mapping[str, Any] = {"loc": "upper center", "ncols": 2, "handletextpad": 0.2}
 
 
 @dataclass(frozen=True)
 class Category:
-    """Cases of one kind: what to call them, which they are, and how they are marked."""
+    """Cases of one kind: name, mask, colour and marker."""
 
     name: str
     chosen: Bool[np.ndarray, " n"]
@@ -53,11 +55,11 @@ class Category:
 
 
 def categories(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Category]:
-    """The kinds by which points are marked: a column of few values, else within and beyond the bound."""
+    """Kinds of points: by a column of few values, else within and beyond the bound."""
     column = category_column(frame)
     if column is not None:
         values = sorted(frame[column].dropna().unique(), key=lambda value: (isinstance(value, str), value))
-        of_each = [(f"{label(column)} {_plain(value)}", frame[column].eq(value).fillna(False)) for value in values]
+        of_each = [(f"{label(column)} {plain_value(value)}", frame[column].eq(value).fillna(False)) for value in values]
         kinds = [(name, chosen.to_numpy(dtype=np.bool_)) for name, chosen in of_each]
     elif bound is not None:
         magnitude = np.abs(numbers(frame, metric))
@@ -70,20 +72,9 @@ def categories(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Ca
 
 @in_page_style
 def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, close: bool = False) -> Figure | None:
-    """Signed errors against each other, with the requirement's circle (the paper's Fig. 10).
+    """Signed errors x against y with the requirement's circle (the paper's Fig. 10); None without both parts.
 
-    Parameters
-    ----------
-    frame, metric
-        The rows, and the radial error whose x and y parts are drawn.
-    bound
-        Radius of the requirement's circle.
-    close
-        Draws the errors' own extent, without the circle where it lies outside.
-
-    Returns
-    -------
-    The figure; None where there are no parts, or no case has them.
+    close: fit the axes to the errors, also if the circle then lies outside
     """
     parts = axis_columns(metric, [str(column) for column in frame.columns])[:2]
     if len(parts) < 2:
@@ -93,7 +84,10 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
     if not known.any():
         return None
     ellipse = error_ellipse(points, ELLIPSE)
-    reach = _reach(points[known], bound, close)
+    reach = 1.08 * float(np.abs(points[known]).max()) or 1.0
+    if not close and bound is not None and bound > 0.0:
+        near = 1.05 * axis_edge(np.abs(points[known]).max(axis=1), bound)
+        reach = min(reach, near) if reach > 1.15 * bound else 1.15 * bound
     if close and ellipse is not None:
         reach = max(reach, ellipse.reach)
     figure, axes = new_axes(5.0, 4.9)
@@ -107,38 +101,38 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
         axes.plot([], [], "o", markerfacecolor="none", color=INK, label=f"{(known & ~inside).sum():,} beyond the axes")
     if bound is not None:
         axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
-        if bound <= reach * math.sqrt(2.0):  # else the circle lies outside of all four corners
+        if bound <= reach * math.sqrt(2.0):  # else the circle lies outside the axes
             axes.plot([], [], "--", color=REQUIREMENT, label=f"requirement {bound:g} {split_unit(metric)[1]}")
     if ellipse is not None:
         outline: dict[str, Any] = {"fill": False, "color": INK, "linewidth": 1.4, "linestyle": ":", "zorder": 3}
         size = (2.0 * ellipse.semi_major, 2.0 * ellipse.semi_minor)
         axes.add_patch(Ellipse(ellipse.centre, *size, angle=ellipse.angle_deg, **outline))
         axes.plot([], [], ":", color=INK, label=f"{stated(ELLIPSE)} ellipse")
-    _cross(axes)
+    axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1)
+    axes.axvline(0.0, color=MUTED, linewidth=0.8, zorder=1)
     axes.set(xlim=(-reach * 1.04, reach * 1.04), ylim=(-reach * 1.04, reach * 1.04), aspect="equal")
     axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))
-    _legend(axes)
+    axes.legend(bbox_to_anchor=(0.5, -0.14), **_BELOW)
     return figure
 
 
 def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
-    """End of an axis that shows magnitudes next to their bound.
+    """End of an axis of magnitudes: the maximum, limited to 1.1 to 3 times the bound.
 
-    Without a bound, the largest magnitude. With one, at least 1.1 and at most 3 times the bound, so that a few gross
-    errors do not hide the others; where more than a quarter of the magnitudes lie beyond that, their 95 % quantile.
+    If more than a quarter of the magnitudes lie beyond 3 times the bound, it is their 95 % quantile.
     """
     if magnitudes.size == 0:
         return bound or 1.0
     largest = float(magnitudes.max())
     if bound is None or bound <= 0.0:
         return largest or 1.0
-    if float(np.mean(magnitudes > _FARTHEST * bound)) > _MAX_BEYOND:
-        return float(np.quantile(magnitudes, _FOLLOWED, method="higher"))
-    return min(max(largest, 1.1 * bound), _FARTHEST * bound)
+    if float(np.mean(magnitudes > _MAX_BOUNDS * bound)) > _MAX_BEYOND:
+        return float(np.quantile(magnitudes, _EDGE_QUANTILE, method="higher"))
+    return min(max(largest, 1.1 * bound), _MAX_BOUNDS * bound)
 
 
-def worth_a_closer_look(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
-    """Whether all errors are so small against the bound that the circle's figure shows only a blot."""
+def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
+    """Whether all errors are so small against the bound that a figure of their own extent is needed."""
     magnitude = np.abs(numbers(frame, metric))
     known = magnitude[np.isfinite(magnitude)]
     return bound is not None and known.size > 0 and 0.0 < float(known.max()) < 0.6 * bound
@@ -146,9 +140,7 @@ def worth_a_closer_look(frame: pd.DataFrame, metric: str, bound: float | None) -
 
 @in_page_style
 def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Figure | None:
-    """How often each magnitude of error occurred; a bar of its own counts those beyond the axis. None where no case
-    has one.
-    """
+    """Histogram of error magnitudes, with a bar for those beyond the axis; None without errors."""
     magnitude, edge = _magnitudes(frame, metric, bound)
     if magnitude.size == 0:
         return None
@@ -167,20 +159,12 @@ def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Fi
 
 
 def _overflow_bar(axes: Axes, beyond: int, edge: float) -> None:
-    """The magnitudes beyond a histogram's axis: a hatched bar to its right, with their number."""
+    """Draw a hatched bar for the magnitudes beyond the axis, with their number."""
     centre = 1.11 * edge
     axes.bar(centre, beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
     axes.axvline(1.04 * edge, color=MUTED, linewidth=0.8)
-    axes.annotate(
-        f"{beyond:,}\n> {edge:.3g}",
-        (centre, beyond),
-        xytext=(0, 2),
-        textcoords="offset points",
-        ha="center",
-        va="bottom",
-        color=INK,
-        fontsize=8,
-    )
+    text = f"{beyond:,}\n> {edge:.3g}"
+    _annotate(axes, text, (centre, beyond), (0, 2), ha="center", va="bottom", fontsize=8)
     axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= edge])
     axes.set_xlim(0.0, 1.18 * edge)
     axes.margins(y=0.25)
@@ -207,16 +191,17 @@ def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) ->
 
 
 def note_beyond(axes: Axes, beyond: int) -> None:
-    """Write at the right edge of a cumulative curve how many cases lie beyond its axis; nothing where none does."""
+    """Write the number of cases beyond the axis at the right edge of a cumulative curve; nothing for none."""
     if beyond:
         text = f"{counted(beyond, 'case')} beyond →"
         axes.annotate(text, (0.985, 0.04), xycoords="axes fraction", ha="right", va="bottom", color=INK, fontsize=9)
 
 
 @in_page_style
-def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> Figure | None:
-    """Errors against what may drive them; cases without an error are ticks on the upper edge, those beyond the axis
-    hollow marks below it. None without numbers.
+def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> Figure | None:
+    """Errors against a condition; None without numbers.
+
+    Cases without an error are ticks on the upper edge, errors beyond the axis hollow marks below it.
     """
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
     known = np.isfinite(x) & np.isfinite(magnitude)
@@ -224,7 +209,7 @@ def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | 
     if not (known | silent).any():
         return None
     figure, axes = new_axes(4.2, 3.2)
-    edge = _driven_edge(magnitude[known], bound)
+    edge = _scatter_edge(magnitude[known], bound)
     top = 1.12 * edge
     kinds = categories(frame, metric, bound)
     for kind in kinds:
@@ -232,8 +217,8 @@ def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | 
         _draw_points(axes, x[inside], magnitude[inside], kind)
         _draw_points(axes, x[beyond], np.full(beyond.sum(), 1.06 * edge), kind, hollow=True)
     if len(kinds) > 1 and not axis_columns(metric, [str(name) for name in frame.columns]):
-        # no scatter on the page tells them apart
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, handletextpad=0.2)
+        # otherwise the scatter figure has the legend
+        axes.legend(bbox_to_anchor=(0.5, -0.18), **_BELOW)
     _conditional_curves(axes, x[known], np.minimum(magnitude[known], 1.06 * edge))
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
@@ -244,25 +229,25 @@ def error_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | 
     return figure
 
 
-def _driven_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
-    """The largest magnitude drawn to scale; the bound is within the axis where it is near."""
+def _scatter_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
+    """Largest magnitude drawn to scale; the axis includes a bound that is near."""
     edge = axis_edge(magnitudes, bound)
     largest = float(magnitudes.max()) if magnitudes.size else 0.0
     near = bound is not None and 1.12 * largest > 0.6 * bound
     return edge if near or largest == 0.0 else largest
 
 
-def beyond_the_axis(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> int:
-    """How many cases `error_against` draws at its upper edge, hollow."""
+def count_beyond_axis(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> int:
+    """Number of hollow marks of `error_scatter_against`."""
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
     known = magnitude[np.isfinite(x) & np.isfinite(magnitude)]
-    return int((known > _driven_edge(known, bound)).sum())
+    return int((known > _scatter_edge(known, bound)).sum())
 
 
 def _conditional_curves(axes: Axes, x: Float[np.ndarray, " n"], magnitude: Float[np.ndarray, " n"]) -> None:
-    """Median (full) and 95 % quantile (dotted) of the errors in bins of as many cases each; none of few cases."""
-    bins = min(magnitude.size // _CASES_PER_POINT, _MOST_POINTS)
-    if bins < _FEWEST_POINTS:
+    """Draw median (solid) and 95 % quantile (dotted) of the errors in bins of equally many cases."""
+    bins = min(magnitude.size // _CASES_PER_POINT, _MAX_POINTS)
+    if bins < _MIN_POINTS:
         return
     parts = np.array_split(np.argsort(x, kind="stable"), bins)
     middles = [float(np.median(x[part])) for part in parts]
@@ -272,24 +257,16 @@ def _conditional_curves(axes: Axes, x: Float[np.ndarray, " n"], magnitude: Float
 
 @in_page_style
 def outcome_bars(frame: pd.DataFrame) -> Figure | None:
-    """How many cases ended in which way; None where there are no rows."""
+    """Number of cases by outcome; None without rows."""
     counts = outcome_counts(frame)
     if not counts:
         return None
     answered = answered_outcomes(frame)
     figure, axes = new_axes(6.4, 0.75 + 0.36 * len(counts))
-    styles: Mapping[str, Any]
     for place, (name, count) in enumerate(counts):
-        if name in ENGINE_FAILURES:
-            styles = {"color": "none", "edgecolor": REQUIREMENT, "hatch": "xxxx"}
-        elif name in answered:
-            styles = {"color": SERIES[0]}
-        else:
-            styles = {"color": "none", "edgecolor": SERIES[1], "hatch": "////"}
-        axes.barh(place, count, height=0.66, **styles)
-        axes.annotate(
-            f"{count:,}", (count, place), xytext=(4, 0), textcoords="offset points", va="center", color=INK, fontsize=9
-        )
+        style = "crossed" if name in ENGINE_FAILURES else "full" if name in answered else "hatched"
+        axes.barh(place, count, height=0.66, **BARS[style])
+        _annotate(axes, f"{count:,}", (count, place), (4, 0), va="center")
     axes.set_yticks(range(len(counts)), [name for name, _ in counts])
     axes.set(xlabel="cases", xlim=(0.0, 1.12 * max(count for _, count in counts)))
     axes.invert_yaxis()
@@ -298,16 +275,13 @@ def outcome_bars(frame: pd.DataFrame) -> Figure | None:
     return figure
 
 
-def _reach(points: Float[np.ndarray, "n 2"], bound: float | None, close: bool) -> float:
-    """Half the width of the scatter's axes."""
-    extent = 1.08 * float(np.abs(points).max()) or 1.0
-    if close or bound is None or bound <= 0.0:
-        return extent
-    return min(extent, 1.05 * axis_edge(np.abs(points).max(axis=1), bound)) if extent > 1.15 * bound else 1.15 * bound
+def _annotate(axes: Axes, text: str, at: tuple[Any, Any], shift: tuple[int, int], **style: Any) -> None:
+    style = {"fontsize": 9, **style}
+    axes.annotate(text, at, xytext=shift, textcoords="offset points", color=INK, **style)
 
 
 def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[Float[np.ndarray, " known"], float]:
-    """Magnitudes of the errors that are known, and the right edge of an axis that shows them beside the bound."""
+    """Known magnitudes of the errors, and the end of their axis."""
     magnitude = np.abs(numbers(frame, metric))
     known = magnitude[np.isfinite(magnitude)]
     return known, axis_edge(known, bound)
@@ -316,55 +290,22 @@ def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[
 def _draw_points(
     axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], kind: Category, *, hollow: bool = False
 ) -> None:
-    """Points of a kind; hollow where they lie beyond the axes and are drawn at their edge."""
+    """Draw points of a kind, hollow at the edge of the axes."""
     many = x.size > LARGEST_VECTOR_SAMPLE
     axes.plot(
-        x,
-        y,
-        linestyle="",
-        marker=kind.marker,
-        markersize=3.0 if many else 5.5,
-        alpha=0.55 if many else 0.85,
-        markeredgewidth=1.0 if hollow else 0.0,
-        markerfacecolor="none" if hollow else kind.colour,
-        color=kind.colour,
-        label="_beyond" if hollow else kind.name,
-        rasterized=many,
-        zorder=2,
-    )
+        x, y, linestyle="", marker=kind.marker, markersize=3.0 if many else 5.5, alpha=0.55 if many else 0.85,
+        markeredgewidth=1.0 if hollow else 0.0, markerfacecolor="none" if hollow else kind.colour, color=kind.colour,
+        label="_beyond" if hollow else kind.name, rasterized=many, zorder=2,
+    )  # fmt: skip
 
 
 def _bound_line(axes: Axes, metric: str, bound: float | None, height: float) -> None:
-    """The requirement, with its name at a height in fractions of the axes."""
+    """Draw the requirement, with its text at a height in fractions of the axes."""
     if bound is None:
         return
     axes.axvline(bound, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3)
-    # to the left of the line, unless it stands too near to the axis for the text
+    # the text is left of the line unless the line is too near to the y axis
     left = bound > 0.3 * axes.get_xlim()[1]
-    axes.annotate(
-        f"requirement {bound:g} {split_unit(metric)[1]}",
-        (bound, height),
-        xycoords=("data", "axes fraction"),
-        xytext=(-5 if left else 5, 0),
-        textcoords="offset points",
-        ha="right" if left else "left",
-        va="top",
-        color=INK,
-        fontsize=9,
-    )
-
-
-def _cross(axes: Axes) -> None:
-    axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1)
-    axes.axvline(0.0, color=MUTED, linewidth=0.8, zorder=1)
-
-
-def _legend(axes: Axes) -> None:
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, handletextpad=0.2)
-
-
-def _plain(value: object) -> str:
-    """A category's value as text: whole numbers without a decimal point."""
-    if isinstance(value, float) and value.is_integer():
-        return str(int(value))
-    return str(value)
+    text, side = f"requirement {bound:g} {split_unit(metric)[1]}", "right" if left else "left"
+    shift = (-5 if left else 5, 0)
+    _annotate(axes, text, (bound, height), shift, xycoords=("data", "axes fraction"), ha=side, va="top")

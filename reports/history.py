@@ -1,51 +1,38 @@
-"""What nights found, in one SQLite file: figures case by case, so that any later night can be held against them."""
+"""History of nightly runs in an SQLite file, detection of changed figures, and the page `nightly.md`."""
 
 from __future__ import annotations
 
+import math
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.reports.statistics.changes import Sample
+from marsyard.reports.statistics.changes import Sample, difference_p, holm
+from marsyard.reports.wording import count, number, percent, stated
 
 #: Version of the tables, as `PRAGMA user_version`.
 SCHEMA = 1
-#: Nights that a night is held against, at most: the latest ones.
+#: Maximum number of earlier nights that a night is compared with.
 WINDOW = 30
-#: Cases of a figure that are kept of a night, at most.
+#: Maximum number of stored cases of a figure and night.
 MAX_CASES = 10_000
 
 RUNNING, FINISHED, INTERRUPTED = "running", "finished", "interrupted"
 
-_TABLES = f"""
-PRAGMA user_version = {SCHEMA};
-CREATE TABLE nights (
-    night INTEGER PRIMARY KEY, started_utc TEXT NOT NULL, finished_utc TEXT, state TEXT NOT NULL, git_commit TEXT
-);
-CREATE TABLE campaigns (
-    night INTEGER NOT NULL REFERENCES nights, name TEXT NOT NULL, definition TEXT NOT NULL, directory TEXT NOT NULL,
-    verdict TEXT NOT NULL, exit_code INTEGER NOT NULL, sentence TEXT NOT NULL, PRIMARY KEY (night, name)
-);
-CREATE TABLE figures (
-    night INTEGER NOT NULL REFERENCES nights, campaign TEXT NOT NULL, figure TEXT NOT NULL, rate INTEGER NOT NULL,
-    level REAL, amounts BLOB NOT NULL, terrains BLOB NOT NULL, PRIMARY KEY (night, campaign, figure)
-);
-CREATE TABLE changes (
-    night INTEGER NOT NULL REFERENCES nights, campaign TEXT NOT NULL, figure TEXT NOT NULL, p_value REAL NOT NULL,
-    worse INTEGER NOT NULL, PRIMARY KEY (night, campaign, figure)
-);
-"""
+_TABLES = Path(__file__).parent / "templates" / "history.sql"
 
 
 @dataclass(frozen=True)
 class NightCampaign:
-    """What a campaign came to in a night; `definition` tells campaigns of one name but other contents apart."""
+    """Result of a campaign in a night; `definition` identifies the campaign's contents."""
 
     name: str
     definition: str
@@ -57,7 +44,7 @@ class NightCampaign:
 
 @dataclass(frozen=True)
 class NightFigure:
-    """One figure of a campaign in a night: whether it is a rate, its level, and its cases."""
+    """One figure of a campaign in a night: rate or error, its level, and its cases."""
 
     figure: str
     rate: bool
@@ -67,7 +54,7 @@ class NightFigure:
 
 @dataclass(frozen=True)
 class Night:
-    """A night as the history has it."""
+    """A stored night."""
 
     night: int
     started_utc: str
@@ -77,17 +64,9 @@ class Night:
 
 
 class History:
-    """The history, as a context: one writer at a time, every step whole or not at all.
+    """The history as a context manager, with atomic writes; a missing file is created.
 
-    Parameters
-    ----------
-    path
-        The file, which is made where there is none.
-
-    Raises
-    ------
-    StoreError
-        Where it cannot be opened, is no history, or is one of another version.
+    Raises StoreError if the file cannot be opened, is no history, or has another version.
     """
 
     def __init__(self, path: Path) -> None:
@@ -98,7 +77,8 @@ class History:
             self._connection.execute("PRAGMA synchronous = FULL")
             version = self._connection.execute("PRAGMA user_version").fetchone()[0]
             if fresh or (version == 0 and not self._connection.execute("SELECT * FROM sqlite_master").fetchall()):
-                self._connection.executescript(f"BEGIN; {_TABLES} COMMIT;")
+                tables = f"PRAGMA user_version = {SCHEMA}; {_TABLES.read_text(encoding='utf-8')}"
+                self._connection.executescript(f"BEGIN; {tables} COMMIT;")
             elif version != SCHEMA:
                 raise StoreError(f"{path} has schema {version}; this version of Marsyard reads {SCHEMA}")
         except sqlite3.Error as error:
@@ -111,8 +91,8 @@ class History:
         self._connection.close()
 
     def begin(self, git_commit: str | None) -> int:
-        """Begins a night and returns its number; one that was still running was interrupted, and is marked so."""
-        with self._whole():
+        """Begin a night and return its number; a night still marked as running becomes interrupted."""
+        with self._transaction():
             self._connection.execute("UPDATE nights SET state = ? WHERE state = ?", (INTERRUPTED, RUNNING))
             row = self._connection.execute("SELECT COALESCE(MAX(night), 0) + 1 FROM nights").fetchone()
             self._connection.execute(
@@ -121,9 +101,9 @@ class History:
         return int(row[0])
 
     def add(self, night: int, campaign: NightCampaign, figures: Sequence[NightFigure]) -> None:
-        """Keeps what a campaign came to in a night."""
+        """Store the result of a campaign in a night."""
         one = campaign
-        with self._whole():
+        with self._transaction():
             self._connection.execute(
                 "INSERT INTO campaigns VALUES (?, ?, ?, ?, ?, ?, ?)",
                 (night, one.name, one.definition, one.directory, one.verdict, one.exit_code, one.sentence),
@@ -137,8 +117,8 @@ class History:
             )
 
     def finish(self, night: int, state: str, changes: Sequence[tuple[str, str, float, bool]] = ()) -> None:
-        """Ends a night with the changes that it found: campaign, figure, corrected p, whether it is for the worse."""
-        with self._whole():
+        """End a night with its changes: campaign, figure, corrected p, whether it is a regression."""
+        with self._transaction():
             self._connection.executemany(
                 "INSERT INTO changes VALUES (?, ?, ?, ?, ?)", [(night, *one) for one in changes]
             )
@@ -151,7 +131,7 @@ class History:
         return [Night(*row) for row in self._connection.execute("SELECT * FROM nights ORDER BY night DESC")]
 
     def campaigns(self, night: int) -> list[NightCampaign]:
-        """What the campaigns of a night came to, in the order in which they ended."""
+        """Results of the campaigns of a night, in the order in which they ended."""
         rows = self._connection.execute(
             "SELECT name, definition, directory, verdict, exit_code, sentence FROM campaigns WHERE night = ? "
             "ORDER BY rowid",
@@ -172,9 +152,7 @@ class History:
         ]
 
     def before(self, night: int, campaign: NightCampaign, figure: str) -> list[Sample]:
-        """A figure in earlier nights of the same campaign, the latest first: those that came to their end, back to the
-        night that last found it changed, which is the first of the new state.
-        """
+        """A figure in earlier finished nights of the same campaign, the latest first, back to its last change."""
         rows = self._connection.execute(
             """
             SELECT f.amounts, f.terrains FROM figures f
@@ -190,8 +168,7 @@ class History:
         return [_unpacked(*row) for row in rows]
 
     @contextmanager
-    def _whole(self) -> Iterator[None]:
-        """One transaction."""
+    def _transaction(self) -> Iterator[None]:
         try:
             self._connection.execute("BEGIN IMMEDIATE")
             try:
@@ -206,7 +183,7 @@ class History:
 
 
 def utc_now() -> str:
-    """The time, to the second."""
+    """Current time, to the second."""
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
@@ -217,3 +194,137 @@ def _packed(sample: Sample) -> tuple[bytes, bytes]:
 
 def _unpacked(values: bytes, terrains: bytes) -> Sample:
     return Sample(np.frombuffer(values, "<f4").astype(np.float64), np.frombuffer(terrains, "<i8").astype(np.int64))
+
+
+#: Maximum probability of any reported change in a night without changes.
+FALSE_ALARMS = 0.01
+#: Significance level of changes; the other half is for nights that follow a false alarm.
+_LEVEL = 0.5 * FALSE_ALARMS
+#: Expected number of permutations beyond a change at the significance level.
+_RESOLVED = 10
+
+
+@dataclass(frozen=True)
+class Change:
+    """A changed figure.
+
+    rate: whether it is a rate of successes, where more is better, or an error
+    before, now: rate or median in the earlier nights and tonight
+    p_value: corrected for the number of figures compared tonight
+    nights: number of earlier nights
+    """
+
+    campaign: str
+    figure: str
+    rate: bool
+    before: float
+    now: float
+    p_value: float
+    nights: int
+
+    @property
+    def worse(self) -> bool:
+        """Whether the change is a regression."""
+        return self.now < self.before if self.rate else self.now > self.before
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A figure of tonight with its samples in earlier nights."""
+
+    campaign: str
+    figure: NightFigure
+    before: Sequence[Sample]
+
+
+def changes(comparisons: Sequence[Comparison]) -> list[Change]:
+    """The changed figures of a night, with a family-wise rate of false alarms of at most `FALSE_ALARMS`."""
+    pooled = [_pooled(one.before) for one in comparisons]
+    permutations = math.ceil(_RESOLVED * len(comparisons) / _LEVEL)
+    p_values = holm(
+        [
+            math.nan if before is None else difference_p(one.figure.sample, before, permutations)
+            for one, before in zip(comparisons, pooled, strict=True)
+        ]
+    )
+    return [
+        Change(
+            campaign=one.campaign,
+            figure=one.figure.figure,
+            rate=one.figure.rate,
+            before=level_of(before, one.figure.rate),
+            now=level_of(one.figure.sample, one.figure.rate),
+            p_value=p,
+            nights=len(one.before),
+        )
+        for one, before, p in zip(comparisons, pooled, p_values, strict=True)
+        if before is not None and p <= _LEVEL
+    ]
+
+
+def comparisons_of(history: History, night: int) -> list[Comparison]:
+    """Every figure of a night with its samples in earlier nights."""
+    return [
+        Comparison(campaign.name, figure, history.before(night, campaign, figure.figure))
+        for campaign in history.campaigns(night)
+        for figure in history.figures(night, campaign.name)
+    ]
+
+
+def level_of(sample: Sample, rate: bool) -> float:
+    """The rate or the median; NaN for no cases."""
+    known = sample.known().values
+    if known.size == 0:
+        return math.nan
+    return float(known.mean() if rate else np.median(known))
+
+
+def _pooled(samples: Sequence[Sample]) -> Sample | None:
+    """The cases of several nights; None if there are none."""
+    if not samples:
+        return None
+    return Sample(*(np.concatenate([getattr(one, part) for one in samples]) for part in ("values", "terrains")))
+
+
+def night_text(
+    night: Night, earlier: Sequence[Night], campaigns: Sequence[NightCampaign], found: Sequence[Change], compared: int
+) -> str:
+    """The night's page in Markdown.
+
+    earlier: previous nights, the latest first
+    found, compared: changed figures, and how many were compared
+    """
+    worse = [one for one in found if one.worse]
+    better = [one for one in found if not one.worse]
+    counts = Counter(one.verdict for one in campaigns)
+    headline, end = night.state.upper(), f"{night.state}: its figures are kept aside"
+    if night.state == FINISHED:
+        verdicts = ", ".join(f"{cases} {word}" for word, cases in counts.items())
+        headline = verdicts + (f", {count(len(worse), 'regression')}" if worse else "")
+        end = f"ended {night.finished_utc}"
+    lines = [f"# Night {night.night}: {headline}", ""]
+    lines.append(f"Begun {night.started_utc}, {end}; commit {night.git_commit or 'not known'}.")
+    broken = list(takewhile(lambda one: one.state != FINISHED, earlier))
+    lines += [""] * bool(broken)
+    lines += [f"Night {one.night}, begun {one.started_utc}, was {one.state}." for one in broken]
+    lines += ["", "| Campaign | Verdict | |", "|---|---|---|"]
+    lines += [f"| {_cell(one.name)} | {_cell(one.verdict)} | {_cell(one.sentence)} |" for one in campaigns]
+    for title, some in (("Regressions", worse), ("Improvements", better)):
+        if some:
+            lines += ["", f"## {title}", ""]
+        for one in some:
+            show = percent if one.rate else number
+            figures = f"{show(one.before)} in {count(one.nights, 'night')} before, {show(one.now)} now"
+            lines.append(f"- **{_cell(one.campaign)}: {_cell(one.figure)}**: {figures} (p = {one.p_value:.1g})")
+    text = (
+        f"{count(compared, 'figure')} compared with the nights before; the chance of any false alarm is at most "
+        f"{stated(FALSE_ALARMS)}.{'' if found else ' None has changed.'}"
+    )
+    lines += ["", text if compared else "No figure has a history to be compared with yet.", ""]
+    return "\n".join(lines)
+
+
+def _cell(text: str) -> str:
+    """A text escaped for a table of Markdown."""
+    marks = {letter: f"&#{ord(letter)};" for letter in "&<>|"} | {letter: f"\\{letter}" for letter in "\\`*_[]#"}
+    return "".join(marks.get(letter, letter) for letter in " ".join(text.split()))

@@ -1,13 +1,12 @@
-"""Kinds of report sections as data: what a system declares instead of writing a section by hand.
+"""Kinds of report sections as data: a `SectionDeclaration` of parts, each of which draws blocks and their numbers.
 
-A `SectionDeclaration` is a section of parts. A part takes the section's rows and gives a block of the page and the same
-in numbers: `RateTable`, `RateByCondition`, `OutcomesBySize`, `Distribution`, `Statistics`, `Quantiles`, `MadeBy` and
-`marsyard.reports.scatter.Scatter`. `marsyard.reports.papers.PaperFacts` is a section of its own. `docs/reports.md` has
-an example.
+Parts: `RateTable`, `RateByCondition`, `OutcomesBySize`, `Distribution`, `Statistics`, `Quantiles`, `Scatter`, `MadeBy`.
+`marsyard.reports.papers.PaperFacts` is a section of its own. Example: `docs/reports.md`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol, runtime_checkable
@@ -16,7 +15,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from marsyard.reports.charts import RateLine, cumulative_figure, rate_figure, stacked_bars
+from marsyard.reports.charts import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
 from marsyard.reports.columns import label, numbers
 from marsyard.reports.rates import (
     CONFIDENCE,
@@ -30,19 +29,21 @@ from marsyard.reports.rates import (
     rate_text,
     share_of,
     share_text,
+    terrain_groups,
     varies,
 )
 from marsyard.reports.section import Block, Grid, Section, Subject, plate
+from marsyard.reports.statistics.drivers import FEWEST_CASES, driver
 from marsyard.reports.tables import error_summaries, statistics_grid
-from marsyard.reports.wording import NOTHING, number, percent, stated
+from marsyard.reports.wording import NOTHING, coefficient, number, percent, stated
 
 Rows = pd.DataFrame
 Drawn = tuple[Sequence[Block], Mapping[str, Any]]
 RateOf = Callable[[Rows], Share | PooledRate]
-#: Bins of a condition, each with as many cases as the others, and the fewest cases of one.
-_BINS, _FEWEST_IN_BIN = 5, 4
-#: Values of a condition that are shown one by one, at most.
-_MOST_VALUES = 24
+#: Number of bins of a condition with equally many cases, and the minimum number of cases of one.
+_BINS, _MIN_IN_BIN = 5, 4
+#: Maximum number of values of a condition that are shown one by one.
+_MAX_VALUES = 24
 
 
 @runtime_checkable
@@ -50,25 +51,16 @@ class Part(Protocol):
     """A part of a declared section."""
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """Blocks of the page and their numbers; `key` is for identifiers of figures. No blocks: nothing to show."""
+        """Blocks of the page and their numbers; `key` prefixes identifiers of figures. No blocks: nothing to show."""
 
 
 @dataclass(frozen=True)
 class SectionDeclaration:
     """A section declared by its parts; call it with a `Subject` to make the section.
 
-    Attributes
-    ----------
-    key, name, title
-        As of `marsyard.reports.section.Section`.
-    parts
-        What it shows, in order.
-    requires
-        Columns without which there is no section: each must be there and have a value.
-    rows
-        The rows that it is about, chosen or extended; None for no section.
-    note
-        What a reader must know of all of it.
+    requires: columns that must exist and have a value
+    rows: rows of the section, chosen or extended; None for no section
+    note: text below all parts
     """
 
     key: str
@@ -80,7 +72,7 @@ class SectionDeclaration:
     note: str = ""
 
     def __call__(self, subject: Subject) -> Section | None:
-        """The section; None where the rows lack what it requires, or no part has anything to show."""
+        """The section; None if the rows lack required columns, or no part has blocks."""
         frame = self.rows(subject)
         if frame is None or any(name not in frame or frame[name].isna().all() for name in self.requires):
             return None
@@ -92,9 +84,8 @@ class SectionDeclaration:
             data |= values
         if not blocks:
             return None
-        return Section(
-            self.key, self.name, self.title, [*blocks, *([Block(note=self.note)] if self.note else [])], data
-        )
+        blocks += [Block(note=self.note)] if self.note else []
+        return Section(self.key, self.name, self.title, blocks, data)
 
 
 @dataclass(frozen=True)
@@ -104,13 +95,13 @@ class MadeBy:
     function: Callable[[Rows, Subject, str], Drawn]
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """What the function makes."""
+        """Call the function."""
         return self.function(frame, subject, key)
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of numbers: its name for readers (by default its own in words), and what it is multiplied by."""
+    """A column of numbers with its name for readers (by default the column in words) and a scale."""
 
     column: str
     name: str = ""
@@ -122,28 +113,29 @@ class Quantity:
         return self.name or label(self.column)
 
     def values(self, frame: Rows) -> Float[np.ndarray, " n"]:
-        """The column's numbers; NaN where there are none."""
+        """The scaled numbers; NaN if missing."""
         return np.asarray(self.scale * numbers(frame, self.column))
 
 
 def flagged(name: str, *among: str, wanted: bool = True) -> RateOf:
-    """The share of rows whose flag is as wanted, among those that have all of the other flags."""
+    """Fraction of rows whose flag is as wanted, among the rows with all of the other flags."""
 
     def rate(frame: Rows) -> Share:
-        chosen = frame[np.logical_and.reduce([np.ones(len(frame), dtype=bool), *(flag(frame, one) for one in among)])]
+        every = np.ones(len(frame), dtype=np.bool_)
+        chosen = frame[np.logical_and.reduce([every, *(flag(frame, one) for one in among)])]
         return share_of(flag(chosen, name) == wanted, chosen)
 
     return rate
 
 
 def pooled(hits: str, of: str) -> RateOf:
-    """The share of one column of counts in another, pooled over the rows."""
+    """Fraction of one column of counts in another, pooled over the rows."""
     return lambda frame: pooled_rate(frame, hits, of)
 
 
 @dataclass(frozen=True)
 class Rate:
-    """A rate of rows: its key in `report.json`, its name for readers, how it is found, and whether figures draw it."""
+    """A rate of rows: key in `report.json`, name for readers, function, and whether figures draw it."""
 
     key: str
     name: str
@@ -153,9 +145,10 @@ class Rate:
 
 @dataclass(frozen=True)
 class RateTable:
-    """A table of rates with their intervals; `rates` may also be made from the rows.
+    """A table of rates with their intervals.
 
-    `shared` says whether the intervals allow for cases that share terrains.
+    rates: declared, or made from the rows
+    shared: whether the intervals allow for cases that share terrains
     """
 
     rates: Sequence[Rate] | Callable[[Rows], Mapping[str, Share]]
@@ -167,7 +160,6 @@ class RateTable:
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
         """The rates that have cases."""
-        del subject, key
         rates = self.rates(frame) if callable(self.rates) else {one.name: one.of(frame) for one in self.rates}
         rows = [
             [name, share_text(one), interval_text(one, shared=self.shared)]
@@ -183,18 +175,10 @@ class RateTable:
 class RateByCondition:
     """Rates against a condition, as a table and as curves.
 
-    Attributes
-    ----------
-    by
-        The condition: its values where they are few, else bins of as many cases each.
-    rates
-        The rates; table columns and, where drawn, curves.
-    cases, ylabel, text, note, caption
-        Words for the table's cases, the figure's axis, the text above, the note below, and the figure's caption.
-    limit
-        A vertical line: its name, and its place found from the campaign.
-    data
-        Name of the list in `report.json`.
+    by: the condition: single values, or bins of equally many cases if it has many
+    cases, ylabel, text, note, caption: heading of the table's cases, label of the figure's axis, and texts
+    limit: name of a vertical line, and its position by campaign
+    data: key of the list in `report.json`
     """
 
     by: Quantity
@@ -208,19 +192,22 @@ class RateByCondition:
     data: str = "by_condition"
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The table and the curves; nothing where the condition does not vary."""
+        """The table and the curves; nothing if the condition does not vary."""
         if not varies(frame, self.by.column):
             return [], {}
         values = self.by.values(frame)
         records = []
-        for chosen in condition_bins(values, _MOST_VALUES):
+        for chosen in condition_bins(values, _MAX_VALUES):
             rates = {one.key: one.of(frame[chosen]) for one in self.rates}
             records.append((float(np.median(values[chosen])), int(chosen.sum()), rates))
         limit = None if self.limit is None else (self.limit[0], self.limit[1](subject))
         x = [value for value, _, _ in records]
         lines = [RateLine(one.name.lower(), x, [r[one.key] for _, _, r in records]) for one in self.rates if one.drawn]
         figure = rate_figure(lines, (self.by.title, self.ylabel), limit)
-        rows = [[f"{x:.4g}", f"{n:,}", *(_any_rate_text(one) for one in rates.values())] for x, n, rates in records]
+        rows = []
+        for value, n, rates in records:
+            texts = [share_text(one) if isinstance(one, Share) else rate_text(one) for one in rates.values()]
+            rows.append([f"{value:.4g}", f"{n:,}", *texts])
         grid = Grid([self.by.title, self.cases, *(one.name for one in self.rates)], rows)
         data: dict[str, Any] = {
             self.data: [
@@ -233,17 +220,13 @@ class RateByCondition:
         return [block, Block(grid=grid, note=self.note)], data
 
 
-def _any_rate_text(one: Share | PooledRate) -> str:
-    return share_text(one) if isinstance(one, Share) else rate_text(one)
-
-
-def condition_bins(values: Float[np.ndarray, " n"], most_values: int = _BINS) -> list[Bool[np.ndarray, " n"]]:
-    """Masks of each value where there are few, else of bins with as many cases each; without a value: in none."""
+def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _BINS) -> list[Bool[np.ndarray, " n"]]:
+    """Masks of single values if they are few, else of bins of equally many cases; NaN is in none."""
     finite = np.isfinite(values)
     kinds = np.unique(values[finite])
-    if kinds.size <= most_values:
+    if kinds.size <= max_values:
         return [values == kind for kind in kinds]
-    bins = max(1, min(_BINS, int(finite.sum()) // _FEWEST_IN_BIN))
+    bins = max(1, min(_BINS, int(finite.sum()) // _MIN_IN_BIN))
     ranks = np.full(values.size, -1)
     ranks[finite] = np.argsort(np.argsort(values[finite], kind="stable"), kind="stable") * bins // int(finite.sum())
     return [ranks == k for k in range(bins)]
@@ -251,21 +234,13 @@ def condition_bins(values: Float[np.ndarray, " n"], most_values: int = _BINS) ->
 
 @dataclass(frozen=True)
 class OutcomesBySize:
-    """What became of cases, by a kind and its size (a fault and its severity): a table and stacked bars.
+    """Outcomes of cases by a kind and its size (a fault and its severity): a table and stacked bars.
 
-    Attributes
-    ----------
-    outcomes
-        Which rows ended in which way, by a key of `report.json`, in the order of the bars; the last is the harm, whose
-        share has an interval.
-    styles
-        Of the outcomes: a name for readers and a style of `marsyard.reports.charts.BARS`.
-    cases
-        What the rows are called.
-    wording
-        The kind and the size in words; the size is empty where there is none.
-    further
-        Further columns: a heading, a key of `report.json`, a value of the rows, and its text.
+    outcomes: masks of the rows by key of `report.json`, in the order of the bars; the last has an interval
+    styles: name for readers and style of `marsyard.reports.svg.BARS` by outcome
+    cases: heading of the rows
+    wording: kind and size in words; no size is empty
+    further: further columns: heading, key of `report.json`, value of the rows, and its text
     """
 
     outcomes: Callable[[Rows, Subject], Mapping[str, Bool[np.ndarray, " n"]]]
@@ -280,7 +255,7 @@ class OutcomesBySize:
     caption: str = ""
 
     def records(self, frame: Rows, subject: Subject) -> list[dict[str, Any]]:
-        """Counts of each kind and size, those without a fault first."""
+        """Counts of each kind and size, cases without a fault first."""
         records = []
         for kind, size, chosen in by_size(frame, self.kind, self.size, self.none):
             ended = self.outcomes(chosen, subject)
@@ -292,7 +267,7 @@ class OutcomesBySize:
         return records
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The table and the bars; nothing where no row has a fault."""
+        """The table and the bars; nothing if no row has a fault."""
         if self.kind not in frame:
             return [], {}
         records = self.records(frame, subject)
@@ -325,17 +300,7 @@ class OutcomesBySize:
 
 @dataclass(frozen=True)
 class Distribution:
-    """Cumulative curves: the share of cases up to each value, or from each value on.
-
-    Attributes
-    ----------
-    curves
-        Quantities by the curve's name; or a function of the rows that gives values by name.
-    labels
-        Of the axes.
-    falling, bound, limits
-        As of `marsyard.reports.charts.cumulative_figure`.
-    """
+    """Cumulative curves of quantities, or of values by name; see `marsyard.reports.charts.cumulative_figure`."""
 
     curves: Sequence[Quantity] | Callable[[Rows], Mapping[str, Float[np.ndarray, " n"]]]
     labels: tuple[str, str]
@@ -347,8 +312,7 @@ class Distribution:
     table: Callable[[Mapping[str, Float[np.ndarray, " n"]]], Grid] | None = None
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The curves, with their table where there is one; nothing where no curve has a value."""
-        del subject
+        """The curves and their table; nothing if no curve has a value."""
         if callable(self.curves):
             curves = self.curves(frame)
         else:
@@ -362,21 +326,20 @@ class Distribution:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Mean, spread and quantiles of a column and of its signed parts, with intervals."""
+    """Mean, standard deviation and quantiles of a column and of its signed parts, with intervals."""
 
     column: str
     heading: str = ""
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
         """The table."""
-        del subject, key
         data = {name: asdict(one) for name, one in error_summaries(frame, self.column)}
         return [Block(heading=self.heading, grid=statistics_grid(frame, self.column))], data
 
 
 @dataclass(frozen=True)
 class Quantiles:
-    """Quantiles of quantities, a row each; `columns` has a heading for each probability."""
+    """Quantiles of quantities; `columns` maps headings to probabilities."""
 
     quantities: Sequence[Quantity]
     columns: Mapping[str, float]
@@ -385,8 +348,7 @@ class Quantiles:
     data: str = ""
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The quantities that the rows have; nothing where there is none."""
-        del subject, key
+        """The quantities that the rows hold; nothing if they hold none."""
         rows = []
         for one in self.quantities:
             values = known(frame, one.column, one.scale)
@@ -394,3 +356,68 @@ class Quantiles:
                 rows.append([one.title, *(number(float(q)) for q in np.quantile(values, [*self.columns.values()]))])
         block = Block(heading=self.heading, grid=Grid(["", *self.columns], rows), note=self.note)
         return ([block], {self.data: len(frame)} if self.data else {}) if rows else ([], {})
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Effect of a condition on a response: Spearman's correlation with its interval, and medians in bins."""
+
+    driver: str
+    error: str
+    rank_correlation: float
+    lower: float
+    upper: float
+    centres: Sequence[float]
+    medians: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Responses against conditions that vary: points, medians of bins, and rank correlations."""
+
+    x: Sequence[Quantity]
+    y: Sequence[Quantity]
+    caption: str
+    heading: str = ""
+    logarithmic: bool = False
+
+    def effects(self, frame: Rows) -> list[Effect]:
+        """Effects of every condition that varies on every response."""
+        effects, groups = [], terrain_groups(frame)
+        for one in (one for one in self.x if varies(frame, one.column)):
+            for response in self.y:
+                x, y = one.values(frame), response.values(frame)
+                bins = condition_bins(np.where(np.isfinite(y), x, np.nan))
+                medians = [[float(np.median(values[chosen])) for chosen in bins] for values in (x, y)]
+                ranks = driver(x, y, groups, CONFIDENCE)
+                of_ranks = (math.nan,) * 3 if ranks is None else (ranks.correlation, ranks.lower, ranks.upper)
+                effects.append(Effect(one.title, response.title, *of_ranks, *medians))
+        return effects
+
+    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
+        """The panels and the rank correlations; nothing if no condition varies."""
+        effects = self.effects(frame)
+        if not effects:
+            return [], {}
+        columns = {one.title: one.values(frame) for one in (*self.x, *self.y)}
+        panels = {
+            (one.driver, one.error): ((columns[one.driver], columns[one.error]), (one.centres, one.medians))
+            for one in effects
+        }
+        texts: dict[str, list[str]] = {}
+        for one in effects:
+            texts.setdefault(one.driver, []).append(correlation_text(one))
+        head = ["Rank correlation", *(one.title for one in self.y)]
+        grid = Grid(head, [[name, *cells] for name, cells in texts.items()])
+        figure = scatter_panels(panels, logarithmic=self.logarithmic)
+        note = f"Intervals at {stated(CONFIDENCE)} confidence; a dash for fewer than {FEWEST_CASES} cases or constants."
+        plates = [plate(figure, key, self.caption, wide=len(effects) > 1)]
+        data = {"effects": [asdict(one) for one in effects]}
+        return [Block(heading=self.heading, plates=plates, grid=grid, note=note)], data
+
+
+def correlation_text(effect: Effect) -> str:
+    """A rank correlation with its interval; a dash for NaN."""
+    if math.isnan(effect.rank_correlation):
+        return NOTHING
+    return f"{coefficient(effect.rank_correlation)} ({coefficient(effect.lower)} to {coefficient(effect.upper)})"

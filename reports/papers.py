@@ -1,4 +1,4 @@
-"""Numbers of papers, each paper's in one TOML file, next to ours."""
+"""Numbers of papers, from one TOML file each, next to ours."""
 
 from __future__ import annotations
 
@@ -19,51 +19,47 @@ from marsyard.reports.wording import NOTHING
 
 @cache
 def read_paper(path: Path) -> Mapping[str, Any]:
-    """A paper's numbers from its TOML file; see `PaperFacts` for the facts of campaigns."""
+    """Read the numbers of a paper from its TOML file."""
     with path.open("rb") as file:
         return tomllib.load(file)
 
 
 @dataclass(frozen=True)
 class PaperFacts:
-    """What a paper reports of single runs, next to ours: `[[facts]]` of its TOML file.
+    """A paper's numbers of single runs next to ours: `[[facts]]` of its TOML file.
 
-    Each has `campaign` (the name of the campaign that repeats the run), `title`, `source`, `note`, and `rows`. A row
-    has `name` (with its unit), `paper` (the paper's value as text; none for a dash), `column`, and optionally
-    `statistic` (``spread``, the median with least and greatest, or ``rate``), `among` (flags that choose rows),
-    `scale`, `digits` and `magnitude` (whether signs are dropped).
+    Keys: `campaign` (that repeats the run), `title`, `source`, `note`, and `rows`. Keys of a row: `name` (with its
+    unit), `paper` (text, a dash by default), `column`, and optionally `statistic` (``spread``, the median with minimum
+    and maximum, or ``rate``), `among` (flags that choose rows), `scale`, `digits`, and `magnitude` (drop signs).
 
-    Attributes
-    ----------
-    path
-        The file.
-    further
-        What a campaign's section has in addition.
+    further: additional parts by campaign
     """
 
     path: Path
     further: Mapping[str, Part] = field(default_factory=dict)
 
     def __call__(self, subject: Subject) -> Section | None:
-        """The section; None where no run of the paper has the campaign's name."""
+        """The section; None if the paper has no run of the campaign's name."""
         facts = {one["campaign"]: one for one in read_paper(self.path)["facts"]}.get(subject.run.name)
         if facts is None or not any(row["column"] in subject.frame for row in facts["rows"]):
             return None
-        texts = {row["name"]: (row.get("paper", NOTHING), ours_text(subject.frame, row)) for row in facts["rows"]}
-        grid = Grid(["", "Paper", "Ours"], [[name, paper, ours] for name, (paper, ours) in texts.items()])
-        data: dict[str, Any] = {name: {"paper": paper, "ours": ours} for name, (paper, ours) in texts.items()}
+        data: dict[str, Any] = {
+            row["name"]: {"paper": row.get("paper", NOTHING), "ours": format_own_value(subject.frame, row)}
+            for row in facts["rows"]
+        }
+        grid = Grid(["", "Paper", "Ours"], [[name, *one.values()] for name, one in data.items()])
         blocks = [Block(grid=grid, note=f"{_MEDIANS} {facts.get('note', '')}".strip())]
         if subject.run.name in self.further:
             shown, numbers_too = self.further[subject.run.name].draw(subject.frame, subject, "paper")
             blocks += shown
             data |= numbers_too
-        return Section("paper", "Beside the paper", facts["title"], blocks, data)
+        return Section("paper", "Paper comparison", facts["title"], blocks, data)
 
 
-_MEDIANS = "Ours: the median over all cases, and least to greatest in brackets. A dash: the paper does not say."
+_MEDIANS = "Ours: median over all cases, minimum to maximum in brackets. A dash: not stated by the paper."
 
 
-def ours_text(frame: Rows, row: Mapping[str, Any]) -> str:
+def format_own_value(frame: Rows, row: Mapping[str, Any]) -> str:
     """Our value of a paper's quantity."""
     chosen, column = frame[all_flags(frame, *row.get("among", ()))], row["column"]
     if row.get("statistic") == "rate":

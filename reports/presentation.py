@@ -1,7 +1,6 @@
-"""How a system's results are presented: its report sections, and the pictures of its cases.
+"""Presentation of a system: its report sections, and the pictures of its cases.
 
-A system names its `Presentation` in `marsyard.scenarios.system.System.report`; reports know systems by the registry
-alone (`marsyard.scenarios.systems`).
+`marsyard.scenarios.system.System.report` names it; reports find systems in `marsyard.scenarios.systems`.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from matplotlib.figure import Figure
 
 from marsyard.reports.section import Plate, SectionMaker
 from marsyard.scenarios.dotted import found_at
-from marsyard.scenarios.system import System
 from marsyard.scenarios.systems import systems
 
 Products = Mapping[str, Any]
@@ -27,7 +25,7 @@ Products = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class TableRow:
-    """A row of a case's table: its values as texts, and whether the case that it describes succeeded."""
+    """A row of a case's table, and whether its item succeeded."""
 
     values: Sequence[str]
     succeeded: bool
@@ -35,7 +33,7 @@ class TableRow:
 
 @dataclass(frozen=True)
 class CaseView:
-    """A case as its page shows it: facts by name, figures, and a table; `legend` in place of its kind's."""
+    """View of a case on the page: facts, figures and a table; `legend` replaces the legend of its kind."""
 
     facts: Sequence[tuple[str, str]]
     plates: Sequence[Plate]
@@ -46,18 +44,10 @@ class CaseView:
 
 @dataclass(frozen=True)
 class CaseKind:
-    """How cases of one kind are drawn, from their products alone.
+    """Functions that draw cases of one kind from their products.
 
-    Attributes
-    ----------
-    is_case
-        Whether products are those of such a case.
-    view
-        What the page shows of it; the text names it in figures' identifiers.
-    write
-        Writes its figures into a folder and returns their paths; raises OSError where they cannot be written.
-    legend
-        What a reader of the page's figures must know.
+    view: view for the page; its text argument prefixes identifiers of figures
+    write: write the figures into a folder and return the paths; raises OSError if they cannot be written
     """
 
     is_case: Callable[[Products], bool]
@@ -68,17 +58,10 @@ class CaseKind:
 
 @dataclass(frozen=True)
 class Presentation:
-    """What reports show of a system beyond what they show of every campaign.
+    """Report sections and case figures of a system.
 
-    Attributes
-    ----------
-    cases
-        Kinds of case; the first whose products they are draws a case.
-    sections
-        Sections after those that every campaign has, in the order of the page. A section is left out where its
-        function returns None, so that each applies to its own rows alone.
-    first
-        Sections before those that every campaign has.
+    cases: kinds of case; the first that matches the products draws a case
+    sections, first: sections after and before those of every campaign; makers return None for rows of other systems
     """
 
     cases: Sequence[CaseKind] = ()
@@ -88,40 +71,37 @@ class Presentation:
 
 @cache
 def presentations() -> tuple[Presentation, ...]:
-    """The presentations of all systems that have one, in the order of the registry.
-
-    One that cannot be used is left out with a warning: no system keeps the others from their reports.
-    """
-    found = []
+    """The presentations of all systems in the order of the registry; an unusable one is left out with a warning."""
+    found: list[Presentation] = []
     for system in systems():
+        if not system.report:
+            continue
+        stated = f"the report '{system.report}' of system '{system.name}'"
         try:
-            found += [_presentation(system)] if system.report else []
-        except ValueError as error:
-            warnings.warn(f"{error}; its sections and pictures are left out", stacklevel=2)
+            presentation = found_at(system.report)
+        except ImportError as error:
+            _warn(f"{stated} cannot be imported: {error}")
+            continue
+        if isinstance(presentation, Presentation):
+            found.append(presentation)
+        else:
+            kind = type(presentation).__name__
+            _warn(f"{stated} is a {kind}; allowed: a marsyard.reports.presentation.Presentation")
     return tuple(found)
 
 
-def _presentation(system: System) -> Presentation:
-    """The presentation of a system that names one. Raises ValueError where it cannot be used."""
-    stated = f"the report '{system.report}' of system '{system.name}'"
-    try:
-        presentation = found_at(system.report)
-    except ImportError as error:
-        raise ValueError(f"{stated} cannot be imported: {error}") from error
-    if not isinstance(presentation, Presentation):
-        kind = type(presentation).__name__
-        raise ValueError(f"{stated} is a {kind}; allowed: a marsyard.reports.presentation.Presentation")
-    return presentation
+def _warn(reason: str) -> None:
+    warnings.warn(f"{reason}; its sections and pictures are left out", stacklevel=3)
 
 
 def case_kind(products: Products) -> CaseKind | None:
-    """The kind of case whose products these are; None where no system knows them."""
+    """The kind of case of these products; None if no system recognizes them."""
     kinds = (kind for presentation in presentations() for kind in presentation.cases)
     return next((kind for kind in kinds if kind.is_case(products)), None)
 
 
 def save_figures(directory: Path, figures: Mapping[str, Figure], dpi: int = 110) -> list[Path]:
-    """Write figures as PNG on white, by their names; returns their paths."""
+    """Write figures as PNG on white; returns their paths."""
     paths = [directory / f"{name}.png" for name in figures]
     for path, figure in zip(paths, figures.values(), strict=True):
         figure.savefig(path, dpi=dpi, facecolor="#ffffff", metadata={"Software": None})
@@ -129,7 +109,7 @@ def save_figures(directory: Path, figures: Mapping[str, Figure], dpi: int = 110)
 
 
 def numbers(value: object) -> Float[np.ndarray, "..."] | None:
-    """A product as float64; None where it is something else. Products come from files."""
+    """A product as float64; None if it is not numeric."""
     if value is None:
         return None
     try:
@@ -139,15 +119,24 @@ def numbers(value: object) -> Float[np.ndarray, "..."] | None:
 
 
 def plane(value: object) -> Float[np.ndarray, "_ _"] | None:
-    """A product of two dimensions with something in it; None where it is something else."""
+    """A non-empty product of two dimensions; None otherwise."""
     values = numbers(value)
     return values if values is not None and values.ndim == 2 and values.size else None
 
 
 def shaped(value: object, *shape: int | None) -> Float[np.ndarray, "..."] | None:
-    """A product of this shape, where None stands for any length; None where it is something else."""
+    """A product of a shape, where None is any length; None otherwise."""
     values = numbers(value)
     if values is None or values.ndim != len(shape):
         return None
     fits = all(wanted in (None, length) for wanted, length in zip(shape, values.shape, strict=True))
     return values if fits else None
+
+
+def read_arrays(
+    products: Products, shapes: Mapping[str, tuple[int | None, ...]], *, finite: bool = False
+) -> list[Float[np.ndarray, "..."]] | None:
+    """Products by name and shape, optionally finite; None if one of them is something else."""
+    found = [shaped(products.get(name), *shape) for name, shape in shapes.items()]
+    known = [one for one in found if one is not None and (not finite or np.isfinite(one).all())]
+    return known if len(known) == len(shapes) else None

@@ -1,4 +1,4 @@
-"""How a campaign's cases were drawn, and what may be said of them: only independent draws carry a probability."""
+"""Sampling design of a stored campaign: only independent random draws allow probability statements."""
 
 from __future__ import annotations
 
@@ -22,16 +22,10 @@ RANDOM = "random"
 
 @dataclass(frozen=True)
 class TerrainSupply:
-    """The terrains that a campaign's cases can be on.
+    """The terrains that a campaign's cases can use.
 
-    Attributes
-    ----------
-    terrains
-        How many there are.
-    key
-        What sets their number: the parameter of the bank's size, or the dispersion of the terrain's number.
-    in_turn
-        Whether the cases take them one after the other; otherwise they draw them with replacement.
+    key: parameter that sets their number: size of the bank, or dispersion of the terrain's number
+    in_turn: whether cases use them in turn; otherwise drawn with replacement
     """
 
     terrains: int
@@ -39,34 +33,26 @@ class TerrainSupply:
     in_turn: bool = False
 
     def advice(self, fewest: int, probability: float, confidence: float) -> str:
-        """Why further cases cannot help, and the change that does."""
+        """Why further cases cannot help, and the change that does; `fewest` terrains are needed."""
         asked = f"{stated(probability)} at {stated(confidence)} confidence takes at least {count(fewest, 'terrain')}"
         has = f"The campaign draws from {count(self.terrains, 'terrain')} ({self.key} = {self.terrains}); {asked}"
         if not self.key.endswith(".bank"):
             return f"{has}: widen the range of {self.key}, and the bank, and run the campaign again."
-        # cases that draw a terrain each from ten times as many rarely meet: 1.1 cases a terrain are enough
+        # random draws from ten times as many terrains rarely repeat: 1.1 cases per terrain suffice
         bank, cases = (fewest, fewest) if self.in_turn else (10 * fewest, math.ceil(1.1 * fewest))
         return f"{has}: run the campaign again with --set {self.key}={bank} -n {cases}."
 
 
 @dataclass(frozen=True)
 class Sampled:
-    """How cases were laid out.
+    """The sampling design of a campaign.
 
-    Attributes
-    ----------
-    design
-        `random`, `latin-hypercube` or `sobol`.
-    grids
-        Paths of the parameters that were swept as a grid.
-    nominal
-        Whether case 0 is the nominal one, which nothing was drawn for.
-    most_cases
-        Cases of the last look at a campaign that stops itself when it is decided; None where it does not.
-    first_look
-        Cases at which the campaign was judged for the first time, where cases have been appended since; else None.
-    terrains
-        The terrains that the cases draw from; None where the configuration does not say.
+    design: `random`, `latin-hypercube` or `sobol`
+    grids: paths of the parameters that were swept as a grid
+    nominal: whether case 0 is the nominal one, without draws
+    most_cases: cases of the last look of a sequential campaign; else None
+    first_look: cases at the first verdict if cases were appended since; else None
+    terrains: the terrains that the cases draw from; None if unknown
     """
 
     design: str = RANDOM
@@ -83,33 +69,27 @@ class Sampled:
 
     @property
     def text(self) -> str:
-        """How the cases were laid out, in words."""
+        """The design in words."""
         return said_of(self.design, self.grids, nominal=self.nominal)
 
     @property
     def no_probability(self) -> str:
-        """Why the cases carry no probability statement; empty where they do."""
+        """Why the cases allow no probability statement; empty if they do."""
         if self.independent:
             return ""
+        changes = [] if self.design == RANDOM else ['set design.kind = "random"']
+        remedy = " and ".join([*changes, *(f"give '{path}' a distribution that is drawn" for path in self.grids)])
         return (
             f"No probability statement: the design is {said_of(self.design, self.grids, nominal=False)}, and only "
-            f"independent random draws carry one. {self._remedy}"
+            f"independent random draws carry one. {remedy[:1].upper()}{remedy[1:]}, and run it again."
         )
 
-    @property
-    def _remedy(self) -> str:
-        """The change that gives independent random draws."""
-        changes = [] if self.design == RANDOM else ['set design.kind = "random"']
-        changes += [f"give '{path}' a distribution that is drawn" for path in self.grids]
-        text = " and ".join(changes)
-        return f"{text[:1].upper()}{text[1:]}, and run it again."
-
     def risk_share(self, cases: int) -> float:
-        """Which share of the risk that a confidence leaves may be spent on a judgement of so many cases."""
+        """Fraction of the risk that a look at so many cases may spend."""
         return 1.0 if self.most_cases is None else spent_share(looks_of(self.most_cases), cases)
 
-    def seen_before(self, frame: pd.DataFrame, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
-        """Which of the chosen rows a first look has judged already; None where the first look is now."""
+    def mask_first_look(self, frame: pd.DataFrame, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
+        """Mask of the chosen rows of an earlier first look; None at the first look."""
         if self.first_look is None or self.most_cases is not None or "case" not in frame:
             return None
         if not bool((frame["case"] >= self.first_look).any()):
@@ -117,18 +97,18 @@ class Sampled:
         return np.asarray(chosen["case"] < self.first_look, dtype=np.bool_)
 
     def drawn(self, frame: pd.DataFrame) -> pd.DataFrame:
-        """The rows of the cases that were drawn: all but the nominal one."""
+        """The rows without the nominal case."""
         if not self.nominal or "case" not in frame:
             return frame
         return frame[frame["case"] != 0].reset_index(drop=True)
 
 
-#: Independent random draws, as of campaigns that state no design.
+#: Independent random draws, the default design.
 INDEPENDENT = Sampled()
 
 
 def sampled(configuration: Mapping[str, Any]) -> Sampled:
-    """How the cases of a stored campaign were drawn, by its configuration; anything odd in it counts as not stated."""
+    """Read the sampling design from a configuration; invalid values count as missing."""
     design = table(configuration.get("design"))
     dispersions = table(configuration.get("dispersions"))
     grids = tuple(str(path) for path, one in dispersions.items() if table(one).get("distribution") == "grid")
@@ -146,7 +126,7 @@ def sampled(configuration: Mapping[str, Any]) -> Sampled:
 
 
 def terrain_supply(configuration: Mapping[str, Any]) -> TerrainSupply | None:
-    """The terrains that the cases of a stored campaign can be on; None where its configuration does not say."""
+    """Read the terrains from a configuration; None if unknown."""
     parameters, dispersions = table(configuration.get("parameters")), table(configuration.get("dispersions"))
     for name in ("place", "world"):
         bank = table(parameters.get(name)).get("bank")

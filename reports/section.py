@@ -1,8 +1,4 @@
-"""What sections of a report are made of: tables, figures with captions, blocks, and the subject they are about.
-
-A section is made by a function that takes a `Subject` and returns the `Section`, or None where the rows hold none of
-its columns. `marsyard.reports.kinds` has such functions as data.
-"""
+"""Building blocks of report sections: tables, figures with captions, blocks, and the subject of a report."""
 
 from __future__ import annotations
 
@@ -22,7 +18,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of texts: headings, rows, and how many rows were left out."""
+    """A table of texts, and the number of rows left out."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -30,13 +26,13 @@ class Grid:
 
 
 def grid_of(records: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> Grid:
-    """A table of records: each column's heading, and the function that makes its text from a record."""
+    """A table of records; `columns` maps headings to functions that make the texts."""
     return Grid([*columns], [[text(record) for text in columns.values()] for record in records])
 
 
 @dataclass(frozen=True)
 class Plate:
-    """A figure as SVG, its caption, and whether it takes the page's whole width."""
+    """A figure as SVG with its caption; `wide` figures have the full width of the page."""
 
     svg: Markup
     caption: str
@@ -45,13 +41,13 @@ class Plate:
 
 def plate(figure: Figure, key: str, caption: str, *, wide: bool = False) -> Plate:
     """A figure with its caption; `key` is as in `svg_markup`."""
-    # Matplotlib has escaped the texts inside; the description is escaped where it is put in.
+    # matplotlib escapes the texts inside, svg_markup the description
     return Plate(Markup(svg_markup(figure, key, caption)), caption, wide)  # noqa: S704
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What a report is about: the stored run, and the page's metric and its bound where there are any."""
+    """Subject of a report: the stored run, and the page's metric with its bound."""
 
     run: StoredRun
     metric: str | None
@@ -59,18 +55,18 @@ class Subject:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """The rows: all, or of very many cases the first."""
+        """The rows of all cases, or of the first of very many."""
         return self.run.frame
 
     @property
     def whole(self) -> pd.DataFrame:
-        """The rows of all cases; of very many only some columns."""
+        """The rows of all cases; of very many, only some columns."""
         return self.run.whole
 
 
 @dataclass(frozen=True)
 class Block:
-    """A part of a section, shown in this order: heading, text, figures, table, note; empty parts are left out."""
+    """A block of a section: heading, text, figures, table, note, as far as they are given."""
 
     heading: str = ""
     text: str = ""
@@ -83,18 +79,9 @@ class Block:
 class Section:
     """A section of the page.
 
-    Attributes
-    ----------
-    key
-        Its anchor, and its name in `report.json`: letters, digits and hyphens.
-    name
-        What the page's menu calls it.
-    title
-        Its heading.
-    blocks
-        What it shows.
-    data
-        The same in numbers, for `report.json`.
+    key: its anchor and its key in `report.json`: letters, digits and hyphens
+    name: its entry in the page's menu
+    data: its numbers, for `report.json`
     """
 
     key: str

@@ -1,59 +1,50 @@
-"""What the report's page says, section by section: plain values and finished figures, in the order they are read."""
+"""Contents of the report's page: rows of its tables, figures with captions, and the points of its explorer."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import math
 import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Int
+from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from marsyard.reports.columns import axis_columns, driver_columns, label, numbers
-from marsyard.reports.evaluation import Overall
-from marsyard.reports.populations import members
+from marsyard.reports.figures import (
+    count_beyond_axis,
+    error_distribution,
+    error_histogram,
+    error_scatter,
+    error_scatter_against,
+    needs_enlarged_figure,
+    outcome_bars,
+)
+from marsyard.reports.rates import CONFIDENCE, engine_failed, members, terrain_groups
 from marsyard.reports.sampled import sampled
-from marsyard.reports.section import Grid
+from marsyard.reports.section import Grid, Plate, plate
+from marsyard.reports.statistics.drivers import Driver, driver
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import outcome_counts
 from marsyard.reports.traceability import algorithms_of
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import NOTHING, asked_text, count, number, percent
+from marsyard.reports.wording import NOTHING, asked_text, coefficient, count, number, percent, stated
 
-#: Rows of the tables of single cases; the rows that are left out are counted.
-_MOST_CASES = 10
-
-
-@dataclass(frozen=True)
-class Strip:
-    """A success rate's interval drawn to scale: places in per cent of the strip's width."""
-
-    left: str
-    lower: float
-    upper: float
-    estimate: float
-    asked: float
-
-
-@dataclass(frozen=True)
-class VerdictRow:
-    """A verdict in words, with its strip; None where there is no evidence to draw."""
-
-    verdict: Verdict
-    asked: str
-    evidence: Sequence[str]
-    bounds: str
-    risk: str
-    further: str
-    strip: Strip | None
+#: Maximum number of rows of the tables of single cases.
+_MAX_CASES = 10
 
 
 @dataclass(frozen=True)
 class CaseRow:
-    """A single case: its number, its values as texts, how to run it again, and what it said when it crashed."""
+    """A case with its values, its replay command, and its error if it crashed."""
 
     case: str
     pictured: bool
@@ -65,68 +56,60 @@ class CaseRow:
 
 @dataclass(frozen=True)
 class CaseTable:
-    """Single cases with the headings of their values, and how many were left out."""
+    """Cases with the headings of their values, and the number of cases left out."""
 
     head: Sequence[str]
     rows: Sequence[CaseRow]
     left_out: int = 0
 
 
-def verdict_row(verdict: Verdict) -> VerdictRow:
-    """A verdict as the page shows it."""
-    asked = asked_text(verdict, label(verdict.metric))
-    bounds = f"{percent(verdict.lower)} to {percent(verdict.upper)}"
+def verdict_row(verdict: Verdict) -> dict[str, Any]:
+    """A verdict as the page shows it; `strip` is its interval to scale, in per cent of the strip's width."""
+    bounds, strip = f"{percent(verdict.lower)} to {percent(verdict.upper)}", None
     if math.isnan(verdict.lower):
         bounds = NOTHING if math.isnan(verdict.estimate) else f"{percent(verdict.estimate)} seen"
-    further = NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}"
-    evidence = [count(verdict.n, "case"), f"{verdict.failures:,} failed"]
-    risk = "" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}"
-    return VerdictRow(verdict, asked, evidence, bounds, risk, further, _strip(verdict))
-
-
-def _strip(verdict: Verdict) -> Strip | None:
-    if math.isnan(verdict.lower):
-        return None
-    lowest = min(verdict.lower, verdict.probability)
-    left = max(0.0, lowest - 0.25 * (1.0 - lowest))
-    scale = 100.0 / max(1.0 - left, 1e-12)
-    places = [scale * (value - left) for value in (verdict.lower, verdict.upper, verdict.estimate, verdict.probability)]
-    return Strip(f"{100.0 * left:.3g} %", *places)
-
-
-def cautions(whole: Overall) -> list[str]:
-    """What the headline alone would hide: crashed cases."""
-    if not whole.crashed:
-        return []
-    return [f"{count(whole.crashed, 'case')} crashed: the campaign is not in order, whatever its verdict."]
+    else:
+        lowest = min(verdict.lower, verdict.probability)
+        left = max(0.0, lowest - 0.25 * (1.0 - lowest))
+        rates = {"estimate": verdict.estimate, "asked": verdict.probability}
+        rates |= {"lower": verdict.lower, "upper": verdict.upper}
+        scale = 100.0 / max(1.0 - left, 1e-12)
+        strip = {"left": f"{100.0 * left:.3g} %"} | {name: scale * (rate - left) for name, rate in rates.items()}
+    return {
+        "verdict": verdict,
+        "asked": asked_text(verdict, label(verdict.metric)),
+        "evidence": [count(verdict.n, "case"), f"{verdict.failures:,} failed"],
+        "bounds": bounds,
+        "risk": "" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}",
+        "further": NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}",
+        "strip": strip,
+    }
 
 
 def outcome_grid(frame: pd.DataFrame) -> Grid:
-    """How many cases ended in which way."""
+    """Number of cases by outcome."""
     rows = [[name, f"{cases:,}", percent(cases / len(frame))] for name, cases in outcome_counts(frame)]
     return Grid(["Outcome", "Cases", "Share"], rows)
 
 
 def worst_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
-    """The cases with the largest errors, largest first; `pictured` are those that the page has pictures of."""
+    """The cases with the largest errors; `pictured` are the cases with pictures on the page."""
     magnitude = np.abs(numbers(run.whole, metric))
     known = np.flatnonzero(np.isfinite(magnitude))
-    order = known[np.argsort(-magnitude[known], kind="stable")][:_MOST_CASES]
+    order = known[np.argsort(-magnitude[known], kind="stable")][:_MAX_CASES]
     columns = [metric, *axis_columns(metric, [str(name) for name in run.whole.columns])]
     return _case_table(run, order.tolist(), columns, metric, known.size - order.size, pictured)
 
 
-def silent_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
-    """Cases that ran to their end without an error to score."""
-    silent = ~np.isfinite(numbers(run.whole, metric)) & members(run.whole, "completed")
-    order = np.flatnonzero(silent)
-    return _case_table(run, order[:_MOST_CASES].tolist(), [], metric, max(0, order.size - _MOST_CASES), pictured)
+def unanswered_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
+    """Completed cases without an error."""
+    order = np.flatnonzero(~np.isfinite(numbers(run.whole, metric)) & members(run.whole, "completed"))
+    return _case_table(run, order[:_MAX_CASES].tolist(), [], metric, max(0, order.size - _MAX_CASES), pictured)
 
 
 def crashed_rows(run: StoredRun) -> CaseTable:
-    """Cases that the engine could not finish, with what they said."""
+    """Cases that the engine could not finish, with their error messages."""
     order = np.flatnonzero(~members(run.whole, "completed"))
-    head = ["Case", "Outcome"]
     rows = [
         CaseRow(
             case=_case(run.whole, index),
@@ -136,29 +119,43 @@ def crashed_rows(run: StoredRun) -> CaseTable:
             message=_text(run.whole, "error", index),
             trace=_text(run.whole, "traceback", index),
         )
-        for index in order[:_MOST_CASES].tolist()
+        for index in order[:_MAX_CASES].tolist()
     ]
-    return CaseTable(head, rows, max(0, order.size - _MOST_CASES))
+    return CaseTable(["Case", "Outcome"], rows, max(0, order.size - _MAX_CASES))
+
+
+#: Keys of a dispersion that are not parameters of its distribution.
+_HIDDEN = ("distribution", "source", "unit", "description")
 
 
 def dispersion_grid(run: StoredRun) -> Grid:
-    """Dispersions as stated, and the values as the rows show them applied."""
+    """Dispersions, and the values applied in the rows."""
     rows = []
-    for path, dispersion in table(run.said("dispersions")).items():
-        column = _drawn_column(run.frame, str(path))
+    for path, value in table(run.said("dispersions")).items():
+        dispersion, parts = table(value), str(path).split(".")
+        # a column is named like the parameter's path, or like the end of its path
+        names = [str(path), *("_".join(parts[start:]) for start in range(len(parts)))]
+        column = next((name for name in names if name in run.frame), None)
+        shown = ", ".join(f"{key}={one}" for key, one in dispersion.items() if key not in _HIDDEN and one is not None)
+        distribution = f"{dispersion.get('distribution', '?')}({shown})"
         drawn = [NOTHING] * 3 if column is None else _extent(run.frame[column])
-        stated_as = _distribution(table(dispersion))
-        rows.append([str(path), stated_as, *drawn, str(table(dispersion).get("source") or NOTHING)])
-    return Grid(["Parameter", "Distribution", "Least", "Mean", "Greatest", "Source"], rows)
+        rows.append([str(path), distribution, *drawn, str(dispersion.get("source") or NOTHING)])
+    return Grid(["Parameter", "Distribution", "Minimum", "Mean", "Maximum", "Source"], rows)
 
 
 def provenance(run: StoredRun) -> list[tuple[str, str]]:
-    """What was run, by which program, on which machine."""
-    environment = table(run.said("environment"))
+    """Campaign, algorithms, program and machine."""
+    environment, times = table(run.said("environment")), numbers(run.frame, "cpu_time_s")
+    times = times[np.isfinite(times)]
+    algorithms: list[tuple[str, Any]] = []
+    for one in algorithms_of(run.record):
+        head = "Algorithm judged" if one.judged else "Algorithm compared"
+        algorithms += [(head, one.name), (f"{head}: class or file", one.path), (f"{head}: version", one.version)]
+        algorithms += [(f"{head}: sources", one.source_hash), (f"{head}: options", one.options_text)]
     facts = [
         ("Campaign", run.name),
         ("Scenario", run.said("scenario")),
-        *_algorithm_facts(run),
+        *algorithms,
         ("State", run.said("state")),
         ("Root seed", run.said("seed")),
         ("Sampling", sampled(run.configuration).text),
@@ -167,7 +164,7 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
         ("Started", run.said("started_utc")),
         ("Finished", run.said("finished_utc")),
         ("Worker processes", run.said("jobs")),
-        ("Processor time of a case", _mean_time(run.frame, "cpu_time_s")),
+        ("Processor time of a case", f"{number(float(times.mean()))} s on average" if times.size else None),
         ("Commit", run.said("git_commit")),
         ("Marsyard", table(run.said("versions")).get("marsyard")),
         *((f"Machine: {name}", value) for name, value in environment.items() if value not in ({}, None)),
@@ -177,32 +174,9 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
     return [(name, _plain(value)) for name, value in facts if value not in (None, "")]
 
 
-def _algorithm_facts(run: StoredRun) -> list[tuple[str, Any]]:
-    """What was judged, and what was compared with it."""
-    facts: list[tuple[str, Any]] = []
-    for one in algorithms_of(run.record):
-        head = "Algorithm judged" if one.judged else "Algorithm compared"
-        facts.append((head, one.name))
-        facts += [
-            (f"{head}: {name}", value)
-            for name, value in (
-                ("class or file", one.path),
-                ("version", one.version),
-                ("sources", one.source_hash),
-                ("options", one.options_text),
-            )
-        ]
-    return facts
-
-
 def versions(run: StoredRun) -> list[tuple[str, str]]:
     """Packages and their versions."""
     return [(str(name), _plain(version)) for name, version in table(run.said("versions")).items()]
-
-
-def configuration_text(run: StoredRun) -> str:
-    """The configuration as run, as indented JSON."""
-    return json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str)
 
 
 def replay_command(run: StoredRun, case: str) -> str:
@@ -211,10 +185,9 @@ def replay_command(run: StoredRun, case: str) -> str:
 
 
 def rerun_commands(run: StoredRun) -> list[str]:
-    """The commands that run the campaign again, into a folder of its own, quoted for a shell.
+    """Shell commands that run the campaign again into a new folder, with a command for each appended block.
 
-    Where the record holds the command that was given it is that one, from the same folder, and one that adds each block
-    of cases that was appended. Records of earlier versions have the campaign's name, cases and seed alone.
+    Records of earlier versions lack the original command: name, cases and seed replace it.
     """
     if run.command is None:
         words = ["marsyard", "run", run.name]
@@ -234,14 +207,11 @@ def rerun_commands(run: StoredRun) -> list[str]:
 
 
 def _case_table(
-    run: StoredRun,
-    order: Sequence[int],
-    columns: Sequence[str],
-    metric: str,
-    left_out: int,
-    pictured: Collection[str],
+    run: StoredRun, order: list[int], columns: list[str], metric: str, left_out: int, pictured: Collection[str]
 ) -> CaseTable:
-    shown = [name for name in [*columns, "terrain", *driver_columns(run.frame, metric, most=3)] if name in run.whole]
+    shown = [
+        name for name in [*columns, "terrain", *driver_columns(run.frame, metric, max_columns=3)] if name in run.whole
+    ]
     rows = [
         CaseRow(
             case=_case(run.whole, index),
@@ -259,7 +229,6 @@ def _case(frame: pd.DataFrame, index: int) -> str:
 
 
 def _text(frame: pd.DataFrame, column: str, index: int) -> str:
-    """A stored value as text; a dash where there is none."""
     if column not in frame:
         return NOTHING
     value = frame[column].iloc[index]
@@ -274,38 +243,119 @@ def _plain(value: object) -> str:
     return str(value)
 
 
-def _drawn_column(frame: pd.DataFrame, path: str) -> str | None:
-    """The column that holds what a dispersed parameter became: by its whole path, or by its end."""
-    parts = path.split(".")
-    names = ["_".join(parts[start:]) for start in range(len(parts))]
-    return next((name for name in [path, *names] if name in frame), None)
-
-
 def _extent(drawn: pd.Series) -> list[str]:
-    """Least, mean and greatest of what was drawn; how many kinds where it is no number."""
+    """Minimum, mean and maximum of the drawn values; the number of kinds if they are no numbers."""
     values = pd.to_numeric(drawn, errors="coerce").dropna()
     if values.empty or pd.api.types.is_bool_dtype(drawn.dtype):
         return [NOTHING, f"{drawn.nunique()} kinds", NOTHING]
     return [_plain(float(value)) for value in (values.min(), values.mean(), values.max())]
 
 
-def _distribution(dispersion: Mapping[str, Any]) -> str:
-    """A distribution and its parameters in one line."""
-    told = {
-        name: value
-        for name, value in dispersion.items()
-        if name not in ("distribution", "source", "unit", "description") and value is not None
-    }
-    return f"{dispersion.get('distribution', '?')}({', '.join(f'{name}={value}' for name, value in told.items())})"
-
-
-def _mean_time(frame: pd.DataFrame, column: str) -> str | None:
-    values = numbers(frame, column)
-    known = values[np.isfinite(values)]
-    return f"{number(float(known.mean()))} s on average" if known.size else None
-
-
 def _only_values(frame: pd.DataFrame, column: str) -> str | None:
     if column not in frame:
         return None
     return "; ".join(str(value) for value in frame[column].dropna().unique()[:3])
+
+
+def error_plates(frame: pd.DataFrame, whole: pd.DataFrame, metric: str, bound: float | None) -> list[Plate]:
+    """Scatter of a metric over some rows, its histogram and distribution over all."""
+    scatter = "Errors of single cases; the dashed circle is the requirement. Hollow: beyond the axes, at their edge."
+    histogram = "How often each magnitude of error occurred; hatched: beyond the axis."
+    figures: list[tuple[str, Figure | None, str]] = [("scatter", error_scatter(frame, metric, bound), scatter)]
+    if needs_enlarged_figure(frame, metric, bound):
+        figures.append(("close", error_scatter(frame, metric, bound, close=True), "The same errors, enlarged."))
+    figures.append(("histogram", error_histogram(whole, metric, bound), histogram))
+    caption = "Fraction of cases up to each magnitude."
+    figures.append(("distribution", error_distribution(whole, metric, bound), caption))
+    return _plates(figures)
+
+
+def driver_plates(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Plate]:
+    """A metric against the conditions that may drive it, with rank correlations."""
+    figures, magnitude, groups = [], np.abs(numbers(frame, metric)), terrain_groups(frame)
+    for k, column in enumerate(driver_columns(frame, metric)):
+        found = driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
+        text = f"{label(column)}." if found is None else f"{label(column)}: rank correlation {rank_text(found)}."
+        beyond = count_beyond_axis(frame, metric, column, bound)
+        if beyond:
+            text = f"{text} {count(beyond, 'error')} beyond the axis: hollow, at its upper edge."
+        figures.append((f"driver{k}", error_scatter_against(frame, metric, column, bound), text))
+    return _plates(figures)
+
+
+def rank_text(found: Driver) -> str:
+    """A rank correlation with its interval: ``0.310 (0.120 to 0.480 at 90 % confidence)``."""
+    lower, upper = coefficient(found.lower), coefficient(found.upper)
+    return f"{coefficient(found.correlation)} ({lower} to {upper} at {stated(CONFIDENCE)} confidence)"
+
+
+def outcome_plates(frame: pd.DataFrame) -> list[Plate]:
+    """Number of cases by outcome."""
+    caption = "Plain: an answer was given. Hatched: the algorithm gave no answer. Crossed: the case crashed."
+    return _plates([("outcomes", outcome_bars(frame), caption)])
+
+
+def _plates(wanted: Sequence[tuple[str, Figure | None, str]]) -> list[Plate]:
+    return [plate(figure, key, caption) for key, figure, caption in wanted if figure is not None]
+
+
+#: Maximum number of points, and of largest errors, cases without an answer and crashed cases that are always included.
+MAX_POINTS, MAX_NOTABLE = 2000, 150
+_SCRIPT = Path(__file__).parent / "templates" / "explorer.js"
+
+
+def explorer_data(run: StoredRun, metric: str, bound: float | None, pictured: Collection[str]) -> dict[str, Any]:
+    """Data of the explorer: columns of the points with labels, initial axes, and the bound."""
+    frame = run.frame
+    parts = axis_columns(metric, [str(name) for name in frame.columns])[:2]
+    drivers = driver_columns(frame, metric)
+    names = list(dict.fromkeys([*parts, *drivers, metric]))
+    chosen = frame.iloc[choose_points(frame, metric)]
+    outcomes = chosen["outcome"].astype(str) if "outcome" in chosen else pd.Series("", index=chosen.index)
+    kinds = list(dict.fromkeys(outcomes))
+    cases = chosen["case"].tolist() if "case" in chosen else chosen.index.tolist()
+    return {
+        "labels": [label(name) for name in names],
+        "columns": [[float(f"{x:.4g}") if math.isfinite(x) else None for x in numbers(chosen, name)] for name in names],
+        "metric": names.index(metric),
+        "parts": [names.index(part) for part in parts] if len(parts) == 2 else [],
+        "axes": [names.index(name) for name in (parts if len(parts) == 2 else [(drivers or [metric])[0], metric])],
+        "bound": bound,
+        "cases": [int(case) for case in cases],
+        "outcomes": [str(kind) for kind in kinds],
+        "outcome": [kinds.index(kind) for kind in outcomes],
+        "pictured": sorted(int(case) for case in pictured),
+        "replay": replay_command(run, "CASE"),
+        "shown": len(chosen),
+        "all": len(run.whole),
+    }
+
+
+def choose_points(frame: pd.DataFrame, metric: str) -> Int[np.ndarray, " n"]:
+    """Rows of the explorer: all, or of many the notable ones and the first others."""
+    if len(frame) <= MAX_POINTS:
+        return np.arange(len(frame))
+    magnitude = np.abs(numbers(frame, metric))
+    known = np.isfinite(magnitude)
+    crashed = engine_failed(frame)
+    worst = np.argsort(-np.where(known, magnitude, -1.0), kind="stable")
+    notable = [part[:MAX_NOTABLE] for part in (worst, np.flatnonzero(~known & ~crashed), np.flatnonzero(crashed))]
+    return np.sort(pd.unique(np.concatenate([*notable, np.arange(len(frame))]))[:MAX_POINTS])
+
+
+def script() -> Markup:
+    """The explorer's script, unescaped."""
+    return Markup(_SCRIPT.read_text(encoding="utf-8"))  # noqa: S704
+
+
+def script_hash(text: str) -> str:
+    """Hash of a script for the page's content security policy."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+def embedded(data: Any) -> Markup:
+    """Data as JSON, escaped for a script element."""
+    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    for letter in "<>&\u2028\u2029":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return Markup(text)  # noqa: S704

@@ -1,4 +1,4 @@
-"""Reads a campaign's folder; nothing but these files goes into a report."""
+"""Read a campaign's folder: rows, record, and products of kept cases."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
 from marsyard.reports.columns import axis_columns, driver_columns, primary_metric
 
-#: Up to so many cases all columns of all are read; of more, all columns of the first so many.
+#: Maximum number of cases of which all columns are read; of more cases, all columns of the first ones are read.
 LARGEST_WHOLE, FIRST_CASES = 50_000, 20_000
 
 TABLE_FILE = "cases.parquet"
@@ -23,20 +23,12 @@ RECORD_FILE = "campaign.json"
 
 @dataclass(frozen=True)
 class StoredRun:
-    """What a campaign's folder holds.
+    """Contents of a campaign's folder.
 
-    Attributes
-    ----------
-    directory
-        The folder, as it was named.
-    frame
-        One row a case, in the order of the cases: all of them, or of very many the first, which are as random as all.
-    whole
-        All cases; of very many only the columns that verdicts, outcomes and errors are known by.
-    record
-        `campaign.json`; empty where there is none or it cannot be read.
-    showcases
-        Numbers of the cases whose products were kept, the one chosen for the report first.
+    frame: rows in the order of the cases; of very many, the first ones
+    whole: all cases; of very many, only the columns of verdicts, outcomes and errors
+    record: `campaign.json`; empty if it cannot be read
+    showcases: kept cases, the one chosen for the report first
     """
 
     directory: Path
@@ -47,7 +39,7 @@ class StoredRun:
 
     @property
     def sampled_from(self) -> int | None:
-        """The number of all cases where `frame` holds but the first of them; None where it holds all."""
+        """Number of all cases if `frame` holds only the first ones; else None."""
         return len(self.whole) if len(self.whole) > len(self.frame) else None
 
     @property
@@ -57,18 +49,18 @@ class StoredRun:
 
     @property
     def name(self) -> str:
-        """The campaign's name; the folder's where the record has none."""
+        """The campaign's name; the folder's if the record has none."""
         return str(self.said("name") or self.directory.resolve().name)
 
     @property
     def requirements(self) -> list[Mapping[str, Any]]:
-        """The requirements that the campaign asks."""
+        """The requirements of the campaign."""
         asked = self.said("requirements")
         return [item for item in asked if isinstance(item, Mapping)] if isinstance(asked, list | tuple) else []
 
     @property
     def command(self) -> tuple[str, tuple[str, ...]] | None:
-        """The folder and the words of the command that ran the campaign; None where the record does not say."""
+        """Working folder and words of the command that ran the campaign; None if unknown."""
         stored = table(self.record.get("command"))
         words = stored.get("words")
         if not isinstance(words, list) or not words:
@@ -76,12 +68,19 @@ class StoredRun:
         return str(stored.get("folder") or ""), tuple(str(word) for word in words)
 
     def said(self, key: str) -> Any:
-        """What the record says under a key, or its configuration; None where neither does."""
+        """Value of a key in the record or in its configuration; None if missing."""
         found = self.record.get(key)
         return found if found is not None else self.configuration.get(key)
 
+    def parameter(self, *path: str) -> Any:
+        """A parameter of the campaign's file; None if missing."""
+        value: Any = self.configuration.get("parameters")
+        for name in path:
+            value = table(value).get(name)
+        return value
+
     def products(self, case: int) -> dict[str, Any]:
-        """The products of a kept case; empty where they cannot be read."""
+        """The products of a kept case; empty if they cannot be read."""
         try:
             return load_products(self.directory / "cases" / str(case))
         except (StoreError, AttributeError, TypeError):
@@ -89,17 +88,14 @@ class StoredRun:
 
 
 def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> StoredRun:
-    """Reads a campaign's folder; `requirements` stand in for the campaign's own.
-
-    Raises
-    ------
-    StoreError
-        Where it holds no table of cases that can be read.
-    """
+    """Read a campaign's folder; `requirements` replace the campaign's own. Raises StoreError without rows."""
     path = directory / TABLE_FILE
     if not path.is_file():
         raise StoreError(f"{directory} holds no {TABLE_FILE}; a report needs the rows of a campaign")
-    record = dict(_record(directory / RECORD_FILE))
+    try:
+        record = dict(table(json.loads((directory / RECORD_FILE).read_text(encoding="utf-8"))))
+    except (OSError, ValueError):
+        record = {}
     if requirements is not None:
         record["requirements"] = list(requirements)
     try:
@@ -110,7 +106,7 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
 
 
 def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The rows as they are looked at, and all of them; the same where there are not very many."""
+    """Rows with all columns, and rows of all cases; the same unless there are very many."""
     import pyarrow.parquet as pq
 
     file = pq.ParquetFile(path)
@@ -122,7 +118,7 @@ def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.Dat
 
 
 def _needed(names: Sequence[str], record: Mapping[str, Any], first: pd.DataFrame) -> list[str]:
-    """Columns that are read of very many cases."""
+    """Columns that are read for very many cases."""
     asked = record.get("requirements")
     stated = [one for one in asked if isinstance(one, Mapping)] if isinstance(asked, list) else []
     wanted = {"case", "outcome", "answered", "terrain", "room", "error", "traceback"}
@@ -131,27 +127,19 @@ def _needed(names: Sequence[str], record: Mapping[str, Any], first: pd.DataFrame
         wanted.update(str(one.get("population", "")).split(" and "))
     metric = primary_metric(first, stated)
     if metric is not None:
-        wanted.update([metric, *axis_columns(metric, names), *driver_columns(first, metric, most=3)])
+        wanted.update([metric, *axis_columns(metric, names), *driver_columns(first, metric, max_columns=3)])
     return [name for name in names if name in wanted]
 
 
 def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
-    """The rows in the order of the cases."""
     if "case" not in frame or frame["case"].is_monotonic_increasing:
         return frame
     return frame.sort_values("case", kind="stable").reset_index(drop=True)
 
 
 def table(value: object) -> Mapping[str, Any]:
-    """A value if it is a table; an empty one otherwise."""
+    """The value if it is a table, else an empty table."""
     return value if isinstance(value, Mapping) else {}
-
-
-def _record(path: Path) -> Mapping[str, Any]:
-    try:
-        return table(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError):
-        return {}
 
 
 def _showcases(cases: Path, chosen: object) -> tuple[int, ...]:

@@ -6,10 +6,11 @@ import functools
 import io
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
-from typing import ParamSpec, TypeVar
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
 
 import matplotlib as mpl
 import matplotlib.style
@@ -21,59 +22,35 @@ from matplotlib.figure import Figure
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Stand-ins that figures are drawn with and the page's own colours that take their place.
+#: Colours that figures are drawn with, and the page's colours that replace them.
 INK, MUTED, GRID = "#10161d", "#5a6672", "#d3d9e0"
 _THEME = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"}
 
-#: Colours and markers of categories. After Okabe & Ito's palette for colour-blind readers, shifted to middle tones that
-#: keep a contrast of 3:1 on white and on the dark page alike; no category is told by its colour alone.
+#: Colours and markers of categories, after Okabe & Ito's palette for colour-blind readers, in tones with a contrast of
+#: 3:1 on the light and on the dark page; colour is never the only distinction.
 SERIES = ("#2f83d6", "#cf6a14", "#1c9a76", "#b262b2", "#9c7f12", "#78838f")
 MARKERS = ("o", "^", "s", "D", "v", "P")
 REQUIREMENT = "#d0392f"
 
-#: Points above this number are drawn as pixels rather than as vectors, to keep pages small.
+#: Styles of bars of outcomes; colour is never the only distinction.
+BARS: Mapping[str, Mapping[str, Any]] = {
+    "full": {"color": SERIES[0]},
+    "hatched": {"color": "none", "edgecolor": SERIES[1], "hatch": "////"},
+    "dotted": {"color": "none", "edgecolor": SERIES[5], "hatch": "...."},
+    "crossed": {"color": "none", "edgecolor": REQUIREMENT, "hatch": "xxxx"},
+}
+
+#: More points than this are drawn as pixels instead of vectors, to keep pages small.
 LARGEST_VECTOR_SAMPLE = 800
-#: Dots per inch of what is drawn as pixels: twice the size on a screen, and fit to be printed.
+#: Dots per inch of parts drawn as pixels: twice the size on a screen.
 RASTER_DPI = 160
 
-_STYLE = {
-    "axes.axisbelow": True,
-    "axes.edgecolor": MUTED,
-    "axes.grid": True,
-    "axes.labelcolor": INK,
-    "axes.labelsize": 10,
-    "axes.linewidth": 0.8,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 11,
-    "axes.titleweight": "bold",
-    "axes.titlecolor": INK,
-    "axes.facecolor": "none",
-    "figure.facecolor": "none",
-    "font.family": "sans-serif",
-    "font.size": 10,
-    "grid.color": GRID,
-    "grid.linewidth": 0.7,
-    "hatch.linewidth": 0.6,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "legend.labelcolor": INK,
-    "path.simplify": True,
-    "savefig.facecolor": "none",
-    "text.color": INK,
-    "text.parse_math": False,
-    "xtick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "xtick.labelsize": 9,
-    "ytick.color": MUTED,
-    "ytick.labelcolor": INK,
-    "ytick.labelsize": 9,
-}
+_STYLE_FILE = Path(__file__).parent / "templates" / "page.mplstyle"
+_STYLE: Any = mpl.rc_params_from_file(_STYLE_FILE, use_default_template=False)
 
 
 def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:
-    """Makes a function draw in the page's style, whatever the reader's own settings of matplotlib are."""
+    """Decorate a drawing function to use the page's style instead of the user's matplotlib settings."""
 
     @functools.wraps(draw)
     def styled(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -85,47 +62,32 @@ def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:
 
 @contextmanager
 def _page_style(**further: str) -> Iterator[None]:
-    """The page's style; what matplotlib finds wrong with a text (a letter that its font lacks) is not worth a word."""
+    """The page's style; warnings about letters that the font lacks are ignored."""
     with mpl.style.context(["default", _STYLE, further]), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 
 
 def new_axes(width: float, height: float) -> tuple[Figure, Axes]:
-    """A figure of one pair of axes, in inches; to be called in the page's style."""
+    """A figure with one pair of axes, size in inches; call it in the page's style."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.add_subplot()
 
 
 def svg_markup(figure: Figure, key: str, description: str) -> str:
-    """The figure as an SVG element to put into a page.
+    """The figure as an SVG element of a page; its texts must have been set through matplotlib, which escapes them.
 
-    Parameters
-    ----------
-    figure
-        The figure.
-    key
-        Letters and digits that no other figure of the page has: they keep the identifiers inside apart.
-    description
-        What a reader who cannot see the figure is told.
-
-    Notes
-    -----
-    Texts in the figure are escaped by matplotlib; they must have been set through its API.
+    key: letters and digits, unique on the page, as prefix of the identifiers inside
+    description: text for readers who cannot see the figure
     """
     buffer = io.StringIO()
     metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     with _page_style(**{"svg.hashsalt": key, "svg.fonttype": "none"}):
         figure.savefig(buffer, format="svg", dpi=RASTER_DPI, metadata=metadata)
-    return _for_page(buffer.getvalue(), key, description)
-
-
-def _for_page(markup: str, key: str, description: str) -> str:
-    """Drops the file's head and fixed size, renames identifiers, and hands the ink to the page."""
+    markup = buffer.getvalue()
     body = markup[markup.index("<svg") :]
     view_box = re.search(r'viewBox="[^"]*"', body)
-    inner = body[body.index(">") + 1 :]
-    inner = re.sub(r' id="([^"]*)"', rf' id="{key}-\1"', inner)
+    inner = re.sub(r' id="([^"]*)"', rf' id="{key}-\1"', body[body.index(">") + 1 :])
     inner = re.sub(r'(href="|url\()#', rf"\1#{key}-", inner)
     for stand_in, colour in _THEME.items():
         inner = inner.replace(stand_in, colour)
@@ -136,28 +98,38 @@ def _for_page(markup: str, key: str, description: str) -> str:
     return head + inner.strip()
 
 
-#: Width of a row of pictures, and height of its titles, inches.
-_ROW_IN = (12.0, 0.35)
-
-
 def show_picture(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
-    """A picture in grey, its contrast stretched between the 1 % and the 99 % quantile."""
+    """Draw a picture in grey, its contrast stretched between the 1 % and the 99 % quantile."""
     finite = picture[np.isfinite(picture)]
     low, high = np.quantile(finite, (0.01, 0.99)) if finite.size else (0.0, 1.0)
     axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="antialiased")
-    axes.set(xticks=[], yticks=[], facecolor=INK)
+    axes.set_facecolor(INK)
     axes.autoscale(enable=False)
+    _hide_frame(axes)
+
+
+def show_subframe(axes: Axes, picture: Float[np.ndarray, "_ _"], quantiles: tuple[float, float] = (0.01, 0.99)) -> None:
+    """Draw a picture in grey pixel by pixel, its contrast stretched between two quantiles."""
+    finite = picture[np.isfinite(picture)]
+    low, high = np.quantile(finite, quantiles) if finite.size else (0.0, 1.0)
+    levels = np.clip((np.nan_to_num(picture, nan=low) - low) / max(float(high - low), 1e-9), 0.0, 1.0)
+    grey = np.round(255.0 * levels).astype(np.uint8)
+    axes.imshow(np.repeat(grey[..., None], 3, axis=2), interpolation="none", aspect="equal")
+    _hide_frame(axes)
+
+
+def _hide_frame(axes: Axes) -> None:
+    axes.set(xticks=[], yticks=[])
     axes.grid(visible=False)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    axes.spines[:].set_visible(False)
 
 
 @in_page_style
 def draw_pictures(pictures: Sequence[Float[np.ndarray, "_ _"]]) -> Figure:
-    """Pictures in a row, numbered, as they were delivered: of a case whose algorithm left no details to draw."""
-    width, title = _ROW_IN
+    """Numbered pictures in a row, as delivered: for a case whose algorithm left no details to draw."""
     rows, columns = pictures[0].shape
-    figure = Figure(figsize=(width, width / len(pictures) * rows / columns + title), layout="constrained")
+    height = 12.0 / len(pictures) * rows / columns + 0.35
+    figure = Figure(figsize=(12.0, height), layout="constrained")
     for number, (axes, picture) in enumerate(zip(figure.subplots(1, len(pictures)), pictures, strict=True), start=1):
         show_picture(axes, picture)
         axes.set_title(f"Picture {number}", fontsize=9)

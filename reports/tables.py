@@ -1,7 +1,4 @@
-"""What the terminal shows: verdicts, outcomes and error statistics as Rich tables.
-
-Texts from files are put into `Text` objects, never into markup: a name in square brackets stays a name.
-"""
+"""Verdicts as a Rich table, outcomes and error statistics; texts from files are `Text` objects, never markup."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from marsyard.reports.columns import axis_columns, label, numbers
-from marsyard.reports.populations import ENGINE_FAILURES, is_flag, members, terrain_groups
+from marsyard.reports.rates import ENGINE_FAILURES, is_flag, members, terrain_groups
 from marsyard.reports.section import Grid
 from marsyard.reports.statistics.samples import ErrorSummary, summarize
 from marsyard.reports.verdicts import Status, Verdict
@@ -29,17 +26,17 @@ _STYLES = {
 
 
 def verdict_table(verdicts: Sequence[Verdict]) -> Table:
-    """Every requirement with its verdict and evidence, legible from 80 columns on."""
+    """Requirements with verdicts and evidence, legible from 80 columns on."""
     table = Table(title="Verdict", box=box.SIMPLE_HEAD, expand=False, title_justify="left", caption_justify="left")
     table.add_column("Requirement", overflow="fold", ratio=None, min_width=18)
     table.add_column("Verdict", no_wrap=True)
-    table.add_column("Failed", justify="right", no_wrap=True)
-    table.add_column("Succeeded", justify="right", no_wrap=True)
-    table.add_column("Bounds", justify="right", no_wrap=True)
-    table.add_column("More", justify="right", no_wrap=True)
+    for heading in ("Failed", "Succeeded", "Bounds", "Needed"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for verdict in verdicts:
+        requirement = Text(verdict.requirement_id, style="bold")
+        requirement.append(f"\n{asked_text(verdict, verdict.metric)}", style="dim")
         table.add_row(
-            _requirement(verdict),
+            requirement,
             Text(str(verdict.status), style=_STYLES[verdict.status]),
             f"{verdict.failures} of {verdict.n}",
             percent(verdict.estimate),
@@ -53,7 +50,7 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
 
 
 def outcome_counts(frame: pd.DataFrame) -> list[tuple[str, int]]:
-    """Outcomes and how many cases ended so: those with an answer first, the engine's failures last, by number."""
+    """Number of cases by outcome: answers first, unfinished cases last, then by number."""
     if "outcome" not in frame:
         return []
     counts = frame["outcome"].astype("object").fillna("(none)").astype(str).value_counts()
@@ -63,27 +60,27 @@ def outcome_counts(frame: pd.DataFrame) -> list[tuple[str, int]]:
 
 
 def answered_outcomes(frame: pd.DataFrame) -> set[str]:
-    """Outcomes of cases that gave an answer; VALID where rows do not tell which did."""
+    """Outcomes of cases with an answer; VALID if rows do not hold `answered`."""
     if "outcome" not in frame or not is_flag(frame, "answered"):
         return {"VALID"}
     return {str(name) for name in frame.loc[members(frame, "valid"), "outcome"].dropna().unique()}
 
 
 def error_summaries(frame: pd.DataFrame, metric: str) -> list[tuple[str, ErrorSummary]]:
-    """Summaries of a metric and of its signed parts, over all cases that have one."""
+    """Statistics of a metric and of its signed parts over all cases with a value."""
     parts = [metric, *axis_columns(metric, [str(column) for column in frame.columns])]
     groups = terrain_groups(frame)
     return [(label(part), summarize(numbers(frame, part), groups=groups)) for part in parts]
 
 
 def statistics_grid(frame: pd.DataFrame, metric: str) -> Grid:
-    """Statistics of a metric and of its parts, a column each."""
+    """Table of statistics with a column for the metric and each of its parts."""
     summaries = error_summaries(frame, metric)
     return Grid(["", *(name for name, _ in summaries)], statistics_rows([summary for _, summary in summaries]))
 
 
 def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
-    """Rows of a table of statistics: the statistic's name, then its value in each summary."""
+    """Rows of a table of statistics: name, then the value of each summary."""
     if not summaries:
         return []
     confidence = stated(summaries[0].confidence)
@@ -104,17 +101,11 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
     return [*rows, ["largest magnitude", *(number(s.largest) for s in summaries)]]
 
 
-def _requirement(verdict: Verdict) -> Text:
-    text = Text(verdict.requirement_id, style="bold")
-    text.append(f"\n{asked_text(verdict, verdict.metric)}", style="dim")
-    return text
-
-
 def _caption(verdicts: Sequence[Verdict]) -> Text:
-    """What the columns mean, and what a reader must know before trusting them."""
+    """Definitions of the columns, and notes on the verdicts."""
     lines = []
     if any(not math.isnan(verdict.lower) for verdict in verdicts):
-        lines.append("Bounds: one-sided Clopper-Pearson at the stated confidence. More: further cases if no more fail.")
+        lines.append("Bounds: one-sided Clopper-Pearson at the stated confidence. Needed: further cases if none fails.")
     shared = {verdict.note for verdict in verdicts}
     if len(verdicts) > 1 and len(shared) == 1 and verdicts[0].note:
         lines.append(verdicts[0].note)

@@ -1,4 +1,4 @@
-"""The algorithms that were judged, and requirements for other programs: the traceability matrix and JUnit's XML."""
+"""Algorithms under test, the traceability matrix of requirements (CSV), and verdicts as JUnit XML."""
 
 from __future__ import annotations
 
@@ -20,22 +20,12 @@ from marsyard.reports.wording import count
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An algorithm under test.
+    """An algorithm under test; text that the record lacks is empty.
 
-    Attributes
-    ----------
-    name
-        As the campaign names it: a name that ships, `module:Class`, or a program.
-    judged
-        Whether requirements judge it, or it is only compared.
-    path
-        Its class as `module:name`, or its file; empty where the record does not say, as are the others.
-    version
-        Of its installed distribution, or its own `version` attribute.
-    options
-        Its options by name.
-    source_hash
-        A hash of its sources.
+    name: as in the campaign: a shipped name, `module:Class`, or a program
+    judged: whether requirements judge it, or it is only compared
+    path: its class as `module:name`, or its file
+    version: of its installed distribution, or its `version` attribute
     """
 
     name: str
@@ -57,74 +47,42 @@ class Algorithm:
 
 
 def algorithms_of(record: Mapping[str, Any]) -> list[Algorithm]:
-    """Read the algorithms from a campaign's record, the judged one first.
-
-    Records of earlier versions have no table of algorithms: their parameters give the names alone.
-    """
+    """Read the algorithms from a campaign's record, the judged one first; old records give names alone."""
     stored = record.get("algorithms")
     entries = [table(one) for one in stored] if isinstance(stored, list) else []
-    found = [_algorithm(entry) for entry in entries if entry.get("spec")]
+    found = [
+        Algorithm(
+            name=str(entry["spec"]),
+            judged=entry.get("role") != "compared",
+            path=str(entry.get("path") or ""),
+            version=str(entry.get("version") or ""),
+            options=table(entry.get("options")),
+            source_hash=str(entry.get("source_hash") or ""),
+        )
+        for entry in entries
+        if entry.get("spec")
+    ]
     if not found:
-        found = _named(table(table(record.get("configuration")).get("parameters")))
+        found = _named_algorithms(table(table(record.get("configuration")).get("parameters")))
     return sorted(found, key=lambda one: not one.judged)
 
 
 def judged_text(algorithms: Sequence[Algorithm]) -> str:
-    """Names and versions of those that are judged."""
+    """Names and versions of the judged algorithms."""
     return ", ".join(one.title for one in algorithms if one.judged)
 
 
-def _algorithm(entry: Mapping[str, Any]) -> Algorithm:
-    return Algorithm(
-        name=str(entry["spec"]),
-        judged=entry.get("role") != "compared",
-        path=str(entry.get("path") or ""),
-        version=str(entry.get("version") or ""),
-        options=table(entry.get("options")),
-        source_hash=str(entry.get("source_hash") or ""),
-    )
-
-
-def _named(parameters: Mapping[str, Any]) -> list[Algorithm]:
-    """The algorithms that parameters choose: in the first table, at any depth, that has the key `algorithm`."""
+def _named_algorithms(parameters: Mapping[str, Any]) -> list[Algorithm]:
+    """The algorithms of the first table of parameters, at any depth, that has the key `algorithm`."""
     chosen = parameters.get("algorithm")
     if isinstance(chosen, str) and chosen:
         compared = parameters.get("compared")
         names = compared if isinstance(compared, list) else []
         return [Algorithm(chosen), *(Algorithm(str(name), judged=False) for name in names)]
-    inner = (_named(value) for value in parameters.values() if isinstance(value, Mapping))
+    inner = (_named_algorithms(value) for value in parameters.values() if isinstance(value, Mapping))
     return next((found for found in inner if found), [])
 
 
-#: Columns of the matrix; one row for each requirement and campaign.
-COLUMNS = (
-    "requirement",
-    "statement",
-    "kind",
-    "source",
-    "campaign",
-    "algorithm",
-    "algorithm_version",
-    "algorithm_options",
-    "algorithm_source",
-    "verdict",
-    "metric",
-    "bound",
-    "population",
-    "probability",
-    "confidence",
-    "decided_by",
-    "cases",
-    "failures",
-    "terrains",
-    "rate",
-    "lower_bound",
-    "upper_bound",
-    "design_effect",
-    "consumer_risk",
-    "further_cases",
-    "note",
-)
 #: Verdicts that show a requirement neither met nor missed at its confidence.
 _SKIPPED = (Status.INSUFFICIENT, Status.MET_BY_RATE)
 #: What XML 1.0 cannot hold.
@@ -132,7 +90,7 @@ _UNPRINTABLE = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff
 
 
 def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
-    """The matrix' columns that name the algorithms that are judged; several are joined by "; "."""
+    """Columns of the matrix that identify the judged algorithms, joined by "; "."""
     judged = [one for one in algorithms if one.judged]
     cells = {
         "algorithm": [one.name for one in judged],
@@ -143,42 +101,33 @@ def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
     return {column: "; ".join(value for value in values if value) for column, values in cells.items()}
 
 
+#: Columns of the matrix before and after those of the algorithm, and the properties of the verdict that they hold.
+_REQUIREMENT = {"requirement": "requirement_id", "statement": "statement", "kind": "kind", "source": "source"}
+_EVIDENCE = {
+    "verdict": "status", "metric": "metric", "bound": "bound", "population": "population", "probability": "probability",
+    "confidence": "confidence", "decided_by": "decide_by", "cases": "n", "failures": "failures", "terrains": "terrains",
+    "rate": "estimate", "lower_bound": "lower", "upper_bound": "upper", "design_effect": "design_effect",
+    "consumer_risk": "consumer_risk", "further_cases": "further_cases", "note": "note",
+}  # fmt: skip
+COLUMNS = (*_REQUIREMENT, "campaign", *algorithm_cells(()), *_EVIDENCE)
+
+
 def evidence_of(
     campaign: str, verdicts: Iterable[Verdict], algorithms: Sequence[Algorithm] = ()
 ) -> list[dict[str, Any]]:
-    """Rows of the matrix: what a campaign shows of each requirement, and of which algorithm."""
-    return [
-        {
-            "requirement": one.requirement_id,
-            "statement": one.statement,
-            "kind": one.kind,
-            "source": one.source,
-            "campaign": campaign,
-            **algorithm_cells(algorithms),
-            "verdict": str(one.status),
-            "metric": one.metric if one.scale == 1.0 else f"{one.scale:g} * ({one.metric})",
-            "bound": one.bound,
-            "population": one.population,
-            "probability": one.probability,
-            "confidence": one.confidence,
-            "decided_by": one.decide_by,
-            "cases": one.n,
-            "failures": one.failures,
-            "terrains": one.terrains,
-            "rate": one.estimate,
-            "lower_bound": one.lower,
-            "upper_bound": one.upper,
-            "design_effect": math.nan if one.clustered is None else one.clustered.design_effect,
-            "consumer_risk": one.consumer_risk,
-            "further_cases": one.further_cases,
-            "note": one.note,
-        }
-        for one in verdicts
-    ]
+    """Rows of the traceability matrix: the evidence of a campaign for each requirement."""
+    cells = {"campaign": campaign, **algorithm_cells(algorithms)}
+    rows = []
+    for one in verdicts:
+        evidence = {column: getattr(one, name) for column, name in _EVIDENCE.items()}
+        evidence["verdict"] = str(one.status)
+        evidence["metric"] = one.metric if one.scale == 1.0 else f"{one.scale:g} * ({one.metric})"
+        rows.append({column: getattr(one, name) for column, name in _REQUIREMENT.items()} | cells | evidence)
+    return rows
 
 
 def verification_csv(rows: Iterable[Mapping[str, Any]]) -> str:
-    """The traceability matrix; what is missing or NaN is empty."""
+    """The traceability matrix; missing values and NaN are empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -190,16 +139,14 @@ def _cell(value: Any) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     text = f"{value:.9g}" if isinstance(value, float) else str(value)
-    # a text that a spreadsheet would take for a formula is shown as the text that it is
+    # the apostrophe keeps spreadsheets from reading a text as a formula
     return f"'{text}" if isinstance(value, str) and text[:1] in "=+-@\t\r" and text else text
 
 
 def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall, algorithms: Sequence[Algorithm] = ()) -> str:
-    """A test case for each requirement, and one that says whether all cases came to an end.
+    """JUnit's XML: a test for each requirement, and one for the completion of all cases.
 
-    Properties of the suite name the algorithms that are judged.
-    FAIL is a failure; INSUFFICIENT and MET BY RATE are skipped: a server of tests then shows them neither as passed nor
-    as failed.
+    FAIL is a failure; INSUFFICIENT and MET BY RATE are skipped. Properties of the suite name the judged algorithms.
     """
     statuses = [one.status for one in verdicts]
     suite = Xml.Element(
@@ -218,14 +165,14 @@ def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall, algori
     subject = f"Judged: {judged}. " if judged else ""
     for one in verdicts:
         case = Xml.SubElement(suite, "testcase", classname=_text(campaign), name=_text(one.requirement_id))
-        said = _text(
+        evidence = _text(
             f"{one.failures} of {one.n} failed; at least {one.lower:.6g}, asked {one.probability:g}. {one.note}"
         )
         if one.status is Status.FAIL:
-            Xml.SubElement(case, "failure", message=said, type=str(one.status))
+            Xml.SubElement(case, "failure", message=evidence, type=str(one.status))
         elif one.status in _SKIPPED:
-            Xml.SubElement(case, "skipped", message=f"{one.status}: {said}")
-        Xml.SubElement(case, "system-out").text = _text(f"{subject}{one.statement} {said}")
+            Xml.SubElement(case, "skipped", message=f"{one.status}: {evidence}")
+        Xml.SubElement(case, "system-out").text = _text(f"{subject}{one.statement} {evidence}")
     ended = Xml.SubElement(suite, "testcase", classname=_text(campaign), name="all cases end")
     if whole.crashed:
         Xml.SubElement(ended, "failure", message=f"{count(whole.crashed, 'case')} crashed", type="CRASHED")

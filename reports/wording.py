@@ -1,51 +1,28 @@
-"""Numbers as a reader should see them: digits that mean something, and never a success rate rounded up to certainty."""
+"""Numbers, fractions and requirements as text: significant digits, and rates never rounded up to certainty."""
 
 from __future__ import annotations
 
 import math
-from typing import Protocol, runtime_checkable
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
 
-#: Stands where there is nothing to say.
+import numpy as np
+
+#: Text of a missing value.
 NOTHING = "–"
 
 #: Magnitudes below this are rounding errors of double precision in any unit that rows have (metres, degrees, pixels).
 _ROUNDING = 1e-9
 
-#: Populations in words where their names alone would not read well; others are columns of true and false.
+#: Built-in populations in words; other populations are columns of true and false.
 _POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "valid answers"}
 
 
-@runtime_checkable
-class Asked(Protocol):
-    """A requirement, as a campaign states it or as a verdict repeats it; a `bound` of None or NaN is none."""
-
-    @property
-    def bound(self) -> float | None:
-        """Largest magnitude of the metric times the scale."""
-
-    @property
-    def scale(self) -> float:
-        """What the metric is multiplied by."""
-
-    @property
-    def probability(self) -> float:
-        """Fraction of the population that must succeed."""
-
-    @property
-    def confidence(self) -> float:
-        """Confidence at which it must."""
-
-    @property
-    def population(self) -> str:
-        """Which cases are asked about."""
-
-    @property
-    def decide_by(self) -> str:
-        """`confidence` or `estimate`."""
-
-
-def asked_text(asked: Asked, metric: str) -> str:
-    """What a requirement asks of a metric, which is named as the reader should see it."""
+def asked_text(asked: Any, metric: str) -> str:
+    """A requirement (of a campaign, or repeated by a verdict) in words, with the metric's name for readers."""
     unbounded = asked.bound is None or math.isnan(asked.bound)
     scaled = "" if asked.scale == 1.0 else f"{asked.scale:g} × "
     what = metric if unbounded else f"{scaled}|{metric}| ≤ {asked.bound:g}"
@@ -68,9 +45,14 @@ def number(value: float) -> str:
     >>> number(1.23456), number(123.456), number(0.0123456), number(9.09e-13)
     ('1.235', '123.5', '0.0123', '0.000')
     """
-    if math.isnan(value):
-        return NOTHING
-    return _digits(0.0 if abs(value) < _ROUNDING else value).replace("-", "−")
+    if not math.isfinite(value):
+        return NOTHING if math.isnan(value) else "∞" if value > 0 else "−∞"
+    magnitude = abs(value) if abs(value) >= _ROUNDING else 0.0
+    if magnitude != 0.0 and (magnitude >= 1e5 or magnitude < 1e-3):
+        return f"{value:.2e}".replace("-", "−")
+    places = ((0.0, 3), (0.01, 5), (0.1, 4), (10.0, 3), (100.0, 2), (math.inf, 1))
+    digits = next(digits for below, digits in places if magnitude <= below)
+    return f"{value if magnitude else 0.0:.{digits}f}".replace("-", "−")
 
 
 def coefficient(value: float) -> str:
@@ -80,16 +62,6 @@ def coefficient(value: float) -> str:
     ('−0.250', '0.000')
     """
     return NOTHING if math.isnan(value) else f"{value:z.3f}".replace("-", "−")
-
-
-def _digits(value: float) -> str:
-    if math.isinf(value):
-        return "∞" if value > 0 else "-∞"
-    magnitude = abs(value)
-    if magnitude != 0.0 and (magnitude >= 1e5 or magnitude < 1e-3):
-        return f"{value:.2e}"
-    places = ((0.0, 3), (0.01, 5), (0.1, 4), (10.0, 3), (100.0, 2), (math.inf, 1))
-    return f"{value:.{next(digits for below, digits in places if magnitude <= below)}f}"
 
 
 def p_text(value: float) -> str:
@@ -127,10 +99,27 @@ def percent(fraction: float) -> str:
 
 
 def stated(fraction: float) -> str:
-    """A fraction that was stated, in per cent with the digits that it was stated with."""
+    """A given fraction in per cent, with all its digits."""
     return NOTHING if math.isnan(fraction) else f"{100.0 * fraction:.10g} %"
 
 
 def count(quantity: int, noun: str) -> str:
-    """A quantity and what is counted: ``1 case``, ``24 cases``."""
+    """A quantity with its noun: ``1 case``, ``24 cases``."""
     return f"{quantity:,} {noun}{'' if quantity == 1 else 's'}"
+
+
+def plain_value(value: object) -> str:
+    """A stored value as text, whole numbers without a decimal point."""
+    return str(int(value)) if isinstance(value, float | np.floating) and value.is_integer() else str(value)
+
+
+@cache
+def _notes() -> Mapping[str, Mapping[str, str]]:
+    with (Path(__file__).parent / "templates" / "notes.toml").open("rb") as file:
+        return tomllib.load(file)
+
+
+def note_text(key: str, **values: object) -> str:
+    """A text of `templates/notes.toml` by ``table.key``, with its values."""
+    table, name = key.split(".")
+    return _notes()[table][name].format(**values)

@@ -43,7 +43,7 @@ def asked(
             return estimator.estimate(handover.given)
         if triple is None:
             raise ValueError(f"it takes three pictures, and {len(measurements.images)} are taken")
-        three = handover.given if len(measurements.images) == len(triple) else handover.given.chosen(triple)
+        three = handover.given if len(measurements.images) == len(triple) else handover.given.select(triple)
         tags = three.tags_s
         return estimator.estimate(three)
 

@@ -7,8 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from marsyard.reports.history import FINISHED, History, NightCampaign, NightFigure
-from marsyard.reports.nights import Comparison, changes, comparisons_of
+from marsyard.reports.history import FINISHED, Comparison, History, NightCampaign, NightFigure, changes, comparisons_of
 from marsyard.reports.statistics.changes import Sample
 
 #: How a campaign's cases lie on terrains.

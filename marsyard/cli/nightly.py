@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from marsyard.campaigns.execution.crew import Crew
     from marsyard.campaigns.running.engine import Watch
     from marsyard.cli.nightly_plan import Plan, PlannedCampaign
-    from marsyard.reports.history import History, NightCampaign
-    from marsyard.reports.nights import Change
+    from marsyard.reports.history import Change, History, NightCampaign
 
 #: What a nightly's folder holds.
 HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "site"
@@ -103,7 +102,7 @@ def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) 
 
 
 def _changes(history: History, night: int) -> list[Change]:
-    from marsyard.reports.nights import changes, comparisons_of
+    from marsyard.reports.history import changes, comparisons_of
 
     return changes(comparisons_of(history, night))
 
@@ -120,7 +119,7 @@ def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> N
 def _write_page(history: History, night: int, out: Path, found: Sequence[Change]) -> str:
     """Writes what is known of the night so far, and returns it."""
     from marsyard.reports.campaign import write_whole
-    from marsyard.reports.nights import comparisons_of, night_text
+    from marsyard.reports.history import comparisons_of, night_text
 
     nights = history.nights()
     now = next(one for one in nights if one.night == night)

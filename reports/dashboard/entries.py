@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.errors import CampaignError
-from marsyard.reports.campaign import TWIN_FILE, write_report
+from marsyard.reports.campaign import SCHEMA, TWIN_FILE, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.traceability import Algorithm, algorithms_of, judged_text
-from marsyard.reports.twin import SCHEMA
 from marsyard.scenarios.systems import system_of
 
 #: How deep below a folder campaigns are looked for.

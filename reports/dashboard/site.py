@@ -28,8 +28,7 @@ from marsyard.reports.dashboard.rows import (
     margin_text,
     requirement_rows,
 )
-from marsyard.reports.page_figures import embedded, script_hash
-from marsyard.reports.sections import replay_command
+from marsyard.reports.sections import embedded, replay_command, script_hash
 from marsyard.reports.stored import read_run
 from marsyard.reports.wording import percent
 

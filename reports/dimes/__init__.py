@@ -1,1 +1,1 @@
-"""What reports say of DIMES alone: its paper's figures, the field test, and the landing that its answer is for."""
+"""Reports of DIMES: its paper's figures, the field test, and the landing that uses its answer."""

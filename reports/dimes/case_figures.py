@@ -1,9 +1,8 @@
-"""Pictures of one DIMES case, laid out as Figs. 7 to 9 of the field test's paper (`papers/dimes-field-test.txt`).
+"""Figures of one DIMES case, laid out as Figs. 7 to 9 of the field test's paper (`papers/dimes-field-test.txt`).
 
-Two image pairs side by side. Below, the pictures as delivered, with the templates as red squares and the tracked places
-as green ones; above, the pictures rectified to a camera that looks straight down, with the templates in red, their
-search windows in blue and the tracked places in green. Between them stand templates and windows as DIMES correlates
-them, which the paper does not show. A square drawn with dashes belongs to a track that failed a validity check.
+Two image pairs side by side. Below, the pictures as delivered, with templates (red) and tracked positions (green);
+above, the pictures rectified to a nadir view, with search windows (blue). Between them the correlated templates and
+windows, which the paper does not show. Dashed squares belong to tracks that failed a validity check.
 """
 
 from __future__ import annotations
@@ -21,38 +20,32 @@ from matplotlib.patches import Polygon, Rectangle
 from scipy import ndimage
 
 from marsyard.reports.presentation import numbers, plane, save_figures
-from marsyard.reports.svg import INK, draw_pictures, in_page_style
+from marsyard.reports.svg import INK, draw_pictures, in_page_style, show_subframe
 
 TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
-#: Side of a template's square on a delivered picture where the products do not tell it, pixels.
+#: Side of a template's square on a delivered picture if the products lack it, pixels.
 _DEFAULT_SIDE = 15.0
 _PAIRS = (0, 1)
-_MOST_TRACKS = 2
-#: Relative heights of the rows of a pair's figure, and inches of one.
+_MAX_TRACKS = 2
+#: Relative heights of the rows of a pair's figure, and inches per unit.
 _ROW_HEIGHTS = {"rectified": 1.95, "templates": 1.0, "delivered": 1.95}
 _INCHES = 8.3 / 4.9
 #: Side of a rectified picture as drawn, pixels.
 _RECTIFIED_PX = 384
-#: Numbers that a template may have; more than two a pair are not drawn, but their numbers are.
+#: Valid template numbers; two templates a pair are drawn, the table lists all.
 _TEMPLATES = range(100)
+_DASHES = (0, (2, 1.5))
 
 
 @dataclass(frozen=True)
 class Track:
-    """One template and what became of it.
+    """One template and its track.
 
-    Attributes
-    ----------
-    pair, template
-        Numbers of the image pair and of the template in it, from 0.
-    valid
-        Whether it passed the validity checks.
-    values
-        Everything that the products hold of it, by name.
-    patch, window
-        The rectified template and search window, None where not kept.
-    place
-        Row and column of the matched template's middle in the window, None where not kept.
+    pair, template: numbers from 0
+    valid: whether it passed the validity checks
+    values: its columns of the products' table
+    patch, window: rectified template and search window
+    place: row and column of the matched template's centre in the window
     """
 
     pair: int
@@ -84,13 +77,7 @@ def tracks(products: Mapping[str, Any]) -> list[Track]:
 
 @in_page_style
 def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
-    """Both image pairs of a case, side by side.
-
-    Raises
-    ------
-    ValueError
-        Where the products do not hold the three pictures; see `is_dimes_case`.
-    """
+    """Both image pairs of a case, side by side; raises ValueError without the three pictures."""
     figure = Figure(figsize=(12.0, max(_height_in(products, pair) for pair in _PAIRS)), layout="constrained")
     halves = figure.add_gridspec(1, 2)
     for pair in _PAIRS:
@@ -100,35 +87,24 @@ def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
 
 @in_page_style
 def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
-    """One image pair of a case, 0 or 1; raises as `draw_dimes_case` does."""
+    """One image pair of a case, 0 or 1; raises ValueError without its pictures."""
     figure = Figure(figsize=(6.0, _height_in(products, pair)), layout="constrained")
     _draw_pair(figure, products, pair)
     return figure
 
 
 def has_dimes_details(products: Mapping[str, Any]) -> bool:
-    """Whether products hold what DIMES keeps of its answer: tracks, if only none of them."""
+    """Whether products hold DIMES' own table of tracks, which may be empty."""
     return "tracks" in products
 
 
 def delivered_pictures(products: Mapping[str, Any]) -> list[Float[np.ndarray, "_ _"]]:
-    """The three pictures, their columns binned; raises as `draw_dimes_case` does."""
+    """The three pictures with binned columns; raises ValueError if one is missing."""
     return [_picture(products, f"image_{number}") for number in (1, 2, 3)]
 
 
 def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Writes a case's figure into a folder; returns its path.
-
-    It is `dimes.png`, as `draw_dimes_case` draws it; of an algorithm without DIMES' details `pictures.png`, the
-    pictures alone.
-
-    Raises
-    ------
-    ValueError
-        Where the products are not those of a DIMES case.
-    OSError
-        Where it cannot be written.
-    """
+    """Write `dimes.png` into a folder, or `pictures.png` if the algorithm has no DIMES details; returns the path."""
     if has_dimes_details(products):
         return save_figures(directory, {"dimes": draw_dimes_case(products)})
     return save_figures(directory, {"pictures": draw_pictures(delivered_pictures(products))})
@@ -150,7 +126,7 @@ def _height_in(products: Mapping[str, Any], pair: int) -> float:
 
 def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> None:
     pictures = [_picture(products, f"image_{number}") for number in (pair + 1, pair + 2)]
-    ours = [track for track in tracks(products) if track.pair == pair][:_MOST_TRACKS]
+    ours = [track for track in tracks(products) if track.pair == pair][:_MAX_TRACKS]
     heights = _row_heights(products, pair)
     cells = figure.add_gridspec(len(heights), 1, height_ratios=[*heights.values()])
     grid = {name: cells[place] for place, name in enumerate(heights)}
@@ -159,19 +135,19 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
         for side, picture in enumerate(pictures):
             _draw_rectified(figure.add_subplot(upper[side]), products, picture, ours, (pair, side))
     if "templates" in grid:
-        middle = grid["templates"].subgridspec(1, 2 * _MOST_TRACKS)
-        for place in range(_MOST_TRACKS):
-            track = ours[place] if place < len(ours) else None
-            _draw_template(figure.add_subplot(middle[2 * place]), track)
-            _draw_window(figure.add_subplot(middle[2 * place + 1]), track)
+        middle = grid["templates"].subgridspec(1, 2 * _MAX_TRACKS)
+        for place in range(_MAX_TRACKS):
+            panels = [figure.add_subplot(middle[2 * place + k]) for k in (0, 1)]
+            _draw_template_window(panels, ours[place] if place < len(ours) else None)
     lower = grid["delivered"].subgridspec(1, 2)
     for side, (picture, stem, colour) in enumerate(
         zip(pictures, ("template", "match"), (TEMPLATE, MATCH), strict=True)
     ):
         axes = figure.add_subplot(lower[side])
-        _show(axes, picture)
-        _mark(axes, ours, stem, colour)
-        _outline(axes, products, pair, side)
+        show_subframe(axes, picture)
+        axes.set_facecolor(INK)
+        _mark_tracks(axes, ours, stem, colour)
+        _outline_overlap(axes, products, pair, side)
         axes.set_title(f"Picture {pair + side + 1}: {'templates' if side == 0 else 'tracked'}", fontsize=9)
 
 
@@ -182,23 +158,22 @@ def _draw_rectified(
     ours: Sequence[Track],
     place: tuple[int, int],
 ) -> None:
-    """One picture of a pair as the virtual camera sees it, at one scale for both; `place` is (pair, side)."""
+    """One picture of a pair in the virtual nadir camera; `place` is (pair, side)."""
     pair, side = place
     lattice = numbers(products.get(f"rectified_{pair}_{side}"))
     frame, gsd = numbers(products.get(f"rectified_frame_{pair}")), numbers(products.get(f"gsd_{pair}"))
     if lattice is None or lattice.ndim != 3 or lattice.shape[2] != 2 or frame is None or frame.size != 3:
         axes.set_axis_off()
         return
-    rectified = _rectified(picture, lattice)
-    _show(axes, rectified)
+    rectified = _rectify(picture, lattice)
+    show_subframe(axes, rectified)
+    axes.set_facecolor(INK)
     step = float(frame[2]) * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
     spacing = float(gsd[0]) if gsd is not None and gsd.size == 1 else np.nan
 
     def square(ground: Float[np.ndarray, "2"], side_px: int, colour: str, valid: bool) -> None:
-        size = side_px * spacing / step
-        middle = ((ground[0] - frame[0]) / step, (frame[1] - ground[1]) / step)
-        if np.isfinite([size, *middle]).all():
-            _square(axes, (middle[0] - size / 2, middle[1] - size / 2), (size, size), colour, valid)
+        centre = ((ground[0] - frame[0]) / step, (frame[1] - ground[1]) / step)
+        _draw_square(axes, centre, side_px * spacing / step, colour, valid)
 
     for track in ours:
         ground = np.array([track.values.get(f"ground_{axis}_m", np.nan) for axis in ("east", "north")])
@@ -213,15 +188,15 @@ def _draw_rectified(
 
 
 def _matched_ground(track: Track, ground: Float[np.ndarray, "2"], gsd_m: float) -> Float[np.ndarray, "2"]:
-    """Where the template was found, in the later picture's ground frame: the window is centred on `ground`."""
+    """Ground position of the match; the window is centred on `ground`."""
     if track.place is None or track.window is None:
         return np.full(2, np.nan)
     middle = 0.5 * (len(track.window) - 1)
     return np.asarray(ground + gsd_m * np.array([track.place[1] - middle, middle - track.place[0]]))
 
 
-def _rectified(picture: Float[np.ndarray, "_ _"], lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
-    """The picture at the lattice's places, which are interpolated between; NaN out of the picture."""
+def _rectify(picture: Float[np.ndarray, "_ _"], lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
+    """Resample the picture at the interpolated pixels of a lattice; NaN outside the picture."""
     places = np.linspace(0.0, lattice.shape[0] - 1.0, _RECTIFIED_PX)
     v, u = np.meshgrid(places, places, indexing="ij")
     pixels = [ndimage.map_coordinates(lattice[..., k], [v, u], order=1, mode="nearest") for k in (1, 0)]
@@ -231,53 +206,42 @@ def _rectified(picture: Float[np.ndarray, "_ _"], lattice: Float[np.ndarray, "n 
     return np.asarray(np.where(seen, values, np.nan))
 
 
-def _draw_template(axes: Axes, track: Track | None) -> None:
-    if track is None or track.patch is None:
-        axes.set_axis_off()
+def _draw_template_window(axes: Sequence[Axes], track: Track | None) -> None:
+    """Draw a template and its search window with the match; nothing for what is missing."""
+    if track is None:
+        for one in axes:
+            one.set_axis_off()
         return
-    _show(axes, track.patch)
-    _frame(axes, TEMPLATE, track.valid)
-    axes.set_title(f"Template {track.template + 1}", fontsize=9)
+    line = "-" if track.valid else _DASHES
+    parts = ((track.patch, f"Template {track.template + 1}", TEMPLATE, line), (track.window, "Window", WINDOW, "-"))
+    for one, (picture, title, colour, style) in zip(axes, parts, strict=True):
+        if picture is None:
+            one.set_axis_off()
+            continue
+        show_subframe(one, picture)
+        one.set_facecolor(INK)
+        one.spines[:].set(visible=True, edgecolor=colour, linewidth=2.2, linestyle=style)
+        one.set_title(title, fontsize=9)
+    if track.place is not None and track.patch is not None and track.window is not None:
+        _draw_square(axes[1], track.place[::-1], float(len(track.patch)), MATCH, track.valid)
 
 
-def _draw_window(axes: Axes, track: Track | None) -> None:
-    if track is None or track.window is None:
-        axes.set_axis_off()
-        return
-    _show(axes, track.window)
-    _frame(axes, WINDOW, True)
-    if track.place is not None and track.patch is not None:
-        height, width = (float(side) for side in track.patch.shape)
-        _square(axes, (track.place[1] - width / 2, track.place[0] - height / 2), (width, height), MATCH, track.valid)
-    axes.set_title("Window", fontsize=9)
-
-
-def _mark(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
-    """Squares at the tracks' places in a delivered picture, numbered."""
+def _mark_tracks(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
+    """Numbered squares at the tracks' positions in a delivered picture."""
+    box = {"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0}
     for track in ours:
         u, v = track.values.get(f"{stem}_u", np.nan), track.values.get(f"{stem}_v", np.nan)
-        if not np.isfinite((u, v)).all():
-            continue
         side = track.values.get("template_side_px", _DEFAULT_SIDE)
-        _square(axes, (u - side / 2, v - side / 2), (side, side), colour, track.valid)
-        number = str(track.template + 1)
-        axes.annotate(
-            number,
-            (u, v - side / 2),
-            xytext=(0, 3),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            color=colour,
-            fontsize=9,
-            fontweight="bold",
-            annotation_clip=True,
-            bbox={"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0},
-        )
+        if np.isfinite((u, v)).all():
+            _draw_square(axes, (u, v), side, colour, track.valid)
+            axes.annotate(
+                str(track.template + 1), (u, v - side / 2), xytext=(0, 3), textcoords="offset points", ha="center",
+                va="bottom", color=colour, fontsize=9, fontweight="bold", annotation_clip=True, bbox=box,
+            )  # fmt: skip
 
 
-def _outline(axes: Axes, products: Mapping[str, Any], pair: int, side: int) -> None:
-    """Where the other picture of the pair overlaps the first, and the middle of the zero-phase spot in each."""
+def _outline_overlap(axes: Axes, products: Mapping[str, Any], pair: int, side: int) -> None:
+    """Outline the overlap in the first picture, and mark the centre of the zero-phase spot."""
     polygon, spot = plane(products.get(f"overlap_{pair}")), plane(products.get(f"zero_phase_{pair}"))
     if side == 0 and polygon is not None and polygon.shape[1] == 2:
         axes.add_patch(Polygon(polygon, fill=False, edgecolor="#f2e35a", linewidth=0.9, linestyle=":"))
@@ -288,27 +252,10 @@ def _outline(axes: Axes, products: Mapping[str, Any], pair: int, side: int) -> N
             axes.plot([u], [v], marker="x", color="#f2e35a", markersize=7)
 
 
-def _square(axes: Axes, corner: tuple[float, float], size: tuple[float, float], colour: str, valid: bool) -> None:
-    line = "-" if valid else (0, (2, 1.5))
-    axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=1.8, linestyle=line))
-
-
-def _frame(axes: Axes, colour: str, valid: bool) -> None:
-    for spine in axes.spines.values():
-        spine.set(visible=True, edgecolor=colour, linewidth=2.2, linestyle="-" if valid else (0, (2, 1.5)))
-
-
-def _show(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
-    """A picture in grey, its contrast stretched between the 1 % and the 99 % quantile."""
-    finite = picture[np.isfinite(picture)]
-    low, high = np.quantile(finite, (0.01, 0.99)) if finite.size else (0.0, 1.0)
-    levels = np.clip((np.nan_to_num(picture, nan=low) - low) / max(high - low, 1e-9), 0.0, 1.0)
-    grey = np.round(255.0 * levels).astype(np.uint8)
-    axes.imshow(np.repeat(grey[..., None], 3, axis=2), interpolation="none", aspect="equal")
-    axes.set(xticks=[], yticks=[], facecolor=INK)
-    axes.grid(visible=False)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: str, valid: bool) -> None:
+    if np.isfinite([*centre, side]).all():
+        corner, line = (centre[0] - side / 2, centre[1] - side / 2), "-" if valid else _DASHES
+        axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=colour, linewidth=1.8, linestyle=line))
 
 
 def _track(products: Mapping[str, Any], row: Mapping[str, float]) -> Track:
@@ -327,7 +274,7 @@ def _track(products: Mapping[str, Any], row: Mapping[str, float]) -> Track:
 
 
 def _picture(products: Mapping[str, Any], key: str) -> Float[np.ndarray, "_ _"]:
-    """A delivered picture with its columns binned in software as DIMES bins them, so that pixels are square."""
+    """A delivered picture with columns binned to square pixels, as in DIMES."""
     counts = plane(products.get(key))
     if counts is None:
         raise ValueError(f"the products hold no picture '{key}'")

@@ -1,92 +1,152 @@
-"""How descents are presented: their sections, and a DIMES case as its image pairs, its velocities and its tracks."""
+"""Presentation of descents: report sections, and views of DIMES cases and of velocity streams."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from marsyard.reports.columns import label
-from marsyard.reports.dimes.case_figures import (
-    Track,
-    delivered_pictures,
-    draw_dimes_pair,
-    has_dimes_details,
-    is_dimes_case,
-    tracks,
-    write_dimes_figures,
-)
+from marsyard.reports.dimes import case_figures as figures
 from marsyard.reports.dimes.sections import FIRING, LANDING, field_test_section, sensitivity_section
-from marsyard.reports.dimes.stream import STREAM_CASE
-from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
+from marsyard.reports.presentation import (
+    CaseKind,
+    CaseView,
+    Presentation,
+    TableRow,
+    numbers,
+    plane,
+    read_arrays,
+    save_figures,
+)
 from marsyard.reports.section import plate
-from marsyard.reports.svg import draw_pictures
-from marsyard.reports.wording import number
+from marsyard.reports.svg import INK, MARKERS, MUTED, SERIES, draw_pictures, in_page_style
+from marsyard.reports.wording import note_text, number
 
-#: Columns of the tracks that the page has no room for, or says otherwise.
+#: Columns of the tracks that the page shows elsewhere or has no width for.
 _NOT_SHOWN = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
-_LEGEND = (
-    "Below, the pictures as delivered, columns binned: squares mark templates (red) and tracked places (green), not "
-    "their size; dotted yellow outlines the overlap, a yellow cross the zero-phase spot. Above, both pictures of a "
-    "pair rectified to one camera that looks straight down, north up, with templates, search windows (blue) and "
-    "tracked places to scale. Between, templates and windows as they are correlated. Dashed: a validity check was not "
-    "passed."
-)
-
-_PLAIN_LEGEND = (
-    "Pictures as delivered, columns binned. Tracks and templates are drawn of algorithms whose answers have the "
-    "details of DIMES (docs/own-algorithms.md)."
-)
+_LEGEND = note_text("dimes.legend")
+_PLAIN_LEGEND = note_text("dimes.plain_legend")
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """A DIMES case; of an algorithm without DIMES' details its pictures alone."""
-    if not has_dimes_details(products):
-        pictures = draw_pictures(delivered_pictures(products))
+    """A DIMES case; its pictures alone if the algorithm left no DIMES details."""
+    if not figures.has_dimes_details(products):
+        pictures = draw_pictures(figures.delivered_pictures(products))
         shown = plate(pictures, f"{key}pictures", "The three pictures that the algorithm was given.", wide=True)
         return CaseView(_velocities(products), [shown], [], [], _PLAIN_LEGEND)
     pairs = enumerate(("first and second picture", "second and third picture"))
-    plates = [plate(draw_dimes_pair(products, k), f"{key}pair{k}", f"Pair {k + 1}: {name}.") for k, name in pairs]
-    of_each = tracks(products)
-    quantities = list(dict.fromkeys(name for track in of_each for name in track.values))
-    quantities = [name for name in quantities if name not in _NOT_SHOWN and not _is_check(name)]
-    return CaseView(
-        facts=_velocities(products),
-        plates=plates,
-        head=["Pair", "Template", "Failed checks", *(label(name) for name in quantities)],
-        rows=[_track_row(track, quantities) for track in of_each],
-    )
-
-
-DIMES_CASE = CaseKind(is_dimes_case, view, write_dimes_figures, _LEGEND)
-DIMES = Presentation(cases=(STREAM_CASE, DIMES_CASE), sections=(FIRING, LANDING, sensitivity_section))
-FIELD_TEST = Presentation(first=(field_test_section,))
-
-
-def _track_row(track: Track, quantities: Sequence[str]) -> TableRow:
-    values = [number(track.values.get(name, float("nan"))) for name in quantities]
-    failed = [_check_words(name) for name, value in track.values.items() if _is_check(name) and value == 1.0]
-    said = ", ".join(failed) or ("none" if track.valid else "unknown")
-    return TableRow([str(track.pair + 1), str(track.template + 1), said, *values], track.valid)
-
-
-def _is_check(name: str) -> bool:
-    return name.startswith("failed_")
-
-
-def _check_words(name: str) -> str:
-    return name.removeprefix("failed_").replace("_", " ")
+    plates = [
+        plate(figures.draw_dimes_pair(products, k), f"{key}pair{k}", f"Pair {k + 1}: {name}.") for k, name in pairs
+    ]
+    tracks = figures.tracks(products)
+    names = dict.fromkeys(name for track in tracks for name in track.values)
+    quantities = [name for name in names if name not in _NOT_SHOWN and not name.startswith("failed_")]
+    head = ["Pair", "Template", "Failed checks", *(label(name) for name in quantities)]
+    rows = []
+    for track in tracks:
+        failed = [name for name, value in track.values.items() if name.startswith("failed_") and value == 1.0]
+        checks = ", ".join(name.removeprefix("failed_").replace("_", " ") for name in failed)
+        texts = [str(track.pair + 1), str(track.template + 1), checks or ("none" if track.valid else "unknown")]
+        texts += [number(track.values.get(name, np.nan)) for name in quantities]
+        rows.append(TableRow(texts, track.valid))
+    return CaseView(_velocities(products), plates, head, rows)
 
 
 def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Estimated and true velocity, where the products hold them."""
+    """Estimated and true velocity, if the products hold them."""
     facts = []
     for key, name in (("velocity_estimated_m_s", "Estimated velocity"), ("velocity_true_m_s", "True velocity")):
-        try:
-            velocity = np.asarray(products.get(key, ()), dtype=np.float64).ravel()
-        except (TypeError, ValueError):
-            continue
-        if velocity.size >= 2 and np.isfinite(velocity[:2]).all():
-            facts.append((name, f"{velocity[0]:+.2f} m/s east, {velocity[1]:+.2f} m/s north"))
+        velocity = numbers(products.get(key))
+        if velocity is not None and velocity.size >= 2 and np.isfinite(velocity.ravel()[:2]).all():
+            east, north = velocity.ravel()[:2]
+            facts.append((name, f"{east:+.2f} m/s east, {north:+.2f} m/s north"))
     return facts
+
+
+#: Pictures in a row of a stream's figure.
+_MAX_IN_ROW = 10
+_STREAM_LEGEND = note_text("dimes.stream_legend")
+
+
+def _stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"] | None:
+    """Begin and end of the time span, estimate and truth (east, north) after each picture; NaN where none was given."""
+    parts = read_arrays(products, dict.fromkeys(("after_spans_s", "after_velocities_m_s", "after_true_m_s"), (None, 2)))
+    if parts is None or len({len(part) for part in parts}) > 1 or not len(parts[0]):
+        return None
+    return np.concatenate(parts, axis=1)
+
+
+def is_stream_case(products: Mapping[str, Any]) -> bool:
+    """Whether products hold the answers of a velocity stream after each of its pictures."""
+    table = _stream(products)
+    return table is not None and all(plane(products.get(f"image_{k + 1}")) is not None for k in range(len(table)))
+
+
+def view_stream(products: Mapping[str, Any], key: str) -> CaseView:
+    """A velocity stream: its pictures, and the estimate after each."""
+    rows = []
+    for place, row in enumerate(_require_stream(products), start=1):
+        answered = bool(np.isfinite(row[2]))
+        values = [number(float(value)) for value in (*row, np.hypot(row[2] - row[4], row[3] - row[5]))]
+        rows.append(TableRow([str(place), *(values if answered else ["" for _ in values])], answered))
+    head = ["After picture", "From (s)", "To (s)", "East (m/s)", "North (m/s)", "True east", "True north"]
+    caption = "Pictures, and the estimate after each."
+    drawn = plate(draw_stream_case(products), f"{key}stream", caption, wide=True)
+    return CaseView([], [drawn], [*head, "Error (m/s)"], rows)
+
+
+def _require_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"]:
+    table = _stream(products)
+    if table is None:
+        raise ValueError("the products hold no velocity stream")
+    return table
+
+
+@in_page_style
+def draw_stream_case(products: Mapping[str, Any]) -> Figure:
+    """The pictures in rows, and both components of the velocity after each."""
+    table = _require_stream(products)
+    lines = -(-len(table) // _MAX_IN_ROW)
+    figure = Figure(figsize=(12.0, 3.4 + 1.6 * lines), layout="constrained")
+    parts = figure.add_gridspec(2, 1, height_ratios=(1.6 * lines, 3.4))
+    upper, lower = (figure.add_subfigure(part) for part in (parts[0], parts[1]))
+    panels = upper.subplots(lines, min(len(table), _MAX_IN_ROW), squeeze=False)
+    for place, axes in enumerate(panels.ravel()):
+        axes.set_axis_off()
+        picture = plane(products.get(f"image_{place + 1}"))
+        if picture is not None and place < len(table):
+            low, high = np.quantile(picture, (0.01, 0.99))
+            axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1.0), aspect="auto")
+            axes.set_box_aspect(1.0)
+            axes.set_title(str(place + 1), fontsize=9)
+    for component, (name, axes) in enumerate(zip(("east", "north"), lower.subplots(1, 2), strict=True)):
+        _draw_component(axes, table[np.isfinite(table[:, 2])], component)
+        axes.set(xlabel="Time tag (s)", ylabel=f"Velocity {name} (m/s)")
+    return figure
+
+
+def _draw_component(axes: Axes, answered: Float[np.ndarray, "n 6"], component: int) -> None:
+    start, end = answered[:, 0], answered[:, 1]
+    centres, true = 0.5 * (start + end), answered[:, 4 + component]
+    axes.hlines(true, start, np.maximum(end, start), color=INK, linewidth=1.0)
+    axes.plot(centres, true, color=INK, linewidth=1.0, label="true")
+    style: dict[str, Any] = {"fmt": MARKERS[component], "color": SERIES[component], "ecolor": MUTED}
+    axes.errorbar(centres, answered[:, 2 + component], xerr=0.5 * (end - start), label="answered", **style)
+    if len(answered):
+        axes.legend()
+
+
+def _write_stream(directory: Path, products: Mapping[str, Any]) -> list[Path]:
+    return save_figures(directory, {"stream": draw_stream_case(products)})
+
+
+STREAM_CASE = CaseKind(is_stream_case, view_stream, _write_stream, _STREAM_LEGEND)
+DIMES_CASE = CaseKind(figures.is_dimes_case, view, figures.write_dimes_figures, _LEGEND)
+DIMES = Presentation(cases=(STREAM_CASE, DIMES_CASE), sections=(FIRING, LANDING, sensitivity_section))
+FIELD_TEST = Presentation(first=(field_test_section,))

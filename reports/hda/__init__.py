@@ -1,1 +1,1 @@
-"""What reports and replays show of the hazard detection and avoidance of `papers/vision-guided-landing.txt`."""
+"""Reports of hazard detection and avoidance (`papers/vision-guided-landing.txt`)."""

@@ -1,9 +1,9 @@
-"""Pictures of one landing as Figs. 1 to 5 and 7 of `papers/vision-guided-landing.txt` show theirs.
+"""Figures of one landing as Figs. 1 to 5 and 7 of `papers/vision-guided-landing.txt`.
 
-The colours are those that the paper's text gives: first and second camera red and green, features white; structure
-pixels red, segments green, matches blue; maps green, yellow and red; the a-priori site a black X, the safe site a
-purple plus. Their tones are apart for colour-blind readers too, and nothing is told by colour alone. The paper gives no
-colours for Fig. 1. The true maps beside Fig. 5 and the true motion in Fig. 2 are ours to show.
+Colours as the paper's text names them, in tones for colour-blind readers: cameras red and green, features white;
+structure pixels red, segments green, matches blue; maps green, yellow and red; a-priori site a black X, safe site a
+purple plus. Added to the paper: the true maps of Fig. 5 and the true motion of Fig. 2. Figures raise ValueError if the
+products lack what they show.
 """
 
 from __future__ import annotations
@@ -19,18 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LightSource, LinearSegmentedColormap, ListedColormap, to_rgb
 from matplotlib.figure import Figure
 
-from marsyard.reports.hda.products import (
-    EpipolarMatches,
-    LandingMaps,
-    SolvedMotion,
-    TrackedFeatures,
-    epipolar_matches,
-    landing_maps,
-    pictures,
-    solved_motion,
-    tracked_features,
-    true_ground,
-)
+from marsyard.reports.hda import products as stages
 from marsyard.reports.presentation import save_figures
 from marsyard.reports.svg import MUTED, in_page_style, show_picture
 
@@ -47,32 +36,22 @@ HAZARD_COLOURS = LinearSegmentedColormap.from_list(
 SAFETY_COLOURS = ListedColormap([GREEN, YELLOW, RED])
 #: Dark is high, bright is low.
 ELEVATION_COLOURS = "gray_r"
-#: Structure pixels drawn at most: Table I has 600.
-_MOST_MATCHES = 600
+#: Maximum number of structure pixels drawn: Table I has 600.
+_MAX_MATCHES = 600
 #: Cells of a terrain's longer side as drawn.
 _DRAWN_CELLS = 90
-#: Height of the drawn relief over the terrain's side, at least, as far as drawing it up to ten times as high does it.
-_LEAST_RELIEF = 0.12
+#: Minimum height of the drawn relief over the terrain's side; heights are exaggerated up to ten times.
+_MIN_RELIEF = 0.12
 _BACKGROUND = "#15191e"
 
 
 @in_page_style
 def draw_tracks(products: Mapping[str, Any]) -> Figure:
-    """Fig. 1: features in the first picture, their tracks in the second.
-
-    Raises
-    ------
-    ValueError
-        As all figures here: where the products do not hold what it shows.
-    """
-    shown, tracks = _known(pictures(products), "pictures"), _known(tracked_features(products), "tracks")
-    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    show_picture(left, shown[0])
-    show_picture(right, shown[1])
+    """Fig. 1: features in the first picture, their tracks in the second."""
+    figure, left, right = _picture_pair(products)
+    tracks = _require(stages.tracked_features(products), "tracks")
     _draw_features(left, tracks.first, tracks)
-    moved = np.stack([tracks.first, tracks.second], axis=1)[tracks.accepted]
-    right.plot(*np.moveaxis(moved, -1, 0).transpose(0, 2, 1), color=FOUND, linewidth=0.8, alpha=0.9)
+    _draw_segments(right, tracks.first[tracks.accepted], tracks.second[tracks.accepted], FOUND, alpha=0.9)
     _draw_features(right, tracks.second, tracks, lost=False)
     left.set_title(f"First picture: {len(tracks.first)} features", fontsize=9)
     right.set_title(f"Second picture: {int(tracks.accepted.sum())} tracks", fontsize=9)
@@ -82,15 +61,14 @@ def draw_tracks(products: Mapping[str, Any]) -> Figure:
 
 @in_page_style
 def draw_motion(products: Mapping[str, Any]) -> Figure:
-    """Fig. 2: three views of motion and structure, orthographic."""
-    motion = _known(solved_motion(products), "motion")
-    maps = landing_maps(products)
-    # Without a map there is no vertical: the first camera's axis stands for it.
+    """Fig. 2: three orthographic views of motion and structure."""
+    motion, maps = _require(stages.solved_motion(products), "motion"), stages.landing_maps(products)
+    # without a map the vertical is unknown: the first camera's optical axis replaces it
     upright = np.diag([1.0, -1.0, -1.0]) if maps is None else maps.surface_from_camera
     figure = Figure(figsize=(9.0, 3.6), layout="constrained", facecolor="none")
     views = (("from above", 0, 1), ("along y", 0, 2), ("along x", 1, 2))
-    for axes, (name, across, up) in zip(figure.subplots(1, 3), views, strict=True):
-        _draw_motion_view(axes, motion, upright, (across, up))
+    for axes, (name, *pair) in zip(figure.subplots(1, 3), views, strict=True):
+        _draw_motion_view(axes, motion, upright, pair)
         axes.set_title(f"Seen {name}", fontsize=9)
     figure.axes[0].legend(loc="upper left", fontsize=7, labelcolor=WHITE)
     return figure
@@ -99,19 +77,14 @@ def draw_motion(products: Mapping[str, Any]) -> Figure:
 @in_page_style
 def draw_epipolar(products: Mapping[str, Any]) -> Figure:
     """Fig. 3: structure pixels in the first picture, their segments and matches in the second."""
-    shown, matches = _known(pictures(products), "pictures"), _known(epipolar_matches(products), "matches")
-    chosen = _thinned(matches)
-    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    show_picture(left, shown[0])
-    show_picture(right, shown[1])
+    figure, left, right = _picture_pair(products)
+    matches = _require(stages.epipolar_matches(products), "matches")
+    chosen = _thin_matches(matches)
     _draw_squares(left, matches.grid[chosen], "#ff4b3e")
-    segments = np.stack([matches.starts, matches.ends], axis=1)[chosen]
-    right.plot(*np.moveaxis(segments, -1, 0).transpose(0, 2, 1), color="#35d46b", linewidth=0.8)
-    found = matches.matched[chosen][matches.accepted[chosen]]
-    _draw_squares(right, found, BLUE)
-    told = "" if len(chosen) == len(matches.grid) else f", {len(chosen)} shown"
-    left.set_title(f"First picture: {len(matches.grid):,} structure pixels{told}", fontsize=9)
+    _draw_segments(right, matches.starts[chosen], matches.ends[chosen], "#35d46b")
+    _draw_squares(right, matches.matched[chosen][matches.accepted[chosen]], BLUE)
+    thinned = "" if len(chosen) == len(matches.grid) else f", {len(chosen)} shown"
+    left.set_title(f"First picture: {len(matches.grid):,} structure pixels{thinned}", fontsize=9)
     right.set_title(f"Second: segments, {int(matches.accepted.sum()):,} matches", fontsize=9)
     return figure
 
@@ -119,7 +92,7 @@ def draw_epipolar(products: Mapping[str, Any]) -> Figure:
 @in_page_style
 def draw_elevation(products: Mapping[str, Any]) -> Figure:
     """Fig. 4: two views of the elevation map."""
-    maps = _known(landing_maps(products), "maps")
+    maps = _require(stages.landing_maps(products), "maps")
     figure = Figure(figsize=(9.0, 3.9), layout="constrained")
     for place, azimuth in enumerate((-115.0, -25.0)):
         axes = figure.add_subplot(1, 2, place + 1, projection="3d", computed_zorder=False)
@@ -130,7 +103,7 @@ def draw_elevation(products: Mapping[str, Any]) -> Figure:
 @in_page_style
 def draw_maps(products: Mapping[str, Any]) -> Figure:
     """Fig. 5 (A): elevation, roughness, slope and safe landing map; below, the truth in the same coordinates."""
-    maps, truth = _known(landing_maps(products), "maps"), _known(true_ground(products), "truth")
+    maps, truth = _require(stages.landing_maps(products), "maps"), _require(stages.true_ground(products), "truth")
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")
     upper, lower = figure.subplots(2, 4)
     degrees, limits = np.degrees(maps.slope_rad), maps.limits
@@ -138,11 +111,11 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
     reach = float(np.nanquantile(np.abs(maps.elevation_m - middle), 0.99)) or 1.0
     at = maps.cells(truth.away_m)
     covered = np.where(truth.covered, 1.0, np.nan)
-    planes: list[tuple[str, np.ndarray, np.ndarray, float | None]] = [
+    planes = (
         ("elevation (m)", maps.elevation_m - middle, truth.elevation_m - middle, None),
         ("roughness (m)", maps.roughness_m, truth.roughness_m * covered, float(limits[1])),
         ("slope (deg)", degrees, np.degrees(truth.slope_rad) * covered, float(np.degrees(limits[0]))),
-    ]
+    )
     for above, below, (name, ours, true, limit) in zip(upper, lower, planes, strict=False):
         scale = {"vmin": -reach, "vmax": reach, "cmap": ELEVATION_COLOURS}
         if limit is not None:
@@ -154,7 +127,9 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
         bar.ax.tick_params(labelsize=7)
         above.set_title(f"Map: {name}", fontsize=9)
         below.set_title("Truth of footprints" if limit is not None else "Truth", fontsize=9)
-    _draw_safety(upper[3], maps)
+    upper[3].imshow(maps.safety, interpolation="nearest", vmin=0, vmax=2, cmap=SAFETY_COLOURS)
+    if (maps.safety > 1.5).any() and (maps.safety < 1.5).any():
+        upper[3].contourf(maps.safety, levels=[1.5, 2.5], colors="none", hatches=["////"])
     true_safety = np.where(truth.covered, np.where(truth.safe, 0.0, 2.0), 1.0)
     lower[3].pcolormesh(
         at[..., 1], at[..., 0], true_safety, shading="nearest", rasterized=True, vmin=0, vmax=2, cmap=SAFETY_COLOURS
@@ -174,20 +149,19 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
 @in_page_style
 def draw_site(products: Mapping[str, Any]) -> Figure:
     """Fig. 7 and Fig. 5 (B): the first picture, the safe landing map and the site on the picture and on the terrain."""
-    shown, maps = _known(pictures(products), "pictures"), _known(landing_maps(products), "maps")
+    shown, maps = _require(stages.pictures(products), "pictures"), _require(stages.landing_maps(products), "maps")
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    grid = figure.add_gridspec(1, 3)
-    plain, over = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
+    plain, over = figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2)
     for axes in (plain, over):
         show_picture(axes, shown[0])
-    limits = over.get_xlim(), over.get_ylim()
+    limits = {"xlim": over.get_xlim(), "ylim": over.get_ylim()}
     if np.isfinite(maps.pixels).all():
         known = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
         over.pcolormesh(
             maps.pixels[..., 0], maps.pixels[..., 1], known, shading="nearest", alpha=0.38,
             vmin=0, vmax=2, cmap=SAFETY_COLOURS, rasterized=True, linewidth=0.0,
         )  # fmt: skip
-    over.set(xlim=limits[0], ylim=limits[1])
+    over.set(**limits)
     for axes in (plain, over):
         for name, cell in (("apriori", maps.apriori), ("site", maps.site)):
             pixel = _at_cell(maps.pixels, cell)
@@ -195,13 +169,13 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
                 _mark(axes, pixel, name)
     plain.set_title("First picture", fontsize=9)
     over.set_title("Safe landing map on it", fontsize=9)
-    terrain = figure.add_subplot(grid[2], projection="3d", computed_zorder=False)
+    terrain = figure.add_subplot(1, 3, 3, projection="3d", computed_zorder=False)
     colours = SAFETY_COLOURS(np.clip(np.nan_to_num(maps.safety, nan=1.0), 0, 2).astype(np.int64))[..., :3]
     _draw_terrain(terrain, maps, colours, -115.0)
     return figure
 
 
-#: The figures by the names of their files, in the paper's order.
+#: The figures by file name, in the paper's order.
 FIGURES: Mapping[str, Callable[[Mapping[str, Any]], Figure]] = {
     "fig1-tracks": draw_tracks,
     "fig2-motion": draw_motion,
@@ -210,37 +184,31 @@ FIGURES: Mapping[str, Callable[[Mapping[str, Any]], Figure]] = {
     "fig5-maps": draw_maps,
     "fig7-site": draw_site,
 }
+#: Stages that single figures show; the others show the maps.
+_STAGES = {
+    "fig1-tracks": stages.tracked_features,
+    "fig2-motion": stages.solved_motion,
+    "fig3-epipolar": stages.epipolar_matches,
+}
 
 
 def figures_reached(products: Mapping[str, Any]) -> list[str]:
-    """Names of the figures that a case can show: those of the stages that it reached."""
-    reached = {
-        "fig1-tracks": tracked_features(products) is not None,
-        "fig2-motion": solved_motion(products) is not None,
-        "fig3-epipolar": epipolar_matches(products) is not None,
-    }
-    mapped = landing_maps(products) is not None
-    return [name for name in FIGURES if reached.get(name, mapped)]
+    """Names of the figures whose stages a case reached."""
+    return [name for name in FIGURES if _STAGES.get(name, stages.landing_maps)(products) is not None]
 
 
 def write_hda_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Writes the figures of the stages that a case reached into a folder; returns their paths.
-
-    Raises
-    ------
-    OSError
-        Where they cannot be written.
-    """
+    """Write the figures of the stages that a case reached into a folder; returns their paths."""
     return save_figures(directory, {name: FIGURES[name](products) for name in figures_reached(products)}, dpi=130)
 
 
-def _known(part: T | None, name: str) -> T:
+def _require(part: T | None, name: str) -> T:
     if part is None:
         raise ValueError(f"the products hold no {name}")
     return part
 
 
-def _draw_features(axes: Axes, pixels: Float[np.ndarray, "n 2"], tracks: TrackedFeatures, *, lost: bool = True) -> None:
+def _draw_features(axes: Axes, pixels: stages.Pixels, tracks: stages.TrackedFeatures, *, lost: bool = True) -> None:
     kept = pixels[tracks.accepted]
     axes.plot(*kept.T, "s", markersize=5.5, markerfacecolor="none", color=FOUND, markeredgewidth=1.3, label="tracked")
     if lost and not tracks.accepted.all():
@@ -248,19 +216,32 @@ def _draw_features(axes: Axes, pixels: Float[np.ndarray, "n 2"], tracks: Tracked
         axes.plot(*gone.T, "x", markersize=5.0, color=LOST, markeredgewidth=1.2, label="not tracked")
 
 
-def _draw_squares(axes: Axes, pixels: Float[np.ndarray, "n 2"], colour: str) -> None:
+def _draw_squares(axes: Axes, pixels: stages.Pixels, colour: str) -> None:
     axes.plot(*pixels.T, "s", markersize=2.6, markerfacecolor="none", color=colour, markeredgewidth=0.9)
 
 
+def _draw_segments(axes: Axes, starts: stages.Pixels, ends: stages.Pixels, colour: str, alpha: float = 1.0) -> None:
+    axes.plot(*np.stack([starts, ends]).transpose(2, 0, 1), color=colour, linewidth=0.8, alpha=alpha)
+
+
+def _picture_pair(products: Mapping[str, Any]) -> tuple[Figure, Axes, Axes]:
+    """A figure of both pictures side by side."""
+    shown = _require(stages.pictures(products), "pictures")
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    show_picture(left, shown[0])
+    show_picture(right, shown[1])
+    return figure, left, right
+
+
 def _draw_motion_view(
-    axes: Axes, motion: SolvedMotion, upright: Float[np.ndarray, "3 3"], pair: tuple[int, int]
+    axes: Axes, motion: stages.SolvedMotion, upright: Float[np.ndarray, "3 3"], pair: list[int]
 ) -> None:
-    """One orthographic view along the axis that `pair` leaves out, in an upright frame at the first camera."""
-    chosen = list(pair)
+    """Draw an orthographic view onto two axes of an upright frame at the first camera."""
     depth = float(np.median(motion.points[:, 2]))
 
     def seen(points: np.ndarray) -> np.ndarray:
-        return np.asarray((points @ upright.T)[..., chosen])
+        return np.asarray((points @ upright.T)[..., pair])
 
     axes.plot(*seen(motion.points).T, "o", color=WHITE, markersize=2.2, label="features")
     poses = (
@@ -282,23 +263,23 @@ def _draw_motion_view(
     axes.grid(visible=False)
     axes.set_aspect("equal", adjustable="datalim")
     axes.tick_params(labelsize=7)
-    axes.set_xlabel("xyz"[pair[0]] + " (m)", fontsize=8)
-    axes.set_ylabel("xyz"[pair[1]] + " (m)", fontsize=8)
+    axes.set_xlabel(f"{'xyz'[pair[0]]} (m)", fontsize=8)
+    axes.set_ylabel(f"{'xyz'[pair[1]]} (m)", fontsize=8)
 
 
-def _thinned(matches: EpipolarMatches) -> np.ndarray:
-    """Indices of matches on a coarser grid, so that no more than `_MOST_MATCHES` are drawn."""
+def _thin_matches(matches: stages.EpipolarMatches) -> np.ndarray:
+    """Indices of matches on a coarser grid, so that no more than `_MAX_MATCHES` are drawn."""
     every = 1
     ranks = [np.unique(matches.grid[:, k], return_inverse=True)[1] for k in (1, 0)]
     chosen = np.arange(len(matches.grid))
-    while len(chosen) > _MOST_MATCHES:
+    while len(chosen) > _MAX_MATCHES:
         every += 1
         chosen = np.flatnonzero((ranks[0] % every == every // 2) & (ranks[1] % every == every // 2))
     return chosen
 
 
 def _draw_terrain(
-    axes: Any, maps: LandingMaps, colours: Float[np.ndarray, "rows columns 3"], azimuth_deg: float
+    axes: Any, maps: stages.LandingMaps, colours: Float[np.ndarray, "rows columns 3"], azimuth_deg: float
 ) -> None:
     """The elevation map as a lit surface in these colours, with the sites on it; the axes are three-dimensional."""
     rows, columns = maps.elevation_m.shape
@@ -307,7 +288,9 @@ def _draw_terrain(
     y = maps.corner_m[1] - maps.cell_m * np.arange(rows)
     heights = maps.elevation_m - np.nanmedian(maps.elevation_m)
     sides = maps.cell_m * np.array([columns, rows])
-    raised = _raised(heights, float(sides.max()))
+    reach = float(np.nanmax(heights) - np.nanmin(heights))
+    # heights are exaggerated so that gentle ground shows its relief
+    raised = next((times for times in (1.0, 2.0, 5.0) if times * reach >= _MIN_RELIEF * sides.max()), 10.0)
     lit = LightSource(315.0, 45.0).shade_rgb(
         np.asarray(colours), np.nan_to_num(heights), vert_exag=raised, dx=maps.cell_m, dy=maps.cell_m, blend_mode="soft"
     )
@@ -322,7 +305,6 @@ def _draw_terrain(
         if height is not None and np.isfinite(height).all():
             place = maps.corner_m + maps.cell_m * cell[::-1] * np.array([1.0, -1.0])
             axes.plot([place[0]], [place[1]], [float(height[0]) + lift], **_SITE_MARKS[name], zorder=5)
-    reach = float(np.nanmax(heights) - np.nanmin(heights))
     axes.set_box_aspect((sides[0], sides[1], max(raised * reach, 0.05 * sides.max())), zoom=1.3)
     axes.view_init(elev=38.0, azim=azimuth_deg)
     axes.set(xlabel="x (m)", ylabel="y (m)")
@@ -333,27 +315,15 @@ def _draw_terrain(
         axis.label.set_size(7)
         axis.labelpad = -6
         axis.set_pane_color((0.0, 0.0, 0.0, 0.0))
-    for flat in ("x", "y"):
-        axes.locator_params(axis=flat, nbins=4)
-
-
-def _raised(heights: Float[np.ndarray, "rows columns"], across: float) -> float:
-    """By how much heights are drawn larger, so that gentle ground shows its relief."""
-    reach = float(np.nanmax(heights) - np.nanmin(heights))
-    return next((times for times in (1.0, 2.0, 5.0) if times * reach >= _LEAST_RELIEF * across), 10.0)
-
-
-def _draw_safety(axes: Axes, maps: LandingMaps) -> None:
-    axes.imshow(maps.safety, interpolation="nearest", vmin=0, vmax=2, cmap=SAFETY_COLOURS)
-    if (maps.safety > 1.5).any() and (maps.safety < 1.5).any():
-        axes.contourf(maps.safety, levels=[1.5, 2.5], colors="none", hatches=["////"])
+    axes.locator_params(axis="x", nbins=4)
+    axes.locator_params(axis="y", nbins=4)
 
 
 def _safety_legend(axes: Axes) -> None:
     for name, colour in (("safe", GREEN), ("unknown", YELLOW), ("hazard", RED)):
         axes.plot([], [], "s", color=colour, label=name)
-    for name in _SITE_MARKS:
-        axes.plot([], [], **_SITE_MARKS[name], label={"apriori": "a-priori site", "site": "safe site"}[name])
+    for mark, label in zip(_SITE_MARKS.values(), ("a-priori site", "safe site"), strict=True):
+        axes.plot([], [], **mark, label=label)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, fontsize=7, columnspacing=1.0)
 
 
@@ -364,7 +334,7 @@ _SITE_MARKS: Mapping[str, Mapping[str, Any]] = {
 _RIM = [patheffects.Stroke(linewidth=3.6, foreground=WHITE), patheffects.Normal()]
 
 
-def _mark_sites(axes: Axes, maps: LandingMaps) -> None:
+def _mark_sites(axes: Axes, maps: stages.LandingMaps) -> None:
     rows, columns = maps.elevation_m.shape
     for name, (row, column) in (("apriori", maps.apriori), ("site", maps.site)):
         if 0 <= row <= rows - 1 and 0 <= column <= columns - 1:
@@ -380,6 +350,6 @@ def _at_cell(values: Float[np.ndarray, "rows columns k"], cell: Float[np.ndarray
     if not np.isfinite(cell).all():
         return None
     row, column = (int(part) for part in np.rint(cell))
-    inside = 0 <= row < values.shape[0] and 0 <= column < values.shape[1]
-    found = values[row, column] if inside else None
-    return found if found is not None and np.isfinite(found).all() else None
+    if not (0 <= row < values.shape[0] and 0 <= column < values.shape[1]):
+        return None
+    return values[row, column] if np.isfinite(values[row, column]).all() else None

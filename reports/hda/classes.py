@@ -1,4 +1,4 @@
-"""Hazards missed by their size, and features tracked by the change between the pictures."""
+"""Missed hazards by size, and tracked features by the change between the pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from marsyard.reports.charts import RateLine, draw_rates
@@ -20,22 +19,17 @@ from marsyard.reports.kinds import Drawn, Rows
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag, pooled_rate, rate_text
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
 from marsyard.reports.svg import MUTED, REQUIREMENT, in_page_style
-from marsyard.reports.wording import NOTHING, percent, stated
+from marsyard.reports.wording import NOTHING, note_text, percent, stated
 from marsyard.scenarios.landing.confusion import CLASS_NAMES, CLASSES
 
 
 @dataclass(frozen=True)
 class HazardClass:
-    """Hazards of one size.
+    """Hazards of one size class.
 
-    Attributes
-    ----------
-    kind
-        `roughness` (their height) or `slope`.
-    low, high
-        Bounds in units of the lander's limit; infinite for the last class.
-    called_safe, unflagged
-        Footprints that the map calls safe, and those under which it has no hazard before growth, of all in the class.
+    kind: `roughness` (their height) or `slope`
+    low, high: bounds in units of the lander's limit
+    called_safe, unflagged: footprints that the map calls safe, and those without a hazard of the map before growth
     """
 
     kind: str
@@ -52,7 +46,7 @@ class HazardClass:
         return f"> {self.low:g}" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}"
 
 
-#: Rates of footprints over all flights, by their names: hits and of what.
+#: Rates of footprints over all flights by name: columns of hits and of all.
 RATES: Mapping[str, tuple[str, str]] = {
     "truly safe, with a hazard of the map under them (false alarms)": ("false_alarms", "footprints_truly_safe"),
     "called safe by the map, not truly safe": ("footprints_called_safe_unsafe", "footprints_called_safe"),
@@ -63,16 +57,11 @@ RATES: Mapping[str, tuple[str, str]] = {
     "such hazards, called safe": ("gross_called_safe", "gross"),
     "such hazards, with no hazard of the map under them": ("gross_unflagged", "gross"),
 }
-_CLASSES_NOTE = (
-    "A footprint is what lies under the lander at a place of a lattice, a tenth of a diameter apart: those of a flight "
-    f"overlap. Its roughness is the height of its highest hazard. Intervals: {stated(CONFIDENCE)}, by bootstrap over "
-    "flights, or terrains where flights share them; none where no flight has a hit. Flagged: a cell under the lander "
-    "is a hazard before growth. Called safe: after growth, border and holes."
-)
+_CLASSES_NOTE = note_text("hda.classes", confidence=stated(CONFIDENCE))
 
 
 def hazard_classes(frame: Rows) -> list[HazardClass]:
-    """Missed hazards by size, in order; none where rows do not count them."""
+    """Missed hazards by size; empty if rows do not count them."""
     edges = (0.0, *CLASSES, math.inf)
     found = []
     for kind in ("roughness", "slope"):
@@ -85,8 +74,7 @@ def hazard_classes(frame: Rows) -> list[HazardClass]:
 
 
 def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
-    """Hazards missed by size, and rates of footprints; nothing where rows do not count them."""
-    del subject
+    """Missed hazards by size, and rates of footprints; nothing if rows do not count them."""
     classes = hazard_classes(frame)
     if not classes:
         return [], {}
@@ -115,7 +103,7 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
 
 @in_page_style
 def class_figure(classes: Sequence[HazardClass]) -> Figure:
-    """Shares called safe and not flagged against the hazards' size, roughness and slope apart."""
+    """Fractions called safe and not flagged against the hazards' size, by roughness and by slope."""
     figure = Figure(figsize=(7.2, 3.3), layout="constrained")
     for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("roughness", "slope"), strict=True):
         ours = [one for one in classes if one.kind == kind]
@@ -130,18 +118,16 @@ def class_figure(classes: Sequence[HazardClass]) -> Figure:
     return figure
 
 
-#: Share of features below which tracking is no longer good.
+#: Minimum fraction of features for good tracking.
 GOOD = 0.9
-#: A change below this share of the paper's limit is none: what is read back of a change that was not asked for.
+#: Changes below this fraction of the paper's limit count as none.
 _NONE = 0.02
-_FEWEST_SIZES = 3
+_MIN_SIZES = 3
 
 
 @dataclass(frozen=True)
 class AtSize:
-    """Flights with one change of one signed size: features that both pictures show and that were tracked rightly, the
-    number of flights, and of those in which `GOOD` of the features were.
-    """
+    """Correctly tracked features of flights with a signed size of change; `good` flights track at least `GOOD`."""
 
     size: float
     tracked: PooledRate
@@ -151,17 +137,11 @@ class AtSize:
 
 @dataclass(frozen=True)
 class Curve:
-    """Tracking against one of the paper's changes.
+    """Tracking against one of the changes of `paper.toml`.
 
-    Attributes
-    ----------
-    change
-        What changes, as `paper.toml` has it.
-    points
-        By size, among them none at all.
-    knee_up, knee_down
-        Largest change upwards and downwards up to which the interpolated share stays at `GOOD`; infinite where it never
-        falls below, NaN where the side was not flown.
+    points: by size, including no change
+    knee_up, knee_down: largest change with an interpolated fraction of `GOOD`; infinite if it never falls below, NaN if
+        that direction was not flown
     """
 
     change: Mapping[str, Any]
@@ -179,29 +159,25 @@ class Curve:
 
     @property
     def least_within(self) -> float:
-        """The least share of all sizes up to the paper's limit, rounded sizes at the limit among them."""
+        """Minimum fraction of all sizes up to the paper's limit."""
         shares = [at.tracked.share for at in self.points if abs(at.size) <= 1.001 * self.change["paper"]]
         return float(np.nanmin(shares)) if shares and not np.all(np.isnan(shares)) else math.nan
 
 
 def limits_section(subject: Subject) -> Section | None:
-    """Features tracked by the change between the pictures; None where flights do not change one condition at a time."""
+    """Features tracked by the change between the pictures; None unless flights change one condition at a time."""
     frame = landing_rows(subject)
     found = [] if frame is None else curves(frame)
     if not found:
         return None
-    text = (
-        "The paper (section II.A): features can be tracked when the change of attitude is less than 10 deg in roll "
-        "about the optical axis and less than 20 deg in pitch and yaw, and that of altitude less than 20 %."
-    )
     knees = grid_of(
         found,
         {
             "Change": lambda one: one.change["name"],
             "Paper's limit": lambda one: f"{one.change['paper']:g} {one.change['unit']}",
             "Knee": lambda one: one.knee_text(one.knee_up, 1.0),
-            "Knee, downwards": lambda one: one.knee_text(one.knee_down, -1.0),
-            "Least share within the paper's limit": lambda one: percent(one.least_within),
+            "Knee, negative change": lambda one: one.knee_text(one.knee_down, -1.0),
+            "Minimum share within the paper's limit": lambda one: percent(one.least_within),
         },
     )
     by_size = grid_of(
@@ -210,18 +186,14 @@ def limits_section(subject: Subject) -> Section | None:
             "Change": lambda pair: pair[0]["name"],
             "Size": lambda pair: f"{pair[1].size:g} {pair[0]['unit']}",
             "Flights": lambda pair: f"{pair[1].flights:,}",
-            "Tracked rightly": lambda pair: rate_text(pair[1].tracked),
+            "Correctly tracked": lambda pair: rate_text(pair[1].tracked),
             "Flights with 90 %": lambda pair: f"{pair[1].good:,}",
         },
     )
-    note = (
-        "Knee: the largest change up to which the share, interpolated between sizes flown, stays at 90 %; '>' where it "
-        "never falls below. Tracked rightly: accepted, and within 1 px of the true place."
-    )
-    caption = "Features tracked rightly, of those that both pictures show; red: the paper's limits; grey: 90 %."
+    caption = "Correctly tracked features, of those in both pictures; red: the paper's limits; grey: 90 %."
     blocks = [
-        Block(text=text, plates=[plate(limits_figure(found), "limits", caption, wide=True)]),
-        Block(heading="Knees", grid=knees, note=note),
+        Block(text=note_text("hda.limits_text"), plates=[plate(limits_figure(found), "limits", caption, wide=True)]),
+        Block(heading="Knees", grid=knees, note=note_text("hda.limits")),
         Block(heading="By size", grid=by_size),
     ]
     data = {"curves": [asdict(one) for one in found]}
@@ -229,7 +201,7 @@ def limits_section(subject: Subject) -> Section | None:
 
 
 def curves(frame: pd.DataFrame) -> list[Curve]:
-    """A curve for every change that was flown in several sizes, alone; none where they come together."""
+    """A curve for every change that was flown alone in several sizes; empty if changes were combined."""
     changes = PAPER["changes"]
     if "tracks_right" not in frame:
         return []
@@ -243,25 +215,19 @@ def curves(frame: pd.DataFrame) -> list[Curve]:
     for one, size, changed in zip(changes, sizes, present, strict=True):
         chosen = flown & (changed | still)
         rounded = np.where(changed, np.round(size, 1), 0.0)
-        if np.unique(rounded[chosen]).size >= _FEWEST_SIZES:
-            found.append(_curve(one, frame, rounded, chosen))
+        if np.unique(rounded[chosen]).size >= _MIN_SIZES:
+            points = []
+            for value in np.unique(rounded[chosen]):
+                flights = frame[chosen & (rounded == value)]
+                # a flight without tracks has tracked none of the visible features
+                tracked = pooled_rate(flights, "tracks_right", "features_in_view")
+                points.append(AtSize(float(value), tracked, len(flights), int(flag(flights, "tracked_well").sum())))
+            found.append(Curve(one, points, knee(points, 1.0), knee(points, -1.0)))
     return found
 
 
-def _curve(
-    change: Mapping[str, Any], frame: Rows, sizes: Float[np.ndarray, " n"], chosen: Bool[np.ndarray, " n"]
-) -> Curve:
-    points = []
-    for size in np.unique(sizes[chosen]):
-        flights = frame[chosen & (sizes == size)]
-        # a flight without tracks has tracked none of what was to be seen
-        tracked = pooled_rate(flights, "tracks_right", "features_in_view")
-        points.append(AtSize(float(size), tracked, len(flights), int(flag(flights, "tracked_well").sum())))
-    return Curve(change, points, knee(points, 1.0), knee(points, -1.0))
-
-
 def knee(points: Sequence[AtSize], sign: float) -> float:
-    """Where the share falls below `GOOD` for the first time, going from no change upwards (1) or downwards (-1)."""
+    """First change at which the fraction falls below `GOOD`, for positive (1) or negative (-1) changes."""
     side = sorted((sign * at.size, at.tracked.share) for at in points if sign * at.size >= 0.0)
     side = [(size, share) for size, share in side if not math.isnan(share)]
     if len(side) < 2:
@@ -276,7 +242,7 @@ def knee(points: Sequence[AtSize], sign: float) -> float:
 
 @in_page_style
 def limits_figure(found: Sequence[Curve]) -> Figure:
-    """The curves next to each other, with the paper's limits."""
+    """The curves with the paper's limits."""
     figure = Figure(figsize=(9.0, 2.7 if len(found) < 3 else 5.2), layout="constrained")
     columns = min(2, len(found))
     panels = figure.subplots(-(-len(found) // columns), columns, squeeze=False, sharey=True)

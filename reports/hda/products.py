@@ -1,4 +1,4 @@
-"""What the products of a landing's case hold, read with care: they come from files."""
+"""Products of a landing case, read from files and checked: pictures, tracks, motion, matches, maps and truth."""
 
 from __future__ import annotations
 
@@ -9,90 +9,75 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.reports.presentation import numbers, plane, shaped
+from marsyard.reports.presentation import numbers, plane, read_arrays, shaped
+
+Plane = Float[np.ndarray, "rows columns"]
+Pixels = Float[np.ndarray, "n 2"]
 
 
 @dataclass(frozen=True)
 class TrackedFeatures:
     """Features and their tracks, pixels (u, v)."""
 
-    first: Float[np.ndarray, "n 2"]
-    second: Float[np.ndarray, "n 2"]
+    first: Pixels
+    second: Pixels
     accepted: Bool[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
 class SolvedMotion:
-    """Motion and structure in the first camera's frame, metres.
+    """Motion of the second from the first camera, and structure in the first camera's frame, metres.
 
-    Attributes
-    ----------
-    rotation, translation
-        Of the second from the first camera.
-    points
-        The accepted tracks' places, shape (n, 3).
-    corner_rays
-        Rays of the two pictures' corners in their cameras' frames, of depth one.
-    true_rotation, true_translation
-        The true motion.
+    points: positions of the accepted tracks
+    corner_rays: rays of each picture's corners in its camera's frame, of depth one
     """
 
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, "3"]
-    points: Float[np.ndarray, "n 3"]
     corner_rays: tuple[Float[np.ndarray, "4 3"], Float[np.ndarray, "4 3"]]
     true_rotation: Float[np.ndarray, "3 3"]
     true_translation: Float[np.ndarray, "3"]
+    points: Float[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True)
 class EpipolarMatches:
-    """Structure pixels, their segments in the second picture, and what was matched; pixels (u, v)."""
+    """Structure pixels of the first picture, their epipolar segments and matches in the second, pixels (u, v)."""
 
-    grid: Float[np.ndarray, "n 2"]
-    starts: Float[np.ndarray, "n 2"]
-    ends: Float[np.ndarray, "n 2"]
-    matched: Float[np.ndarray, "n 2"]
+    grid: Pixels
+    starts: Pixels
+    ends: Pixels
+    matched: Pixels
     accepted: Bool[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
 class LandingMaps:
-    """The maps of a case; all have the elevation map's cells, row 0 farthest along y.
+    """The maps of a case on the cells of the elevation map, row 0 farthest along y.
 
-    Attributes
-    ----------
-    elevation_m, roughness_m, slope_rad
-        As mapped, the elevation from the first camera.
-    safety
-        0 safe, 1 unknown, 2 hazard.
-    pixels
-        Of the first picture, for every cell's middle; where its elevation is not known, about there.
-    corner_m, cell_m
-        (x, y) of the first cell's middle in the surface frame, and the cells' side.
-    site, apriori
-        Row and column; NaN for no site.
-    surface_from_camera, world_from_surface
-        Rotations.
-    limits
-        Of slope (radians) and roughness (metres), and the lander's diameter.
+    elevation_m: from the first camera
+    safety: 0 safe, 1 unknown, 2 hazard
+    pixels: of the first picture for the centre of every cell; extrapolated where the elevation is unknown
+    corner_m: centre of the first cell (x, y) in the surface frame
+    site, apriori: row and column; NaN for no site
+    limits: of slope (radians) and roughness (metres), and the lander's diameter
     """
 
-    elevation_m: Float[np.ndarray, "rows columns"]
-    roughness_m: Float[np.ndarray, "rows columns"]
-    slope_rad: Float[np.ndarray, "rows columns"]
-    safety: Float[np.ndarray, "rows columns"]
+    elevation_m: Plane
+    roughness_m: Plane
+    slope_rad: Plane
+    safety: Plane
     pixels: Float[np.ndarray, "rows columns 2"]
     corner_m: Float[np.ndarray, "2"]
-    cell_m: float
-    site: Float[np.ndarray, "2"]
     apriori: Float[np.ndarray, "2"]
     surface_from_camera: Float[np.ndarray, "3 3"]
     world_from_surface: Float[np.ndarray, "3 3"]
     limits: Float[np.ndarray, "3"]
+    cell_m: float
+    site: Float[np.ndarray, "2"]
 
     def cells(self, away_m: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """(row, column), not whole, of places (x, y) along the world's axes from the camera's foot."""
+        """Fractional (row, column) of positions (x, y) along the world's axes from the camera's nadir point."""
         local = away_m @ self.world_from_surface[:2, :2]
         return np.asarray(((local - self.corner_m) / self.cell_m * np.array([1.0, -1.0]))[..., ::-1])
 
@@ -101,22 +86,16 @@ class LandingMaps:
 class TrueGround:
     """The truth on its lattice.
 
-    Attributes
-    ----------
-    away_m
-        World x, y of the places from the camera's true foot.
-    elevation_m
-        Exact height at the places from the camera.
-    slope_rad, roughness_m, safe
-        Of a lander's footprint there.
-    covered
-        Whether both pictures show all of it.
+    away_m: world (x, y) from the camera's true nadir point
+    elevation_m: exact height from the camera
+    slope_rad, roughness_m, safe: of a lander's footprint centred there
+    covered: whether both pictures show the whole footprint
     """
 
     away_m: Float[np.ndarray, "rows columns 2"]
-    elevation_m: Float[np.ndarray, "rows columns"]
-    slope_rad: Float[np.ndarray, "rows columns"]
-    roughness_m: Float[np.ndarray, "rows columns"]
+    elevation_m: Plane
+    slope_rad: Plane
+    roughness_m: Plane
     safe: Bool[np.ndarray, "rows columns"]
     covered: Bool[np.ndarray, "rows columns"]
 
@@ -127,85 +106,58 @@ def is_hda_case(products: Mapping[str, Any]) -> bool:
 
 
 def pictures(products: Mapping[str, Any]) -> tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]] | None:
-    """The two pictures; None where one is missing."""
+    """The two pictures; None if one is missing."""
     first, second = (plane(products.get(f"image_{number}")) for number in (1, 2))
     return None if first is None or second is None else (first, second)
 
 
 def tracked_features(products: Mapping[str, Any]) -> TrackedFeatures | None:
-    """Features and tracks; None where there are none."""
-    first, second = (shaped(products.get(name), None, 2) for name in ("features", "tracked"))
-    accepted = _flags(products, "tracks_accepted")
-    if first is None or second is None or accepted is None or not len(first) == len(second) == len(accepted):
+    """Features and tracks; None if missing."""
+    found = read_arrays(products, {"features": (None, 2), "tracked": (None, 2), "tracks_accepted": (None,)})
+    if found is None or len({len(one) for one in found}) > 1:
         return None
-    return TrackedFeatures(first, second, accepted)
+    return TrackedFeatures(found[0], found[1], found[2] > 0.5)
 
 
 def solved_motion(products: Mapping[str, Any]) -> SolvedMotion | None:
-    """Motion and structure; None where none was found."""
-    rotations = [_finite(products, name, 3, 3) for name in ("rotation", "true_rotation")]
-    translations = [_finite(products, name, 3) for name in ("translation", "true_translation")]
-    rays = [_finite(products, f"frustum_{number}", 4, 3) for number in (0, 1)]
+    """Motion and structure; None if the motion was not solved."""
+    rotation, translation, rays = (3, 3), (3,), (4, 3)
+    shapes = {"rotation": rotation, "translation": translation, "frustum_0": rays, "frustum_1": rays}
+    found = read_arrays(products, shapes | {"true_rotation": rotation, "true_translation": translation}, finite=True)
     points = shaped(products.get("sparse_points"), None, 3)
-    known = [one for one in (*rotations, *translations, *rays) if one is not None]
-    if points is None or not len(points) or len(known) < 6:
+    if found is None or points is None or not len(points):
         return None
-    return SolvedMotion(known[0], known[2], points, (known[4], known[5]), known[1], known[3])
+    return SolvedMotion(found[0], found[1], (found[2], found[3]), found[4], found[5], points)
 
 
 def epipolar_matches(products: Mapping[str, Any]) -> EpipolarMatches | None:
-    """Structure pixels and matches; None where there are none."""
-    arrays = [shaped(products.get(name), None, 2) for name in ("grid", "segment_starts", "segment_ends", "matched")]
-    known = [one for one in arrays if one is not None]
-    accepted = _flags(products, "matches_accepted")
-    if len(known) < 4 or accepted is None or {len(one) for one in known} != {len(accepted)}:
+    """Structure pixels and matches; None if missing."""
+    shapes = dict.fromkeys(("grid", "segment_starts", "segment_ends", "matched"), (None, 2))
+    found = read_arrays(products, {**shapes, "matches_accepted": (None,)})
+    if found is None or len({len(one) for one in found}) > 1:
         return None
-    return EpipolarMatches(known[0], known[1], known[2], known[3], accepted)
+    return EpipolarMatches(found[0], found[1], found[2], found[3], found[4] > 0.5)
 
 
 def landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
-    """The maps; None where the ground was not mapped."""
-    planes = [numbers(products.get(name)) for name in ("elevation", "roughness", "slope", "safety")]
-    known = [one for one in planes if one is not None and one.ndim == 2 and min(one.shape) >= 2]
-    if len(known) < 4 or len({one.shape for one in known}) > 1:
+    """The maps; None if the ground was not mapped."""
+    planes = read_arrays(products, dict.fromkeys(("elevation", "roughness", "slope", "safety"), (None, None)))
+    if planes is None or len({one.shape for one in planes}) > 1 or min(planes[0].shape) < 2:
         return None
-    shapes = {
-        "corner": (2,),
-        "apriori": (2,),
-        "surface_from_camera": (3, 3),
-        "world_from_surface": (3, 3),
-        "limits": (3,),
-    }
-    others = [_finite(products, name, *shape) for name, shape in shapes.items()]
-    further = [one for one in others if one is not None]
-    pixels = numbers(products.get("map_pixels"))
-    if pixels is None or pixels.shape != (*known[0].shape, 2):
+    shapes = {"corner": (2,), "apriori": (2,), "surface_from_camera": (3, 3), "world_from_surface": (3, 3)}
+    frames = read_arrays(products, shapes | {"limits": (3,)}, finite=True)
+    pixels, cell_m = shaped(products.get("map_pixels"), *planes[0].shape, 2), _positive(products, "cell")
+    if frames is None or pixels is None or cell_m is None or not np.all(frames[-1] > 0.0):
         return None
-    cell = numbers(products.get("cell"))
-    if len(further) < len(shapes) or cell is None or cell.size != 1 or not cell.item() > 0.0:
-        return None
-    corner, apriori, surface, world, limits = further
-    if not np.all(limits > 0.0):
-        return None
-    site = _finite(products, "site", 2)
-    return LandingMaps(
-        elevation_m=known[0],
-        roughness_m=known[1],
-        slope_rad=known[2],
-        safety=known[3],
-        pixels=_filled(pixels),
-        corner_m=corner,
-        cell_m=float(cell.item()),
-        site=np.full(2, np.nan) if site is None else site,
-        apriori=apriori,
-        surface_from_camera=surface,
-        world_from_surface=world,
-        limits=limits,
-    )
+    site = read_arrays(products, {"site": (2,)}, finite=True) or [np.full(2, np.nan)]
+    names = ("corner_m", "apriori", "surface_from_camera", "world_from_surface", "limits")
+    named: dict[str, Any] = dict(zip(("elevation_m", "roughness_m", "slope_rad", "safety"), planes, strict=True))
+    named |= dict(zip(names, frames, strict=True))
+    return LandingMaps(pixels=_extrapolate_pixels(pixels), cell_m=cell_m, site=site[0], **named)
 
 
-def _filled(pixels: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
-    """Pixels of all cells: where they are not known those of an affine map of the others, as of level ground."""
+def _extrapolate_pixels(pixels: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
+    """Pixels of all cells: unknown ones by an affine map of the known ones, as for level ground."""
     known = np.isfinite(pixels).all(axis=-1)
     if known.all() or known.sum() < 3:
         return pixels
@@ -215,36 +167,23 @@ def _filled(pixels: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "r
 
 
 def true_ground(products: Mapping[str, Any]) -> TrueGround | None:
-    """The truth; None where it is missing."""
-    places, camera = numbers(products.get("true_places")), _finite(products, "camera_true", 4, 4)
-    heights, corner = numbers(products.get("true_heights")), _finite(products, "true_corner", 2)
-    spacing = numbers(products.get("true_spacing"))
-    if places is None or places.ndim != 3 or places.shape[2] != 2 or min(places.shape[:2]) < 2:
+    """The truth; None if missing."""
+    places, heights = shaped(products.get("true_places"), None, None, 2), plane(products.get("true_heights"))
+    frames = read_arrays(products, {"camera_true": (4, 4), "true_corner": (2,)}, finite=True)
+    spacing_m = _positive(products, "true_spacing")
+    if places is None or min(places.shape[:2]) < 2 or heights is None or frames is None or spacing_m is None:
         return None
-    if camera is None or heights is None or heights.ndim != 2 or not heights.size or corner is None:
+    names = ("true_slope", "true_roughness", "true_safe", "true_covered")
+    planes = read_arrays(products, dict.fromkeys(names, places.shape[:2]), finite=True)
+    if planes is None:
         return None
-    shape = places.shape[:2]
-    planes = [_finite(products, f"true_{name}", *shape) for name in ("slope", "roughness", "safe", "covered")]
-    known = [one for one in planes if one is not None]
-    if len(known) < 4 or spacing is None or spacing.size != 1 or not spacing.item() > 0.0:
-        return None
-    at = np.nan_to_num((places - corner)[..., ::-1] / spacing.item())
+    camera, corner = frames
+    at = np.nan_to_num((places - corner)[..., ::-1] / spacing_m)
     rows, columns = np.moveaxis(np.clip(np.rint(at), 0, np.array(heights.shape) - 1).astype(np.int64), -1, 0)
-    return TrueGround(
-        away_m=places - camera[:2, 3],
-        elevation_m=heights[rows, columns] - camera[2, 3],
-        slope_rad=known[0],
-        roughness_m=known[1],
-        safe=known[2] > 0.5,
-        covered=known[3] > 0.5,
-    )
+    elevation_m = heights[rows, columns] - camera[2, 3]
+    return TrueGround(places - camera[:2, 3], elevation_m, planes[0], planes[1], planes[2] > 0.5, planes[3] > 0.5)
 
 
-def _flags(products: Mapping[str, Any], name: str) -> Bool[np.ndarray, " n"] | None:
-    values = shaped(products.get(name), None)
-    return None if values is None else values > 0.5
-
-
-def _finite(products: Mapping[str, Any], name: str, *shape: int) -> Float[np.ndarray, "..."] | None:
-    values = shaped(products.get(name), *shape)
-    return values if values is not None and np.isfinite(values).all() else None
+def _positive(products: Mapping[str, Any], name: str) -> float | None:
+    value = numbers(products.get(name))
+    return float(value.item()) if value is not None and value.size == 1 and value.item() > 0.0 else None

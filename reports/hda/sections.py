@@ -1,4 +1,4 @@
-"""Sections about landings: thresholds, faults, errors of the map, touchdowns, sites, and run times."""
+"""Sections on landings: roughness threshold, faults, map errors, touchdowns, sites, and run times."""
 
 from __future__ import annotations
 
@@ -10,49 +10,24 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
+from marsyard.reports import kinds, rates
 from marsyard.reports.columns import numbers
-from marsyard.reports.kinds import (
-    Distribution,
-    Drawn,
-    MadeBy,
-    OutcomesBySize,
-    Quantiles,
-    Quantity,
-    Rate,
-    RateByCondition,
-    RateTable,
-    SectionDeclaration,
-    flagged,
-    pooled,
-)
 from marsyard.reports.papers import read_paper
-from marsyard.reports.populations import terrain_groups
-from marsyard.reports.rates import (
-    CONFIDENCE,
-    Share,
-    flag,
-    flag_share,
-    known,
-    quantile,
-    share_of,
-    stated_parameter,
-    varies,
-)
-from marsyard.reports.scatter import Scatter
+from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
-from marsyard.reports.wording import NOTHING, count, number, stated
+from marsyard.reports.wording import NOTHING, count, note_text, number, stated
 from marsyard.scenarios.landing.parameters import LanderParameters
 
 PAPER = read_paper(Path(__file__).with_name("paper.toml"))
-#: Columns that every row of a landing case has.
+#: Columns of every row of a landing case.
 _OWN = ("site_safe", "site_reported", "no_site_reported", "truly_safe_share")
-#: Fewest cases with a map for the section on its errors.
-FEWEST_MAPS = 8
+#: Minimum number of cases with a map for the section on map errors.
+MIN_MAPS = 8
 
 
 def landing_rows(subject: Subject) -> pd.DataFrame | None:
-    """The rows if they are those of landing cases."""
+    """The rows of landing cases; None for other rows."""
     frame = subject.frame
     return frame if all(name in frame for name in _OWN) and len(frame) > 0 else None
 
@@ -66,31 +41,32 @@ def _threshold_rows(subject: Subject) -> pd.DataFrame | None:
 
 
 def _lander_limit_m(subject: Subject) -> float:
-    """The lander's own limit of roughness, as the campaign states it."""
-    limit = stated_parameter(subject, "lander", "max_roughness_m")
+    limit = subject.run.parameter("lander", "max_roughness_m")
     return float(limit) if isinstance(limit, int | float) else LanderParameters().max_roughness_m
 
 
-#: What the landing paper says of its false positives: false alarms and misses against the threshold of roughness.
-THRESHOLD = SectionDeclaration(
+#: False alarms and misses against the roughness threshold, for the paper's remark on false positives.
+THRESHOLD = kinds.SectionDeclaration(
     "threshold",
     "Threshold",
     "False alarms and misses by threshold of roughness",
     rows=_threshold_rows,
     requires=("false_alarms",),
     parts=(
-        RateByCondition(
-            by=Quantity("max_roughness_m", "Threshold of roughness (m)"),
+        kinds.RateByCondition(
+            by=kinds.Quantity("max_roughness_m", "Threshold of roughness (m)"),
             rates=(
-                Rate("false_alarms", "False alarms", pooled("false_alarms", "footprints_truly_safe")),
-                Rate("missed", "Missed", pooled("missed", "footprints_not_safe")),
-                Rate(
+                kinds.Rate("false_alarms", "False alarms", kinds.pooled("false_alarms", "footprints_truly_safe")),
+                kinds.Rate("missed", "Missed", kinds.pooled("missed", "footprints_not_safe")),
+                kinds.Rate(
                     "called_safe_unsafe",
                     "Called safe, not safe",
-                    pooled("footprints_called_safe_unsafe", "footprints_called_safe"),
+                    kinds.pooled("footprints_called_safe_unsafe", "footprints_called_safe"),
                 ),
-                Rate("found", "Site found, of those with one", flagged("site_reported", "roomy_exists"), drawn=False),
-                Rate("safe", "Sites truly safe", flagged("site_safe", "site_reported"), drawn=False),
+                kinds.Rate(
+                    "found", "Site found, of those with one", kinds.flagged("site_reported", "roomy_exists"), False
+                ),
+                kinds.Rate("safe", "Sites truly safe", kinds.flagged("site_safe", "site_reported"), False),
             ),
             cases="Flights",
             ylabel="share of footprints",
@@ -105,26 +81,10 @@ THRESHOLD = SectionDeclaration(
     ),
 )
 
-#: Faults in words with the unit of their size; a unit of None is one kind without sizes.
-FAULT_NAMES: Mapping[str, tuple[str, str | None]] = {
-    "none": ("none", None),
-    "black_picture": ("picture delivered black", "number"),
-    "repeated_picture": ("first picture delivered again", None),
-    "lost_rows": ("rows of the second picture lost", "share"),
-    "lost_pictures": ("pictures of the flight lost", "share"),
-    "laser_silent": ("altimeter silent", None),
-    "laser_stuck": ("altimeter stuck at a height greater by", "share"),
-    "gps_outage_s": ("no GPS from before the pictures on", "s"),
-    "bad_pixels": ("dead pixels, and as many hot ones", "share"),
-    "listed_bad_pixels": ("the same, listed and filled", "share"),
-    "dust_discs": ("specks of dust on the lens", "number"),
-    "own_shadow_m": ("own shadow in view", "m"),
-    "several": ("several", None),
-}
-
 
 def _fault_words(fault: str, size: float) -> tuple[str, str]:
-    name, unit = FAULT_NAMES.get(fault, (fault.replace("_", " "), "number"))
+    known = PAPER["fault_names"].get(fault, {"name": fault.replace("_", " "), "unit": "number"})
+    name, unit = known["name"], known.get("unit")
     if unit is None or math.isnan(size):
         return name, ""
     if unit == "share":
@@ -133,8 +93,8 @@ def _fault_words(fault: str, size: float) -> tuple[str, str]:
 
 
 def answers(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
-    """What became of the search: each row is in one of these."""
-    reported, safe, refused = (flag(frame, name) for name in ("site_reported", "site_safe", "no_site_reported"))
+    """Outcomes of the search; each row has one of them."""
+    reported, safe, refused = (rates.flag(frame, name) for name in ("site_reported", "site_safe", "no_site_reported"))
     finished = frame["site_reported"].notna().to_numpy(dtype=np.bool_)
     return {
         "safe": reported & safe,
@@ -145,11 +105,15 @@ def answers(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
     }
 
 
+def _median(frame: pd.DataFrame, column: str) -> float:
+    return rates.quantile(rates.known(frame, column), 0.5)
+
+
 def _two_digits(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:.2f}"
 
 
-FAULT_OUTCOMES = OutcomesBySize(
+FAULT_OUTCOMES = kinds.OutcomesBySize(
     outcomes=lambda frame, _: answers(frame),
     styles={
         "safe": ("safe site", "full"),
@@ -160,22 +124,19 @@ FAULT_OUTCOMES = OutcomesBySize(
     cases="Flights",
     wording=_fault_words,
     further=(
-        ("Touchdown off (m)", "off_m", lambda rows: quantile(known(rows, "touchdown_error_m"), 0.5), _two_digits),
-        ("Sinking (m/s)", "sink_m_s", lambda rows: quantile(known(rows, "touchdown_sink_m_s"), 0.5), _two_digits),
+        ("Touchdown off (m)", "off_m", lambda rows: _median(rows, "touchdown_error_m"), _two_digits),
+        ("Sinking (m/s)", "sink_m_s", lambda rows: _median(rows, "touchdown_sink_m_s"), _two_digits),
     ),
     caption="Full: a truly safe site. Hatched: no safe site. Dotted: not converged. Crossed: a site that is not safe.",
-    note="Not converged: said so, and the a-priori site is what is left. Wrong: a site was reported as safe and is "
-    f"not, with the interval of its share at {stated(CONFIDENCE)}. 'No safe site' may be right: rows hold no "
-    "difference. Touchdown off: median distance of the true touchdown from where the site was; sinking: median speed "
-    "then.",
+    note=note_text("hda.faults", confidence=stated(CONFIDENCE)),
 )
-FAULTS = SectionDeclaration("landing-faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), rows=landing_rows)
+FAULTS = kinds.SectionDeclaration("landing-faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), rows=landing_rows)
 
 
 def map_rows(subject: Subject) -> pd.DataFrame | None:
-    """The cases with a map, with errors as shares of height and range; None where no condition varies, or for few."""
+    """Cases with a map, with errors as fractions of height and range; None if few, or without varying conditions."""
     frame = landing_rows(subject)
-    if frame is None or not (varies(frame, "texture") and varies(frame, "baseline_share")):
+    if frame is None or not (rates.varies(frame, "texture") and rates.varies(frame, "baseline_share")):
         return None
     shares = {
         "rms_share": numbers(frame, "elevation_rms_m") / numbers(frame, "height_m"),
@@ -183,66 +144,62 @@ def map_rows(subject: Subject) -> pd.DataFrame | None:
         "altimeter_share": np.abs(numbers(frame, "range_error_m")) / numbers(frame, "range_m"),
     }
     mapped = pd.DataFrame(frame.assign(**shares)[np.isfinite(shares["rms_share"])])
-    return mapped if len(mapped) >= FEWEST_MAPS else None
+    return mapped if len(mapped) >= MIN_MAPS else None
 
 
-#: Errors of the map, as columns made by `map_rows`.
+#: Errors of the map; columns of `map_rows`.
 _MAP_ERRORS = (
-    Quantity("rms_share", "elevation error rms (% of height)", 100.0),
-    Quantity("noise_share", "the same without its plane (% of height)", 100.0),
-    Quantity("slope_error_rms_deg", "slope error rms (deg)"),
+    kinds.Quantity("rms_share", "elevation error rms (% of height)", 100.0),
+    kinds.Quantity("noise_share", "elevation error rms without its plane (% of height)", 100.0),
+    kinds.Quantity("slope_error_rms_deg", "slope error rms (deg)"),
 )
-#: What the errors depend on; errors as they were applied.
-MAP_EFFECTS = Scatter(
+#: Conditions of the map errors, as applied.
+MAP_EFFECTS = kinds.Scatter(
     x=(
-        Quantity("baseline_share", "baseline over height"),
-        Quantity("texture", "texture over the site's"),
-        Quantity("grid_px", "grid spacing (px)"),
-        Quantity("level_error_deg", "error of the vertical (deg)"),
-        Quantity("altimeter_share", "altimeter's error (% of the range)", 100.0),
+        kinds.Quantity("baseline_share", "baseline over height"),
+        kinds.Quantity("texture", "texture over the site's"),
+        kinds.Quantity("grid_px", "grid spacing (px)"),
+        kinds.Quantity("level_error_deg", "error of the vertical (deg)"),
+        kinds.Quantity("altimeter_share", "altimeter's error (% of the range)", 100.0),
     ),
     y=_MAP_ERRORS,
-    heading="What they depend on",
+    heading="Dependence on conditions",
     caption="Every case, and medians of bins with equally many cases; scales of the errors are logarithmic.",
     logarithmic=True,
 )
-MAP_ERRORS = SectionDeclaration(
+MAP_ERRORS = kinds.SectionDeclaration(
     "map-errors",
     "Map",
     "Errors of the elevation map",
     rows=map_rows,
     parts=(
-        Quantiles(
+        kinds.Quantiles(
             _MAP_ERRORS,
             {"5 %": 0.05, "Median": 0.5, "95 %": 0.95},
             heading="Errors of the maps",
-            note="Against exact heights averaged over each cell. Rms holds what the altimeter, the vertical and the "
-            "motion do to the whole map; without its plane the map's own noise is left, which roughness sees. Errors "
-            "as they were applied in the case: that of the vertical from the inclinometers, that of the altimeter from "
-            "its reading.",
+            note=note_text("hda.map"),
             data="maps",
         ),
         MAP_EFFECTS,
     ),
 )
 
-#: Errors of the touchdown: columns, and how they are called.
+#: Errors of the touchdown.
 TOUCHDOWN_ERRORS = (
-    Quantity("touchdown_error_gps_m", "by averaged GPS, as the paper"),
-    Quantity("touchdown_error_m", "by truth"),
-    Quantity("touchdown_error_believed_m", "as the filter believes"),
+    kinds.Quantity("touchdown_error_gps_m", "by averaged GPS, as in the paper"),
+    kinds.Quantity("touchdown_error_m", "by truth"),
+    kinds.Quantity("touchdown_error_believed_m", "by the filter's estimate"),
 )
 _DEVIATIONS = ("gps_deviation_north_m", "gps_deviation_east_m")
 
 
 def _landed(subject: Subject) -> pd.DataFrame | None:
     frame = landing_rows(subject)
-    return None if frame is None else frame[flag(frame, "landed")]
+    return None if frame is None else frame[rates.flag(frame, "landed")]
 
 
-def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> Drawn:
+def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> kinds.Drawn:
     """The paper's runs, their mean, and ours by each measure."""
-    del subject, key
     runs: Sequence[Mapping[str, float]] = PAPER["landings"]
     columns = ("error_m", "north_m", "east_m", "run_time_s")
     paper = {f"run {run['run']}": (1, [run[name] for name in columns]) for run in runs}
@@ -251,9 +208,9 @@ def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> Drawn:
         [f"paper, {name}", str(n), f"{error:.2f}", NOTHING, f"{north:.2f}", f"{east:.2f}", f"{taken:.1f} s"]
         for name, (n, (error, north, east, taken)) in paper.items()
     ]
-    deviations = {name: known(landed, name) for name in _DEVIATIONS}
-    taken_s = known(landed, "estimation_time_s")
-    groups, means, intervals = terrain_groups(landed), {}, {}
+    deviations = {name: rates.known(landed, name) for name in _DEVIATIONS}
+    taken_s = rates.known(landed, "estimation_time_s")
+    groups, means, intervals = rates.terrain_groups(landed), {}, {}
     for one in TOUCHDOWN_ERRORS:
         values = one.values(landed)
         finite = np.isfinite(values)
@@ -266,41 +223,36 @@ def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> Drawn:
             off = [f"{each.mean():.2f}" if each.size else NOTHING for each in deviations.values()]
             rows.append([f"ours, {one.title}", f"{int(finite.sum()):,}", text, spread, *off, run_time])
     head = ["", "Landings", "Position error (m)", "90 % of errors (m)", "Northing dev. (m)", "Easting dev. (m)"]
-    note = (
-        "By averaged GPS: distance of the receiver's averaged solutions after landing from the site's coordinates, as "
-        "the paper measured it. By truth: of the true touchdown from where these coordinates led, the navigation's "
-        "error at the first picture taken off. Deviations: the receiver's own. Intervals of means: "
-        f"{stated(CONFIDENCE)}."
-    )
+    note = note_text("hda.touchdown", confidence=stated(CONFIDENCE))
     data = {
         "landings": len(landed),
         "mean_m": means,
         "mean_interval_m": intervals,
         "deviations_m": {name: float(values.mean()) for name, values in deviations.items() if values.size},
-        "touchdown_safe": flag_share(landed, "touchdown_safe").share if "touchdown_safe" in landed else math.nan,
+        "touchdown_safe": rates.flag_share(landed, "touchdown_safe").share if "touchdown_safe" in landed else math.nan,
         "paper_m": {str(run["run"]): run["error_m"] for run in runs},
     }
     return [Block(heading="Table II", grid=Grid([*head, "Run time"], rows), note=note)], data
 
 
-TOUCHDOWN = SectionDeclaration(
+TOUCHDOWN = kinds.SectionDeclaration(
     "touchdown",
     "Touchdown",
     "Touchdown, next to Table II",
     rows=_landed,
     requires=("touchdown_error_gps_m", "touchdown_error_m"),
     parts=(
-        Distribution(
+        kinds.Distribution(
             TOUCHDOWN_ERRORS,
             ("distance of the touchdown from the site (m)", "share of landings"),
-            "Share of landings nearer to the site than so much; vertical: the paper's three runs, by averaged GPS.",
+            "Fraction of landings up to each distance from the site; vertical: the paper's runs, by averaged GPS.",
             limits={"paper, runs 1, 3, 4": [run["error_m"] for run in PAPER["landings"]]},
         ),
-        MadeBy(_table_2),
-        RateTable(
+        kinds.MadeBy(_table_2),
+        kinds.RateTable(
             (
-                Rate("touchdown", "came down on ground that is safe", flagged("touchdown_safe")),
-                Rate("site", "the site itself was safe", flagged("site_safe")),
+                kinds.Rate("touchdown", "touchdown on safe ground", kinds.flagged("touchdown_safe")),
+                kinds.Rate("site", "safe site", kinds.flagged("site_safe")),
             ),
             cases="Landings",
             heading="Ground under the helicopter",
@@ -310,33 +262,36 @@ TOUCHDOWN = SectionDeclaration(
     ),
 )
 
-#: What is true of the ground that both pictures show, best first, and what became of the search.
-GROUNDS = ("safe place with room about it", "safe place without room", "no safe place")
+#: Truth of the ground in both pictures, best first, and outcomes of the search. A wide safe site is safe with its whole
+#: surroundings up to a lander's radius.
+GROUNDS = ("wide safe site", "narrow safe site", "no safe site")
 ANSWERS = ("safe site, truly safe", "site, not safe", "no safe site", "not converged", "not finished")
 
 
-def site_shares(frame: pd.DataFrame) -> dict[str, Share]:
-    """How often the answer was right, by what was asked for; those alone that had cases."""
+def site_shares(frame: pd.DataFrame) -> dict[str, rates.Share]:
+    """Fractions of right answers by the truth of the ground, as far as they have cases."""
     reported, none, roomy, landed = (
-        flag(frame, name) for name in ("site_reported", "none_exists", "roomy_exists", "landed")
+        rates.flag(frame, name) for name in ("site_reported", "none_exists", "roomy_exists", "landed")
     )
-    refused, safe = flag(frame, "no_site_reported"), flag(frame, "site_safe")
-    narrow, right = flag(frame, "safe_exists") & ~roomy, refused | (reported & safe)
+    refused, safe = rates.flag(frame, "no_site_reported"), rates.flag(frame, "site_safe")
+    narrow, right = rates.flag(frame, "safe_exists") & ~roomy, refused | (reported & safe)
     shares = {
-        "chosen sites that are truly safe": share_of(safe[reported], frame[reported]),
-        "'no safe site', where none exists": share_of(refused[none], frame[none]),
-        "a site reported, where none exists": share_of(reported[none], frame[none]),
-        "a site found, where one has room about it": share_of(reported[roomy], frame[roomy]),
-        "a truly safe site or 'no safe site', where safe sites have no room": share_of(right[narrow], frame[narrow]),
-        "ground mapped, of all flights": share_of(flag(frame, "converged"), frame),
-        "landings on safe ground": share_of(flag(frame, "touchdown_safe")[landed], frame[landed]),
+        "chosen sites that are truly safe": rates.share_of(safe[reported], frame[reported]),
+        "'no safe site', where none exists": rates.share_of(refused[none], frame[none]),
+        "a site reported, where none exists": rates.share_of(reported[none], frame[none]),
+        "a site reported, where a wide safe site exists": rates.share_of(reported[roomy], frame[roomy]),
+        "a truly safe site or 'no safe site', where all safe sites are narrow": rates.share_of(
+            right[narrow], frame[narrow]
+        ),
+        "ground mapped, of all flights": rates.share_of(rates.flag(frame, "converged"), frame),
+        "landings on safe ground": rates.share_of(rates.flag(frame, "touchdown_safe")[landed], frame[landed]),
     }
     return {name: one for name, one in shares.items() if one.n}
 
 
 def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
-    """Flights by what is true (`GROUNDS`) and what became of them (`ANSWERS`)."""
-    roomy, exists, none = (flag(frame, name) for name in ("roomy_exists", "safe_exists", "none_exists"))
+    """Flights by truth (`GROUNDS`) and outcome (`ANSWERS`)."""
+    roomy, exists, none = (rates.flag(frame, name) for name in ("roomy_exists", "safe_exists", "none_exists"))
     given = dict(zip(ANSWERS, answers(frame).values(), strict=True))
     truths = dict(zip(GROUNDS, (roomy, exists & ~roomy, none), strict=True))
     return {
@@ -345,40 +300,38 @@ def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
     }
 
 
-def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> Drawn:
-    """What became of the search by what is true of the ground."""
-    del subject, key
+def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.Drawn:
+    """Outcomes of the search by the truth of the ground."""
     counts = outcome_counts(frame)
     rows = [[ground, *(f"{of_answer[name]:,}" for name in ANSWERS)] for ground, of_answer in counts.items()]
-    note = (
-        "Flights by what is true of the ground that both pictures show. Room: every place within a lander's radius is "
-        "safe too. Where the algorithm does not converge the a-priori site is what is left; it is reported as such."
-    )
-    block = Block(heading="By what is there", grid=Grid(["The pictures show", *ANSWERS], rows), note=note)
+    note = note_text("hda.outcomes")
+    block = Block(heading="By true ground", grid=Grid(["The pictures show", *ANSWERS], rows), note=note)
     return [block], {"outcomes": counts}
 
 
 def distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
     """Distances of reported sites and of touchdowns to the nearest true hazard, metres."""
     return {
-        "site, where one was reported": known(frame[flag(frame, "site_reported")], "site_hazard_distance_m"),
-        "touchdown": known(frame, "touchdown_hazard_distance_m"),
+        "site, where one was reported": rates.known(
+            frame[rates.flag(frame, "site_reported")], "site_hazard_distance_m"
+        ),
+        "touchdown": rates.known(frame, "touchdown_hazard_distance_m"),
     }
 
 
 def distance_grid(curves: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
-    """Least distance, low quantiles, and the bound of the 5 % quantile."""
+    """Minimum distance, low quantiles, and the bound of the 5 % quantile."""
     rows = []
     for name, values in curves.items():
         if values.size:
             bound = quantile_bounds(values, 0.05, CONFIDENCE)[0]
             texts = [number(float(one)) for one in (values.min(), *np.quantile(values, (0.05, 0.5)))]
             rows.append([name, f"{values.size:,}", *texts, NOTHING if math.isinf(bound) else number(bound)])
-    return Grid(["Distance (m)", "Cases", "Least", "5 % quantile", "Median", "5 % quantile is at least"], rows)
+    return Grid(["Distance (m)", "Cases", "Minimum", "5 % quantile", "Median", "Bound of the 5 % quantile"], rows)
 
 
 def run_times_section(subject: Subject) -> Section | None:
-    """Processor time of the four stages next to Table I; None where no case went through all of them."""
+    """Processor time of the four stages next to Table I; None if no case reached all of them."""
     frame, stages = landing_rows(subject), PAPER["stages"]
     if frame is None:
         return None
@@ -391,7 +344,7 @@ def run_times_section(subject: Subject) -> Section | None:
     paper, ours = sum(stage["seconds"] for stage in stages), float(median.sum())
     factor, rows, data = paper / ours, [], []
     for stage, middle, slow in zip(stages, median.tolist(), late.tolist(), strict=True):
-        sizes = [quantile(known(chosen, name), 0.5) for name in stage["ours"]]
+        sizes = [rates.quantile(rates.known(chosen, name), 0.5) for name in stage["ours"]]
         text = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
         data.append(
             {"name": stage["name"], "paper_s": stage["seconds"], "median_s": middle, "late_s": slow}
@@ -401,11 +354,6 @@ def run_times_section(subject: Subject) -> Section | None:
         rows.append([stage["name"], *times, stage["parameters"], text])
     rows.append(["Together", f"{paper:.2f}", f"{1e3 * ours:.1f}", NOTHING, f"{ours * factor:.2f}", NOTHING, NOTHING])
     head = ["Stage", "Paper (s)", "Here, median (ms)", "95 %", "Scaled (s)", "Paper's parameters", "Parameters here"]
-    note = (
-        f"Processor time of {count(cases, 'case')} that reached a map. The paper's is of a 400 MHz R12000. Scaled: "
-        f"times {number(factor)}, which makes the sum the paper's, as no benchmark is known of both processors: it "
-        "compares how the time is shared out, not how fast either is. Here the elevation map counts with the hazards, "
-        "the scale with the motion. Stages with exactly the paper's parameters, on an idle machine: make bench."
-    )
+    note = note_text("hda.run_times", cases=count(cases, "case"), factor=number(factor))
     block, data_of_section = Block(grid=Grid(head, rows), note=note), {"factor": factor, "cases": cases, "stages": data}
     return Section("run-times", "Run time", "Run time by stage, next to Table I", [block], data_of_section)

@@ -1,1 +1,1 @@
-"""What reports say of visual target tracking alone: its paper's tables and figures, beside ours."""
+"""Reports of visual target tracking: the paper's tables and figures next to ours."""

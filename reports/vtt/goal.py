@@ -1,4 +1,4 @@
-"""The requirement on a target's position at the goal: error, drift, completion and harm, by camera."""
+"""Rows of tracking campaigns, and the section on the target's position at the goal by camera."""
 
 from __future__ import annotations
 
@@ -9,41 +9,44 @@ import numpy as np
 import pandas as pd
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
+from marsyard.reports import rates
 from marsyard.reports.columns import numbers
 from marsyard.reports.kinds import Distribution, Drawn, MadeBy, Rows, SectionDeclaration
-from marsyard.reports.populations import terrain_groups
-from marsyard.reports.rates import (
-    CONFIDENCE,
-    Share,
-    flag,
-    flag_share,
-    interval_text,
-    known,
-    quantile,
-    rms,
-    share_of,
-    share_text,
-)
+from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Subject, grid_of
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.vtt.rows import is_closed_loop, selectable
-from marsyard.reports.wording import NOTHING, number, stated
+from marsyard.reports.wording import NOTHING, note_text, number, stated
 
-#: The instrument placement's requirement of section 4.2, metres, and the share of runs that shall keep it.
-WITHIN_M = 0.03
-QUANTILE = 0.99
-#: Rates of a camera's runs at selectable targets: name and key. `completed`: came to the goal. `tracked`: the target
-#: was then within the stated pixels. `false_tracks`: some update reported a wrong place, which is the harm.
+#: Columns of every row of a tracking case.
+_TRACKING_COLUMNS = ("tracked", "drift_px", "position_error_m", "losses")
+#: Requirement of the instrument placement (section 4.2), metres, and the quantile of runs that shall meet it.
+WITHIN_M, QUANTILE = 0.03, 0.99
+#: Rates of a camera's runs at selectable targets, by key. Tracked: the target is within the stated pixels at the goal.
 _RATES: Mapping[str, str] = {
     "Completed": "completed",
     "Tracked at the goal": "tracked",
     f"Within {100.0 * WITHIN_M:g} cm, of completed": "within",
-    "Falsely tracked": "false_tracks",
+    "False track": "false_tracks",
 }
 
 
+def is_tracking(frame: pd.DataFrame) -> bool:
+    """Whether rows are those of tracking cases."""
+    return {*_TRACKING_COLUMNS} <= {*frame}
+
+
+def is_closed_loop(frame: pd.DataFrame) -> bool:
+    """Whether rows are those of runs that the tracker steers, not of pictures shared by many targets."""
+    return is_tracking(frame) and "skip" not in frame
+
+
+def selectable(frame: pd.DataFrame) -> pd.DataFrame:
+    """Rows with selectable targets: lit, off the rock's edge, in both pictures to the end, on the stated face."""
+    return frame[rates.all_flags(frame, "selectable", "in_view", "on_face")]
+
+
 def goal_rows(subject: Subject) -> Rows | None:
-    """Rows at selectable targets; None where they are not those of runs that the tracker steers to a goal."""
+    """Rows at selectable targets; None unless the tracker steers the runs to a goal."""
     frame = subject.frame
     return selectable(frame) if is_closed_loop(frame) and "camera" in frame else None
 
@@ -54,28 +57,26 @@ def _by_camera(runs: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def camera_runs(runs: Rows) -> list[dict[str, Any]]:
-    """Each camera's rates (`_RATES`, each a `Share`) and the position errors of its completed runs: median, 99 %
-    quantile and its upper bound (infinite for too few), root mean square along the line of sight and across it, drift.
-    """
+    """Each camera's rates (`_RATES`, each a `Share`), and position errors and drift of its completed runs."""
     found = []
     for camera, ours in _by_camera(runs):
         reached = np.isfinite(numbers(ours, "position_error_m"))
         completed = ours[reached]
-        error, drift = known(completed, "position_error_m"), known(completed, "drift_px")
+        error, drift = rates.known(completed, "position_error_m"), rates.known(completed, "drift_px")
         found.append(
             {
                 "camera": camera,
-                "completed": share_of(reached, ours),
-                "tracked": flag_share(ours, "tracked"),
-                "within": share_of(error <= WITHIN_M, completed),
-                "false_tracks": flag_share(ours, "true_track", wanted=False),
-                "median_m": quantile(error, 0.5),
-                "quantile_m": quantile(error, QUANTILE),
-                "quantile_bound_m": quantile_bounds(error, QUANTILE, CONFIDENCE, terrain_groups(completed))[1],
-                "range_rms_m": rms(known(completed, "range_error_m")),
-                "cross_rms_m": rms(known(completed, "cross_error_m")),
-                "drift_median_px": quantile(drift, 0.5),
-                "drift_quantile_px": quantile(drift, QUANTILE),
+                "completed": rates.share_of(reached, ours),
+                "tracked": rates.flag_share(ours, "tracked"),
+                "within": rates.share_of(error <= WITHIN_M, completed),
+                "false_tracks": rates.flag_share(ours, "true_track", wanted=False),
+                "median_m": rates.quantile(error, 0.5),
+                "quantile_m": rates.quantile(error, QUANTILE),
+                "quantile_bound_m": quantile_bounds(error, QUANTILE, CONFIDENCE, rates.terrain_groups(completed))[1],
+                "range_rms_m": rates.rms(rates.known(completed, "range_error_m")),
+                "cross_rms_m": rates.rms(rates.known(completed, "cross_error_m")),
+                "drift_median_px": rates.quantile(drift, 0.5),
+                "drift_quantile_px": rates.quantile(drift, QUANTILE),
             }
         )
     return found
@@ -86,18 +87,17 @@ def _millimetres(name: str) -> Any:
 
 
 def _draw_cameras(runs: Rows, subject: Subject, key: str) -> Drawn:
-    del subject, key
     found = camera_runs(runs)
-    rates: list[tuple[str, str, Share]] = [
+    shares: list[tuple[str, str, rates.Share]] = [
         (one["camera"], name, one[rate]) for one in found for name, rate in _RATES.items()
     ]
     of_runs = grid_of(
-        rates,
+        shares,
         {
             "Camera": lambda row: row[0],
             "": lambda row: row[1],
-            "Runs": lambda row: share_text(row[2]),
-            f"{stated(CONFIDENCE)} interval": lambda row: interval_text(row[2]),
+            "Runs": lambda row: rates.share_text(row[2]),
+            f"{stated(CONFIDENCE)} interval": lambda row: rates.interval_text(row[2]),
         },
     )
     of_errors = grid_of(
@@ -113,50 +113,42 @@ def _draw_cameras(runs: Rows, subject: Subject, key: str) -> Drawn:
             f"Drift, {stated(QUANTILE)} quantile (px)": lambda one: number(one["drift_quantile_px"]),
         },
     )
-    note = (
-        "Selectable: the designated point is lit and off the rock's edge. Falsely tracked: some update reported the "
-        "target beyond the stated pixels from the designated point's true projection. Intervals: two-sided, Clopper "
-        f"and Pearson, at {stated(CONFIDENCE)} confidence."
-    )
+    note = note_text("vtt.goal", confidence=stated(CONFIDENCE))
     blocks = [
         Block(heading="Runs at selectable targets", grid=of_runs, note=note),
-        Block(heading="Errors at the goal", grid=of_errors, note=_physics()),
+        Block(heading="Errors at the goal", grid=of_errors, note=_expected_errors()),
     ]
     lost = losses_grid(runs)
     if lost.rows:
-        note = (
-            "Losses are the criteria (section 4.6) of the first update that lost the target. Azimuth change: the "
-            "largest between two sightings; clouds: whether there were any. What caused a loss is shown by a replay."
-        )
-        blocks.append(Block(heading="Runs that did not track to the end", grid=lost, note=note))
+        note = note_text("vtt.losses")
+        blocks.append(Block(heading="Runs that lost the target", grid=lost, note=note))
     data = [one | {rate: vars(one[rate]) for rate in _RATES.values()} for one in found]
     return blocks, {"cameras": data}
 
 
-def _physics() -> str:
-    """What Eqs. 1 and 4 make of the paper's cameras at the goal."""
-    said = []
+def _expected_errors() -> str:
+    """Errors of the paper's cameras at the goal by Eqs. 1 and 4."""
+    errors = []
     for design in (PANCAM, NAVCAM):
         stereo = stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m)
         drift = drift_error_m(GOAL_M, design.focal_px, 1.0)
-        said.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
+        errors.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
     return (
         f"By Eqs. 1 and 4 a pixel of disparity and a pixel of drift at {GOAL_M:g} m are, for the paper's cameras: "
-        f"{'; '.join(said)}. Along: of the line of sight. Bound: of the {stated(QUANTILE)} quantile at "
+        f"{'; '.join(errors)}. Along: along the line of sight. Bound: of the {stated(QUANTILE)} quantile at "
         f"{stated(CONFIDENCE)} confidence (order statistics; it takes 230 runs)."
     )
 
 
 def losses_grid(frame: Rows) -> Grid:
-    """Runs that ended without a tracked target, by how they ended and what lost it."""
-    failed = frame[~flag(frame, "tracked")]
+    """Runs that ended without a tracked target, by outcome and loss criteria."""
+    failed = frame[~rates.flag(frame, "tracked")]
     rows = []
     for (outcome, losses), chosen in failed.groupby([failed["outcome"], failed["losses"].fillna(NOTHING)]):
-        azimuth = known(chosen, "azimuth_change_max_deg")
+        azimuth, distance = rates.known(chosen, "azimuth_change_max_deg"), rates.known(chosen, "lost_range_m")
         turned = f"{azimuth.max():.1f}" if azimuth.size else NOTHING
-        distance = known(chosen, "lost_range_m")
         where = f"{distance.min():.1f} to {distance.max():.1f}" if distance.size else NOTHING
-        cloudy = flag_share(chosen, "clear_sky", wanted=False).hits if "clear_sky" in chosen else 0
+        cloudy = rates.flag_share(chosen, "clear_sky", wanted=False).hits if "clear_sky" in chosen else 0
         words = str(losses).replace("_", " ").lower()
         rows.append([str(outcome), words, f"{len(chosen):,}", where, turned, f"{cloudy:,}"])
     rows.sort(key=lambda row: -int(row[2].replace(",", "")))
@@ -174,10 +166,10 @@ GOAL = SectionDeclaration(
             lambda runs: {
                 f"{camera} ({error.size:,})": error
                 for camera, ours in _by_camera(runs)
-                if (error := known(ours, "position_error_m", 100.0)).size
+                if (error := rates.known(ours, "position_error_m", 100.0)).size
             },
             ("position error at the goal (cm)", "fraction of completed runs"),
-            "Share of completed runs with an error at the goal of up to so much; dashed: the requirement.",
+            "Fraction of completed runs up to each error at the goal; dashed: the requirement.",
             bound=100.0 * WITHIN_M,
         ),
         MadeBy(_draw_cameras),

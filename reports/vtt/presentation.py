@@ -8,9 +8,8 @@ from typing import Any
 from marsyard.reports.columns import label
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import plate
-from marsyard.reports.vtt.case_figures import draw_stops, draw_way, write_vtt_figures
+from marsyard.reports.vtt.case_figures import draw_path, draw_stops, is_vtt_case, path_of, stops_of, write_vtt_figures
 from marsyard.reports.vtt.goal import GOAL
-from marsyard.reports.vtt.products import is_vtt_case, stops_of, way_of
 from marsyard.reports.vtt.sections import (
     SINGLE_RUNS,
     regression_section,
@@ -19,33 +18,26 @@ from marsyard.reports.vtt.sections import (
     terrains_section,
     updates_section,
 )
-from marsyard.reports.wording import NOTHING, count, number
+from marsyard.reports.wording import NOTHING, note_text, number
 
-#: Stops whose pictures go into the page.
-_MOST_STOPS = 8
+#: Maximum number of stops whose pictures the page shows.
+_MAX_STOPS = 8
 #: Numbers of an update in the order of the table.
 _QUANTITIES = (
     "range_m", "azimuth_deg", "elevation_deg", "magnification", "roll_change_deg", "azimuth_change_deg", "match_score",
     "stereo_score", "correction_px", "error_px", "position_error_m",
 )  # fmt: skip
-_LEGEND = (
-    "As the paper's Figs. 15, 17 and 16b. Of every stop: the left subframe with the search window (blue, dashed), "
-    "the target found (orange) and, as a white cross, where the designated point truly is; beside it the target "
-    "enlarged and the right subframe. Distance is that from the camera, azimuth and elevation those of the mast. "
-    "Seen from above, north is up; estimates of the target lie where the rover believed them to be in the world, "
-    "hence hold the error of its pose as well."
-)
+_LEGEND = note_text("vtt.legend")
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
     """A tracking case."""
     stops = stops_of(products)
-    told = f"{count(min(len(stops), _MOST_STOPS), 'stop')} of {len(stops)}" if len(stops) > _MOST_STOPS else "All stops"
-    plates = [plate(draw_stops(products, _MOST_STOPS), f"{key}stops", f"{told}.", wide=True)]
-    if way_of(products) is not None:
-        plates.append(
-            plate(draw_way(products), f"{key}way", "The way from above, and the target as estimated.", wide=True)
-        )
+    caption = f"{_MAX_STOPS} stops of {len(stops)}." if len(stops) > _MAX_STOPS else "All stops."
+    plates = [plate(draw_stops(products, _MAX_STOPS), f"{key}stops", caption, wide=True)]
+    if path_of(products) is not None:
+        text = "The path from above, and the target as estimated."
+        plates.append(plate(draw_path(products), f"{key}way", text, wide=True))
     names = [name for name in _QUANTITIES if any(name in stop.figures for stop in stops)]
     rows = [
         TableRow(
@@ -58,13 +50,5 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 VTT = Presentation(
     cases=(CaseKind(is_vtt_case, view, write_vtt_figures, _LEGEND),),
-    first=(
-        table_1_section,
-        SINGLE_RUNS,
-        updates_section,
-        steps_section,
-        terrains_section,
-        regression_section,
-        GOAL,
-    ),
+    first=(table_1_section, SINGLE_RUNS, updates_section, steps_section, terrains_section, regression_section, GOAL),
 )

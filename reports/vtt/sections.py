@@ -14,27 +14,16 @@ import numpy as np
 import pandas as pd
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, AccuracyRow, table_1, tracked_approach_error_m
+from marsyard.reports import rates
 from marsyard.reports.charts import RateLine, rate_figure
 from marsyard.reports.columns import numbers
 from marsyard.reports.kinds import Drawn, MadeBy, Rows
 from marsyard.reports.papers import PaperFacts, read_paper
-from marsyard.reports.rates import (
-    CONFIDENCE,
-    all_flags,
-    flag,
-    flag_share,
-    interval_text,
-    known,
-    rms,
-    share_text,
-    spread_text,
-    stated_parameter,
-)
+from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
 from marsyard.reports.stored import table
-from marsyard.reports.vtt.goal import losses_grid
-from marsyard.reports.vtt.rows import is_closed_loop, is_tracking, selectable
-from marsyard.reports.wording import NOTHING, number, percent, stated
+from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, selectable
+from marsyard.reports.wording import NOTHING, note_text, number, percent, stated
 
 _PAPER_FILE = Path(__file__).with_name("paper.toml")
 PAPER = read_paper(_PAPER_FILE)
@@ -47,9 +36,7 @@ _NEAR = 0.1
 
 
 def table_1_section(subject: Subject) -> Section | None:
-    """Table I: computed from its equations, as printed, and measured; None where no completed run goes from the paper's
-    10 m to its 2 m.
-    """
+    """Table I: computed, printed and measured; None without completed runs from the paper's 10 m to its 2 m."""
     found = measured_accuracy(subject.frame)
     if not found:
         return None
@@ -65,19 +52,9 @@ def table_1_section(subject: Subject) -> Section | None:
             "Approach with N px of drift (cm)": lambda pair: pair[1].tracked_formula,
         },
     )
-    note = (
-        "All 3 sigma. Computed by Eqs. 1 to 5 with the 4.65 µm pixel of the manufacturer, each column rounded "
-        "before the next is computed from it."
-    )
-    measured_note = (
-        f"Selectable targets of completed runs from {START_M:g} m to {GOAL_M:g} m: three times the root mean square. "
-        "Without tracker: by Eq. 3 from the measured errors of designation and pose, with any odometry that the runs "
-        "had; the paper's is visual. Table I, the same: its last column for the drift measured. The paper takes 1 "
-        "px as the disparity error of 3 sigma; the error, calibration included, that Eq. 1 makes of the designation "
-        "stands next to."
-    )
+    measured_note = note_text("vtt.table_1_measured", start=f"{START_M:g}", goal=f"{GOAL_M:g}")
     blocks = [
-        Block(heading="Computed", grid=grid, note=note),
+        Block(heading="Computed", grid=grid, note=note_text("vtt.table_1")),
         Block(heading="Measured", grid=_measured_grid(found), note=measured_note),
     ]
     data = {
@@ -89,9 +66,10 @@ def table_1_section(subject: Subject) -> Section | None:
 
 
 def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
-    """Errors of each camera's completed runs: three times their root mean square, centimetres, as the paper states
-    3 sigma. `disparity_px` is the disparity error, 1 sigma, that Eq. 1 makes of the designation's error for the camera
-    as it was; `untracked_cm` is Eq. 3 of the errors of designation and pose.
+    """Errors of each camera's completed runs, 3 sigma (three times the root mean square).
+
+    disparity_px: 1 sigma, from the designation error by Eq. 1
+    untracked_cm: by Eq. 3 from the errors of designation and pose
     """
     if not is_closed_loop(frame) or "designation_error_m" not in frame or "camera" not in frame:
         return []
@@ -106,11 +84,11 @@ def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
             {
                 "camera": str(camera),
                 "runs": len(runs),
-                "designation_cm": 300.0 * rms(designation),
-                "disparity_px": rms(designation / numbers(runs, "designation_3_sigma_m")),
-                "untracked_cm": 300.0 * rms(np.hypot(designation, pose)),
-                "tracked_cm": 300.0 * rms(numbers(runs, "position_error_m")),
-                "drift_px": rms(numbers(runs, "drift_px")),
+                "designation_cm": 300.0 * rates.rms(designation),
+                "disparity_px": rates.rms(designation / numbers(runs, "designation_3_sigma_m")),
+                "untracked_cm": 300.0 * rates.rms(np.hypot(designation, pose)),
+                "tracked_cm": 300.0 * rates.rms(numbers(runs, "position_error_m")),
+                "drift_px": rates.rms(numbers(runs, "drift_px")),
             }
         )
     return found
@@ -133,14 +111,14 @@ def _measured_grid(found: Sequence[Mapping[str, Any]]) -> Grid:
 
 
 def legs(subject: Subject) -> list[Mapping[str, Any]]:
-    """The legs that the campaign's file gives its drive or its runs."""
-    drive = stated_parameter(subject, "drive")
-    said = table(drive).get("legs") if drive is not None else stated_parameter(subject, "legs")
-    return [table(leg) for leg in said] if isinstance(said, list | tuple) else []
+    """The legs of the campaign's drive or runs."""
+    drive = subject.run.parameter("drive")
+    found = table(drive).get("legs") if drive is not None else subject.run.parameter("legs")
+    return [table(leg) for leg in found] if isinstance(found, list | tuple) else []
 
 
 def table_4(frame: Rows, driven: Sequence[Mapping[str, Any]]) -> Grid:
-    """Table IV: tracking updates and minutes of each operational mode, the paper's and ours; `driven` are the legs."""
+    """Table IV: tracking updates and minutes of each operational mode; `driven` are the legs."""
     of_update = [int(str(name).split("_")[1]) for name in frame.columns if re.match(r"^update_\d+_leg$", str(name))]
     legs_of = np.column_stack([numbers(frame, f"update_{n}_leg") for n in of_update])
     times = np.column_stack([numbers(frame, f"update_{n}_time_s") for n in of_update]) / 60.0
@@ -154,49 +132,37 @@ def table_4(frame: Rows, driven: Sequence[Mapping[str, Any]]) -> Grid:
         reached = chosen.any(axis=1)
         end = np.where(chosen, times, -np.inf).max(axis=1)
         counts, minutes = chosen.sum(axis=1).astype(np.float64), (end - before)[reached]
-        ours = (spread_text(counts[reached], 0), spread_text(minutes, 1))
+        ours = (rates.spread_text(counts[reached], 0), rates.spread_text(minutes, 1))
         rows.append([mode["name"], f"{mode['updates']}", ours[0], f"{mode['minutes']:g}", ours[1]])
         before = np.where(reached, end, before)
     return Grid(["Mode", "Updates, paper", "Updates, ours", "Minutes, paper", "Minutes, ours"], rows)
 
 
 def _modes(frame: Rows, subject: Subject, key: str) -> Drawn:
-    del key
     if "update_1_leg" not in frame:
         return [], {}
-    note = (
-        "The paper's 5 minutes for the first map stand with the navigator's 23, as the map is begun on the way back in "
-        "ours. Ours: as above. A mode lasts from the last update before it to its own last."
-    )
-    return [Block(heading="By operational mode", grid=table_4(frame, legs(subject)), note=note)], {}
+    return [Block(heading="By operational mode", grid=table_4(frame, legs(subject)), note=note_text("vtt.table_4"))], {}
 
 
-#: What the paper states of single runs, next to the campaign that repeats the run.
+#: The paper's single runs next to the campaigns that repeat them.
 SINGLE_RUNS = PaperFacts(_PAPER_FILE, further={CHECKOUT_3: MadeBy(_modes)})
 
-#: What the table shows of an update: its heading, the column's ending, digits.
+#: Numbers of an update in the table: heading, ending of the column, digits.
 QUANTITIES: tuple[tuple[str, str, int], ...] = (
-    ("Distance (m)", "range_m", 2),
-    ("Magnification", "magnification", 2),
-    ("Roll change (deg)", "roll_change_deg", 2),
-    ("Azimuth change (deg)", "azimuth_change_deg", 2),
-    ("NCC score", "match_score", 2),
-    ("Stereo score", "stereo_score", 2),
-    ("Correction (px)", "correction_px", 1),
-    ("Off by (px)", "error_px", 1),
-)
+    ("Distance (m)", "range_m", 2), ("Magnification", "magnification", 2), ("Roll change (deg)", "roll_change_deg", 2),
+    ("Azimuth change (deg)", "azimuth_change_deg", 2), ("NCC score", "match_score", 2),
+    ("Stereo score", "stereo_score", 2), ("Correction (px)", "correction_px", 1), ("Error (px)", "error_px", 1),
+)  # fmt: skip
 
 
 def updates_section(subject: Subject) -> Section | None:
-    """Numbers of every stored update, next to Table III where the campaign is the first checkout; None where rows store
-    none.
-    """
+    """Numbers of every stored update, for the first checkout next to Table III; None if rows store no updates."""
     frame = subject.frame
     matched = (re.match(r"^update_(\d+)_range_m$", str(name)) for name in frame.columns)
     updates = sorted(int(one[1]) for one in matched if one)
     if not is_tracking(frame) or not updates:
         return None
-    values = {n: {ending: known(frame, f"update_{n}_{ending}") for _, ending, _ in QUANTITIES} for n in updates}
+    values = {n: {ending: rates.known(frame, f"update_{n}_{ending}") for _, ending, _ in QUANTITIES} for n in updates}
     grid = grid_of(
         [n for n in updates if values[n]["range_m"].size],
         {
@@ -205,60 +171,43 @@ def updates_section(subject: Subject) -> Section | None:
             **{one[0]: _update_text(values, *one[1:]) for one in QUANTITIES},
         },
     )
-    note = (
-        "Of all cases that came so far: median, and least to greatest in brackets. Changes are since the update "
-        "before; roll and azimuth with their sign. Correction: the larger of row and column, found less predicted. "
-        "Off by: found less true."
-    )
+    note = note_text("vtt.updates")
     blocks, title = [Block(grid=grid, note=note)], "Updates one by one"
     if subject.run.name == CHECKOUT_1:
         title = "Table III: the first checkout's updates"
-        paper_note = (
-            "The paper's number, then ours: the median, and least to greatest in brackets, without their signs, as the "
-            "paper prints them. Distances are those that Fig. 15 states. Path and steps are the paper's; rock, ground "
-            "and light are not known from it."
-        )
         blocks = [
-            Block(heading="Beside the paper's", grid=_table_3(values), note=paper_note),
-            Block(heading="All of ours", grid=grid, note=note),
+            Block(heading="Comparison with the paper", grid=_table_3(values), note=note_text("vtt.table_3")),
+            Block(heading="All our updates", grid=grid, note=note),
         ]
     lists = {str(n): {ending: one.tolist() for ending, one in of_n.items()} for n, of_n in values.items()}
     return Section("updates", "Updates", title, blocks, {"updates": lists})
 
 
 def _update_text(values: Mapping[int, Mapping[str, np.ndarray]], ending: str, digits: int) -> Callable[[int], str]:
-    return lambda n: spread_text(values[n][ending], digits)
+    return lambda n: rates.spread_text(values[n][ending], digits)
 
 
 def _table_3(values: Mapping[int, Mapping[str, np.ndarray]]) -> Grid:
-    """Table III, a row for each quantity and whose it is, a column for each rover position."""
+    """Table III: rows of paper and ours for each quantity, a column for each rover position."""
     rows = []
     for heading, ending, digits in QUANTITIES:
         printed = PAPER["table_3"].get(ending)
         if printed is not None:
             paper = [f"{printed[str(n)]:.{digits}f}" if str(n) in printed else NOTHING for n in values]
-            ours = [spread_text(np.abs(of_n[ending]), digits) for of_n in values.values()]
+            ours = [rates.spread_text(np.abs(of_n[ending]), digits) for of_n in values.values()]
             rows += [[heading, "paper", *paper], ["", "ours", *ours]]
     return Grid(["Parameter", "Rover position", *(str(n) for n in values)], rows)
 
 
-#: What distinguishes the lines of a figure of steps, where it varies.
+#: Columns that distinguish the lines of a figure of steps, if they vary.
 _SERIES = ("algorithm", "search_px")
-_STEPS_NOTE = (
-    "Selectable: lit, off the rock's edge, in both pictures to the end and, where the campaign says so, on the face "
-    "that all stops see. Tracked: found in the last picture within the stated pixels of the designated point's true "
-    "projection. Falsely tracked: reported beyond them at some stop. "
-    f"Intervals: two-sided, Clopper and Pearson, at {stated(CONFIDENCE)} confidence, as for independent targets; "
-    "those of a rock share its pictures and are not."
-)
+_STEPS_NOTE = note_text("vtt.steps", confidence=stated(CONFIDENCE))
 #: Edges of classes of the most oblique sight, deg.
 _CLASSES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
 
 def steps_section(subject: Subject) -> Section | None:
-    """Targets tracked by size of step: Fig. 8, sideways motions (5.2), turns (5.3); None where rows do not share
-    pictures of a drive.
-    """
+    """Targets tracked by step size: Fig. 8, sideways motion (5.2), turns (5.3); None unless rows share pictures."""
     motion, found = _motion(subject), step_rates(subject)
     if motion is None or not found:
         return None
@@ -280,41 +229,32 @@ def steps_section(subject: Subject) -> Section | None:
         {
             "Tracker": lambda one: one["line"] or "vtt",
             f"Step ({unit})": lambda one: number(one["step"]).rstrip("0").rstrip("."),
-            "Tracked, of selectable": lambda one: share_text(one["good"]),
-            f"{stated(CONFIDENCE)} interval": lambda one: interval_text(one["good"]),
+            "Tracked, of selectable": lambda one: rates.share_text(one["good"]),
+            f"{stated(CONFIDENCE)} interval": lambda one: rates.interval_text(one["good"]),
             "Paper": lambda one: NOTHING if one["paper_percent"] is None else f"{one['paper_percent']:.0f} %",
-            "Tracked, of all targets": lambda one: share_text(one["all_targets"]),
-            "Falsely tracked, of selectable": lambda one: share_text(one["false_tracks"]),
+            "Tracked, of all targets": lambda one: rates.share_text(one["all_targets"]),
+            "False track, of selectable": lambda one: rates.share_text(one["false_tracks"]),
         },
     )
     figure = rate_figure(lines, (xlabel, "targets tracked"))
-    blocks = [
-        Block(text=motion["text"], plates=[plate(figure, "steps", caption)]),
-        Block(grid=grid, note=_STEPS_NOTE),
-    ]
+    blocks = [Block(text=motion["text"], plates=[plate(figure, "steps", caption)]), Block(grid=grid, note=_STEPS_NOTE)]
     oblique = None if motion["per_cent"] else _obliquity_grid(subject.frame)
     if oblique is not None:
-        note = (
-            "Lit targets in view to the end, tracked of all, by how obliquely their surface was seen at most. The "
-            "template is scaled and rolled, but not narrowed as an oblique patch is that turns."
-        )
-        blocks.append(Block(grid=oblique, note=note))
-    rates = ("good", "all_targets", "false_tracks")
-    data = [one | {name: asdict(one[name]) for name in rates} for one in found]
+        blocks.append(Block(grid=oblique, note=note_text("vtt.obliquity")))
+    keys = ("good", "all_targets", "false_tracks")
+    data = [one | {name: asdict(one[name]) for name in keys} for one in found]
     return Section("steps", "Steps", motion["title"], blocks, {"cells": data})
 
 
 def _motion(subject: Subject) -> Mapping[str, Any] | None:
-    """What the paper states of the campaign's motion; None where it does not drive one leg."""
+    """The paper's numbers of the campaign's motion; None unless it drives one leg."""
     of_drive = legs(subject)
     motions: Mapping[str, Mapping[str, Any]] = PAPER["steps"]
     return motions.get(str(of_drive[0].get("motion", "approach"))) if len(of_drive) == 1 else None
 
 
 def step_rates(subject: Subject) -> list[dict[str, Any]]:
-    """Every line (the tracker, or its search window) and step: shares tracked of selectable targets (`good`) and of
-    all, share of selectable targets that some update reported at a wrong place, and the paper's per cent.
-    """
+    """Rates for every line (tracker or search window) and step size; `good` is of selectable targets."""
     frame, motion = subject.frame, _motion(subject)
     if motion is None or not is_tracking(frame) or "step" not in frame or "skip" not in frame:
         return []
@@ -328,9 +268,9 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
                 {
                     "line": line,
                     "step": step,
-                    "good": flag_share(good, "tracked"),
-                    "all_targets": flag_share(chosen, "tracked"),
-                    "false_tracks": flag_share(good, "true_track", wanted=False),
+                    "good": rates.flag_share(good, "tracked"),
+                    "all_targets": rates.flag_share(chosen, "tracked"),
+                    "false_tracks": rates.flag_share(good, "true_track", wanted=False),
                     "paper_percent": next((p for size, p in paper.items() if abs(step - float(size)) < 0.5), None),
                 }
             )
@@ -338,7 +278,7 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
 
 
 def _lines(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Rows by what distinguishes them; one line without a name where nothing does."""
+    """Rows by the column that distinguishes the lines; one nameless line if none varies."""
     column = next((name for name in _SERIES if name in frame and frame[name].nunique() > 1), None)
     if column is None:
         yield "", frame
@@ -350,18 +290,18 @@ def _lines(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def _obliquity_grid(frame: Rows) -> Grid | None:
-    """Targets tracked by class of the most oblique sight and step; None where rows hold no sights."""
+    """Targets tracked by maximum obliquity and step size; None if rows lack obliquities."""
     if "obliquity_max_deg" not in frame:
         return None
-    seen = frame[all_flags(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
+    seen = frame[rates.all_flags(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
     steps = sorted(seen["step"].unique())
     rows = []
     for low, high in pairwise(_CLASSES_DEG):
         chosen = seen[seen["obliquity_max_deg"].between(low, high, inclusive="left")]
         if len(chosen):
-            shares = [flag_share(chosen[chosen["step"].eq(step)], "tracked") for step in steps]
+            shares = [rates.flag_share(chosen[chosen["step"].eq(step)], "tracked") for step in steps]
             rows.append([f"{low:g} to {high:g}", *(f"{one.hits:,} of {one.n:,}" for one in shares)])
-    return Grid(["Most oblique sight (deg)", *(f"{step:g} deg" for step in steps)], rows) if rows else None
+    return Grid(["Maximum obliquity (deg)", *(f"{step:g} deg" for step in steps)], rows) if rows else None
 
 
 #: A change of azimuth that the paper calls excessive, degrees (section 5.5).
@@ -371,7 +311,7 @@ SMALL_M = 0.1
 
 
 def terrains_section(subject: Subject) -> Section | None:
-    """Table II; None where the campaign is not that of the paper's terrains."""
+    """Table II; None unless the campaign is that of the paper's terrains."""
     frame, printed = subject.frame, PAPER["table_2"]
     if subject.run.name != TERRAINS or not is_closed_loop(frame) or "incline" not in frame:
         return None
@@ -380,30 +320,31 @@ def terrains_section(subject: Subject) -> Section | None:
     rows, data = [], []
     for name in ordered:
         runs = frame[frame["incline"].eq(name)]
-        good, slips = selectable(runs), known(runs, "slip_max")
-        counted = dict(Counter(cause_of(row) for _, row in good[~flag(good, "tracked")].iterrows()).most_common())
-        failed, failed_all = (flag_share(one, "tracked", wanted=False) for one in (good, runs))
+        good, slips = selectable(runs), rates.known(runs, "slip_max")
+        counted = dict(
+            Counter(failure_cause(row) for _, row in good[~rates.flag(good, "tracked")].iterrows()).most_common()
+        )
+        failed, failed_all = (rates.flag_share(one, "tracked", wanted=False) for one in (good, runs))
         slip = float(slips.max()) if slips.size else float("nan")
         row = printed.get(name)
         paper = [NOTHING] * 2 if row is None else [f"{row['failures']} of {row['trials']}", row["reason"]]
-        ours = [share_text(failed), interval_text(failed), "; ".join(f"{c}: {n}" for c, n in counted.items()) or "none"]
-        rows.append([name, *paper, *ours, share_text(failed_all), percent(slip)])
+        ours = [
+            rates.share_text(failed),
+            rates.interval_text(failed),
+            "; ".join(f"{c}: {n}" for c, n in counted.items()) or "none",
+        ]
+        rows.append([name, *paper, *ours, rates.share_text(failed_all), percent(slip)])
         shares = {"failed": asdict(failed), "failed_all": asdict(failed_all)}
         data.append({"name": name, **shares, "causes": counted, "slip_max": slip})
     head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{stated(CONFIDENCE)} interval"]
-    head += ["Cause, ours", "Failures, with unfit targets", "Largest slip"]
-    note = (
-        "Failures: runs that did not end at the goal with the target within the stated pixels; ours of selectable "
-        "targets, and of all, those in shade or on the rock's edge included. Causes, the first that holds: the "
-        f"navigator or mast gave up; the azimuth changed by more than {EXCESSIVE_DEG:g} deg between two updates; "
-        "clouds passed; drifted though never lost; else the criterion that lost the target."
-    )
+    head += ["Cause, ours", "Failures, all targets", "Maximum slip"]
+    note = note_text("vtt.table_2", limit=f"{EXCESSIVE_DEG:g}")
     title = "Table II: tracking with visual odometry on four kinds of ground"
     return Section("table-2", "Table II", title, [Block(grid=Grid(head, rows), note=note)], {"terrains": data})
 
 
-def cause_of(row: pd.Series) -> str:
-    """Why a run failed, as far as its row shows."""
+def failure_cause(row: pd.Series) -> str:
+    """Cause of a failed run by its row."""
     outcome = str(row["outcome"])
     if outcome not in ("COMPLETED", "LOST"):
         return outcome.replace("_", " ").lower()
@@ -415,7 +356,7 @@ def cause_of(row: pd.Series) -> str:
 
 
 def regression_section(subject: Subject) -> Section | None:
-    """The regression runs (section 6) one by one; None where the campaign is not that one."""
+    """The regression runs (section 6); None unless the campaign is that one."""
     frame = subject.frame
     if subject.run.name != REGRESSION or not is_closed_loop(frame) or "visual_odometry" not in frame:
         return None
@@ -433,16 +374,16 @@ def regression_section(subject: Subject) -> Section | None:
             "Rock": lambda one: str(one[0][1]),
             "Ground": lambda one: str(one[0][2]),
             "Runs": lambda one: f"{len(one[1]):,}",
-            "Tracked to the goal": lambda one: share_text(flag_share(one[1], "tracked")),
+            "Tracked to the goal": lambda one: rates.share_text(rates.flag_share(one[1], "tracked")),
             "Outcomes": lambda one: ", ".join(sorted(str(outcome) for outcome in one[1]["outcome"].unique())),
-            "Position error (cm)": lambda one: spread_text(known(one[1], "position_error_m", 100.0), 2),
-            "Drift (px)": lambda one: spread_text(known(one[1], "drift_px"), 1),
-            "Navigation updates": lambda one: spread_text(known(one[1], "autonav_updates"), 0),
+            "Position error (cm)": lambda one: rates.spread_text(rates.known(one[1], "position_error_m", 100.0), 2),
+            "Drift (px)": lambda one: rates.spread_text(rates.known(one[1], "drift_px"), 1),
+            "Navigation updates": lambda one: rates.spread_text(rates.known(one[1], "autonav_updates"), 0),
         },
     )
     note = "The paper: 14 runs, all successful, which it does not list. Small rocks are those less than 10 cm high."
     blocks, lost = [Block(grid=grid, note=note)], losses_grid(frame)
     if lost.rows:
-        blocks.append(Block(heading="Runs that did not track to the end", grid=lost))
-    data = {"tracked": asdict(flag_share(frame, "tracked"))}
+        blocks.append(Block(heading="Runs that lost the target", grid=lost))
+    data = {"tracked": asdict(rates.flag_share(frame, "tracked"))}
     return Section("regression", "Regression", "Regression runs on the engineering model", blocks, data)

@@ -31,7 +31,7 @@ from marsyard.scenarios.descent.score import (
 )
 from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.estimators import VELOCITY
-from marsyard.scenarios.exposure import pixel_sample
+from marsyard.scenarios.exposure import Sample, pixel_sample
 from marsyard.scenarios.faults import deliver, faulty_detector
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.optics import Optics

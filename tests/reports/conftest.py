@@ -70,7 +70,8 @@ def _crash(frame: pd.DataFrame, crashed: int) -> pd.DataFrame:
     frame = frame.astype(dict.fromkeys(numbers, "float64"))
     frame.loc[rows, numbers] = np.nan
     frame.loc[rows, ["image_hash", "gl_backend", "gl_version"]] = None
-    frame.loc[rows, ["outcome", "answered"]] = ["CRASHED", False]
+    frame.loc[rows, "outcome"] = "CRASHED"
+    frame.loc[rows, "answered"] = False
     frame.loc[rows, "error"] = "RuntimeError: the context is lost"
     frame.loc[rows, "traceback"] = 'Traceback (most recent call last):\n  File "x.py", line 1\nRuntimeError: lost'
     return frame

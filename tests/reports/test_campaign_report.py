@@ -13,7 +13,7 @@ import pytest
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.reports.campaign import write_report
-from marsyard.reports.page_figures import script_hash
+from marsyard.reports.sections import script_hash
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]

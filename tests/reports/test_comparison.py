@@ -1,16 +1,18 @@
 """Algorithms in pairs, and covariances against errors: closed forms, and rates over many repetitions."""
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
 
 from marsyard.reports.common_sections import consistencies, consistency
-from marsyard.reports.comparison import comparison, own_frame
+from marsyard.reports.comparison import comparison, select_algorithm
 
 
 def rows(mine: list[float], its: list[float]) -> pd.DataFrame:
-    frame = {"case": range(len(mine)), "algorithm": "dimes", "velocity_error_m_s": mine}
+    frame: dict[str, Any] = {"case": range(len(mine)), "algorithm": "dimes", "velocity_error_m_s": mine}
     for prefix, errors in (("", mine), ("other.", its)):
         known = np.isfinite(errors)
         frame[f"{prefix}outcome"] = np.where(known, "VALID", "CRASHED")
@@ -44,7 +46,7 @@ def test_one_algorithm_alone_is_no_comparison() -> None:
 
 
 def test_a_frame_as_if_the_other_had_been_judged() -> None:
-    own = own_frame(rows([1, 2], [3, 4]), "other")
+    own = select_algorithm(rows([1, 2], [3, 4]), "other")
     assert own["velocity_error_m_s"].tolist() == [3, 4]
     assert own["altitude_m"].tolist() == [1.0, 1.0]
     assert not any("." in str(name) for name in own.columns)
@@ -52,14 +54,14 @@ def test_a_frame_as_if_the_other_had_been_judged() -> None:
 
 def test_right_covariances_are_consistent_19_times_in_20() -> None:
     rng = np.random.default_rng(7)
-    words = [consistency("x", stats.chi2.rvs(2, size=50, random_state=rng)).word for _ in range(400)]
+    words = [consistency(stats.chi2.rvs(2, size=50, random_state=rng))["word"] for _ in range(400)]
     assert 0.91 <= words.count("consistent") / 400 <= 0.985  # 0.95 with 4 standard deviations below, 3 above
-    found = consistency("x", stats.chi2.rvs(2, size=50, random_state=rng) * 4.0)
-    assert found.word == "too sure"
-    assert consistency("x", stats.chi2.rvs(2, size=50, random_state=rng) / 4.0).word == "too cautious"
+    found = consistency(stats.chi2.rvs(2, size=50, random_state=rng) * 4.0)
+    assert found["word"] == "too sure"
+    assert consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "too cautious"
 
 
 def test_consistency_of_every_algorithm_that_states_covariances() -> None:
     frame = rows([1, 2], [3, 4]).assign(**{"other.velocity_nees": [2.0, 2.0]})
-    (only,) = consistencies(frame)
-    assert (only.name, only.n, only.mean, only.word) == ("other", 2, 2.0, "consistent")
+    ((name, only),) = consistencies(frame).items()
+    assert (name, only["n"], only["mean"], only["word"]) == ("other", 2, 2.0, "consistent")

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.reports.cases import gallery_cases, notable_cases
-from marsyard.reports.page_figures import MOST_POINTS, embedded, explorer_data, points_of
+from marsyard.reports.sections import MAX_POINTS, choose_points, embedded, explorer_data
 from marsyard.reports.stored import read_run
 
 Rows = Callable[..., pd.DataFrame]
@@ -18,13 +18,13 @@ METRIC = "velocity_error_m_s"
 
 def test_points_hold_the_worst_the_silent_and_the_crashed(make_rows: Rows) -> None:
     frame = make_rows(12_000, crashed=3)
-    chosen = points_of(frame, METRIC)
-    assert chosen.size == MOST_POINTS
+    chosen = choose_points(frame, METRIC)
+    assert chosen.size == MAX_POINTS
     assert np.all(np.diff(chosen) > 0)
     assert int(np.nanargmax(frame[METRIC])) in chosen
     assert {11_997, 11_998, 11_999} <= set(chosen.tolist())
     assert frame.iloc[chosen]["outcome"].nunique() == frame["outcome"].nunique()
-    assert points_of(frame.head(50), METRIC).tolist() == list(range(50))
+    assert choose_points(frame.head(50), METRIC).tolist() == list(range(50))
 
 
 def test_data_of_the_points(make_rows: Rows, make_run: Callable[..., Path]) -> None:

@@ -3,17 +3,18 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 
+import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from marsyard.reports.figures import (
-    beyond_the_axis,
-    error_against,
+    count_beyond_axis,
     error_distribution,
     error_histogram,
     error_scatter,
+    error_scatter_against,
     outcome_bars,
 )
 from marsyard.reports.svg import svg_markup
@@ -28,7 +29,7 @@ def _all_figures(frame: pd.DataFrame, bound: float | None) -> list[Figure | None
         error_scatter(frame, METRIC, bound, close=True),
         error_histogram(frame, METRIC, bound),
         error_distribution(frame, METRIC, bound),
-        error_against(frame, METRIC, "off_nadir_max_deg", bound),
+        error_scatter_against(frame, METRIC, "off_nadir_max_deg", bound),
         outcome_bars(frame),
     ]
 
@@ -46,8 +47,8 @@ def test_figures_of_what_is_not_there(make_rows: Rows) -> None:
     silent = make_rows(5, answered=0.0)
     assert error_scatter(silent, METRIC, 5.0) is None
     assert error_histogram(silent, METRIC, 5.0) is None
-    assert error_against(silent, METRIC, "off_nadir_max_deg", 5.0) is not None
-    assert error_against(silent, METRIC, "nonesuch", 5.0) is None
+    assert error_scatter_against(silent, METRIC, "off_nadir_max_deg", 5.0) is not None
+    assert error_scatter_against(silent, METRIC, "nonesuch", 5.0) is None
     bare = pd.DataFrame({"case": [0, 1], METRIC: [1.0, 2.0]})
     assert error_scatter(bare, METRIC, 5.0) is None
     assert outcome_bars(bare) is None
@@ -120,21 +121,29 @@ def test_axes_follow_errors_that_are_mostly_gross(make_rows: Rows) -> None:
     distribution = error_distribution(frame, METRIC, 5.0)
     assert distribution is not None
     axes = distribution.axes[0]
-    x, share = axes.lines[0].get_data()
+    x, share = (np.asarray(values) for values in axes.lines[0].get_data())
     assert share[x <= axes.get_xlim()[1]].max() > 0.9
     assert any("beyond" in text.get_text() for text in axes.texts)
+
+
+def _hollow_marks(figure: Figure) -> int:
+    lines = [line for line in figure.axes[0].lines if line.get_markerfacecolor() == "none"]
+    return sum(np.size(line.get_xdata()) for line in lines)
 
 
 def test_points_beyond_the_axes_are_hollow_and_counted(make_rows: Rows) -> None:
     frame = _with_gross_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
     figure = error_scatter(frame, METRIC, 5.0)
     assert figure is not None
-    hollow = [line for line in figure.axes[0].lines if line.get_markerfacecolor() == "none" and len(line.get_xdata())]
-    count = sum(len(line.get_xdata()) for line in hollow)
+    count = _hollow_marks(figure)
     assert count >= 4
-    assert f"{count} beyond the axes" in [text.get_text() for text in figure.axes[0].get_legend().texts]
-    driven = error_against(frame, METRIC, "off_nadir_max_deg", 5.0)
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    assert f"{count} beyond the axes" in [text.get_text() for text in legend.texts]
+    driven = error_scatter_against(frame, METRIC, "off_nadir_max_deg", 5.0)
     assert driven is not None
-    hollow = [line for line in driven.axes[0].lines if line.get_markerfacecolor() == "none"]
-    drawn = sum(len(line.get_xdata()) for line in hollow)
-    assert drawn == beyond_the_axis(frame, METRIC, "off_nadir_max_deg", 5.0) == (frame[METRIC] > 15.0).sum()
+    assert (
+        _hollow_marks(driven)
+        == count_beyond_axis(frame, METRIC, "off_nadir_max_deg", 5.0)
+        == (frame[METRIC] > 15.0).sum()
+    )

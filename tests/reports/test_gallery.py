@@ -12,8 +12,8 @@ import pytest
 
 from marsyard.reports.evaluation import overall
 from marsyard.reports.hda.sections import MAP_EFFECTS, distance_grid
-from marsyard.reports.page_figures import driver_plates
-from marsyard.reports.scatter import correlation_text
+from marsyard.reports.kinds import correlation_text
+from marsyard.reports.sections import driver_plates
 from marsyard.reports.traceability import junit_xml
 from marsyard.reports.wording import NOTHING, number
 

@@ -18,6 +18,7 @@ from marsyard.reports.kinds import (
     Rate,
     RateByCondition,
     RateTable,
+    Scatter,
     SectionDeclaration,
     Statistics,
     condition_bins,
@@ -25,7 +26,6 @@ from marsyard.reports.kinds import (
 )
 from marsyard.reports.papers import PaperFacts
 from marsyard.reports.presentation import Presentation, presentations
-from marsyard.reports.scatter import Scatter
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.scenarios.system import System
@@ -85,7 +85,7 @@ def test_a_cumulative_curve_counts_up_or_down() -> None:
     values = {"ours": np.array([1.0, 2.0, 3.0, 4.0])}
     for falling, at_two in ((False, 0.5), (True, 0.5)):
         (line,) = cumulative_figure(values, ("", ""), falling=falling).axes[0].get_lines()
-        heights = dict(zip(line.get_xdata(), line.get_ydata(), strict=True))
+        heights = dict(np.column_stack([np.asarray(line.get_xdata()), np.asarray(line.get_ydata())]).tolist())
         assert heights[2.0] == at_two
         assert heights[4.0] == (0.0 if falling else 1.0)
 

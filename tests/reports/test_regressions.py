@@ -7,8 +7,19 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.reports.history import FINISHED, INTERRUPTED, RUNNING, History, NightCampaign, NightFigure
-from marsyard.reports.nights import Change, Comparison, changes, comparisons_of, night_text
+from marsyard.reports.history import (
+    FINISHED,
+    INTERRUPTED,
+    RUNNING,
+    Change,
+    Comparison,
+    History,
+    NightCampaign,
+    NightFigure,
+    changes,
+    comparisons_of,
+    night_text,
+)
 from marsyard.reports.statistics.changes import Sample
 
 CASES, TERRAINS = 100, 12

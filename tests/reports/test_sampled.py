@@ -121,7 +121,7 @@ def test_the_page_and_its_twin_say_how_cases_were_drawn(make_rows: Rows, make_ru
         "% seen",
     ):
         assert text in page, text
-    assert "Further cases</th>" in page
+    assert "Additional cases needed</th>" in page
     assert twin["sampling"] == {
         "design": "latin-hypercube",
         "grids": [],

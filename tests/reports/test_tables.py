@@ -85,7 +85,7 @@ def test_parts_of_an_error(make_rows: Rows) -> None:
 
 
 def test_drivers_leave_out_bookkeeping_and_the_error_itself(make_rows: Rows) -> None:
-    drivers = driver_columns(make_rows(50), "velocity_error_m_s", most=20)
+    drivers = driver_columns(make_rows(50), "velocity_error_m_s", max_columns=20)
     assert drivers[:3] == ["off_nadir_max_deg", "attitude_rate_max_deg_s", "altitude_1_m"]
     assert not {"case", "wall_time_s", "velocity_error_x_m_s", "terrain", "answered"} & set(drivers)
 

@@ -193,14 +193,16 @@ def test_crashes_withhold_a_verdict_on_answers_that_they_might_have_failed(popul
     """A crash is no answer; but where crashes instead of wrong answers would earn a PASS, there is none."""
     asked = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
     frame = _rows(50, 0).assign(near=True)
-    frame.loc[:9, ["outcome", "answered"]] = ["CRASHED", False]
+    frame.loc[:9, "outcome"] = "CRASHED"
+    frame.loc[:9, "answered"] = False
     for how in ("confidence", "estimate"):
         found = _judge(frame, asked, population=population, decide_by=how)
         assert (found.status, found.n, found.failures) == (Status.INSUFFICIENT, 40, 0)
         assert "10 cases did not come to an end" in found.note
     # crashes that are too few to matter, or that belong elsewhere, withhold nothing
     few = _rows(200, 0).assign(near=True)
-    few.loc[:1, ["outcome", "answered"]] = ["CRASHED", False]
+    few.loc[:1, "outcome"] = "CRASHED"
+    few.loc[:1, "answered"] = False
     assert _judge(few, asked, population=population).status is Status.PASS
     elsewhere = frame.assign(near=frame["answered"])
     assert _judge(elsewhere, asked, population="valid and near").status is Status.PASS
@@ -364,7 +366,8 @@ def test_looks_of_a_campaign_that_stops_itself_share_the_risk(velocity: dict[str
     assert early.bounds_confidence == pytest.approx(1.0 - 0.1 * 160 / 640)
     assert early.lower == proportion_lower(320, 320, early.bounds_confidence)
     (last,) = judge_campaign(_rows(640, 0), [velocity], how)
-    assert (last.status, last.bounds_confidence) == (Status.PASS, pytest.approx(0.95))
+    assert last.status is Status.PASS
+    assert last.bounds_confidence == pytest.approx(0.95)
     assert "judged more than once" in last.note
 
 

@@ -14,7 +14,7 @@ from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.reports.dashboard.entries import Shown, find_campaigns, read_entries, slug_of
 from marsyard.reports.dashboard.rows import margin_text, requirement_rows, sparkline
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.page_figures import script_hash
+from marsyard.reports.sections import script_hash
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from marsyard.reports.cases import write_case_figures
-from marsyard.reports.dimes.stream import draw_stream_case, is_stream_case, view
+from marsyard.reports.dimes.presentation import draw_stream_case, is_stream_case
+from marsyard.reports.dimes.presentation import view_stream as view
 
 PICTURES = 4
 
@@ -35,8 +36,8 @@ def test_every_picture_and_answer_is_drawn(products: dict[str, Any]) -> None:
     east, north = axes[-2:]
     for component, (drawn, error) in enumerate(((east, 0.5), (north, 0.0))):
         answered = next(line for line in drawn.get_lines() if line.get_marker() not in ("None", "", "|"))
-        np.testing.assert_allclose(answered.get_xdata(), [0.5, 1.5, 2.5])
-        np.testing.assert_allclose(answered.get_ydata(), products["after_true_m_s"][1:, component] + error)
+        np.testing.assert_allclose(np.asarray(answered.get_xdata()), np.array([0.5, 1.5, 2.5]))
+        np.testing.assert_allclose(np.asarray(answered.get_ydata()), products["after_true_m_s"][1:, component] + error)
 
 
 def test_a_case_is_told_picture_by_picture(products: dict[str, Any], tmp_path: Path) -> None:

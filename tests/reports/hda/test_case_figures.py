@@ -72,13 +72,14 @@ def test_matches_are_the_accepted_ones_of_those_drawn(hda_products: dict[str, An
 def test_maps_have_the_papers_colours(hda_products: dict[str, Any]) -> None:
     figure = draw_maps(hda_products)
     elevation, roughness, slope, safety = (axes.get_images()[0] for axes in figure.axes[:4])
-    high, low = elevation.cmap(elevation.norm(0.5))[:3], elevation.cmap(elevation.norm(-0.5))[:3]
-    assert sum(high) < sum(low)
+    high, low = elevation.to_rgba(np.array([0.5, -0.5]))
+    assert sum(high[:3]) < sum(low[:3])
     for image, limit in ((roughness, 0.2), (slope, 15.0)):
-        colours = [to_hex(image.cmap(image.norm(share * limit))) for share in (0.2, 0.95)]
+        colours = [to_hex(one) for one in image.to_rgba(limit * np.array([0.2, 0.95]))]
         assert colours == [GREEN, YELLOW]
-        assert image.cmap(image.norm(1.01 * limit))[0] > 1.8 * image.cmap(image.norm(1.01 * limit))[1]
-    assert [to_hex(safety.cmap(safety.norm(value))) for value in (0, 1, 2)] == [GREEN, YELLOW, RED]
+        (beyond,) = image.to_rgba(np.array([1.01 * limit]))
+        assert beyond[0] > 1.8 * beyond[1]
+    assert [to_hex(one) for one in safety.to_rgba(np.arange(3))] == [GREEN, YELLOW, RED]
 
 
 def test_tones_are_apart_without_hue() -> None:

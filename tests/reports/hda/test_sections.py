@@ -90,7 +90,7 @@ def test_sites_against_the_truth() -> None:
     assert shares["'no safe site', where none exists"].share == 1.0
     counts = outcome_counts(frame)
     assert sum(sum(row.values()) for row in counts.values()) == len(frame)
-    assert counts["no safe place"]["no safe site"] == (frame["outcome"] == "NO_SAFE_SITE").sum()
+    assert counts["no safe site"]["no safe site"] == (frame["outcome"] == "NO_SAFE_SITE").sum()
 
 
 def test_crashed_flights_are_counted_as_not_finished() -> None:
@@ -185,7 +185,7 @@ def test_map_errors_follow_their_drivers() -> None:
     mapped = map_rows(_subject(frame))
     assert mapped is not None
     effects = {(one.driver, one.error): one for one in MAP_EFFECTS.effects(mapped)}
-    noise = effects["baseline over height", "the same without its plane (% of height)"]
+    noise = effects["baseline over height", "elevation error rms without its plane (% of height)"]
     assert noise.rank_correlation == pytest.approx(-1.0)
     assert np.all(np.diff(noise.medians) < 0.0)
     scale = effects["altimeter's error (% of the range)", "elevation error rms (% of height)"]

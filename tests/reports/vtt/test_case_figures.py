@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from marsyard.reports.cases import write_case_figures
-from marsyard.reports.vtt.case_figures import TARGET, WINDOW, draw_stops, draw_way
+from marsyard.reports.vtt.case_figures import TARGET, WINDOW, draw_path, draw_stops, is_vtt_case, path_of, stops_of
 from marsyard.reports.vtt.presentation import view
-from marsyard.reports.vtt.products import is_vtt_case, stops_of, way_of
 from tests.reports.vtt.tracking_rows import products
 
 
@@ -59,12 +58,12 @@ def test_numbers_stand_above_their_stop() -> None:
 
 
 def test_a_few_stops_hold_the_first_and_the_last() -> None:
-    titles = [axes.get_title(loc="left") for axes in draw_stops(products(9), most=4).axes]
+    titles = [axes.get_title(loc="left") for axes in draw_stops(products(9), max_stops=4).axes]
     assert [title.split(":")[0].split(" ")[0] for title in titles if title] == ["1", "4", "6", "9"]
 
 
 def test_the_way_and_the_estimates_are_drawn_in_their_places() -> None:
-    above, close = draw_way(products(4)).axes
+    above, close = draw_path(products(4)).axes
     drawn = {line.get_label(): np.column_stack(line.get_data()) for line in above.lines}
     assert drawn["stops"][-1].tolist() == [8.0, 0.0]
     assert drawn["stops as believed"][0].tolist() == pytest.approx([0.05, 0.05])
@@ -100,7 +99,7 @@ def test_figures_are_written(tmp_path: Path) -> None:
 def test_cases_with_parts_missing(changes: dict[str, Any]) -> None:
     kept = products() | changes
     assert draw_stops(kept).axes
-    assert draw_way(kept).axes
+    assert draw_path(kept).axes
     assert len(view(kept, "case1").rows) == 3
 
 
@@ -109,11 +108,11 @@ def test_what_is_no_tracking_case() -> None:
     assert not is_vtt_case({})
     assert not is_vtt_case(products() | {"template_px": None})
     assert stops_of({}) == []
-    assert way_of(products() | {"rover_true_m": np.zeros((2, 3))}) is None
+    assert path_of(products() | {"rover_true_m": np.zeros((2, 3))}) is None
     with pytest.raises(ValueError, match="no picture"):
         draw_stops({})
     with pytest.raises(ValueError, match="no way"):
-        draw_way({})
+        draw_path({})
 
 
 def test_the_page_shows_every_stop_in_its_table() -> None:

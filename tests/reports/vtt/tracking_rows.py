@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,11 +47,17 @@ def rows(cases: int, **columns: Any) -> pd.DataFrame:
     return pd.DataFrame(own | columns, index=range(cases))
 
 
-def subject(frame: pd.DataFrame, name: str = "a-campaign", legs: list[Mapping[str, Any]] | None = None) -> Subject:
+def subject(frame: pd.DataFrame, name: str = "a-campaign", legs: Sequence[Mapping[str, Any]] | None = None) -> Subject:
     """A report's subject of these rows, as of a campaign of this name whose shared drive has these legs."""
     parameters = {"drive": {"legs": legs}} if legs else {}
     record = {"name": name, "configuration": {"parameters": parameters}}
     return Subject(StoredRun(Path("run"), frame, frame, record, ()), "position_error_m", 0.03)
+
+
+def put(frame: pd.DataFrame, index: int, **values: Any) -> None:
+    """Set values of a row."""
+    for name, value in values.items():
+        frame.loc[index, name] = value
 
 
 def table(section: Section | None, block: int = 0) -> list[dict[str, str]]:

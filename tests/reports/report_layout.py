@@ -1,17 +1,10 @@
-"""The layout of `report.json`, the page's machine-readable twin: what other programs may rely on.
-
-`report.schema.json` is this layout as JSON Schema, kept beside this module and held to it by the tests. What is taken
-away or changes its meaning raises `SCHEMA`; what is added does not.
-"""
+"""Layout of `report.json` as models, which generate and check `reports/report.schema.json`."""
 
 from __future__ import annotations
 
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
-
-#: Version of the layout.
-SCHEMA = 4
 
 Word = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE"]
 
@@ -23,13 +16,13 @@ class _Part(BaseModel):
 
 
 class TwinClusters(_Part):
-    """What cases that share terrains show of a success rate."""
+    """Evidence of cases that share terrains."""
 
     terrains: int
     failed_terrains: int
     method: str
-    design_effect: float | None = Field(description="null where too few failures, or terrains, tell it")
-    effective_n: float = Field(description="independent cases that the evidence is worth")
+    design_effect: float | None = Field(description="null for too few failures or terrains")
+    effective_n: float = Field(description="equivalent number of independent cases")
     effective_successes: float
     lower: float
     upper: float
@@ -61,13 +54,13 @@ class TwinVerdict(_Part):
     upper_confidence: float | None
     plain_lower: float | None
     plain_upper: float | None
-    consumer_risk: float | None = Field(description="chance of evidence as good from a rate only just the one asked")
-    margin: float | None = Field(description="what decides less the rate asked")
+    consumer_risk: float | None = Field(description="probability of evidence as good at just the rate asked")
+    margin: float | None = Field(description="deciding bound, or estimate, less the rate asked")
     further_cases: int | None = Field(description="that would pass it if none fails")
     terrains: int | None
     clustered: TwinClusters | None
     reason: str
-    advice: str = Field(description="what keeps more cases from helping, and the change that helps")
+    advice: str = Field(description="why more cases cannot help, and the change that does")
     accept_rate: bool = Field(description="whether MET BY RATE gives the exit status 0")
     note: str
 
@@ -82,7 +75,7 @@ class TwinQuantile(_Part):
 
 
 class TwinStatistics(_Part):
-    """What errors say."""
+    """Statistics of errors."""
 
     n: int
     missing: int
@@ -101,10 +94,10 @@ class TwinStatistics(_Part):
 
 
 class TwinTerrains(_Part):
-    """The terrains that cases can be on."""
+    """The terrains that cases can use."""
 
     terrains: int
-    key: str = Field(description="what sets their number")
+    key: str = Field(description="parameter that sets their number")
     in_turn: bool
 
 
@@ -122,7 +115,7 @@ class TwinSampling(_Part):
 
 
 class TwinAlgorithm(_Part):
-    """An algorithm under test; what the campaign's record does not say is empty."""
+    """An algorithm under test; unknown texts are empty."""
 
     name: str = Field(description="as the campaign names it")
     judged: bool = Field(description="false where it is only compared")
