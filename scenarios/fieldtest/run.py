@@ -135,7 +135,7 @@ def _flight(p: FieldTestParameters, run: RunParameters, surface: Surface, rng: n
 
 
 def _clouds(run: RunParameters, ground_m: float, rng: np.random.Generator) -> CloudLayer | None:
-    return None if run.clouds is None else CloudLayer.drawn(run.clouds, rng, ground_m=ground_m)
+    return None if run.clouds is None else CloudLayer.draw(run.clouds, rng, ground_m=ground_m)
 
 
 def _pictures(

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
-from marsyard.sim.terrain.embedding import embed, grid_for
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, filled, read_rasters
+from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, embed, filled, grid_for, read_rasters
 from marsyard.sim.terrain.statistics import terrain_statistics
 
 ROWS, COLUMNS = 90, 110

@@ -16,7 +16,7 @@ from marsyard.sim.terrain.rocks.shapes import (
     SHAPES_OF_FORM,
     UNIT_HEIGHT,
     ShapeSet,
-    pixels_held,
+    max_pixels,
     rock_shapes,
 )
 
@@ -249,7 +249,7 @@ def test_a_coarse_rock_cannot_be_told_from_the_finest(number: int, detail: int) 
     finest = finest[finest[:, 2] > 0.0]
     nearest = cKDTree(samples).query(finest)[1]
     away = np.sum((finest - samples[nearest]) * coarse.face_normals[triangles[nearest]], axis=1)
-    assert 0.15 < np.sqrt(np.mean(away**2)) * pixels_held()[number, detail] < 0.28
+    assert 0.15 < np.sqrt(np.mean(away**2)) * max_pixels()[number, detail] < 0.28
 
 
 def test_rocks_are_drawn_as_finely_as_the_camera_sees(field: RockField) -> None:
@@ -260,5 +260,5 @@ def test_rocks_are_drawn_as_finely_as_the_camera_sees(field: RockField) -> None:
             detail = faces.index(int(count))
             away = np.hypot(np.hypot(*(field.position_m[rock, :2] - 32.0)), 1.5)
             across_px = field.diameter_m[rock] / (away - 0.5 * field.diameter_m[rock]) / pixel_rad
-            held = np.concatenate([[0.0], pixels_held()[field.shape[rock]], [np.inf]])
+            held = np.concatenate([[0.0], max_pixels()[field.shape[rock]], [np.inf]])
             assert held[detail] < across_px <= held[detail + 1]
