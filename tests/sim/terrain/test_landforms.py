@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
-from marsyard.sim.terrain.landforms.ground import finer, smooth_pair
+from marsyard.sim.terrain.landforms.ground import refined, smooth_pair
 from marsyard.sim.terrain.landforms.kernels import Bedforms, add_cracks, add_dunes, stamp_craters
 from marsyard.sim.terrain.random_fields import substream
 from marsyard.sim.terrain.statistics import mean_slope_deg
@@ -167,7 +167,7 @@ def test_gullies_have_steep_walls() -> None:
 def test_refinement_keeps_the_surface_exactly() -> None:
     rng = np.random.default_rng(0)
     coarse = rng.normal(size=(16, 16)).astype(np.float32)
-    fine = finer(coarse, 64)
+    fine = refined(coarse, 64)
     x, y = rng.uniform(0, 16, 200), rng.uniform(0, 16, 200)
     theirs = map_coordinates(coarse.astype(float), [y, x], order=3, mode="grid-wrap", prefilter=False)
     ours = map_coordinates(fine.astype(float), [4 * y, 4 * x], order=3, mode="grid-wrap", prefilter=False)
