@@ -109,7 +109,7 @@ def test_sizes_follow_golombek(abundance: float) -> None:
 def test_no_two_rocks_overlap(field: RockField) -> None:
     """Every pair in reach of one another, across the border as well; rocks stay apart in plan."""
     reach = rock_shapes(COARSE).reach[field.shape] * field.diameter_m
-    tree = cKDTree(field.position_m[:, :2], boxsize=field.period_m)
+    tree = cKDTree(field.position_m[:, :2], boxsize=np.full(2, field.period_m))
     pairs = tree.query_pairs(2 * reach.max(), output_type="ndarray")
     apart = np.abs(field.position_m[pairs[:, 0], :2] - field.position_m[pairs[:, 1], :2])
     apart = np.minimum(apart, field.period_m - apart)
@@ -228,7 +228,7 @@ def test_faces_are_turned_outwards(field: RockField) -> None:
 )
 def test_refuses_impossible_rocks(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
-        RockParameters(**wrong)
+        RockParameters.model_validate(wrong)
 
 
 def test_refuses_more_rocks_than_fit_in_memory_and_unknown_shapes(ground: Surface) -> None:
