@@ -266,7 +266,9 @@ def test_cracks_are_the_borders_of_a_periodic_voronoi_diagram() -> None:
     row, column = np.mgrid[:count, :count]
     places = (points + np.stack([column, row], axis=-1)).reshape(-1, 2)
     y, x = np.mgrid[:side, :side] * spacing / cell
-    distance, number = cKDTree(places, boxsize=np.full(2, float(count))).query(np.stack([x, y], axis=-1), k=2)
+    distance, number = map(
+        np.asarray, cKDTree(places, boxsize=np.full(2, float(count))).query(np.stack([x, y], axis=-1), k=2)
+    )
     between = (places[number[..., 1]] - places[number[..., 0]] + count / 2) % count - count / 2
     border = 0.5 * (distance[..., 1] ** 2 - distance[..., 0] ** 2) / np.linalg.norm(between, axis=-1) * cell
     share = np.clip(1.0 - border / width, 0.0, None)

@@ -34,7 +34,8 @@ def ground() -> Surface:
 
 
 def make(ground: Surface, seed: int = 1, **changes: object) -> RockField:
-    parameters = RockParameters(**{"abundance": 0.2, "smallest_m": 0.1, "placed": (TARGET,), **changes})
+    values = {"abundance": 0.2, "smallest_m": 0.1, "placed": (TARGET,), **changes}
+    parameters = RockParameters.model_validate(values)
     return RockField.on(ground, parameters, np.random.default_rng(seed))
 
 
