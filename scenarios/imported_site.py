@@ -7,8 +7,7 @@ from pathlib import Path
 
 from marsyard.scenarios.terrain_files import check_source
 from marsyard.sim.terrain import Site, TerrainParameters, site
-from marsyard.sim.terrain.embedding import grid_for
-from marsyard.sim.terrain.imported import RealTerrain
+from marsyard.sim.terrain.imported import RealTerrain, grid_for
 
 #: Suffixes of terrain models.
 ENDINGS = (".npz", ".tif", ".tiff")

@@ -20,7 +20,7 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
 from marsyard.sim.sensor import CameraDesign
 from marsyard.sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
-from marsyard.sim.terrain.rocks.shapes import FINEST, pixels_held, rock_shapes
+from marsyard.sim.terrain.rocks.shapes import FINEST, max_pixels, rock_shapes
 
 Scale = Literal["descent", "ground"]
 
@@ -216,7 +216,7 @@ def _pixel_of_detail_rad(field: RockField, eye: Eye) -> float:
     to the distance ``D / (p_k pixel)``.
     """
     triangles = np.array([rock_shapes(detail).faces.shape[0] for detail in range(FINEST + 1)])
-    added = (np.diff(triangles) / pixels_held() ** 2).sum(axis=1)
+    added = (np.diff(triangles) / max_pixels() ** 2).sum(axis=1)
     per_m2 = float(np.sum(field.diameter_m**2 * added[field.shape])) / field.period_m**2
     return float(max(eye.pixel_rad, np.sqrt(eye.half_width_rad * per_m2 / DETAIL_TRIANGLES)))
 

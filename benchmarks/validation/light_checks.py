@@ -208,7 +208,7 @@ def run_clouds(quick: bool) -> Iterator[Measure]:
     lit = FLAT_ALBEDO * float(sun.direction[2])
     covers, moved = [], []
     for seed in range(2 if quick else 8):
-        layer = CloudLayer.drawn(given, np.random.default_rng(seed))
+        layer = CloudLayer.draw(given, np.random.default_rng(seed))
         scene = Scene(_flat(), (0.0, 0.0), sun, law, clouds=layer, edge_rays=1)
         rng = np.random.default_rng(100 + seed)
         more = FLAT_ALBEDO * given.sky_light(sun)

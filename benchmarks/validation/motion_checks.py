@@ -12,7 +12,7 @@ from benchmarks.validation.estimators import PATCH
 from benchmarks.validation.motion import STEPS_PX, Motion, View, measure, render, supersampled
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import descent_view, renderer, rock_view, tile_view
-from marsyard.sim.render.edges import edge_pixels
+from marsyard.sim.render.renderer import edge_pixels
 from marsyard.sim.terrain.sites import sites
 
 #: With 16 samples a pixel instead of 256 the pictures themselves are less true.

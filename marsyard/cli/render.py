@@ -265,7 +265,7 @@ def _filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"
     """Which pixels see ground in holes of a terrain model; None where the ground is a preset's."""
     import numpy as np
 
-    from marsyard.sim.terrain.embedding import embed
+    from marsyard.sim.terrain.imported import embed
 
     terrain = ground.terrain
     if terrain.source is None:

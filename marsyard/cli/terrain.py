@@ -11,7 +11,7 @@ import typer
 from marsyard.cli.campaign import Exit, JsonOption, MaxHolesOption, SiteArgument
 
 if TYPE_CHECKING:
-    from marsyard.sim.terrain.embedding import RealExtent
+    from marsyard.sim.terrain.imported import RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
     from marsyard.sim.terrain.sites import PaperFigures
     from marsyard.sim.terrain.statistics import TerrainStatistics
@@ -74,10 +74,10 @@ def stats(
     from marsyard.cli.terrain_picture import write_terrain_picture
     from marsyard.scenarios.imported_site import MAX_HOLE_FRACTION, site_or_file
     from marsyard.scenarios.terrain_files import grid_north_deg
-    from marsyard.sim.terrain.embedding import embed
+    from marsyard.sim.terrain.bank import synthesise
+    from marsyard.sim.terrain.imported import embed
     from marsyard.sim.terrain.sites import PAPER
     from marsyard.sim.terrain.statistics import terrain_statistics
-    from marsyard.sim.terrain.synthesis import synthesise
 
     try:
         known = site_or_file(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from marsyard.sim.terrain import Surface
-    from marsyard.sim.terrain.embedding import Embedded
+    from marsyard.sim.terrain.imported import Embedded
 
 #: Longest side of a picture, pixels.
 MAX_PIXELS = 2048

@@ -60,7 +60,7 @@ def draw_clouds(faults: Faults, ground_m: float, rng: np.random.Generator) -> Cl
     """Draw clouds whose shadows move over ground of this height; None without the fault."""
     if faults.cloud_cover == 0.0:
         return None
-    return CloudLayer.drawn(CloudParameters(cover=faults.cloud_cover), rng, ground_m=ground_m)
+    return CloudLayer.draw(CloudParameters(cover=faults.cloud_cover), rng, ground_m=ground_m)
 
 
 def faulty_times(faults: Faults, times_s: Sequence[float]) -> list[float]:

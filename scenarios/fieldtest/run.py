@@ -139,7 +139,7 @@ def simulate_run(key: RunKey) -> Run:
     )
     clouds = None
     if run.clouds is not None:
-        clouds = CloudLayer.drawn(run.clouds, streams.generator("clouds"), ground_m=float(flight.origin_m[2]))
+        clouds = CloudLayer.draw(run.clouds, streams.generator("clouds"), ground_m=float(flight.origin_m[2]))
     return Run(
         key=key,
         parameters=run,

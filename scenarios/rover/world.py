@@ -132,7 +132,7 @@ class RunWorld:
         clouds = None
         if p.clouds is not None:
             level = float(ground.surface.height(w.east_m, w.north_m))
-            clouds = CloudLayer.drawn(p.clouds, streams.generator("clouds"), ground_m=level)
+            clouds = CloudLayer.draw(p.clouds, streams.generator("clouds"), ground_m=level)
         scene = replace(
             site_scene(ground, eye, path.held(0, ground.site.environment.sun_radius_rad)),
             mesh_finest_m=MESH_FINEST_M,

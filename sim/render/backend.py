@@ -1,9 +1,8 @@
-"""The OpenGL context: the only module that knows which library draws.
+"""The OpenGL context, and the depth and triangle numbers of pinhole views that it draws.
 
-OpenGL is asked for one thing: what each pixel of a pinhole view sees, as depth and number of the triangle. pyrender
-makes the context, off-screen, through OSMesa or EGL; its scenes and renderer are left out, as they take longer than a
-small picture does. The platform has to be chosen before pyrender or PyOpenGL is first imported in a process, and
-contexts belong to the process that made them: they survive neither fork nor threads.
+pyrender makes the context, off-screen, through OSMesa or EGL; its scenes and renderer are not used, as they take longer
+than a small picture does. The platform has to be chosen before pyrender or PyOpenGL is first imported in a process.
+Contexts belong to the process that made them: they survive neither fork nor threads.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt32
 from numpy.typing import NDArray
 
-from marsyard.sim.render.kernels.depth import metres
+from marsyard.sim.render.kernels.views import depth_in_metres
 
 if TYPE_CHECKING:
     import trimesh
@@ -30,7 +29,7 @@ BACKEND_VARIABLE = "MARSYARD_GL"
 
 
 class RenderingError(RuntimeError):
-    """OpenGL cannot draw here; the message says why and what to do."""
+    """OpenGL cannot draw here; the message states the cause and a remedy."""
 
 
 #: The library that each backend loads.
@@ -38,32 +37,27 @@ _LIBRARIES: dict[Backend, str] = {"osmesa": "OSMesa", "egl": "EGL"}
 
 
 def default_backend() -> Backend:
-    """The backend of the environment variable ``MARSYARD_GL``; without it OSMesa, or EGL where only that is installed.
+    """Return the backend of the environment variable ``MARSYARD_GL``; without it OSMesa, or EGL if only it is
+    installed.
 
-    Recent Mesa no longer has OSMesa, so that new distributions lack it.
+    Recent Mesa no longer has OSMesa, so new distributions lack it.
     """
-    wanted = os.environ.get(BACKEND_VARIABLE, "").lower()
-    if not wanted:
-        installed = [backend for backend in BACKENDS if find_library(_LIBRARIES[backend])]
-        return installed[0] if installed else "osmesa"
+    name = os.environ.get(BACKEND_VARIABLE, "").lower()
+    if not name:
+        return next((backend for backend in BACKENDS if find_library(_LIBRARIES[backend])), "osmesa")
     for backend in BACKENDS:
-        if wanted == backend:
+        if name == backend:
             return backend
-    raise RenderingError(f"{BACKEND_VARIABLE} is '{wanted}'; allowed: {', '.join(BACKENDS)}")
+    raise RenderingError(f"{BACKEND_VARIABLE} is '{name}'; allowed: {', '.join(BACKENDS)}")
 
 
 @dataclass(frozen=True)
 class PinholeView:
     """A pinhole view to be drawn.
 
-    Attributes
-    ----------
-    world_from_view
-        4 x 4 pose; the view's axes are x right, y down, z forward, its origin the centre of projection.
-    focal_px
-        Focal length in samples of the depth picture; the principal point is the picture's centre.
-    near_m, far_m
-        Depths between which the ground may lie, metres.
+    - world_from_view: pose; the view's axes are x right, y down, z forward, its origin the centre of projection
+    - focal_px: focal length in samples of the depth picture; the principal point is the picture's centre
+    - near_m, far_m: depths of the clipping planes
     """
 
     world_from_view: Float[np.ndarray, "4 4"]
@@ -76,47 +70,38 @@ class PinholeView:
 _VIEW_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 _Numbers = NDArray[Any]
 
-#: Every corner tells its triangle's number to all of the triangle.
+#: Passes the triangle's number from its corners to its samples.
 _CORNERS = """#version 330 core
 layout(location = 0) in vec3 position;
 layout(location = 1) in vec4 number;
 uniform mat4 view;
 uniform mat4 projection;
-flat out vec4 spelled;
+flat out vec4 encoded;
 void main()
 {
     // mat4() keeps the compiler from projecting the viewed corner instead, which rounds otherwise
     gl_Position = mat4(projection * view) * vec4(position, 1.0);
-    spelled = number;
+    encoded = number;
 }
 """
 _SAMPLES = """#version 330 core
-flat in vec4 spelled;
+flat in vec4 encoded;
 out vec4 colour;
 void main()
 {
-    colour = spelled;
+    colour = encoded;
 }
 """
 _POSITION, _NUMBER = 0, 1
-#: Numbers are spelled in the 24 bits of a colour, least significant first; the rest is opacity.
-_SPELLED, _OPAQUE = 0xFFFFFF, 0xFF000000
+#: Numbers are encoded in the 24 bits of a colour, least significant first; the other bits are opacity.
+_NUMBER_BITS, _OPAQUE = 0xFFFFFF, 0xFF000000
 
 
 class DepthRenderer:
     """Draws depth and triangle numbers of a scene, one sample at the centre of each pixel.
 
-    Parameters
-    ----------
-    side_px
-        Width and height of the depth picture. Fixed for the life of the renderer: resizing costs more than drawing.
-    backend
-        Which library provides the context.
-
-    Raises
-    ------
-    RenderingError
-        No context could be had.
+    `side_px`, width and height of the picture, is fixed: resizing costs more than drawing. Raises RenderingError where
+    no context can be created.
     """
 
     def __init__(self, side_px: int, backend: Backend) -> None:
@@ -138,40 +123,30 @@ class DepthRenderer:
         triangles: Float64[np.ndarray, "triangles 3 3"],
         numbers: Int64[np.ndarray, "triangles"],
     ) -> None:
-        """Makes this ground, and these triangles on it, what is drawn; what was before is released.
-
-        Parameters
-        ----------
-        ground
-            Mesh in world coordinates.
-        triangles, numbers
-            Corners in world coordinates of triangles that stand on the ground, and the number by which each is told
-            apart in the picture, counted from zero.
-        """
+        """Load the ground, and numbered triangles on it, in world coordinates, in place of those before."""
         self._platform.make_current()
-        spelled = (numbers + 1).astype(np.uint32) | np.uint32(_OPAQUE)
+        encoded = (numbers + 1).astype(np.uint32) | np.uint32(_OPAQUE)
         self._drawing.load(
             ground.vertices.view(np.ndarray).astype(np.float32),
             ground.faces.view(np.ndarray).astype(np.uint32),
             triangles.astype(np.float32),
-            np.repeat(spelled, 3),
+            np.repeat(encoded, 3),
         )
         self._loaded = True
 
     def draw(self, view: PinholeView) -> tuple[Float32[np.ndarray, "side side"], Int32[np.ndarray, "_ _"]]:
-        """Depth along the view's axis, metres, and the number of the triangle seen plus one, 0 for the ground.
+        """Draw depth along the view's axis, metres, 0 for nothing, and triangle numbers plus one, 0 for the ground.
 
-        The depth is 0 where there is nothing. The numbers are an empty array where nothing but ground is loaded. Row 0
-        is the top of the view.
+        The numbers are an empty array where only ground is loaded. Row 0 is the top of the view.
         """
         if not self._loaded:
             raise RenderingError("no mesh has been loaded")
         self._platform.make_current()
         self._drawing.draw(np.linalg.inv(view.world_from_view @ _VIEW_FROM_GL), _projection(view, self.side_px))
-        depth = metres(self._drawing.depth(), float(view.near_m), float(view.far_m))
-        if self._drawing.things == 0:
+        depth = depth_in_metres(self._drawing.depth(), float(view.near_m), float(view.far_m))
+        if self._drawing.object_corners == 0:
             return depth, np.zeros((0, 0), dtype=np.int32)
-        numbers = np.bitwise_and(self._drawing.colours()[::-1], np.uint32(_SPELLED), order="C")
+        numbers = np.bitwise_and(self._drawing.colours()[::-1], np.uint32(_NUMBER_BITS), order="C")
         return depth, numbers.view(np.int32)
 
     def description(self) -> str:
@@ -182,21 +157,16 @@ class DepthRenderer:
         return " / ".join(glGetString(name).decode() for name in (GL_RENDERER, GL_VERSION))
 
     def close(self) -> None:
-        """Releases the context, and all that it holds."""
+        """Release the context and its buffers."""
         self._platform.make_current()
         self._platform.delete_context()
 
 
 class _Drawing:
-    """The program, the buffers and the calls of the context that is current.
+    """Program, buffers and calls of the current context.
 
-    Parameters
-    ----------
-    side_px
-        Width and height of the picture.
-    in_buffer
-        Whether the context has no picture of its own, so that one is made. It has one sample a pixel, at its centre:
-        with several, drivers that honour multisampling (EGL) give the depth of one that lies off-centre.
+    `in_buffer` states that the context has no picture of its own, so a framebuffer is created. It has one sample a
+    pixel, at its centre: with several, drivers that honour multisampling (EGL) return an off-centre depth.
     """
 
     def __init__(self, side_px: int, *, in_buffer: bool) -> None:
@@ -204,13 +174,13 @@ class _Drawing:
 
         self.gl = GL
         self.side_px = side_px
-        self.corners = self.things = 0
+        self.ground_corners = self.object_corners = 0
         program = _program()
         GL.glUseProgram(program)
         self.view, self.projection = (GL.glGetUniformLocation(program, name) for name in ("view", "projection"))
-        self.ground_array, self.things_array = GL.glGenVertexArrays(2)
+        self.ground_array, self.objects_array = GL.glGenVertexArrays(2)
         self.vertices, self.faces, self.triangles, self.numbers = GL.glGenBuffers(4)
-        for array, vertices in ((self.ground_array, self.vertices), (self.things_array, self.triangles)):
+        for array, vertices in ((self.ground_array, self.vertices), (self.objects_array, self.triangles)):
             GL.glBindVertexArray(array)
             GL.glBindBuffer(GL.GL_ARRAY_BUFFER, vertices)
             GL.glVertexAttribPointer(_POSITION, 3, GL.GL_FLOAT, False, 0, None)
@@ -224,8 +194,8 @@ class _Drawing:
             self._make_buffer()
         else:
             GL.glReadBuffer(GL.GL_FRONT)
-        for what in (GL.GL_DEPTH_TEST, GL.GL_CULL_FACE):
-            GL.glEnable(what)
+        GL.glEnable(GL.GL_DEPTH_TEST)
+        GL.glEnable(GL.GL_CULL_FACE)
         GL.glViewport(0, 0, side_px, side_px)
         GL.glClearColor(0.0, 0.0, 0.0, 0.0)
 
@@ -239,54 +209,48 @@ class _Drawing:
             gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, place, gl.GL_RENDERBUFFER, buffer)
 
     def load(self, vertices: _Numbers, faces: _Numbers, triangles: _Numbers, numbers: _Numbers) -> None:
-        """Fills the buffers: the ground's vertices and faces, triangles on it, the number of each of their corners."""
+        """Fill the buffers: the ground's vertices and faces, triangles on it, the number of each of their corners."""
         gl = self.gl
         gl.glBindVertexArray(self.ground_array)
         self._fill(gl.GL_ARRAY_BUFFER, self.vertices, vertices)
         self._fill(gl.GL_ELEMENT_ARRAY_BUFFER, self.faces, faces)
-        if len(triangles) or self.things:
+        if len(triangles) or self.object_corners:
             self._fill(gl.GL_ARRAY_BUFFER, self.triangles, triangles)
             self._fill(gl.GL_ARRAY_BUFFER, self.numbers, numbers)
-        self.corners, self.things = faces.size, 3 * len(triangles)
+        self.ground_corners, self.object_corners = faces.size, 3 * len(triangles)
 
     def _fill(self, kind: int, buffer: int, values: _Numbers) -> None:
         self.gl.glBindBuffer(kind, buffer)
         self.gl.glBufferData(kind, values.nbytes, np.ascontiguousarray(values), self.gl.GL_STREAM_DRAW)
 
     def draw(self, view: Float64[np.ndarray, "4 4"], projection: Float64[np.ndarray, "4 4"]) -> None:
-        """Draws what is loaded."""
+        """Draw the loaded triangles."""
         gl = self.gl
         gl.glClear(gl.GL_COLOR_BUFFER_BIT | gl.GL_DEPTH_BUFFER_BIT)
         for place, matrix in ((self.view, view), (self.projection, projection)):
             gl.glUniformMatrix4fv(place, 1, True, matrix.astype(np.float32))
         gl.glBindVertexArray(self.ground_array)
-        gl.glDrawElements(gl.GL_TRIANGLES, self.corners, gl.GL_UNSIGNED_INT, None)
-        if self.things:
-            gl.glBindVertexArray(self.things_array)
-            gl.glDrawArrays(gl.GL_TRIANGLES, 0, self.things)
+        gl.glDrawElements(gl.GL_TRIANGLES, self.ground_corners, gl.GL_UNSIGNED_INT, None)
+        if self.object_corners:
+            gl.glBindVertexArray(self.objects_array)
+            gl.glDrawArrays(gl.GL_TRIANGLES, 0, self.object_corners)
 
     def depth(self) -> Float32[np.ndarray, "side side"]:
         """OpenGL's depths, from 0 to 1, the lowest row first."""
-        depth = np.empty(self._size, dtype=np.float32)
-        self._read(self.gl.GL_DEPTH_COMPONENT, self.gl.GL_FLOAT, depth)
-        return depth
+        return self._read(self.gl.GL_DEPTH_COMPONENT, self.gl.GL_FLOAT, np.empty((self.side_px,) * 2, np.float32))
 
     def colours(self) -> UInt32[np.ndarray, "side side"]:
         """Colours, red in the least significant byte, the lowest row first."""
-        spelled = np.empty((*self._size, 4), dtype=np.uint8)
-        self._read(self.gl.GL_RGBA, self.gl.GL_UNSIGNED_BYTE, spelled)
-        return spelled.view(np.uint32)[..., 0]
+        colours = np.empty((self.side_px, self.side_px, 4), np.uint8)
+        return self._read(self.gl.GL_RGBA, self.gl.GL_UNSIGNED_BYTE, colours).view(np.uint32)[..., 0]
 
-    @property
-    def _size(self) -> tuple[int, int]:
-        return self.side_px, self.side_px
-
-    def _read(self, what: int, kind: int, pixels: _Numbers) -> None:
-        self.gl.glReadPixels(0, 0, *self._size, what, kind, pixels)
+    def _read(self, content: int, kind: int, pixels: _Numbers) -> _Numbers:
+        self.gl.glReadPixels(0, 0, self.side_px, self.side_px, content, kind, pixels)
+        return pixels
 
 
 def _program() -> int:
-    """The program that draws."""
+    """Compile and link the shaders."""
     from OpenGL import GL
 
     program: int = GL.glCreateProgram()
@@ -304,7 +268,7 @@ def _program() -> int:
 
 
 def _projection(view: PinholeView, side_px: int) -> Float64[np.ndarray, "4 4"]:
-    """OpenGL's projection matrix of a view whose principal point is the picture's middle."""
+    """OpenGL's projection matrix of a view whose principal point is the picture's centre."""
     scale = 2.0 * view.focal_px / side_px
     near, far = view.near_m, view.far_m
     matrix = np.diag([scale, scale, (far + near) / (near - far), 0.0])
@@ -313,7 +277,7 @@ def _projection(view: PinholeView, side_px: int) -> Float64[np.ndarray, "4 4"]:
 
 
 def _context(side_px: int, backend: Backend) -> Any:
-    """A context, made current."""
+    """Create a context and make it current."""
     if backend == "osmesa":
         from pyrender.platforms.osmesa import OSMesaPlatform
 
@@ -340,7 +304,7 @@ def _import_pyrender(backend: Backend) -> None:
     os.environ["PYOPENGL_PLATFORM"] = backend
     try:
         import pyrender  # noqa: F401
-    # PyOpenGL meets a missing library with an AttributeError of the functions that it could not find
+    # PyOpenGL raises AttributeError for the functions of a missing library
     except (ImportError, AttributeError, OSError) as error:
         raise RenderingError(
             f"OpenGL through {backend} cannot be loaded ({error}); run 'marsyard doctor' to see what is missing"

@@ -39,12 +39,12 @@ class CloudParameters(Parameters):
     wind_north_m_s: Annotated[float, Field(ge=-100.0, le=100.0, description="drift to the north, m/s")] = 3.0
 
     def direct_transmittance(self, sun: Sun) -> float:
-        """Share of the direct sun that passes a cloud: ``exp(-tau / sin elevation)``; 0 for a sun that is down."""
+        """Fraction of the direct sun that passes a cloud: ``exp(-tau / sin elevation)``; 0 for a sun that is down."""
         up = float(sun.direction[2])
         return float(np.exp(-self.optical_depth / up)) if up > 0.0 else 0.0
 
     def sky_light(self, sun: Sun) -> float:
-        """Light that the clouds scatter down, over the direct sun's on a plane facing it.
+        """Irradiance that the clouds scatter down, over the direct sun's on a plane facing it.
 
         A cloud that absorbs nothing lets ``2 / (2 + (1 - g) tau)`` of the light through (two streams; Bohren, Am. J.
         Phys. 55, 1987), of which `direct_transmittance` keeps its direction. The rest is spread evenly over the ground:
@@ -59,19 +59,12 @@ class CloudParameters(Parameters):
 class CloudLayer:
     """One realisation of the clouds: a thin, periodic layer that keeps its shape and drifts with the wind.
 
-    The layer dims the direct sun where the line from a place to the sun passes a cloud; light from the sky stays and
-    grows by what all clouds scatter down. The clouds themselves are not drawn: pictures from above the layer, or that
-    show the sky, lack them. The layer has no thickness, so that a low sun sees no more cover than a high one.
+    The layer dims the direct sun where the line from a point to the sun passes a cloud; skylight remains and grows by
+    the light that all clouds scatter down. The clouds themselves are not drawn: pictures from above the layer, or of
+    the sky, lack them. The layer has no thickness, so a low sun meets no more cover than a high one.
 
-    Attributes
-    ----------
-    parameters
-        What it was drawn from.
-    height_m
-        Height of the layer above the world's datum.
-    cover
-        Share of the light's path that meets cloud, from 0 to 1, shape (rows, columns): y grows with the row, one cell
-        every `cell_m`. Read-only.
+    - height_m: height of the layer above the world's datum
+    - cover: fraction of the light's path through cloud, read-only: y grows with the row, one cell every `cell_m`
     """
 
     parameters: CloudParameters
@@ -79,10 +72,10 @@ class CloudLayer:
     cover: Float32[np.ndarray, "rows columns"]
 
     @classmethod
-    def drawn(cls, parameters: CloudParameters, rng: np.random.Generator, *, ground_m: float = 0.0) -> CloudLayer:
-        """A layer over ground of this mean height.
+    def draw(cls, parameters: CloudParameters, rng: np.random.Generator, *, ground_m: float = 0.0) -> CloudLayer:
+        """Draw a layer over ground of this mean height.
 
-        A Gaussian field of three octaves is cut at the height that leaves `cover` above it. Lines through it meet
+        A Gaussian field of three octaves is cut at the level that leaves `cover` above it. Lines through it meet
         cloud ``sqrt(m2) exp(-u**2 / 2) / 2 pi`` times a metre (Rice 1944), m2 the mean square of its slope along the
         line and u the cut, both in standard deviations: that sets the octaves' length so that the mean passage is
         `size_m`. The edge is softened by a Gaussian, which keeps the mean cover.
@@ -100,7 +93,7 @@ class CloudLayer:
         )
         field = np.fft.irfft2(noise * np.sqrt(power), s=(CELLS, CELLS))
         above = field - np.quantile(field, 1.0 - parameters.cover)
-        # a cell that the outline crosses is cloud by about the share that lies inside
+        # a cell that the outline crosses is cloud by about the fraction that lies inside
         slope = np.hypot(*(0.5 * (np.roll(above, -1, k) - np.roll(above, 1, k)) for k in (0, 1)))
         inside = np.clip(0.5 + above / np.maximum(slope, 1e-12), 0.0, 1.0)
         soft = np.fft.irfft2(np.fft.rfft2(inside) * np.exp(-0.5 * wave * parameters.edge_m**2), s=inside.shape)
@@ -111,40 +104,33 @@ class CloudLayer:
         """Distance between cells."""
         return self.parameters.size_m * PERIOD_SIZES / CELLS
 
-    def numbers(self, sun: Sun, time_s: float) -> Float64[np.ndarray, "5"]:
-        """What the kernel takes: cells a metre, height, drift to east and north, what a cloud keeps."""
-        given = self.parameters
-        return np.array(
-            [
-                1.0 / self.cell_m,
-                self.height_m,
-                given.wind_east_m_s * time_s,
-                given.wind_north_m_s * time_s,
-                1.0 - given.direct_transmittance(sun),
-            ]
-        )
+    def coefficients(self, sun: Sun, time_s: float) -> Float64[np.ndarray, "5"]:
+        """Coefficients of the kernel: cells per metre, height, drift to east and north, opacity of a cloud."""
+        p = self.parameters
+        drift = p.wind_east_m_s * time_s, p.wind_north_m_s * time_s
+        return np.array([1.0 / self.cell_m, self.height_m, *drift, 1.0 - p.direct_transmittance(sun)])
 
     def transmittance(
         self, points: Float[np.ndarray, "*batch 3"], sun: Sun, time_s: float
     ) -> Float64[np.ndarray, "*batch"]:
-        """Share of the direct sun that reaches these world points (metres) through the layer; NaN where they are NaN.
+        """Fraction of the direct sun that reaches world points (metres) through the layer; NaN where they are NaN.
 
         The truth of a picture: ``clouds.transmittance(frame.points_world(), scene.sun, time_s)``.
         """
-        _cells, height, east, north, loss = self.numbers(sun, time_s)
+        _cells, height, east, north, loss = self.coefficients(sun, time_s)
         towards = np.asarray(sun.direction, dtype=np.float64)
         up = np.maximum(height - points[..., 2], 0.0) / towards[2]
         x = (points[..., 0] + up * towards[0] - east) / self.cell_m
         y = (points[..., 1] + up * towards[1] - north) / self.cell_m
-        known = np.isfinite(x) & np.isfinite(y)
-        places = np.where(known, np.stack([y, x]), 0.0)
-        cover = map_coordinates(self.cover.astype(np.float64), places, order=1, mode="grid-wrap")
-        passed: Float64[np.ndarray, "*batch"] = np.where(known, 1.0 - loss * cover, np.nan)
+        finite = np.isfinite(x) & np.isfinite(y)
+        cells = np.where(finite, np.stack([y, x]), 0.0)
+        cover = map_coordinates(self.cover.astype(np.float64), cells, order=1, mode="grid-wrap")
+        passed: Float64[np.ndarray, "*batch"] = np.where(finite, 1.0 - loss * cover, np.nan)
         return passed
 
 
 def no_cover() -> Float32[np.ndarray, "one one"]:
-    """The cover of a scene without clouds, of the same kind to the compiler as a layer's."""
+    """The cover of a scene without clouds, of the same numba type as a layer's."""
     return _frozen(np.zeros((1, 1)))
 
 

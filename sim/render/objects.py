@@ -1,4 +1,4 @@
-"""Things that stand on the ground, as triangles: rocks, rovers, landers."""
+"""Objects on the ground, as triangles: rocks, rovers, landers."""
 
 from __future__ import annotations
 
@@ -9,29 +9,20 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
-from marsyard.sim.render.kernels.hierarchy import Hierarchy, morton_codes, node_boxes
-from marsyard.sim.render.kernels.triangles import body_spheres, select_facing
+from marsyard.sim.render.kernels.hierarchy import Hierarchy, body_spheres, morton_codes, node_boxes, select_facing
 
 #: Triangle numbers are drawn as colours of 24 bits, of which 0 is the ground.
-MOST_TRIANGLES = 2**24 - 2
+MAX_TRIANGLES = 2**24 - 2
 
 
 @dataclass(frozen=True)
 class Objects:
-    """Triangles of bodies in world axes. Triangles of one body follow each other.
+    """Triangles of bodies in world axes, in contiguous ranges, one per body.
 
-    Attributes
-    ----------
-    triangles, normals
-        Corners and their unit normals, shape (triangles, 3 corners, 3), metres.
-    body_of_triangle
-        Number of the body of each triangle: row of `albedo`.
-    first_triangle
-        First triangle of each body, and the number of triangles at the end.
-    albedo
-        Albedo of each body.
-    names
-        What each body is: the number given to it by whoever made it (a rock's number in its field).
+    - normals: unit normals of the smooth surface at the triangles' corners
+    - body_of_triangle: number of each triangle's body: row of `albedo`
+    - first_triangle: first triangle of each body, and the number of triangles at the end
+    - names: number by which the creator of each body identifies it, as a rock's number in its field
     """
 
     triangles: Float64[np.ndarray, "triangles 3 3"]
@@ -51,18 +42,16 @@ class Objects:
         albedo: float,
         body_of_face: Int32[np.ndarray, "triangles"] | None = None,
     ) -> Objects:
-        """Bodies of one albedo from a mesh; faces that follow each other under one name are one body.
+        """Build bodies of one albedo from a mesh: contiguous faces of one name, or of one `body_of_face`, are one body.
 
-        Where several bodies of one name may follow each other, `body_of_face` tells them apart.
-
-        Raises ValueError for more triangles than can be told apart in a picture.
+        Raises ValueError for more triangles than a picture can number.
         """
-        if len(faces) > MOST_TRIANGLES:
-            raise ValueError(f"{len(faces)} triangles; at most {MOST_TRIANGLES} can be drawn at once")
+        if len(faces) > MAX_TRIANGLES:
+            raise ValueError(f"{len(faces)} triangles; at most {MAX_TRIANGLES} can be drawn at once")
         changes = np.flatnonzero(np.diff(name_of_face if body_of_face is None else body_of_face)) + 1
         first = np.concatenate([[0], changes, [len(faces)]]).astype(np.int64) if len(faces) else np.zeros(1, np.int64)
         counts = np.diff(first)
-        # taken, not indexed: several times faster for a scene's million triangles
+        # np.take is several times faster than indexing for a scene's million triangles
         return cls(
             triangles=np.take(np.asarray(vertices, dtype=np.float64), faces, axis=0),
             normals=np.take(np.asarray(vertex_normals, dtype=np.float64), faces, axis=0),
@@ -74,13 +63,13 @@ class Objects:
 
     @classmethod
     def joined(cls, parts: Sequence[Objects]) -> Objects:
-        """All bodies of several sets."""
+        """Join the bodies of several sets."""
         bodies = np.cumsum([0] + [len(part.albedo) for part in parts])
         starts = np.cumsum([0] + [len(part.triangles) for part in parts])
         first = [part.first_triangle[:-1] + start for part, start in zip(parts, starts, strict=False)]
         numbers = [part.body_of_triangle + np.int32(body) for part, body in zip(parts, bodies, strict=False)]
-        if starts[-1] > MOST_TRIANGLES:
-            raise ValueError(f"{starts[-1]} triangles; at most {MOST_TRIANGLES} can be drawn at once")
+        if starts[-1] > MAX_TRIANGLES:
+            raise ValueError(f"{starts[-1]} triangles; at most {MAX_TRIANGLES} can be drawn at once")
         whole = cls(
             triangles=np.concatenate([part.triangles for part in parts]),
             normals=np.concatenate([part.normals for part in parts]),
@@ -93,7 +82,7 @@ class Objects:
 
     @classmethod
     def none(cls) -> Objects:
-        """No bodies at all."""
+        """Return an empty set."""
         return cls.of_mesh(
             np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.int32), albedo=1.0
         )
@@ -103,20 +92,20 @@ class Objects:
 
     @cached_property
     def spheres(self) -> Float64[np.ndarray, "bodies 4"]:
-        """Centre and radius of a sphere around each body: about the middle of its bounding box."""
+        """Centre and radius of a sphere around each body, about the centre of its bounding box."""
         spheres: Float64[np.ndarray, "bodies 4"] = body_spheres(self.triangles, self.first_triangle)
         return spheres
 
     def in_cone(
         self, apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_angle_rad: float
     ) -> Int64[np.ndarray, "kept"]:
-        """Numbers of the triangles that face the tip of a cone, of all bodies whose spheres reach into it."""
+        """Numbers of the triangles that face a cone's apex, of all bodies whose spheres reach into the cone."""
         kept = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
         numbers: Int64[np.ndarray, "kept"] = select_facing(self.triangles, self._triangles_of(kept), *apex)
         return numbers
 
     def only(self, kept: Bool[np.ndarray, "bodies"]) -> Objects:
-        """Some of the bodies, which are counted anew."""
+        """Select some of the bodies, which are numbered again."""
         counts = np.diff(self.first_triangle)
         triangles = self._triangles_of(kept)
         some = Objects(
@@ -130,12 +119,11 @@ class Objects:
         return _with_spheres(some, self.spheres[kept])
 
     def _triangles_of(self, kept: Bool[np.ndarray, "bodies"]) -> Int64[np.ndarray, "kept"]:
-        """Numbers of the triangles of some bodies."""
         return np.flatnonzero(np.repeat(kept, np.diff(self.first_triangle)))
 
     @cached_property
     def hierarchy(self) -> Hierarchy:
-        """The tree in which rays look for triangles."""
+        """The bounding volume hierarchy of the triangles."""
         order = np.argsort(morton_codes(self.triangles), kind="stable")
         return self.triangles, order, node_boxes(self.triangles, order)
 
@@ -146,18 +134,18 @@ def spheres_in_cone(
     axis: Float64[np.ndarray, "3"],
     half_angle_rad: float,
 ) -> Bool[np.ndarray, "bodies"]:
-    """Which spheres reach into a cone."""
+    """Select the spheres that reach into a cone."""
     away = spheres[:, :3] - apex
     distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
-    beside = np.arccos(np.clip(away @ axis / distance, -1.0, 1.0))
+    off_axis = np.arccos(np.clip(away @ axis / distance, -1.0, 1.0))
     widening = np.arcsin(np.clip(spheres[:, 3] / distance, 0.0, 1.0))
-    reaching: Bool[np.ndarray, "bodies"] = beside <= half_angle_rad + np.where(
+    reaching: Bool[np.ndarray, "bodies"] = off_axis <= half_angle_rad + np.where(
         distance <= spheres[:, 3], np.pi, widening
     )
     return reaching
 
 
 def _with_spheres(objects: Objects, spheres: Float64[np.ndarray, "bodies 4"]) -> Objects:
-    """Objects whose spheres are known: a scene's thousands of rocks are not gone through again for each rover there."""
+    """Set the spheres of objects, which spares computing those of a scene's thousands of rocks again."""
     objects.__dict__["spheres"] = spheres
     return objects

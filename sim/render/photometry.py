@@ -1,4 +1,4 @@
-"""How bright the ground looks: the reflectance law, the light, and texture finer than the terrain's samples."""
+"""Reflectance law, illumination, sky, and texture finer than the terrain's samples."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, Float64
 
-from marsyard.sim.render.kernels.sky import scattered_irradiance
+from marsyard.sim.render.kernels.photometry import scattered_irradiance
 
 #: Angular radius of the sun seen from Mars at 1.52 AU, radians (0.35 deg across).
 SUN_RADIUS_AT_MARS_RAD = 0.00305
@@ -16,15 +16,7 @@ SUN_RADIUS_AT_MARS_RAD = 0.00305
 
 @dataclass(frozen=True)
 class Sun:
-    """Direct sunlight.
-
-    Attributes
-    ----------
-    direction
-        Unit vector towards the sun, world axes.
-    angular_radius_rad
-        Half the angle that the sun's disc takes.
-    """
+    """Direct sunlight: unit vector towards the sun in world axes, and half the angle that its disc subtends."""
 
     direction: Float[np.ndarray, "3"]
     angular_radius_rad: float = SUN_RADIUS_AT_MARS_RAD
@@ -38,22 +30,18 @@ class Sun:
 
 @dataclass(frozen=True)
 class DustySky:
-    """A sky that is brighter towards the sun and the horizon, for cameras that see it; the sun's disc is drawn in it.
+    """A sky that is brighter towards the sun and the horizon, for cameras that see it, with the sun's disc.
 
     Light scattered once in a plane layer of air (Chandrasekhar 1960, section 7), over the sun's at the ground::
 
         I/F = (w tau / 4 t) P(g) mu0 / (mu0 - mu) (1 - exp(t / mu0 - t / mu))
 
-    with the Henyey-Greenstein phase function P and the sines of elevation mu of the view and mu0 of the sun. Light is
-    weakened on its way by ``t = (1 - w g**2) tau``, as the forward peak, the share g**2 of what is scattered, is not
-    lost but counts as direct sun (Joseph et al. 1976). Light scattered more often is spread evenly, so much of it that
-    all but that peak gives a level ground the irradiance `Photometry.sky_share`; where light scattered once comes to
-    more than that, it is scaled down to it. The ground is lit as by an even sky.
-
-    Attributes
-    ----------
-    optical_depth, single_scattering_albedo, asymmetry
-        tau, w and g, the mean cosine of the scattering angle.
+    with the Henyey-Greenstein phase function P, optical depth tau, single-scattering albedo w, mean cosine g of the
+    scattering angle, and the sines of elevation mu of the view and mu0 of the sun. Light is weakened on its way by
+    ``t = (1 - w g**2) tau``: the forward peak, a fraction g**2 of the scattered light, counts as direct sun (Joseph et
+    al. 1976). Multiply scattered light is spread evenly, so that all light except that peak gives level ground the
+    irradiance `Photometry.sky_share`; where single scattering exceeds that, it is scaled down to it. The ground is lit
+    as by an even sky.
     """
 
     optical_depth: float
@@ -70,12 +58,12 @@ class DustySky:
                 "allowed: above 0, above 0 and at most 1, at least 0 and below 1"
             )
 
-    def numbers(self, sun_z: float, sky_share: float) -> tuple[float, float, float, float]:
-        """Even radiance factor, factor of light scattered once, its optical depth and asymmetry, for the kernel."""
+    def coefficients(self, sun_z: float, sky_share: float) -> tuple[float, float, float, float]:
+        """Coefficients of `sky_brightness`: even radiance; factor, depth and asymmetry of single scattering."""
         depth = (1.0 - self.single_scattering_albedo * self.asymmetry**2) * self.optical_depth
         scale = self.single_scattering_albedo * self.optical_depth / (4.0 * depth)
-        beside_peak = 1.0 - self.asymmetry**2
-        once = beside_peak * scale * _scattered_irradiance(sun_z, depth, self.asymmetry)
+        without_peak = 1.0 - self.asymmetry**2
+        once = without_peak * scale * _scattered_irradiance(sun_z, depth, self.asymmetry)
         return max(sky_share - once, 0.0), scale * min(sky_share / once, 1.0), depth, self.asymmetry
 
 
@@ -89,23 +77,15 @@ class Photometry:
         S(g) = 1 + B0 / (1 + tan(g / 2) / h)
 
     The Lunar-Lambert law is that of McEwen (1991); the surge has the form of Hapke's shadow-hiding term (1986). K makes
-    A the spherical albedo of the law: the share that a surface returns of light from all sides. The law is reciprocal.
+    A the spherical albedo of the law: the fraction of isotropic light that a surface reflects. The law is reciprocal.
 
-    Attributes
-    ----------
-    lunar_share
-        L, between 0 (Lambert) and 1 (Lommel-Seeliger). About 0.55 for Mars at small phase (McEwen 1991).
-    surge_amplitude, surge_width
-        B0 and h.
-    sky_share
-        D, diffuse irradiance from the sky over the direct sun's on a plane facing it.
-    sky_radiance
-        Radiance factor of an even sky, where a pixel sees no ground.
-    sky
-        The sky seen there in place of the even one; None for the even one.
-    surrounding_albedo
-        Albedo of the ground that scatters light onto slopes and into shadows: B is this times the light that falls on
-        a level ground.
+    - lunar_share: L, between 0 (Lambert) and 1 (Lommel-Seeliger). About 0.55 for Mars at small phase (McEwen 1991)
+    - surge_amplitude, surge_width: B0 and h
+    - sky_share: D, diffuse irradiance from the sky over the direct sun's on a plane facing it
+    - sky_radiance: radiance factor of an even sky in pixels without ground
+    - sky: replaces the even sky there
+    - surrounding_albedo: albedo of the ground that scatters light onto slopes and into shadows: B is this times the
+      irradiance of level ground
     """
 
     lunar_share: float = 0.55
@@ -117,49 +97,35 @@ class Photometry:
     sky: DustySky | None = None
 
     def normalisation(self) -> float:
-        """K of the law."""
+        """Compute K of the law."""
         return 1.0 / _spherical_albedo(self.lunar_share, self.surge_amplitude, self.surge_width)
 
     def law(self, sun: Sun, caster_diameter_m: float) -> Float64[np.ndarray, "8"]:
-        """The numbers that the kernel takes, in its order."""
+        """Coefficients of the reflectance kernel, in its order."""
         bounced = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_share)
-        return np.array(
-            [
-                self.lunar_share,
-                self.surge_amplitude,
-                self.surge_width,
-                self.normalisation(),
-                self.sky_share,
-                bounced,
-                caster_diameter_m,
-                sun.angular_radius_rad,
-            ]
-        )
+        law = (self.lunar_share, self.surge_amplitude, self.surge_width, self.normalisation())
+        return np.array([*law, self.sky_share, bounced, caster_diameter_m, sun.angular_radius_rad])
 
-    def sky_numbers(self, sun: Sun) -> Float64[np.ndarray, "4"]:
-        """What the kernel takes for the sky: even radiance factor, and the numbers of light scattered once."""
+    def sky_coefficients(self, sun: Sun) -> Float64[np.ndarray, "4"]:
+        """Coefficients of the sky kernel."""
         if self.sky is None:
             return np.array([self.sky_radiance, 0.0, 0.0, 0.0])
-        return np.array(self.sky.numbers(float(sun.direction[2]), self.sky_share))
+        return np.array(self.sky.coefficients(float(sun.direction[2]), self.sky_share))
 
 
 @dataclass(frozen=True)
 class Texture:
-    """Albedo finer than the terrain's samples: octaves of noise in three dimensions, evaluated per pixel.
+    """Albedo finer than the terrain's samples: octaves of three-dimensional noise, evaluated per pixel.
 
-    Attributes
-    ----------
-    coarsest_m
-        Size of the coarsest octave's cells, metres; each further octave is half as large.
-    amplitudes
-        Amplitude of each octave in the natural logarithm of albedo, coarsest first.
+    - coarsest_m: size of the coarsest octave's cells; each further octave is half as large
+    - amplitudes: amplitude of each octave in the natural logarithm of albedo, coarsest first
     """
 
     coarsest_m: float = 1.0
     amplitudes: tuple[float, ...] = ()
 
     def arrays(self) -> tuple[float, Float64[np.ndarray, "octaves"]]:
-        """What the kernel takes."""
+        """Arguments of the texture kernel."""
         return float(self.coarsest_m), np.asarray(self.amplitudes, dtype=np.float64)
 
 
@@ -172,13 +138,12 @@ def _scattered_irradiance(sun_z: float, depth: float, asymmetry: float) -> float
 def _spherical_albedo(lunar_share: float, surge_amplitude: float, surge_width: float) -> float:
     """Spherical albedo of the law with A = K = 1, by Gauss-Legendre quadrature over incidence, emission and azimuth.
 
-    ``2 int_0^1 [(1 / pi) int I/F cos e dOmega_e / cos i] cos i d(cos i)``. The surge's peak is narrow: its azimuths are
-    taken closest around opposition by the substitution phi = pi s^3.
+    ``2 int_0^1 [(1 / pi) int I/F cos e dOmega_e / cos i] cos i d(cos i)``. The substitution phi = pi s^3 samples the
+    surge's narrow peak densely.
     """
     nodes, weights = np.polynomial.legendre.leggauss(96)
     mu, mu_weights = 0.5 * (nodes + 1.0), 0.5 * weights
-    s, s_weights = mu, mu_weights
-    phi, phi_weights = np.pi * s**3, 3.0 * np.pi * s**2 * s_weights
+    phi, phi_weights = np.pi * mu**3, 3.0 * np.pi * mu**2 * mu_weights
     cos_i, cos_e, azimuth = mu[:, None, None], mu[None, :, None], phi[None, None, :]
     cos_g = cos_i * cos_e + np.sqrt((1.0 - cos_i**2) * (1.0 - cos_e**2)) * np.cos(azimuth)
     tan_half = np.sqrt(np.clip(1.0 - cos_g, 0.0, None) / (1.0 + cos_g))

@@ -1,4 +1,4 @@
-"""Every pixel's ray, and the pinhole views that contain them."""
+"""The ray of every pixel, and the pinhole views that contain all rays."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import turn_matrix
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.kernels.rays import extent, least_along, pixel_angles, summed
 from marsyard.sim.render.kernels.structs import Rays
-from marsyard.sim.render.reach import Cone
+from marsyard.sim.render.kernels.views import max_image_radius, min_component, pixel_angles, sum_of_vectors
+from marsyard.sim.render.shadows import Cone
 
-#: Samples along each side of the pinhole views: a camera takes the first that leaves `_SPARE_PX` of them beside its own
-#: pixels, and the last where none does (full frames of 1024 x 1024 and 45 deg are drawn at about their own resolution).
+#: Samples along each side of the pinhole views: a camera takes the first that exceeds its own pixels by `_SPARE_PX`,
+#: else the last (full frames of 1024 x 1024 and 45 deg are drawn at about their own resolution).
 VIEW_SIDES_PX = (208, 288, 352, 544, 1088)
 VIEW_SIDE_PX = VIEW_SIDES_PX[-1]
 _SPARE_PX = 16
-#: Samples left free around the pixels' field in a view.
+#: Margin of samples around the pixels' field in a view.
 MARGIN_PX = 2.0
-#: Widest angle from its axis that a view is given; a wider field is cut into quarters.
+#: Largest angle of a view from its axis; a wider field is cut into quarters.
 WIDEST_HALF_ANGLE_RAD = np.radians(52.0)
 
 
@@ -31,24 +31,13 @@ WIDEST_HALF_ANGLE_RAD = np.radians(52.0)
 class PixelRays:
     """Every pixel's ray in body axes, and the pinhole views that contain them all.
 
-    Attributes
-    ----------
-    centre
-        Centre of projection in the body frame, metres; for CAHVORE the mean of the moving entrance pupil.
-    origins, directions
-        Rays relative to `centre`, shape (rows * columns, 3), float32; directions are unit vectors.
-    size
-        Columns and rows.
-    pixel_angles
-        Angle that each pixel takes: the square root of its solid angle, radians.
-    view_side_px
-        Samples along each side of the pinhole views.
-    view_from_body
-        Rotation matrices from body axes to those of each view (x right, y down, z forward).
-    focal_px
-        Focal length of each view.
-    view_of_pixel
-        Number of the view that holds each pixel.
+    - centre: centre of projection in the body frame, metres; for CAHVORE the mean of the moving entrance pupil
+    - origins, directions: rays relative to `centre`; directions are unit vectors
+    - size: columns and rows
+    - pixel_angles: angle that each pixel subtends: the square root of its solid angle, radians
+    - view_side_px: samples along each side of the pinhole views
+    - view_from_body: rotation matrices from body axes to those of each view (x right, y down, z forward)
+    - view_of_pixel: number of the view that contains each pixel
     """
 
     centre: Float64[np.ndarray, "3"]
@@ -63,33 +52,33 @@ class PixelRays:
 
     @property
     def rays(self) -> Rays:
-        """The rays alone."""
+        """The rays as a struct for kernels."""
         return Rays(self.origins, self.directions, self.pixel_angles)
 
     @cached_property
     def axis(self) -> Float64[np.ndarray, "3"]:
-        """Unit vector along the middle of all rays, body axes."""
-        middle = np.array(summed(self.directions))
-        middle /= np.linalg.norm(middle)
-        return middle
+        """Unit vector along the mean of all rays, body axes."""
+        mean = np.array(sum_of_vectors(self.directions))
+        mean /= np.linalg.norm(mean)
+        return mean
 
     @cached_property
     def pixel_rad(self) -> float:
-        """Median of the angles that pixels take, radians."""
+        """Median of the angles that pixels subtend."""
         return float(np.median(self.pixel_angles))
 
     @cached_property
     def half_angle_rad(self) -> float:
-        """Widest angle of a ray from the axis, radians."""
-        return float(np.arccos(np.clip(least_along(self.directions, self.axis), -1.0, 1.0)))
+        """Largest angle of a ray from the axis."""
+        return float(np.arccos(np.clip(min_component(self.directions, self.axis), -1.0, 1.0)))
 
     def cone(self, world_from_body: RigidTransform) -> Cone:
-        """What holds all rays where the camera stands so."""
+        """The cone that contains all rays of a camera in this pose."""
         return world_from_body.apply(self.centre.copy()), turn_matrix(world_from_body) @ self.axis, self.half_angle_rad
 
     @classmethod
     def of(cls, camera: CameraModel) -> PixelRays:
-        """The rays of this camera, given in the body frame. Raises RenderingError where pixels have no ray."""
+        """Compute the rays of a camera in the body frame. Raises RenderingError where pixels have no ray."""
         columns, rows = camera.size
         starts, directions = camera.rays(camera.pixel_grid())
         if not np.isfinite(directions).all():
@@ -101,8 +90,13 @@ class PixelRays:
         for part in _parts(directions):
             view_of_pixel[part] = len(axes)
             axes.append(_view_axes(directions[part]))
-            focal.append(_focal_length(directions[part], axes[-1], side))
-        centre, origins = _from_centre(starts)
+            # the focal length at which these rays just fill the view
+            focal.append(float((side / 2.0 - MARGIN_PX) / max_image_radius(directions[part], axes[-1])))
+        if starts.strides[:2] == (0, 0):
+            centre, origins = starts[0, 0].copy(), np.zeros((rows * columns, 3), dtype=np.float32)
+        else:
+            centre = starts.reshape(-1, 3).mean(axis=0)
+            origins = (starts - centre).reshape(-1, 3).astype(np.float32)
         return cls(
             centre=centre,
             origins=origins,
@@ -116,19 +110,8 @@ class PixelRays:
         )
 
 
-def _from_centre(
-    starts: Float64[np.ndarray, "rows columns 3"],
-) -> tuple[Float64[np.ndarray, "3"], Float32[np.ndarray, "pixels 3"]]:
-    """The mean of where rays start, and where each starts from there."""
-    count = starts.shape[0] * starts.shape[1]
-    if starts.strides[:2] == (0, 0):
-        return starts[0, 0].copy(), np.zeros((count, 3), dtype=np.float32)
-    centre = starts.reshape(-1, 3).mean(axis=0)
-    return centre, (starts - centre).reshape(-1, 3).astype(np.float32)
-
-
 def _parts(directions: Float64[np.ndarray, "rows columns 3"]) -> list[tuple[slice, slice]]:
-    """The picture whole, or cut into quarters until each fits a view."""
+    """Cut the picture into quarters until each part fits a view."""
     rows, columns = directions.shape[:2]
     pending, parts = [(slice(0, rows), slice(0, columns))], []
     while pending:
@@ -150,7 +133,7 @@ def _parts(directions: Float64[np.ndarray, "rows columns 3"]) -> list[tuple[slic
 
 
 def _view_axes(directions: Float64[np.ndarray, "rows columns 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Rows: right, down and forward of a view that looks along the middle of these rays, in body axes."""
+    """Right, down and forward, one row each in body axes, of a view along the mean direction of these rays."""
     corners = directions[[0, 0, -1, -1], [0, -1, 0, -1]]
     forward = corners.mean(axis=0) + directions[directions.shape[0] // 2, directions.shape[1] // 2]
     forward /= np.linalg.norm(forward)
@@ -158,10 +141,3 @@ def _view_axes(directions: Float64[np.ndarray, "rows columns 3"]) -> Float64[np.
     right -= forward * (right @ forward)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(forward, right), forward])
-
-
-def _focal_length(
-    directions: Float64[np.ndarray, "rows columns 3"], axes: Float64[np.ndarray, "3 3"], side: int
-) -> float:
-    """The focal length at which these rays just fill a view."""
-    return float((side / 2.0 - MARGIN_PX) / extent(directions, axes))

@@ -1,7 +1,7 @@
-"""A rover's shape, for the shadows that it and its mast cast, and for pictures that show its deck.
+"""A rover's shape, for its shadows and for pictures that show its deck.
 
-Boxes and cylinders: six wheels, rockers and bogies, body, deck with its panels, mast and head. They stand as the
-suspension stands and the mast points. The head lies behind its cameras, so that it hides nothing from them.
+Boxes and cylinders: six wheels, rockers and bogies, body, deck with its panels, mast and head, in the pose of
+suspension and mast. The head lies behind its cameras, so that it hides nothing from them.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from marsyard.sim.render.objects import Objects
 
 #: Albedo of everything: bright metal and glass under dust. Assumed.
 ALBEDO = 0.25
-#: Numbers that rocks have count from 0; the rover is none of them.
+#: Number of the rover's body; rocks have numbers from 0.
 ROVER_NAME = -1
-#: Sizes that matter to shadows only, assumed: widths of legs and mast, thickness of the deck, and the body's share of
-#: the deck's length and width, m.
-_LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_SHARE = 0.05, 0.05, 0.04, (0.65, 0.4)
+#: Sizes that matter to shadows only, assumed: widths of legs and mast, thickness of the deck, m, and the body's
+#: fraction of the deck's length and width.
+_LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)
 #: The head: depth, height, how much wider than the cameras' baseline, and how far behind their centres it ends, m.
 _HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
 _SIDES = 24
@@ -38,28 +38,18 @@ def rover_objects(
     elevation_rad: float,
     baseline_m: float = 0.3,
 ) -> Objects:
-    """The rover as one body, where it stands, its mast as it points.
+    """Build the rover as one body in its stance, its mast at its true angles.
 
-    Join it with a scene's rocks: ``Objects.joined([scene.objects, rover_objects(...)])``.
-
-    Parameters
-    ----------
-    rover, stance
-        Its shape, and where and how it stands.
-    mast
-        The mast; its head turns to the angles.
-    azimuth_rad, elevation_rad
-        True angles of the mast.
-    baseline_m
-        Distance of the widest pair of cameras: the head is as wide and a little more.
+    Join it with a scene's rocks: ``Objects.joined([scene.objects, rover_objects(...)])``. `baseline_m` is the distance
+    of the widest pair of cameras: the head is a little wider.
     """
     parts = [
         _body(rover, mast),
         _undercarriage(rover, stance.differential_rad, stance.bogies_rad),
-        _moved(_head(baseline_m), mast.rover_from_head(azimuth_rad, elevation_rad)),
+        _transform(_head(baseline_m), mast.rover_from_head(azimuth_rad, elevation_rad)),
         _elevation_axis(mast, azimuth_rad, elevation_rad),
     ]
-    triangles = _moved(np.concatenate(parts), stance.world_from_rover)
+    triangles = _transform(np.concatenate(parts), stance.world_from_rover)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals = across / np.linalg.norm(across, axis=1, keepdims=True)
     faces = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
@@ -70,9 +60,9 @@ def rover_objects(
 def rover_sphere(
     rover: RoverParameters, stance: Stance, mast: MastGeometry, baseline_m: float = 0.3
 ) -> Float64[np.ndarray, "1 4"]:
-    """Centre and radius of a sphere that holds `rover_objects`, whichever way suspension and mast turn.
+    """Centre and radius of a sphere that contains `rover_objects` for all angles of suspension and mast.
 
-    Joints turn about axes, so that nothing is farther away than the way along the links that carry it.
+    Joints rotate about axes, so no part is farther away than the sum of the links that carry it.
     """
     front, middle, rear = wheel_centres(rover, 0.0, (0.0, 0.0))[:3]
     bogie = bogie_pivots(rover, 0.0)[0]
@@ -93,15 +83,12 @@ def may_shade(
     place_m: Float64[np.ndarray, "3"],
     radius_m: float,
 ) -> bool:
-    """Whether bodies in spheres can hide the sun from a point within a radius of a place: false is certain, true not.
-
-    Drawing a rover that cannot matter to what a picture shows takes time for nothing.
-    """
+    """Whether bodies in spheres may hide the sun from a point within a radius of a position; false is certain."""
     away = spheres[:, :3] - place_m
     along = away @ sun_direction
     reach = spheres[:, 3] + radius_m
-    beside = np.linalg.norm(away - along[:, None] * sun_direction, axis=1)
-    return bool(np.any((beside <= reach) & (along >= -reach)))
+    across = np.linalg.norm(away - along[:, None] * sun_direction, axis=1)
+    return bool(np.any((across <= reach) & (along >= -reach)))
 
 
 def _length(*parts: float | Float64[np.ndarray, "3"]) -> float:
@@ -111,7 +98,7 @@ def _length(*parts: float | Float64[np.ndarray, "3"]) -> float:
 def _body(rover: RoverParameters, mast: MastGeometry) -> Triangles:
     """Body, deck, and mast up to the elbow."""
     length, width = (
-        share * size for share, size in zip(_BODY_SHARE, (rover.body_length_m, rover.body_width_m), strict=True)
+        share * size for share, size in zip(_BODY_FRACTION, (rover.body_length_m, rover.body_width_m), strict=True)
     )
     body = _box((length, width, rover.deck_m - rover.clearance_m), (0.0, 0.0, 0.5 * (rover.deck_m + rover.clearance_m)))
     deck = _box((rover.body_length_m, rover.body_width_m, _DECK_M), (0.0, 0.0, rover.deck_m))
@@ -123,9 +110,8 @@ def _body(rover: RoverParameters, mast: MastGeometry) -> Triangles:
 def _undercarriage(rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]) -> Triangles:
     """Wheels, and the legs that carry them."""
     centres = wheel_centres(rover, differential_rad, bogies_rad)
-    bogies = bogie_pivots(rover, differential_rad)
     parts = []
-    for side, bogie in enumerate(bogies):
+    for side, bogie in enumerate(bogie_pivots(rover, differential_rad)):
         front, middle, rear = centres[3 * side : 3 * side + 3]
         rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
         parts += [
@@ -185,5 +171,5 @@ def _rod(
     return np.asarray(np.asarray(start) + _unit_rod() @ axes.T)
 
 
-def _moved(triangles: Triangles, new_from_old: RigidTransform) -> Triangles:
+def _transform(triangles: Triangles, new_from_old: RigidTransform) -> Triangles:
     return np.asarray(new_from_old.apply(triangles.reshape(-1, 3))).reshape(-1, 3, 3)

@@ -1,4 +1,4 @@
-"""What is rendered: ground, things on it, and light."""
+"""A scene: ground, objects and light, and the quantities that kernels need of them."""
 
 from __future__ import annotations
 
@@ -10,17 +10,27 @@ import numpy as np
 from jaxtyping import Float64
 
 from marsyard.sim.render.clouds import CloudLayer, no_cover
-from marsyard.sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
 from marsyard.sim.render.kernels.ground import height_range
 from marsyard.sim.render.kernels.shading import Occluders
 from marsyard.sim.render.kernels.structs import Bounds, Extent, Footprint, GroundShadow, Light, Materials
 from marsyard.sim.render.mesh import graded_offsets
 from marsyard.sim.render.objects import Objects
 from marsyard.sim.render.photometry import Photometry, Sun, Texture
-from marsyard.sim.render.reach import EVERYWHERE, Cone, casters_towards, potentially_visible, shadow_footprint
+from marsyard.sim.render.shadows import (
+    EVERYWHERE,
+    NO_SHADOW,
+    Cone,
+    casters_towards,
+    ground_in_cones,
+    ground_shadow,
+    potentially_visible,
+    shadow_footprint,
+    slope_bounds,
+    sun_over_slopes,
+)
 from marsyard.sim.terrain import Surface
 
-#: By how much a mean of heights may stand above the highest of them, metres: single precision rounds at a few km.
+#: Rounding of a mean of heights in single precision, metres, at a few km.
 ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
 NO_CLOUDS = (no_cover(), np.zeros(5))
@@ -28,37 +38,20 @@ NO_CLOUDS = (no_cover(), np.zeros(5))
 
 @dataclass(frozen=True)
 class Scene:
-    """Ground, things on it, and light.
+    """Ground, objects and light.
 
-    Attributes
-    ----------
-    surface
-        The terrain.
-    centre_m
-        World x, y around which the mesh is dense: below a camera near the ground, or the place of a descent.
-    sun, photometry
-        The light, and how the ground scatters it.
-    objects
-        What stands on the ground.
-    ground_texture, object_texture
-        Albedo finer than the terrain's samples.
-    caster_diameter_m
-        Diameter of what casts a shadow from the camera's place: the lander seen against the sun. 0 for none.
-    ground_shadows
-        Whether the ground hides the sun from itself, as softly as the sun's disc is wide; shadows of objects are hard.
-    clouds
-        Clouds that dim the sun as they drift; None for none.
-    mesh_finest_m, mesh_reach_m, mesh_lines
-        Spacing of the mesh at the centre, how far it reaches to each side, and the number of its lines.
-    among_objects
-        Whether pictures are taken from among the objects, whose shadows may then fall nearly anywhere in them. Without
-        it the places where they may fall are found before, which spares all others the search
-        (`marsyard.sim.render.reach`).
-    edge_rays
-        Rays along each side of a pixel that holds an edge (`marsyard.sim.render.edges`); 1 draws every pixel by one
-        ray.
-    shown_m
-        Least and greatest x, least and greatest y of what pictures show; None where they may show anything.
+    - centre_m: world x, y around which the mesh is dense: below a camera near the ground, or the site of a descent
+    - ground_texture, object_texture: albedo finer than the terrain's samples
+    - caster_diameter_m: diameter of a body at the camera that casts a shadow, as a lander seen against the sun
+    - ground_shadows: whether the ground shades itself, with a penumbra; shadows of objects are hard
+    - clouds: clouds that dim the sun as they drift
+    - mesh_finest_m, mesh_reach_m, mesh_lines: spacing of the mesh at the centre, its extent to each side, and the
+      number of its lines
+    - among_objects: whether pictures are taken from among the objects, whose shadows may then fall nearly anywhere.
+      Otherwise the region where they may fall is computed in advance, which spares all other pixels the search
+      (`marsyard.sim.render.shadows`)
+    - edge_rays: rays along each side of a pixel at an edge (`marsyard.sim.render.renderer`); 1 draws every pixel by one
+    - shown_m: bounds of x, then of y, of what pictures show; None for no bounds
     """
 
     surface: Surface
@@ -84,37 +77,36 @@ class Scene:
         return graded_offsets(self.mesh_reach_m, self.mesh_finest_m, self.mesh_lines)
 
     def with_objects(self, objects: Objects) -> Scene:
-        """The same ground in the same light with other things on it; what was found of the ground is kept."""
-        return self._knowing(replace(self, objects=objects), "mesh_offsets", "height_range_m", "steepest", "shadow")
+        """Replace the objects; keep the results computed for the ground."""
+        return self._keep_results(
+            replace(self, objects=objects), "mesh_offsets", "height_range_m", "max_slopes", "shadow"
+        )
 
     def in_light(self, sun: Sun, photometry: Photometry) -> Scene:
-        """The same ground with the same things on it under another sun."""
-        other = self._knowing(replace(self, sun=sun, photometry=photometry), "mesh_offsets", "height_range_m")
-        # bounds that were not found for this sun may be for the other
-        return self._knowing(other, "steepest") if np.all(np.isfinite(self.steepest)) else other
+        """Replace the light."""
+        other = self._keep_results(replace(self, sun=sun, photometry=photometry), "mesh_offsets", "height_range_m")
+        # the other sun may have bounds although this one has none
+        return self._keep_results(other, "max_slopes") if np.all(np.isfinite(self.max_slopes)) else other
 
-    def _knowing(self, other: Scene, *found: str) -> Scene:
-        """Another scene, with what was found of this one and holds for it too."""
-        other.__dict__.update({name: getattr(self, name) for name in found})
+    def _keep_results(self, other: Scene, *names: str) -> Scene:
+        """Copy cached results of this scene that hold for another."""
+        other.__dict__.update({name: getattr(self, name) for name in names})
         return other
 
     def within(self, cones: Sequence[Cone]) -> Scene:
-        """The scene with those objects alone that pictures within these cones may show, or show the shadows of.
-
-        The ground's shadow is found only where these pictures may show it.
-        """
+        """Restrict objects, and the ground's shadow, to those that pictures within these cones may show."""
         sun, lowest = np.asarray(self.sun.direction, dtype=np.float64), self.height_range_m[0]
         kept = np.zeros(len(self.objects), dtype=np.bool_)
         for cone in cones:
             kept |= potentially_visible(self.objects.spheres, sun, lowest, cone)
         less = replace(self, objects=self.objects.only(kept), shown_m=ground_in_cones(cones, lowest))
-        return self._knowing(less, "mesh_offsets", "height_range_m", "steepest")
+        return self._keep_results(less, "mesh_offsets", "height_range_m", "max_slopes")
 
     @property
     def extent_m(self) -> Extent:
-        """Where the ground ends: least and greatest x, least and greatest y of the mesh, greatest z of the surface."""
+        """Bounds of the mesh in x, then in y, and of the surface's height."""
         (x, y), reach = self.centre_m, self.mesh_reach_m
-        # coarser levels are means of finer ones: none stands higher, but for rounding
+        # coarser levels are means of finer ones: none is higher, except for rounding
         return x - reach, x + reach, y - reach, y + reach, self.height_range_m[1] + ROUNDING_M
 
     @cached_property
@@ -124,20 +116,20 @@ class Scene:
         return float(low), float(high)
 
     @cached_property
-    def steepest(self) -> tuple[float, float]:
-        """Bounds of the ground's slope along x and along y; infinite where it rises as steeply as the sun's rays."""
+    def max_slopes(self) -> tuple[float, float]:
+        """Bounds of the ground's slope along x and y; infinite where it may rise as steeply as the sun's rays."""
         return slope_bounds(self.surface, self.sun)
 
     @cached_property
     def shadow(self) -> GroundShadow:
-        """The ground's shadow on the grid of a level of the surface."""
-        if not self.ground_shadows or self.sun.direction[2] <= 0.0 or sun_over_slopes(self.sun, self.steepest):
+        """The ground's shadow."""
+        if not self.ground_shadows or self.sun.direction[2] <= 0.0 or sun_over_slopes(self.sun, self.max_slopes):
             return NO_SHADOW
         return ground_shadow(self.surface, self.sun, self.height_range_m, self.shown_m)
 
     @cached_property
     def footprint(self) -> Footprint:
-        """Where objects may shade the ground."""
+        """Region where objects may shade the ground."""
         if self.among_objects:
             return EVERYWHERE
         towards = np.asarray(self.sun.direction, dtype=np.float64)
@@ -145,12 +137,12 @@ class Scene:
 
     @cached_property
     def occluders(self) -> Occluders:
-        """What hides the sun, for kernels."""
+        """Occluders of the sun, for kernels."""
         return Occluders(self.shadow, casters_towards(self.objects, self.sun), self.footprint)
 
     @cached_property
     def materials(self) -> Materials:
-        """How ground and objects look, for kernels."""
+        """Textures, normals and albedo, for kernels."""
         objects = self.objects
         textures = self.ground_texture.arrays(), self.object_texture.arrays()
         return Materials(*textures, objects.normals, objects.body_of_triangle, objects.albedo)
@@ -161,8 +153,8 @@ class Scene:
         if self.clouds is not None:
             more = self.clouds.parameters.sky_light(self.sun)
             photometry = replace(photometry, sky_share=photometry.sky_share + more)
-            drifting = (self.clouds.cover, self.clouds.numbers(self.sun, time_s))
-        # clouds are not drawn: the sky between them is as bright as ever
-        sky = self.photometry.sky_numbers(self.sun)
+            drifting = (self.clouds.cover, self.clouds.coefficients(self.sun, time_s))
+        # clouds are not drawn: they do not change the sky's own brightness
+        sky = self.photometry.sky_coefficients(self.sun)
         towards = np.asarray(self.sun.direction, dtype=np.float64)
         return Light(towards, photometry.law(self.sun, self.caster_diameter_m), sky, *drifting)

@@ -1,4 +1,4 @@
-"""The terrains that a campaign draws from, built once and shared by its workers through the disk."""
+"""Synthesis of terrains from seeds, and the bank that keeps them on disk for a campaign's workers."""
 
 from __future__ import annotations
 
@@ -13,58 +13,96 @@ import numpy as np
 from jaxtyping import Float32
 
 from marsyard.sim.cache import CacheWarning, cache_directory, load_array, make_room, save_array, touch
-from marsyard.sim.terrain.parameters import TerrainParameters
+from marsyard.sim.terrain.imported import blend_into_ground, detail_below_posting, embed
+from marsyard.sim.terrain.landforms.ground import Ground
+from marsyard.sim.terrain.landforms.kernels import pack, stamp_craters
+from marsyard.sim.terrain.landforms.relief import EJECTA_REACH_RADII, draw_craters
+from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
+from marsyard.sim.terrain.random_fields import Spectrum, substream
 from marsyard.sim.terrain.rocks.field import RockField
-from marsyard.sim.terrain.substreams import substream
 from marsyard.sim.terrain.surface import SMALLEST_LEVEL, Surface
-from marsyard.sim.terrain.synthesis import synthesise
 
-#: What a terrain's samples do not depend on but through its parameters: sites, figures, and the rocks upon it.
-NOT_OF_THE_SAMPLES = ("environment.py", "presets.py", "rocks", "sites.py", "statistics.py")
-#: Samples of the terrains that this process uses, by their files: these are not removed to make room.
+#: Modules that a terrain's samples do not depend on, except through its parameters.
+MODULES_WITHOUT_SAMPLES = ("rocks", "sites.py", "statistics.py")
+#: Samples of the terrains that this process uses, by file: the cache does not evict these files.
 _IN_USE: WeakValueDictionary[Path, np.ndarray] = WeakValueDictionary()
+
+
+def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surface:
+    """Synthesise a terrain from parameters and a random stream; the same stream gives the same bytes.
+
+    Every part draws from its own named substream: adding or changing a landform changes no other. Single-threaded, so
+    the bytes do not depend on the number of threads.
+    """
+    p = parameters
+    relief = Spectrum.power_law(p.samples, p.spacing_m, p.hurst, p.outer_scale_m)
+    rms_slope = np.tan(np.radians(p.rms_slope_deg))
+    height = relief.field(substream(rng, "relief"), scale=rms_slope / relief.line_slope_rms(p.slope_baseline_m))
+    albedo = Spectrum.power_law(p.samples, p.spacing_m, p.albedo_hurst, p.outer_scale_m)
+    ground = Ground(height, albedo.field(substream(rng, "albedo"), scale=p.albedo_contrast), p.spacing_m)
+    real = None
+    if p.source is not None:
+        real = embed(p.source, ground.side, ground.spacing_m)
+        detail = detail_below_posting(ground, real) if p.source.roughen else None
+    for name in LANDFORMS:
+        landform = getattr(p, name)
+        if landform is not None:
+            landform.apply(ground, substream(rng, name))
+    if p.craters_per_km2 > 0.0:
+        craters = draw_craters(p, substream(rng, "craters"))
+        stamp_craters(ground.height, ground.tone, ground.spacing_m, craters, EJECTA_REACH_RADII)
+    if real is not None:
+        blend_into_ground(ground, real, detail)
+    relative = np.exp(ground.tone, out=ground.tone)
+    samples = np.empty((ground.side, ground.side, 2), dtype=np.float32)
+    pack(ground.height, relative, p.albedo / float(relative.mean(dtype=np.float64)), samples)
+    return Surface.from_samples(samples, ground.spacing_m)
 
 
 @cache
 def _code_version() -> str:
-    """Hash of the code that makes a terrain: a change of it makes cached terrains unknown, never wrong."""
+    """Hash of the code that makes a terrain: after a change of it, cached terrains are built again."""
     digest = hashlib.sha256(np.__version__.encode())
     folder = Path(__file__).parent
     for path in sorted(folder.rglob("*.py")):
-        if path.relative_to(folder).parts[0] not in NOT_OF_THE_SAMPLES:
+        if path.relative_to(folder).parts[0] not in MODULES_WITHOUT_SAMPLES:
             digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
 @dataclass(frozen=True)
 class TerrainBank:
-    """Numbered terrains of one kind.
+    """Numbered terrains of one kind, cached on disk.
 
-    Terrain k is a pure function of the parameters, the seed and k. On disk it is one array of all levels, memory-mapped
-    by every worker that uses it, so workers share its pages. The disk's share is bounded: see
-    `marsyard.sim.cache.make_room`.
+    Terrain k is a pure function of the parameters, the seed and k. On disk it is one array of all levels, which workers
+    memory-map, so they share its pages. The cache's size is bounded: see `marsyard.sim.cache.make_room`.
     """
 
     parameters: TerrainParameters
     seed: int
 
     def terrain(self, number: int) -> Surface:
-        """Terrain `number`, from the disk if it is there, otherwise built and kept."""
+        """Load a terrain from disk, or build and store it; where it cannot be written, it is kept in memory only."""
         path = self._path(number)
-        flat = self._kept(path)
-        if flat is None:
-            flat = self._build(number, path)
-        else:
+        flat = load_array(path)
+        if flat is not None and flat.size == self._size():
             touch(path)
+        else:
+            flat = self._build(number, path)
         _IN_USE[path] = flat
-        return self._surface(flat)
+        levels, start = [], 0
+        for side in self._sides():
+            stop = start + 2 * side**2
+            levels.append(flat[start:stop].reshape(side, side, 2))
+            start = stop
+        return Surface(tuple(levels), self.parameters.spacing_m)
 
     def missing_bytes(self, number: int) -> int:
-        """Bytes that a terrain would take on disk, but for some hundred; 0 where it is there."""
+        """Return the bytes that a terrain would add on disk, except for some hundred; 0 where it is stored."""
         return 0 if self._path(number).exists() else 4 * self._size()
 
     def rocks(self, number: int) -> RockField | None:
-        """The rocks of terrain `number`, built anew each time; None where the parameters ask for none."""
+        """Build the rocks of a terrain, at each call; None where the parameters have none."""
         if self.parameters.rocks is None:
             return None
         return RockField.on(self.terrain(number), self.parameters.rocks, substream(self._rng(number), "rocks"))
@@ -74,24 +112,18 @@ class TerrainBank:
 
     def _path(self, number: int) -> Path:
         parameters = self.parameters.model_dump_json(exclude={"rocks"})
-        identity = f"{parameters} {self.seed} {number} {_code_version()} {self._files()}"
+        identity = f"{parameters} {self.seed} {number} {_code_version()} {self._source_hashes()}"
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
 
-    def _files(self) -> str:
-        """Hash of the files of real terrain, which may change under the same name."""
+    def _source_hashes(self) -> str:
+        """Hashes of the real terrain's files, whose content may change under the same name."""
         source = self.parameters.source
         if source is None:
             return ""
         paths = [path for path in (source.dtm, source.ortho) if path is not None and path.exists()]
         return " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
 
-    def _kept(self, path: Path) -> Float32[np.ndarray, "samples"] | None:
-        """Samples of all levels, memory-mapped; None where the file is missing or damaged."""
-        flat = load_array(path)
-        return flat if flat is not None and flat.size == self._size() else None
-
     def _build(self, number: int, path: Path) -> Float32[np.ndarray, "samples"]:
-        """Builds a terrain and keeps it on disk; where that cannot be written, in memory only."""
         built = synthesise(self.parameters, self._rng(number))
         flat = np.concatenate([level.reshape(-1) for level in built.levels])
         try:
@@ -103,19 +135,10 @@ class TerrainBank:
             return flat
 
     def _sides(self) -> list[int]:
-        sides = [self.parameters.samples]
-        while sides[-1] > SMALLEST_LEVEL:
-            sides.append(sides[-1] // 2)
-        return sides
+        """Samples along a side of each level."""
+        levels = (self.parameters.samples // SMALLEST_LEVEL).bit_length()
+        return [self.parameters.samples >> level for level in range(levels)]
 
     def _size(self) -> int:
         """Values in a terrain's file: height and albedo on every level."""
         return 2 * sum(side**2 for side in self._sides())
-
-    def _surface(self, flat: Float32[np.ndarray, "samples"]) -> Surface:
-        levels, start = [], 0
-        for side in self._sides():
-            stop = start + 2 * side**2
-            levels.append(flat[start:stop].reshape(side, side, 2))
-            start = stop
-        return Surface(tuple(levels), self.parameters.spacing_m)

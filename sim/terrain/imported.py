@@ -1,4 +1,4 @@
-"""Files of real terrain: a terrain model and an optional picture of it."""
+"""Terrain models (DTM) from files, embedded in a periodic synthetic surround."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float32, Float64
 from pydantic import Field
-from scipy.ndimage import distance_transform_edt
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, spline_filter
 
 from marsyard.sim.parameters import Parameters
+from marsyard.sim.terrain.landforms.ground import Ground, refined
 
 
 class TerrainFileError(ValueError):
@@ -54,17 +56,7 @@ class RealTerrain(Parameters):
 
 @dataclass(frozen=True)
 class Raster:
-    """A grid of values, row 0 in the south, NaN where there is none.
-
-    Attributes
-    ----------
-    values
-        Shape (rows, columns).
-    posting_m
-        Distance between values.
-    west_m, south_m
-        Place of value (0, 0), the centre of its cell, in the file's own coordinates.
-    """
+    """A grid of values, row 0 in the south, NaN where missing; cell (0, 0) is centred at `west_m`, `south_m`."""
 
     values: Float64[np.ndarray, "rows columns"]
     posting_m: float
@@ -73,13 +65,10 @@ class Raster:
 
 
 def read_rasters(source: RealTerrain) -> tuple[Raster, Raster | None]:
-    """Heights, and brightness where there is a picture that is wanted. Raises TerrainFileError."""
+    """Read heights, and brightness where there is an image that shall be used. Raises TerrainFileError."""
     if not source.dtm.exists():
         raise TerrainFileError(f"terrain file {source.dtm} does not exist")
-    if source.dtm.suffix == ".npz":
-        heights, ortho = _read_npz(source.dtm)
-    else:
-        heights, ortho = _read_geotiff(source.dtm), None
+    heights, ortho = _read_npz(source.dtm) if source.dtm.suffix == ".npz" else (_read_geotiff(source.dtm), None)
     if source.ortho is not None:
         if not source.ortho.exists():
             raise TerrainFileError(f"ortho image {source.ortho} does not exist")
@@ -89,7 +78,7 @@ def read_rasters(source: RealTerrain) -> tuple[Raster, Raster | None]:
 
 
 def check_holes(source: RealTerrain, heights: Float64[np.ndarray, "rows columns"]) -> None:
-    """Raises TerrainFileError where more heights are missing (not finite) than the source allows."""
+    """Raise TerrainFileError where more heights are missing (not finite) than the source allows."""
     fraction = float(np.mean(~np.isfinite(heights)))
     if fraction == 1.0:
         raise TerrainFileError(f"{source.dtm}: has no valid height at all")
@@ -118,7 +107,7 @@ def _read_npz(path: Path) -> tuple[Raster, Raster | None]:
 
 
 def _from_north(values: Any, posting_m: float, path: Path) -> Raster:
-    """A raster whose upper left corner, not the centre of its first cell, is the origin."""
+    """A raster from rows that run from north to south; the origin is the outer corner of the north-western cell."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 2 or min(array.shape) < 4:
         raise TerrainFileError(f"{path} has a grid of shape {array.shape}; at least 4 x 4 values are needed")
@@ -147,9 +136,9 @@ def _read_geotiff(path: Path) -> Raster:
 
 
 def filled(values: Float64[np.ndarray, "rows columns"]) -> tuple[Float64[np.ndarray, "rows columns"], int]:
-    """Values with each hole filled smoothly from its rim, and the number of values that were missing.
+    """Fill holes smoothly from their rims; return the values, and how many were missing.
 
-    Every missing value starts as its nearest valid one; then the holes are relaxed towards a membrane (Laplace).
+    Every missing value starts as its nearest valid one; then Laplace's equation is relaxed.
     """
     missing: Bool[np.ndarray, "rows columns"] = np.isnan(values)
     holes = int(missing.sum())
@@ -162,3 +151,199 @@ def filled(values: Float64[np.ndarray, "rows columns"]) -> tuple[Float64[np.ndar
         around = 0.25 * (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:])
         whole[missing] = around[missing]
     return whole, holes
+
+
+#: Side of the grid on which the surround is deformed to meet the real terrain.
+MEMBRANE_SIDE = 128
+#: Largest number of samples along a side of a terrain.
+MAX_SIDE = 8192
+#: Pixels next to missing ones that resampling has mixed with black.
+TORN_EDGE_PX = 3
+
+
+@dataclass(frozen=True)
+class RealExtent:
+    """Borders of the DTM in terrain coordinates, and the defects of its file, which are filled from around.
+
+    Within `border_m` of the borders the DTM blends into its surround.
+
+    - holes, hole_fraction: posts without a height, and their fraction of all posts
+    - ortho_holes: pixels without a brightness
+    """
+
+    west_m: float
+    south_m: float
+    east_m: float
+    north_m: float
+    posting_m: float
+    holes: int
+    ortho_holes: int
+    hole_fraction: float
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """A real terrain resampled on the grid of its surround.
+
+    - rows, columns: the part of the grid that it covers
+    - height: control values there: the B-spline passes through the DTM's interpolated heights
+    - tone: natural logarithm of brightness over its mean
+    - weight: 1 inside, falling to 0 at the border
+    - real: whether the DTM has a height at the post nearest to each sample; elsewhere a hole is filled
+    """
+
+    rows: slice
+    columns: slice
+    height: Float32[np.ndarray, "rows columns"]
+    tone: Float32[np.ndarray, "rows columns"] | None
+    weight: Float32[np.ndarray, "rows columns"]
+    real: Bool[np.ndarray, "rows columns"]
+    extent: RealExtent
+
+    def real_samples(self, side: int) -> Bool[np.ndarray, "side side"]:
+        """Mask of the whole terrain's samples on posts with a height: statistics are computed from these."""
+        return self._mask(side, self.real)
+
+    def filled_samples(self, side: int) -> Bool[np.ndarray, "side side"]:
+        """Mask of the whole terrain's samples in filled holes of the DTM."""
+        return self._mask(side, ~self.real)
+
+    def _mask(self, side: int, part: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "side side"]:
+        samples = np.zeros((side, side), dtype=np.bool_)
+        samples[self.rows, self.columns] = part
+        return samples
+
+
+def embed(source: RealTerrain, side: int, spacing_m: float) -> Embedded:
+    """Resample the file's terrain for the middle of a grid of this side and spacing. Raises TerrainFileError."""
+    raster, ortho = read_rasters(source)
+    period = side * spacing_m
+    rows, columns = raster.values.shape
+    width, length = (columns - 1) * raster.posting_m, (rows - 1) * raster.posting_m
+    if max(width, length) > period - 2.0 * spacing_m:
+        raise TerrainFileError(
+            f"{source.dtm} covers {width:g} m x {length:g} m; the terrain repeats after {period:g} m: "
+            "choose more terrain.samples or a larger terrain.spacing_m"
+        )
+    if min(width, length) <= 2.0 * source.border_m:
+        raise TerrainFileError(
+            f"{source.dtm} covers {width:g} m x {length:g} m; a border of {source.border_m:g} m leaves nothing of it"
+        )
+    heights, holes = filled(raster.values)
+    # aligned with the grid, so that posts coincide with samples where the postings allow it
+    west, south = (round(0.5 * (period - span) / spacing_m) * spacing_m for span in (width, length))
+    i = np.arange(int(np.ceil(south / spacing_m)), int(np.floor((south + length) / spacing_m)) + 1)
+    j = np.arange(int(np.ceil(west / spacing_m)), int(np.floor((west + width) / spacing_m)) + 1)
+    y, x = i * spacing_m, j * spacing_m
+    posts_y, posts_x = south + raster.posting_m * np.arange(rows), west + raster.posting_m * np.arange(columns)
+    # cubic between the DTM's posts, then control values of the B-spline through the interpolated heights
+    resampled = RectBivariateSpline(posts_y, posts_x, heights - heights.mean(), kx=3, ky=3)(y, x)
+    control = spline_filter(resampled, order=3, mode="mirror", output=np.float64).astype(np.float32)
+    inward_y, inward_x = np.minimum(y - south, south + length - y), np.minimum(x - west, west + width - x)
+    fraction = np.clip(np.minimum(inward_y[:, None], inward_x[None, :]) / source.border_m, 0.0, 1.0)
+    weight = (fraction * fraction * (3.0 - 2.0 * fraction)).astype(np.float32)
+    tone, ortho_holes = None, 0
+    if ortho is not None:
+        tone, ortho_holes = _tone(source, raster, ortho, x - west, y - south)
+    extent = RealExtent(
+        west, south, west + width, south + length, raster.posting_m, holes, ortho_holes, holes / heights.size
+    )
+    nearest = (
+        np.clip(np.rint(offset / raster.posting_m).astype(int), 0, count - 1)
+        for offset, count in ((y - south, rows), (x - west, columns))
+    )
+    real = np.isfinite(raster.values)[np.ix_(*nearest)]
+    return Embedded(slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), control, tone, weight, real, extent)
+
+
+def _tone(
+    source: RealTerrain,
+    raster: Raster,
+    ortho: Raster,
+    x: Float64[np.ndarray, "columns"],
+    y: Float64[np.ndarray, "rows"],
+) -> tuple[Float32[np.ndarray, "rows columns"], int]:
+    """Log brightness of the image over its mean at positions relative to the DTM's south-western post; missing pixels.
+
+    The image's own shading remains: it is taken for albedo. Black is limited to a fifth of the mean.
+    """
+    missing = ~(ortho.values > 0.0)
+    holes = int(missing.sum())
+    if holes:
+        missing = binary_dilation(missing, iterations=TORN_EDGE_PX)
+    brightness, _ = filled(np.where(missing, np.nan, ortho.values))
+    logarithm = np.log(np.maximum(brightness / float(brightness.mean()), 0.2))
+    rows, columns = logarithm.shape
+    posts_x = ortho.west_m - raster.west_m - source.ortho_east_m + ortho.posting_m * np.arange(columns)
+    posts_y = ortho.south_m - raster.south_m - source.ortho_north_m + ortho.posting_m * np.arange(rows)
+    spline = RectBivariateSpline(posts_y, posts_x, logarithm, kx=1, ky=1)
+    tone = spline(np.clip(y, posts_y[0], posts_y[-1]), np.clip(x, posts_x[0], posts_x[-1]))
+    return tone.astype(np.float32), holes
+
+
+def grid_for(source: RealTerrain) -> tuple[int, float]:
+    """Choose samples and spacing of a terrain that holds the DTM at its own posting, with a surround.
+
+    Raises TerrainFileError for a DTM that is too large.
+    """
+    raster, _ = read_rasters(source)
+    longest = max(raster.values.shape)
+    samples = 64
+    while samples < 1.5 * longest:
+        samples *= 2
+    if samples > MAX_SIDE:
+        raise TerrainFileError(f"{source.dtm} has {longest} posts along a side; at most 5461 fit")
+    return samples, raster.posting_m
+
+
+#: Heights and tones finer than a DTM's posting.
+Detail = tuple[Float32[np.ndarray, "rows columns"], Float32[np.ndarray, "rows columns"]]
+
+
+def detail_below_posting(ground: Ground, real: Embedded) -> Detail:
+    """Extract the ground's waves shorter than twice the DTM's posting, where the DTM lies.
+
+    The remainder of a Gaussian low-pass whose amplitude is a half at that wavelength.
+    """
+    sigma = real.extent.posting_m * np.sqrt(2.0 * np.log(2.0)) / np.pi / ground.spacing_m
+    height, tone = (
+        (grid - gaussian_filter(grid, sigma, mode="wrap"))[real.rows, real.columns]
+        for grid in (ground.height, ground.tone)
+    )
+    return height, tone
+
+
+def blend_into_ground(ground: Ground, real: Embedded, detail: Detail | None) -> None:
+    """Blend the real terrain into the ground, in place, after deforming the surround to meet it at the border.
+
+    The deformation is a membrane: the height difference along the border, continued by Laplace's equation on a coarse
+    periodic grid.
+    """
+    height = real.height if detail is None else real.height + detail[0]
+    step = max(ground.side // MEMBRANE_SIDE, 1)
+    known = np.zeros((ground.side, ground.side), dtype=bool)
+    known[real.rows, real.columns] = real.weight > 0.0
+    difference = np.zeros((ground.side, ground.side), dtype=np.float32)
+    difference[real.rows, real.columns] = real.height - ground.height[real.rows, real.columns]
+    membrane = _membrane(difference[::step, ::step].astype(np.float64), known[::step, ::step])
+    np.add(ground.height, refined(membrane.astype(np.float32), ground.side), out=ground.height)
+    area = ground.height[real.rows, real.columns]
+    area += real.weight * (height - area)
+    if real.tone is not None:
+        tone = real.tone if detail is None else real.tone + detail[1]
+        area = ground.tone[real.rows, real.columns]
+        area += real.weight * (tone - area)
+
+
+def _membrane(
+    values: Float64[np.ndarray, "side side"], known: Bool[np.ndarray, "side side"]
+) -> Float64[np.ndarray, "side side"]:
+    """Continue values where they are not known as the mean of the neighbours, by successively finer relaxation."""
+    if known.shape[0] > 8 and known[::2, ::2].any():
+        field = np.repeat(np.repeat(_membrane(values[::2, ::2], known[::2, ::2]), 2, axis=0), 2, axis=1)
+    else:
+        field = np.full(values.shape, float(values[known].mean()))
+    for _ in range(60):
+        around = np.roll(field, 1, 0) + np.roll(field, -1, 0) + np.roll(field, 1, 1) + np.roll(field, -1, 1)
+        field = np.where(known, values, 0.25 * around)
+    return field

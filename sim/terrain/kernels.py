@@ -1,4 +1,4 @@
-"""Compiled kernels of the terrain: cubic B-spline evaluation, pyramid reduction."""
+"""Compiled kernels of the terrain: evaluation of the cubic B-spline, its upper bounds, reduction to coarser levels."""
 
 from __future__ import annotations
 
@@ -33,31 +33,20 @@ def bspline_weights(t: float) -> Eight:
 
 @njit(cache=True, inline="always")
 def sample(field: Level, inverse_spacing: float, x: float, y: float) -> tuple[float, float, float, float]:
-    """Height, its slopes along x and y, and albedo of one level at one place."""
+    """Evaluate height, its slopes along x and y, and albedo of one level at one position."""
     side = field.shape[0]
     mask = side - 1
     gx = x * inverse_spacing
     gy = y * inverse_spacing
-    fx = math.floor(gx)
-    fy = math.floor(gy)
-    j = int(fx)
-    i = int(fy)
+    fx, fy = math.floor(gx), math.floor(gy)
+    j, i = int(fx), int(fy)
     wx0, wx1, wx2, wx3, dx0, dx1, dx2, dx3 = bspline_weights(gx - fx)
     wy = bspline_weights(gy - fy)
-    j0 = (j - 1) & mask
-    j1 = j & mask
-    j2 = (j + 1) & mask
-    j3 = (j + 2) & mask
-    height = 0.0
-    slope_x = 0.0
-    slope_y = 0.0
-    albedo = 0.0
+    j0, j1, j2, j3 = (j - 1) & mask, j & mask, (j + 1) & mask, (j + 2) & mask
+    height, slope_x, slope_y, albedo = 0.0, 0.0, 0.0, 0.0
     for k in range(4):
         row = field[(i + k - 1) & mask]
-        h0 = row[j0, 0]
-        h1 = row[j1, 0]
-        h2 = row[j2, 0]
-        h3 = row[j3, 0]
+        h0, h1, h2, h3 = row[j0, 0], row[j1, 0], row[j2, 0], row[j3, 0]
         across = wx0 * h0 + wx1 * h1 + wx2 * h2 + wx3 * h3
         height += wy[k] * across
         slope_y += wy[k + 4] * across
@@ -68,7 +57,7 @@ def sample(field: Level, inverse_spacing: float, x: float, y: float) -> tuple[fl
 
 @njit(cache=True, inline="always")
 def collapse(field: Level, gy: float, out: Array) -> None:
-    """The control values of a level along the line y = gy, counted in samples: both fields as splines of x alone."""
+    """Control values of a level along the line y = gy, counted in samples: both fields become splines of x alone."""
     mask = field.shape[0] - 1
     fy = math.floor(gy)
     i = int(fy)
@@ -85,29 +74,23 @@ def collapse(field: Level, gy: float, out: Array) -> None:
 
 @njit(cache=True)
 def evaluate_field(field: Level, spacing: float, x: Array, y: Array) -> Array:
-    """Height, slopes and albedo at many places; shape (n, 4)."""
+    """Evaluate height, slopes and albedo at many positions; shape (n, 4)."""
     out = np.empty((x.size, 4), dtype=np.float64)
     inverse_spacing = 1.0 / spacing
     for n in range(x.size):
-        height, slope_x, slope_y, albedo = sample(field, inverse_spacing, x[n], y[n])
-        out[n, 0] = height
-        out[n, 1] = slope_x
-        out[n, 2] = slope_y
-        out[n, 3] = albedo
+        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = sample(field, inverse_spacing, x[n], y[n])
     return out
 
 
-#: Samples along each side of the blocks over which ceilings are found: half as many make rays no faster, and four times
-#: as many blocks.
+#: Samples along each side of the blocks that have ceilings; with half as many, rays are no faster.
 CEILING_BLOCK = 4
 
 
 @njit(cache=True)
-def ceiling_of(field: Level) -> NDArray[np.float32]:
-    """Upper bounds of a level's height over blocks of samples: of the control values that a place in one has around it.
+def block_ceilings(field: Level) -> NDArray[np.float32]:
+    """Upper bounds of a level's height over blocks of samples: the highest control value that affects a block.
 
-    Block (a, b) holds the places between the samples ``CEILING_BLOCK * a`` and ``CEILING_BLOCK * (a + 1)`` along y, and
-    likewise along x.
+    Block (a, b) lies between the samples ``CEILING_BLOCK * a`` and ``CEILING_BLOCK * (a + 1)`` along y; b along x.
     """
     side = field.shape[0]
     mask = side - 1
@@ -130,7 +113,7 @@ def ceiling_of(field: Level) -> NDArray[np.float32]:
 
 @njit(cache=True)
 def reduce_level(fine: Level) -> Level:
-    """The next coarser level: binomial (1 4 6 4 1)/16 along both axes, every second sample kept, periodic."""
+    """Compute the next coarser level: binomial (1 4 6 4 1)/16 along both axes, every second sample kept, periodic."""
     side = fine.shape[0]
     half = side // 2
     mask = side - 1

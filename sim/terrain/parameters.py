@@ -1,4 +1,4 @@
-"""What a terrain depends on, besides its seed."""
+"""Parameters of a terrain."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ class TerrainParameters(Parameters):
         return samples
 
     def changed(self, changes: Mapping[str, Any]) -> TerrainParameters:
-        """These parameters with some set anew, validated.
+        """Return these parameters with some changed, validated.
 
-        Changes are nested as in a file: ``{"samples": 2048, "rocks": {"abundance": 0.1}}`` keeps all else of the rocks.
-        None takes a landform, the rocks or a source away; a landform that was not there takes its defaults for what is
-        not given. Raises ValueError, naming the first parameter that is wrong.
+        Changes are nested as in a file: ``{"samples": 2048, "rocks": {"abundance": 0.1}}`` keeps all other values of
+        the rocks. None removes a landform, the rocks or a source; a new landform takes its defaults. Raises ValueError,
+        naming the first invalid parameter.
         """
         _check_names(TerrainParameters, changes, "")
         try:
@@ -81,25 +81,20 @@ class TerrainParameters(Parameters):
             raise ValueError(f"terrain.{where}: {first['msg']}; given: {first['input']!r}") from None
 
 
-#: The landforms in the order in which they are laid upon the fractal ground.
+#: The landforms in the order in which they are added to the fractal ground.
 LANDFORMS = ("fans", "playa", "lava", "swell", "ramp", "gullies", "dunes", "ripples")
 
 
 def _check_names(model: type[BaseModel], changes: Mapping[str, Any], where: str) -> None:
-    """Raises ValueError for the first name that no parameter has, naming those there are."""
+    """Raise ValueError for the first unknown name, naming the allowed ones."""
     for name, value in changes.items():
         if name not in model.model_fields:
             allowed = ", ".join(model.model_fields)
             raise ValueError(f"terrain{where} has no parameter '{name}'; allowed: {allowed}")
-        part = _model_of(model, name)
-        if part is not None and isinstance(value, Mapping):
-            _check_names(part, value, f"{where}.{name}")
-
-
-def _model_of(model: type[BaseModel], name: str) -> type[BaseModel] | None:
-    """The model of a parameter that is itself a set of parameters, or None."""
-    kinds = get_args(model.model_fields[name].annotation)
-    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
+        if isinstance(value, Mapping):
+            for kind in get_args(model.model_fields[name].annotation):
+                if isinstance(kind, type) and issubclass(kind, BaseModel):
+                    _check_names(kind, value, f"{where}.{name}")
 
 
 def _merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,24 +1,94 @@
-"""Sites: an environment, how its ground scatters light, and its terrain at the scales at which it is looked at.
-
-Figures of the field test's sites and of the MER landing sites: DIMES field test paper, section III.A.
-"""
+"""Sites: planet and atmosphere, reflectance of the ground, and terrain parameters at two scales."""
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field
 
-from marsyard.sim.parameters import Parameters
-from marsyard.sim.terrain.environment import Environment
+from marsyard.sim.parameters import Parameters, Positive
 from marsyard.sim.terrain.parameters import TerrainParameters
+
+#: Lowest sine of the sun's elevation for which a plane-parallel atmosphere is used.
+LOWEST_SUN_SINE = 0.05
+#: Angular radius of the sun at 1 AU.
+SUN_RADIUS_AT_1_AU_RAD = 0.00465
+
+
+class Environment(Parameters):
+    """A planet's gravity, rotation, sunlight and dusty air at a site."""
+
+    planet: Annotated[str, Field(description="which planet")] = "Mars"
+    gravity_m_s2: Annotated[Positive, Field(description="gravity, m/s2")] = 3.72
+    rotation_rad_s: Annotated[float, Field(ge=0.0, description="sidereal rotation rate, rad/s")] = 7.0882e-5
+    solar_irradiance: Annotated[
+        Positive, Field(description="sunlight above the air over that at 1 AU; 0.44 at 1.5 AU")
+    ] = 0.44
+    optical_depth: Annotated[float, Field(ge=0.0, le=10.0, description="extinction optical depth of the air")] = 0.5
+    single_scattering_albedo: Annotated[
+        float, Field(ge=0.0, lt=1.0, description="share of the extinction that is scattering")
+    ] = 0.94
+    asymmetry: Annotated[float, Field(gt=-1.0, lt=1.0, description="mean cosine of the scattering angle")] = 0.65
+
+    @property
+    def sun_radius_rad(self) -> float:
+        """Angular radius of the sun's disc: it falls with distance as the square root of the irradiance does."""
+        return float(SUN_RADIUS_AT_1_AU_RAD * np.sqrt(self.solar_irradiance))
+
+    def direct_share(self, sun_elevation_rad: float) -> float:
+        """Fraction of sunlight that reaches a plane facing the sun, with the aureole scattered forward around it.
+
+        ``exp(-tau' / sin elevation)``, tau' the optical depth less the forward peak (delta scaling, Joseph et al.
+        1976): light scattered by a few degrees shades the ground as the sun's own does.
+        """
+        return float(np.exp(-self._delta_scaled()[0] / max(np.sin(sun_elevation_rad), LOWEST_SUN_SINE)))
+
+    def sky_share(self, sun_elevation_rad: float) -> float:
+        """Diffuse irradiance of level ground over the direct sun's on a plane facing it.
+
+        The delta-Eddington approximation (Joseph, Wiscombe & Weinman 1976) over black ground; it omits light that the
+        ground reflects and the air returns. An even sky of this radiance factor gives this irradiance.
+        """
+        tau, albedo, asymmetry = self._delta_scaled()
+        if tau == 0.0:
+            return 0.0
+        mu = max(float(np.sin(sun_elevation_rad)), LOWEST_SUN_SINE)
+        k = np.sqrt(3.0 * (1.0 - albedo) * (1.0 - albedo * asymmetry))
+        p = np.sqrt(3.0 * (1.0 - albedo) / (1.0 - albedo * asymmetry))
+        # intensity I + I1 cos(angle from the nadir) for a solar flux of pi, particular solution -alpha, -beta
+        alpha = 0.75 * albedo * mu**2 * (1.0 + asymmetry * (1.0 - albedo)) / (1.0 - (k * mu) ** 2)
+        beta = 0.75 * albedo * mu * (1.0 + 3.0 * asymmetry * (1.0 - albedo) * mu**2) / (1.0 - (k * mu) ** 2)
+        # I = C1 e^-kt + C2 e^kt - alpha e^-t/mu, I1 = p (C1 e^-kt - C2 e^kt) - beta e^-t/mu; no diffuse light comes
+        # down at the top (I + 2/3 I1 = 0) nor up from the ground (I - 2/3 I1 = 0)
+        two_thirds = 2.0 / 3.0
+        fade = np.exp(-tau / mu)
+        system = np.array(
+            [
+                [1.0 + two_thirds * p, 1.0 - two_thirds * p],
+                [(1.0 - two_thirds * p) * np.exp(-k * tau), (1.0 + two_thirds * p) * np.exp(k * tau)],
+            ]
+        )
+        c1, c2 = np.linalg.solve(system, [alpha + two_thirds * beta, (alpha - two_thirds * beta) * fade])
+        mean = c1 * np.exp(-k * tau) + c2 * np.exp(k * tau) - alpha * fade
+        slant = p * (c1 * np.exp(-k * tau) - c2 * np.exp(k * tau)) - beta * fade
+        return float(max(mean + two_thirds * slant, 0.0) / fade)
+
+    def _delta_scaled(self) -> tuple[float, float, float]:
+        """Optical depth, single-scattering albedo and asymmetry without the forward peak g**2."""
+        peak = self.asymmetry**2
+        remainder = 1.0 - self.single_scattering_albedo * peak
+        albedo = self.single_scattering_albedo * (1.0 - peak) / remainder
+        return self.optical_depth * remainder, albedo, self.asymmetry / (1.0 + self.asymmetry)
 
 
 class SitePhotometry(Parameters):
-    """Parameters of the Lunar-Lambert law with an opposition surge, as `marsyard.sim.render.Photometry` takes them."""
+    """Parameters of the Lunar-Lambert law with an opposition surge, see `marsyard.sim.render.Photometry`."""
 
     lunar_share: Annotated[float, Field(ge=0.0, le=1.0, description="L: 0 Lambert, 1 Lommel-Seeliger")] = 0.55
     surge_amplitude: Annotated[float, Field(ge=0.0, le=3.0, description="B0")] = 0.7
@@ -28,24 +98,13 @@ class SitePhotometry(Parameters):
 
 
 class SiteTexture(Parameters):
-    """Albedo finer than the terrain's posts: octaves of noise, as `marsyard.sim.render.Texture` takes them.
+    """Albedo finer than the terrain's posts: octaves of noise in the natural logarithm of albedo.
 
-    Amplitudes are of the natural logarithm of albedo, the coarsest octave first; each octave is half as large as the
-    one before.
+    The coarsest octave comes first; the cells of each octave are half as large as those of the one before.
     """
 
-    coarsest_m: Annotated[float, Field(gt=0.0, description="size of the coarsest octave's cells, m")]
+    coarsest_m: Annotated[Positive, Field(description="size of the coarsest octave's cells, m")]
     amplitudes: Annotated[tuple[float, ...], Field(description="amplitude of each octave")]
-
-
-def texture(coarsest_m: float, finest_m: float, amplitude: float, decay: float = 1.0) -> SiteTexture:
-    """Octaves from one size to another, each `decay` times as strong as the one before."""
-    octaves: list[float] = []
-    size = coarsest_m
-    while size >= finest_m:
-        octaves.append(round(amplitude * decay ** len(octaves), 5))
-        size /= 2.0
-    return SiteTexture(coarsest_m=coarsest_m, amplitudes=tuple(octaves))
 
 
 class Site(Parameters):
@@ -65,25 +124,22 @@ class Site(Parameters):
     ground: TerrainParameters | None = None
 
     def terrain(self, scale: str | None = None, changes: Mapping[str, Any] | None = None) -> TerrainParameters:
-        """The terrain at a scale, 'descent' or 'ground', with some parameters set anew; by default the coarsest scale.
+        """Return the terrain at a scale, 'descent' or 'ground', with some parameters changed; default: the coarsest.
 
-        `changes` are those of `TerrainParameters.changed`: fewer samples for a large bank, a `source` of real terrain
-        in the site's surround. Raises ValueError where the site has no terrain at that scale, or a change is wrong.
+        `changes` are those of `TerrainParameters.changed`: fewer samples for a large bank, a `source` of real terrain.
+        Raises ValueError where the site has no terrain at that scale, or a change is invalid.
         """
         if scale not in (None, "descent", "ground"):
             raise ValueError(f"'{scale}' is no scale of terrain; allowed: descent, ground")
-        wanted = (self.descent or self.ground) if scale is None else getattr(self, scale)
-        if not isinstance(wanted, TerrainParameters):
+        terrain = (self.descent or self.ground) if scale is None else getattr(self, scale)
+        if not isinstance(terrain, TerrainParameters):
             raise ValueError(f"site {self.name} has no terrain at the scale '{scale}'")
-        return wanted.changed(changes) if changes else wanted
+        return terrain.changed(changes) if changes else terrain
 
 
 @dataclass(frozen=True)
 class PaperFigures:
-    """What the field test paper says of a site; ranges as (least, most). None where it says nothing.
-
-    Slopes hold for baselines of 30 m and 90 m.
-    """
+    """Published figures of a site: ranges from lowest to highest; slopes hold for baselines of 30 m and 90 m."""
 
     albedo: tuple[float, float]
     mean_slope_deg: tuple[float, float]
@@ -91,29 +147,46 @@ class PaperFigures:
     contrast: str
 
 
-_FIELD_SLOPE, _MARS_SLOPE, _MARS_ALBEDO = (2.0, 3.0), (1.0, 2.0), (0.1, 0.3)
-
-#: Section III.A of the field test paper. MER landing sites are given together.
+_MER_SITE = PaperFigures((0.1, 0.3), (1.0, 2.0), None, "MOC: a lower limit, seen through dust")
+#: DIMES field test paper, section III.A; it gives the MER landing sites together.
 PAPER: dict[str, PaperFigures] = {
-    "pisgah": PaperFigures((0.1, 0.1), _FIELD_SLOPE, None, "very little; like synthesised images of most MER sites"),
-    "kelso": PaperFigures((0.5, 0.5), _FIELD_SLOPE, (200.0, float("inf")), "repetitive"),
-    "ivanpah": PaperFigures((0.4, 0.4), _FIELD_SLOPE, None, "bland; the smoothest of the field sites"),
-    "gusev": PaperFigures(_MARS_ALBEDO, _MARS_SLOPE, None, "MOC: a lower limit, seen through dust"),
-    "meridiani": PaperFigures(_MARS_ALBEDO, _MARS_SLOPE, None, "MOC: a lower limit, seen through dust"),
+    "pisgah": PaperFigures((0.1, 0.1), (2.0, 3.0), None, "very little; like synthesised images of most MER sites"),
+    "kelso": PaperFigures((0.5, 0.5), (2.0, 3.0), (200.0, float("inf")), "repetitive"),
+    "ivanpah": PaperFigures((0.4, 0.4), (2.0, 3.0), None, "bland; the smoothest of the field sites"),
+    "gusev": _MER_SITE,
+    "meridiani": _MER_SITE,
 }
+
+
+def _texture(coarsest_m: float, amplitude: float, decay: float) -> SiteTexture:
+    """Octaves down to a millimetre, each `decay` times as strong as the one before."""
+    octaves = int(np.log2(coarsest_m / 0.001)) + 1
+    return SiteTexture(coarsest_m=coarsest_m, amplitudes=tuple(round(amplitude * decay**n, 5) for n in range(octaves)))
 
 
 @cache
 def sites() -> dict[str, Site]:
-    """All presets by name."""
-    from marsyard.sim.terrain.presets import PRESETS
+    """Return all sites of ``sites.toml`` by name."""
+    tables = tomllib.loads(Path(__file__).with_name("sites.toml").read_text("utf-8"))
+    found = {}
+    for name, entry in tables["sites"].items():
+        entry["environment"] = _with_base(tables["environments"][entry["environment"]], tables["environments"])
+        for scale in {"descent", "ground"} & set(entry):
+            entry[scale] = _with_base(entry[scale], tables["grounds"])
+        for texture, coarsest_m in (("ground_texture", 3.0), ("rock_texture", 0.2)):
+            entry[texture] = _texture(coarsest_m, **entry[texture])
+        found[name] = Site(name=name, **entry)
+    return found
 
-    return {site.name: site for site in PRESETS}
+
+def _with_base(entry: dict[str, Any], bases: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Fill in the values of the entry's base."""
+    own = {key: value for key, value in entry.items() if key != "base"}
+    return {**_with_base(bases[entry["base"]], bases), **own} if "base" in entry else own
 
 
 def site(name: str) -> Site:
-    """The preset of this name. Raises ValueError, naming those there are."""
-    known = sites()
-    if name not in known:
-        raise ValueError(f"no site is called '{name}'; allowed: {', '.join(known)}")
-    return known[name]
+    """Return the site of this name. Raises ValueError, naming the existing ones."""
+    if name not in sites():
+        raise ValueError(f"no site is called '{name}'; allowed: {', '.join(sites())}")
+    return sites()[name]

@@ -1,12 +1,8 @@
 """The ground as a smooth, periodic surface with albedo.
 
 A terrain is *defined* as the uniform cubic B-spline whose control values are the stored samples: twice continuously
-differentiable, evaluated exactly and cheaply with its gradient, and reproduced independently by
-``scipy.ndimage.map_coordinates(samples, order=3, mode="grid-wrap", prefilter=False)``. It repeats in x and y with
-period ``period_m``, so the ground has no edge.
-
-Coarser levels of the same ground, for views in which a pixel covers many samples, form a pyramid: level l has samples
-every ``spacing_m * 2**l`` metres, sample (0, 0) at the same place on every level.
+differentiable, evaluated exactly with its gradient, and reproduced independently by
+``scipy.ndimage.map_coordinates(samples, order=3, mode="grid-wrap", prefilter=False)``. It repeats in x and y.
 """
 
 from __future__ import annotations
@@ -17,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Float32
 
-from marsyard.sim.terrain.kernels import ceiling_of, evaluate_field, reduce_level
+from marsyard.sim.terrain.kernels import block_ceilings, evaluate_field, reduce_level
 
 #: Channels of the stored samples.
 HEIGHT, ALBEDO = 0, 1
@@ -29,15 +25,11 @@ SMALLEST_LEVEL = 16
 
 @dataclass(frozen=True)
 class Surface:
-    """A periodic terrain surface.
+    """A periodic terrain surface with a pyramid of levels, coarser ones for pixels that cover many samples.
 
-    Attributes
-    ----------
-    levels
-        Control values of height (metres, channel 0) and albedo (channel 1), one array per level of the pyramid, shape
-        (rows, columns, 2), read-only. Row i lies at y = i * spacing, column j at x = j * spacing: y grows with the row.
-    spacing_m
-        Distance between samples at level 0, metres.
+    - levels: read-only control values of height (metres) and albedo. Level l has samples every ``spacing_m * 2**l``
+      metres: row i lies at y = i * spacing, column j at x = j * spacing
+    - spacing_m: distance between samples at level 0
     """
 
     levels: tuple[Float32[np.ndarray, "rows columns 2"], ...]
@@ -45,7 +37,7 @@ class Surface:
 
     @classmethod
     def from_samples(cls, samples: Float32[np.ndarray, "rows columns 2"], spacing_m: float) -> Surface:
-        """The surface of these level-0 control values; both sides must be the same power of two, at least 16."""
+        """Build the pyramid over level 0, a square whose side is a power of two of at least 16; else ValueError."""
         side = samples.shape[0]
         if samples.shape[1] != side or side < SMALLEST_LEVEL or side & (side - 1):
             raise ValueError(
@@ -60,24 +52,24 @@ class Surface:
 
     @property
     def period_m(self) -> float:
-        """The distance after which the terrain repeats, metres."""
+        """Distance after which the terrain repeats."""
         return float(self.levels[0].shape[0] * self.spacing_m)
 
     @cached_property
     def ceilings(self) -> tuple[Float32[np.ndarray, "_ _"], ...]:
         """Upper bounds of each level's height, metres, over blocks of `CEILING_BLOCK` samples along each side."""
-        return tuple(ceiling_of(level) for level in self.levels)
+        return tuple(block_ceilings(level) for level in self.levels)
 
     def height(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch"]:
-        """Height above the datum, metres, at world positions x, y (metres)."""
+        """Height above the datum, metres, at world positions."""
         return self._evaluate(x, y, level)[..., 0]
 
     def gradient(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch 2"]:
-        """Slope (dz/dx, dz/dy) at world positions x, y (metres)."""
+        """Slope (dz/dx, dz/dy) at world positions."""
         return self._evaluate(x, y, level)[..., 1:3]
 
     def albedo(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch"]:
-        """Albedo at world positions x, y (metres)."""
+        """Albedo at world positions."""
         return self._evaluate(x, y, level)[..., 3]
 
     def _evaluate(self, x: Coordinate, y: Coordinate, level: int) -> Float[np.ndarray, "*batch 4"]:

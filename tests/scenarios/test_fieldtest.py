@@ -207,7 +207,7 @@ def test_shadows_of_clouds_move_steadily_from_picture_to_picture() -> None:
     places = []
     for time_s in np.arange(1000.0, 1120.0, 3.0).tolist():
         sun = sun_at(run, time_s)
-        _, height, east, north, _ = run.clouds.numbers(sun, time_s)
+        _, height, east, north, _ = run.clouds.coefficients(sun, time_s)
         up = (height - ground[0, 0, 2]) / sun.direction[2]
         # where in the layer the ground's point sees the sun
         places.append([up * sun.direction[0] - east, up * sun.direction[1] - north])

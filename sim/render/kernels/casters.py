@@ -1,9 +1,9 @@
-"""What hides the sun from a place: triangles, listed by where they lie across the sun's rays.
+"""Occlusion of the sun by triangles, listed by their position across the sun's rays.
 
-All rays to the sun run the same way: seen along it, each is a point, and where it meets a triangle's plane, and with
-which weights of the corners, is linear in the point. The triangles of a body are listed in the cells of a grid over the
-body's outline as the sun sees it, and bodies in the cells of one grid over them all. A ray is then held against the few
-triangles of one cell of each body in whose outline it lies.
+All rays to the sun are parallel: seen along it, each is a point (u, v), and its distance s to a triangle's plane and
+the weights of the corners there are linear in u and v. The triangles of a body are listed in the cells of a grid over
+the body's outline as the sun sees it, and bodies in the cells of one grid over them all. A ray is then tested against
+the few triangles of one cell of each body in whose outline it lies.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from marsyard.sim.render.kernels.strips import numbers, times
 from marsyard.sim.render.kernels.structs import Flags, Longs
 from marsyard.sim.terrain.kernels import Array
 
-#: Cells of a grid: least u and v, cells a metre along u and v; columns, rows; the first item of each cell, and one more
-#: at the end; the items.
+#: Cells of a grid: least u and v, cells per metre along u and v; cells along a side; the first item of each cell, and
+#: the end of the last; the items.
 Grid = tuple[Array, Longs, Longs, Longs]
-#: The same for every body: rows of outlines (least u and v, cells a metre along both, greatest s) and of columns, rows
-#: and first cell; first item of each cell; triangles in cells; greatest s of each of these.
+#: The same for every body: rows of outlines (least u and v, cells per metre along both, greatest s) and of side and
+#: first cell; first item of each cell; triangles in cells; greatest s of each of these.
 BodyGrids = tuple[Array, Longs, Longs, Longs, Array]
-#: What of each triangle is linear in u and v, as constant, slope along u and slope along v: the weights of its second
-#: and third corner, and s of its plane; unit vectors u and v across the sun's direction, and s along it; grids.
+#: Linear functions of each triangle (constant, slope along u, slope along v): the weights of its second and third
+#: corner, and s of its plane; unit vectors u and v across the sun's direction, and s along it; grids.
 Casters = tuple[Array, Array, Grid, BodyGrids]
-#: Triangles to a cell of a body's grid, if none reached over more than one, and most cells along a side of a grid.
-TO_A_CELL, MOST_CELLS = 4, 1024
+#: Triangles per cell of a body's grid, if each lay in one cell, and the largest number of cells along a side.
+PER_CELL, MAX_CELLS = 4, 1024
 #: Slack of all bounds, metres: more than rounding.
 SLACK_M = 1e-6
 
@@ -37,8 +37,8 @@ EDGE_ON = 1e-18
 
 
 @njit(cache=True)
-def _as_the_sun_sees(triangles: Array, axes: Array) -> tuple[Array, Array]:
-    """Least u and v, greatest u, v and s of each triangle; and what of it is linear in u and v (`Casters`)."""
+def _project_along_sun(triangles: Array, axes: Array) -> tuple[Array, Array]:
+    """Bounds of each triangle (least u and v, greatest u, v and s), and its linear coefficients (`Casters`)."""
     bounds = np.empty((triangles.shape[0], 5))
     linear = np.empty((triangles.shape[0], 9))
     at = np.empty((3, 3))
@@ -68,8 +68,8 @@ def _as_the_sun_sees(triangles: Array, axes: Array) -> tuple[Array, Array]:
 
 
 @njit(cache=True)
-def _joint(bounds: Array, first: int, end: int) -> tuple[float, float, float, float, float]:
-    """Bounds of some rows of bounds."""
+def _joint_bounds(bounds: Array, first: int, end: int) -> tuple[float, float, float, float, float]:
+    """Joint bounds of some rows of bounds."""
     u0, v0, u1, v1, s1 = math.inf, math.inf, -math.inf, -math.inf, -math.inf
     for n in range(first, end):
         u0 = min(u0, bounds[n, 0])
@@ -82,13 +82,13 @@ def _joint(bounds: Array, first: int, end: int) -> tuple[float, float, float, fl
 
 @njit(cache=True)
 def _side(items: float) -> int:
-    """Cells along a side for so many items to be one to a cell."""
-    return min(max(math.ceil(math.sqrt(items)), 1), MOST_CELLS)
+    """Cells along a side for about one of so many items to a cell."""
+    return min(max(math.ceil(math.sqrt(items)), 1), MAX_CELLS)
 
 
 @njit(cache=True, inline="always")
 def _cell(value: float, low: float, per_metre: float, count: int) -> int:
-    """The cell of a coordinate; those at the borders hold what rounding carries over."""
+    """The cell of a coordinate; those at the borders include values beyond by rounding."""
     return min(max(int((value - low) * per_metre), 0), count - 1)
 
 
@@ -96,8 +96,8 @@ def _cell(value: float, low: float, per_metre: float, count: int) -> int:
 def _enter(bounds: Array, n: int, outline: Array, side: int, first: int, ends: Longs, items: Longs) -> None:
     """Enter a row of bounds in the list of each cell that it touches, of a grid over an outline.
 
-    `first` is the grid's first cell; `ends` are where cells' lists end so far, moved on. Where there is no room for
-    items, they are only counted.
+    `first` is the grid's first cell; `ends` are the current ends of cells' lists, updated. Without space for items,
+    they are only counted.
     """
     for i in range(
         _cell(bounds[n, 1], outline[1], outline[3], side), _cell(bounds[n, 3], outline[1], outline[3], side) + 1
@@ -117,14 +117,14 @@ def _list_in_cells(
 ) -> tuple[Longs, Longs]:
     """List rows of bounds in the cells of grids: rows from `first_row[g]` to the next belong to grid g.
 
-    Returns where the list of each cell begins and where the last one ends, and the items.
+    Returns the start of each cell's list and the end of the last, and the items.
     """
     grids = sides.size
     cells = first_cells[-1] + sides[-1] ** 2 if grids > 0 else 0
     starts = np.zeros(cells + 1, dtype=np.int64)
     items = np.empty(0, dtype=np.int64)
     for filling in range(2):
-        # first counted, one cell ahead, then listed
+        # count, one cell ahead, then list
         ends = starts[:-1].copy() if filling else starts[1:]
         for grid in range(grids):
             for n in range(first_row[grid], first_row[grid + 1]):
@@ -138,23 +138,23 @@ def _list_in_cells(
 
 @njit(cache=True)
 def _outline(rect: Array, side: int) -> tuple[float, float, float, float, float]:
-    """Least u and v, cells a metre along both, and greatest s of a grid over some bounds."""
+    """Least u and v, cells per metre along both, and greatest s of a grid over some bounds."""
     return rect[0], rect[1], side / (rect[2] - rect[0]), side / (rect[3] - rect[1]), rect[4]
 
 
 @njit(cache=True)
 def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Casters:
-    """The lists for bodies, contiguous ranges of triangles, and a sun in the direction of the third axis."""
+    """List the triangles of bodies, contiguous ranges, for a sun in the direction of the third axis."""
     bodies = first_triangle.size - 1
-    bounds, linear = _as_the_sun_sees(triangles, axes)
+    bounds, linear = _project_along_sun(triangles, axes)
     rects = np.empty((bodies, 5))
     outlines = np.empty((bodies, 5))
     shapes = np.empty((bodies, 2), dtype=np.int64)
     cells = 0
     for body in range(bodies):
         first, end = first_triangle[body], first_triangle[body + 1]
-        side = _side((end - first) / TO_A_CELL)
-        rects[body] = _joint(bounds, first, end)
+        side = _side((end - first) / PER_CELL)
+        rects[body] = _joint_bounds(bounds, first, end)
         outlines[body] = _outline(rects[body], side)
         shapes[body, 0], shapes[body, 1] = side, cells
         cells += side * side
@@ -168,7 +168,7 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     whole[0] = (0.0, 0.0, 1.0, 1.0, 0.0)
     if bodies > 0:
         rects_of_all = np.empty((1, 5))
-        rects_of_all[0] = _joint(rects, 0, bodies)
+        rects_of_all[0] = _joint_bounds(rects, 0, bodies)
         whole[0] = _outline(rects_of_all[0], sides[0])
     first_items, bodies_listed = _list_in_cells(rects, np.array([0, bodies]), whole, sides, np.zeros(1, dtype=np.int64))
     grid: Grid = (whole[0, :4].copy(), sides, first_items, bodies_listed)
@@ -177,9 +177,9 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
 
 @njit(cache=True)
 def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) -> None:
-    """Whether a triangle stands between each of some places and the sun; `hidden` is the output.
+    """Test whether a triangle stands between positions and the sun; `hidden` is the output.
 
-    All places in one call: handing over so many arrays takes longer than most places do.
+    All positions in one call: passing so many arrays takes longer than most positions do.
     """
     linear, axes, (grid, sides, starts, items), (outlines, shapes, first_items, listed, tops) = casters
     to_axes = numbers(axes)

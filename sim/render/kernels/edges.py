@@ -1,4 +1,4 @@
-"""Compiled kernels of pixels that hold an edge: which they are, the rays in them, and what these meet."""
+"""Kernels of pixels at edges: their selection, the rays in them, and the hits of these."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from marsyard.sim.render.kernels.ground import cross_ground, way_in, way_out
-from marsyard.sim.render.kernels.hierarchy import Hierarchy, list_in_beam, nearest_hit
+from marsyard.sim.render.kernels.ground import cross_ground, entry_distance, exit_distance
+from marsyard.sim.render.kernels.hierarchy import Hierarchy, TriangleHit, list_in_beam, nearer_hit, nearest_hit
 from marsyard.sim.render.kernels.structs import (
     Array32,
     Flags,
@@ -23,24 +23,21 @@ from marsyard.sim.render.kernels.structs import (
     Rays,
     world_ray,
 )
-from marsyard.sim.render.kernels.triangles import TriangleHit, nearer_hit
 from marsyard.sim.terrain.kernels import Array
 
-#: Difference of brightness, as a share of the brighter, from which an edge between two things matters: four times
-#: the noise of a picture of SNR 100:1.
+#: Relative difference of brightness from which an edge between two objects matters: four times the noise at SNR 100:1.
 EDGE_CONTRAST = 0.04
-#: Difference of brightness from which there is an edge of light: a shadow's. Texture seldom makes as much.
+#: Relative difference of brightness from which there is an edge of a shadow; texture seldom reaches it.
 LIGHT_CONTRAST = 0.25
-#: Jump in inverse range, as a share of it, and as a multiple of the change beside it, from which something stands
-#: before something else.
+#: Jump in inverse range, relative, and as a multiple of the change next to it, from which one surface occludes another.
 JUMP, STEEPER = 0.02, 3.0
-#: Where the ground is sought, as shares of the range at which a pixel beside has met it.
+#: Limits of the search for the ground, relative to the range of a neighbouring pixel.
 AHEAD, BEYOND = 0.95, 1.05
-#: The same beside the sky, where range grows without bound from pixel to pixel.
+#: The same next to the sky, where range grows without bound from pixel to pixel.
 TO_HORIZON = 5.0
-#: Triangles that a pixel's beam may list; where there are more, every ray walks through the hierarchy by itself.
-MOST_LISTED = 96
-#: Half a pixel's diagonal, in pixels, and a little more, for pixels are not quite square.
+#: Largest number of triangles listed for a pixel's beam; with more, each ray traverses the hierarchy.
+MAX_LISTED = 96
+#: Half a pixel's diagonal, in pixels, and a margin, as pixels are not quite square.
 BEAM_PX = 0.8
 
 
@@ -52,45 +49,31 @@ def _jumps(before: float, here: float, there: float, after: float) -> bool:
     """
     if not abs(there - here) > JUMP * max(here, there):
         return False
-    q0 = 1.0 / before
-    q1 = 1.0 / here
-    q2 = 1.0 / there
-    q3 = 1.0 / after
+    q0, q1, q2, q3 = 1.0 / before, 1.0 / here, 1.0 / there, 1.0 / after
     step = abs(q2 - q1)
     return bool(step > STEEPER * max(abs(q1 - q0), abs(q3 - q2)))
 
 
 @njit(cache=True)
 def _differ(
-    line: Array32,
-    beside: Array32,
-    far: Array,
-    far_beside: Array,
-    body: Ints,
-    body_beside: Ints,
-    differs: Flags,
+    line: Array32, next_line: Array32, far: Array, next_far: Array, body: Ints, next_body: Ints, differs: Flags
 ) -> None:
-    """Whether pixels of a line differ enough for an edge from those beside them, in all that one needs; few do."""
-    for j in range(beside.size):
-        here, there = line[j], beside[j]
+    """Test a necessary condition of an edge between neighbouring pixels of two lines; few meet it."""
+    for j in range(next_line.size):
+        here, there = line[j], next_line[j]
         brighter = here if here > there else there
         change = abs(there - here)
-        farther = far[j] if far[j] > far_beside[j] else far_beside[j]
-        jumps = abs(far_beside[j] - far[j]) > JUMP * farther
-        other = (body[j] != body_beside[j]) | (change > np.float32(LIGHT_CONTRAST) * brighter) | jumps
+        farther = far[j] if far[j] > next_far[j] else next_far[j]
+        jumps = abs(next_far[j] - far[j]) > JUMP * farther
+        other = (body[j] != next_body[j]) | (change > np.float32(LIGHT_CONTRAST) * brighter) | jumps
         differs[j] = (change >= np.float32(EDGE_CONTRAST) * brighter) & other
 
 
 @njit(cache=True)
 def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: Flags) -> None:
-    """Marks the pixels to both sides of every visible edge: of a thing, of ground before ground, of a shadow.
+    """Mark the pixels on both sides of every visible edge of an object, of ground before ground, or of a shadow.
 
-    Parameters
-    ----------
-    radiance, distance, body
-        A picture and its truth, shape (rows, columns).
-    marked
-        Output of that shape, all False before.
+    `marked` is the output, all False before.
     """
     rows, columns = radiance.shape
     differs = np.empty(columns, dtype=np.bool_)
@@ -101,52 +84,28 @@ def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: Flags) ->
                 continue
             last = columns - 1 + side
             shift = 1 - side
-            _differ(
-                radiance[i],
-                radiance[i2, shift:],
-                distance[i],
-                distance[i2, shift:],
-                body[i],
-                body[i2, shift:],
-                differs,
-            )
+            far, next_far = distance[i], distance[i2, shift:]
+            _differ(radiance[i], radiance[i2, shift:], far, next_far, body[i], body[i2, shift:], differs)
             for j in range(last):
                 if not differs[j]:
                     continue
                 j2 = j + shift
-                here = radiance[i, j]
-                there = radiance[i2, j2]
+                here, there = radiance[i, j], radiance[i2, j2]
                 edge = body[i, j] != body[i2, j2] or abs(there - here) > LIGHT_CONTRAST * max(here, there)
                 if not edge:
-                    i0 = max(i - side, 0)
-                    j0 = max(j - 1 + side, 0)
-                    i3 = min(i2 + side, rows - 1)
-                    j3 = min(j2 + 1 - side, columns - 1)
+                    i0, j0 = max(i - side, 0), max(j - 1 + side, 0)
+                    i3, j3 = min(i2 + side, rows - 1), min(j2 + 1 - side, columns - 1)
                     edge = _jumps(distance[i0, j0], distance[i, j], distance[i2, j2], distance[i3, j3])
                 if edge:
-                    marked[i, j] = True
-                    marked[i2, j2] = True
+                    marked[i, j], marked[i2, j2] = True, True
 
 
 @njit(cache=True)
 def split_rays(rays: Array32, size: tuple[int, int], pixels: Longs, side: int, unit: bool, out: Array32) -> None:
-    """Vectors at side x side places within each of some pixels, from those at all pixels' middles.
+    """Interpolate vectors at side x side positions within each of some pixels, from those at all pixels' centres.
 
-    The places are a square grid turned so that no two share a row or a column: an edge along either is found to a
-    part in side**2.
-
-    Parameters
-    ----------
-    rays
-        A vector for each pixel, shape (rows * columns, 3).
-    size
-        Rows and columns of the picture.
-    pixels, side
-        Numbers of the pixels, and places along each side of one.
-    unit
-        Whether the vectors are made unit vectors.
-    out
-        Output, shape (pixels * side**2, 3).
+    The positions are a square grid rotated so that no two share a row or a column: an edge along either is resolved to
+    1 / side**2. `size` is rows and columns; `unit` normalises the vectors; `out` is the output.
     """
     rows, columns = size
     number = 0
@@ -178,23 +137,20 @@ def split_rays(rays: Array32, size: tuple[int, int], pixels: Longs, side: int, u
                 number += 1
 
 
-# Fused multiplications round differently, but the same way every time on the same processor: below, "contract".
+# "contract" allows fused multiplications: they round differently, but always the same way on one processor.
 
 
 @njit(cache=True, fastmath={"contract"})
 def _gather_neighbours(
     hits: Hits, pixel: int, columns: int, ranges: Array, levels: Longs
 ) -> tuple[int, bool, bool, float]:
-    """Places where a pixel and the eight around it meet the ground, in order of range, and the level of each.
+    """Ranges at which a pixel and the eight around it meet the ground, in increasing order, and the level of each.
 
-    Returns how many, whether one of the pixels sees the sky, whether one sees an object, and the greatest range.
+    Returns their number, whether one pixel sees the sky, whether one sees an object, and the greatest range.
     """
     row = pixel // columns
     column = pixel - row * columns
-    count = 0
-    sky = False
-    objects = False
-    farthest = 0.0
+    count, sky, objects, farthest = 0, False, False, 0.0
     for i in range(max(row - 1, 0), min(row + 2, hits.distance.size // columns)):
         for j in range(max(column - 1, 0), min(column + 2, columns)):
             n = i * columns + j
@@ -219,7 +175,7 @@ def _gather_neighbours(
 
 @njit(cache=True, fastmath={"contract"})
 def _middle_ray(pose: Pose, rays: Rays, first: int, last: int, origin: Array32, direction: Array32) -> Ray:
-    """The ray through a pixel's middle, which lies between its first ray and its last; room for it in body axes."""
+    """The ray through a pixel's centre, the mean of its first ray and its last; with buffers for it in body axes."""
     for axis in range(3):
         origin[0, axis] = 0.5 * (rays.origins[first, axis] + rays.origins[last, axis])
         direction[0, axis] = 0.5 * (rays.directions[first, axis] + rays.directions[last, axis])
@@ -233,27 +189,15 @@ def trace_subpixel_rays(
 ) -> None:
     """Trace the rays within some pixels, among what these pixels and the eight around each see.
 
-    Triangles are sought among those that a beam around the pixel may meet, and the ground where a pixel around has met
-    it, on the level on which it did, so that neighbouring pixels show one ground.
-
-    Parameters
-    ----------
-    ground, pose, tree
-        As for `trace_primary_rays`.
-    columns, pixels
-        Columns of the picture, and numbers of the pixels.
-    rays
-        As many of each pixel, one pixel after the other.
-    seen
-        What the picture's pixels meet.
-    hits
-        Output: what the rays meet.
+    Triangles are tested that a beam around the pixel may meet. The ground is searched near the ranges of the pixels
+    around, on their levels, so that neighbouring pixels show one ground. `rays` has equally many of each pixel in
+    order; `seen` holds the hits of all pixels, `hits` is the output.
     """
     fields, ceilings, _top_level, spacing, extent = ground
     share = rays.directions.shape[0] // max(pixels.size, 1)
     ranges = np.empty(9)
     levels = np.empty(9, dtype=np.int64)
-    listed = np.empty(MOST_LISTED, dtype=np.int64)
+    listed = np.empty(MAX_LISTED, dtype=np.int64)
     origin, direction = np.empty((1, 3), dtype=np.float32), np.empty((1, 3), dtype=np.float32)
     for k in range(pixels.size):
         pixel = pixels[k]
@@ -274,16 +218,16 @@ def trace_subpixel_rays(
             end = math.inf
             c = 0
             while c < count and t == math.inf:
-                # places met on one level are one stretch; it begins where the stretch before has ended
+                # ranges on one level form one interval; it begins where the one before has ended
                 level = levels[c]
-                start = max(min(AHEAD * ranges[c], end), way_in(extent, ray))
+                start = max(min(AHEAD * ranges[c], end), entry_distance(extent, ray))
                 # ground behind an object is hidden
                 if start >= hit.distance:
                     break
                 while c + 1 < count and levels[c + 1] == level:
                     c += 1
                 end = (TO_HORIZON if sky and c + 1 == count else BEYOND) * ranges[c]
-                end = min(end, way_out(extent, ray))
+                end = min(end, exit_distance(extent, ray))
                 m = max(level, 0)
                 ground_level = GroundLevel(fields[m], ceilings[m], 1.0 / spacing / (1 << m))
                 t = cross_ground(ground_level, ray, start, min(end, hit.distance))
@@ -297,7 +241,7 @@ def trace_subpixel_rays(
                     # grazes the ground without dipping below it
                     hit = TriangleHit(ranges[count - 1], -1, 0.0, 0.0)
                 else:
-                    # a sliver of ground that no pixel around sees
+                    # a sliver of ground that no neighbouring pixel sees
                     level = int(seen.level[pixel])
                     triangle: Any = np.int64(seen.triangle[pixel])
                     second, third = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Where a ray meets the ground."""
+"""Intersection of rays with the ground."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from numba import njit
 from marsyard.sim.render.kernels.structs import Extent, GroundLevel, Ray
 from marsyard.sim.terrain.kernels import CEILING_BLOCK, Level, sample
 
-#: Shortest step along a ray that looks for the ground, as a share of the distance: a quarter of what a navcam's pixel
-#: takes in at 10 deg, for crests hide what is behind them however little they stand out.
+#: Shortest step of the search along a ray, relative to the distance: a quarter of a navcam pixel's footprint at 10 deg,
+#: because even low crests hide the ground behind them.
 FINEST_STEP = 0.00125
-#: How often a crest between two places is looked for, ever closer to its top. Of 51,485 flat rays of a rover's pictures
-#: 4 then go through one; with one look, and by steps alone, 25 did (ADR 34).
-CREST_LOOKS = 4
-#: How often a crossing is looked for where values and slopes at both ends say, which nearly always finds it at once
-#: (1.1 looks, of 3.6 by false position); and in all, for after that it is false position, which never fails.
-CUBIC_LOOKS, MOST_LOOKS = 3, 40
-#: Slowest closing of a ray with the ground, metres a metre, at which Newton's method is trusted.
+#: Iterations of the search for a crest. Of 51,485 grazing rays of a rover's pictures 4 then pass through one; with one
+#: iteration, and by steps alone, 25 did (ADR 34).
+CREST_ITERATIONS = 4
+#: Iterations of the search for a crossing by the cubic (1.1 are needed on average, 3.6 by false position), and in all;
+#: the later ones are false position, which never fails.
+CUBIC_ITERATIONS, MAX_ITERATIONS = 3, 40
+#: Rate of clearance above which Newton's method is not used.
 CLOSING = -1e-3
 
 
 class Clearance(NamedTuple):
-    """How far a ray is above the ground at a distance along it, metres, and how fast that changes with the distance."""
+    """Height of a ray above the ground at a distance along it, metres, and its rate of change with the distance."""
 
     t: float
     height: float
@@ -41,10 +41,9 @@ def clearance_at(field: Level, per_metre: float, ray: Ray, t: float) -> Clearanc
 
 @njit(cache=True)
 def skip_empty_blocks(level: GroundLevel, ray: Ray, start: float, farthest: float) -> float:
-    """Distance at which a ray enters the first block of the ground that it may not be clear of, from `start` on.
+    """Distance from `start` on at which a ray enters the first block that it may not be clear of; else >= `farthest`.
 
-    At least `farthest` where it is clear of all on its way. The blocks are those of `Surface.ceilings`, traversed one
-    by one (Amanatides & Woo 1987).
+    The blocks are those of `Surface.ceilings`, traversed one by one (Amanatides & Woo 1987).
     """
     per_metre = level.per_metre / CEILING_BLOCK
     ceiling = level.ceiling
@@ -64,7 +63,7 @@ def skip_empty_blocks(level: GroundLevel, ray: Ray, start: float, farthest: floa
         if lowest <= ceiling[i & mask, j & mask]:
             break
         t = out
-        # selections in place of branches: which side a ray leaves a block by cannot be predicted
+        # selections instead of branches: the side by which a ray leaves a block cannot be predicted
         through_side = next_x < next_y
         j += right if through_side else 0
         i += 0 if through_side else up
@@ -75,14 +74,14 @@ def skip_empty_blocks(level: GroundLevel, ray: Ray, start: float, farthest: floa
 
 @njit(cache=True)
 def find_occluding_crest(level: GroundLevel, ray: Ray, near: Clearance, far: Clearance) -> Clearance:
-    """Bracket a crest between two places above the ground by tangent intersection.
+    """Bracket a crest between two positions above the ground by tangent intersection.
 
-    The ray approaches the ground at `near` and leaves it at `far`. A crest between stands no higher than where the
-    tangents of the clearance meet; while that is below the ground, the place is sampled and replaces that side.
-    Returns a place below the crest; its height is 0 where there is none.
+    The ray approaches the ground at `near` and leaves it at `far`. A crest between is no higher than the intersection
+    of the tangents of the clearance; while that is below the ground, the clearance there is sampled and replaces one
+    side. Returns a position below the crest; its height is 0 where there is none.
     """
     field, per_metre = level.field, level.per_metre
-    for _ in range(CREST_LOOKS):
+    for _ in range(CREST_ITERATIONS):
         step = (far.rate * (far.t - near.t) - far.height + near.height) / (far.rate - near.rate)
         if near.height + near.rate * step >= 0.0:
             break
@@ -97,10 +96,10 @@ def find_occluding_crest(level: GroundLevel, ray: Ray, near: Clearance, far: Cle
 
 
 @njit(cache=True, inline="always")
-def _down_through(above: float, rate_above: float, below: float, rate_below: float, guess: float) -> float:
-    """The share of the way from a value above 0 to one below it at which the cubic of these values and rates is 0.
+def _cubic_crossing(above: float, rate_above: float, below: float, rate_below: float, guess: float) -> float:
+    """Fraction of the way at which the cubic of a value above 0, one below it, and both rates crosses 0.
 
-    By three steps of Newton's method from a guess; the guess where they lead astray.
+    Three steps of Newton's method from a guess; the guess itself where they diverge.
     """
     second = 3.0 * (below - above) - 2.0 * rate_above - rate_below
     third = 2.0 * (above - below) + rate_above + rate_below
@@ -113,8 +112,8 @@ def _down_through(above: float, rate_above: float, below: float, rate_below: flo
 
 
 @njit(cache=True)
-def _close_in(level: GroundLevel, ray: Ray, above: Clearance, below: Clearance) -> float:
-    """Distance of the crossing between a place above the ground and one below it.
+def _bracketed_crossing(level: GroundLevel, ray: Ray, above: Clearance, below: Clearance) -> float:
+    """Distance of the crossing between a position above the ground and one below it.
 
     The root of the cubic of clearance and rate at both ends, then false position (Illinois), to a thousandth of a
     sample; a final step of Newton's method needs no further sample.
@@ -124,11 +123,11 @@ def _close_in(level: GroundLevel, ray: Ray, above: Clearance, below: Clearance) 
     before, above_height, above_rate = above.t, above.height, above.rate
     t, below_height, below_rate = below.t, below.height, below.rate
     middle = below
-    for look in range(MOST_LOOKS):
+    for iteration in range(MAX_ITERATIONS):
         share = above_height / (above_height - below_height)
         kept = 0.5
-        if look < CUBIC_LOOKS:
-            share = _down_through(
+        if iteration < CUBIC_ITERATIONS:
+            share = _cubic_crossing(
                 above_height, above_rate * (t - before), below_height, below_rate * (t - before), share
             )
             kept = 1.0
@@ -149,9 +148,9 @@ def _close_in(level: GroundLevel, ray: Ray, above: Clearance, below: Clearance) 
 def cross_ground(level: GroundLevel, ray: Ray, start: float, farthest: float) -> float:
     """Distance at which a ray first dips below the ground between two distances; infinite where it does not.
 
-    The ray is followed by steps of a sample, longer far away. Blocks of ground that it is clear of by their ceilings
-    are skipped, or, where no ceilings are known (a single one), longer steps are taken high above the ground. Where it
-    approaches the ground at the beginning of a step and leaves it at the end, a crest between is searched for.
+    Steps are a sample long, longer far away. Blocks whose ceilings the ray clears are skipped; without ceilings (a
+    single one) steps are longer high above the ground. Where the ray approaches the ground at the beginning of a step
+    and leaves it at the end, a crest between is searched for.
     """
     if start >= farthest:
         return math.inf
@@ -189,11 +188,11 @@ def cross_ground(level: GroundLevel, ray: Ray, start: float, farthest: float) ->
                 step = clear - t
                 skipped = True
         t = min(t + step, farthest)
-    return math.inf if here.t == before.t else _close_in(level, ray, before, here)
+    return math.inf if here.t == before.t else _bracketed_crossing(level, ray, before, here)
 
 
 @njit(cache=True, inline="always")
-def way_out(extent: Extent, ray: Ray) -> float:
+def exit_distance(extent: Extent, ray: Ray) -> float:
     """Distance along a ray to where it leaves the ground's extent, in which it begins."""
     along_x = ((extent[1] if ray.dx > 0.0 else extent[0]) - ray.x) / ray.dx if ray.dx != 0.0 else math.inf
     along_y = ((extent[3] if ray.dy > 0.0 else extent[2]) - ray.y) / ray.dy if ray.dy != 0.0 else math.inf
@@ -201,8 +200,8 @@ def way_out(extent: Extent, ray: Ray) -> float:
 
 
 @njit(cache=True, inline="always")
-def way_in(extent: Extent, ray: Ray) -> float:
-    """Distance along a ray from which it may meet the ground: where it comes below the highest ground."""
+def entry_distance(extent: Extent, ray: Ray) -> float:
+    """Distance along a ray to where it comes below the highest ground."""
     if ray.z <= extent[4]:
         return 0.0
     return (extent[4] - ray.z) / ray.dz if ray.dz < 0.0 else math.inf
@@ -210,13 +209,13 @@ def way_in(extent: Extent, ray: Ray) -> float:
 
 @njit(cache=True)
 def first_ground(level: GroundLevel, extent: Extent, ray: Ray, guess: float) -> float:
-    """Distance at which a flat ray first dips below the ground, from four fifths of the way to a guess to past it.
+    """Distance at which a grazing ray first dips below the ground, from four fifths of a guess to past it; else the
+    guess.
 
-    The mesh that gives the guess does not hold every crest. The guess itself where the ray does not dip within the
-    extent.
+    The mesh that gives the guess does not resolve every crest.
     """
-    start = max(0.8 * guess, way_in(extent, ray))
-    farthest = min(1.25 * guess + 4.0 / level.per_metre, way_out(extent, ray))
+    start = max(0.8 * guess, entry_distance(extent, ray))
+    farthest = min(1.25 * guess + 4.0 / level.per_metre, exit_distance(extent, ray))
     met = cross_ground(level, ray, start, farthest)
     return met if met < math.inf else guess
 
@@ -224,7 +223,7 @@ def first_ground(level: GroundLevel, extent: Extent, ray: Ray, guess: float) -> 
 @njit(cache=True)
 def height_range(field: Level) -> tuple[float, float]:
     """Lowest and highest control value of height: bounds of the surface."""
-    # row by row, heights and albedos alike: numbers side by side are compared by vector instructions
+    # heights and albedos alike: adjacent numbers are compared by vector instructions
     flat = field.reshape(field.shape[0], -1)
     low = np.full(flat.shape[1], np.inf, dtype=np.float32)
     high = np.full(flat.shape[1], -np.inf, dtype=np.float32)
@@ -237,27 +236,26 @@ def height_range(field: Level) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def greatest_rises(field: Level, most: float, along_x: float, along_y: float) -> tuple[float, float]:
-    """Greatest difference of height between control values side by side, along x and along y; infinite if in vain.
+def max_rises(field: Level, bound: float, along_x: float, along_y: float) -> tuple[float, float]:
+    """Maximum height step between adjacent control values, along x and y; infinite as soon as a bound is exceeded.
 
-    A spline's slope is a mean of such differences over the spacing, and so is a straight line's between any two places.
-    In vain is a sum beyond `most` of both, weighed by `along_x` and `along_y`: the rest of the ground is not looked at.
+    It bounds the spline's slope times the spacing, and that of any straight line between two points. The bound is on
+    the sum of both, weighted by `along_x` and `along_y`.
     """
     side = field.shape[0]
-    beside = np.zeros(side, dtype=np.float32)
-    before = np.zeros(side, dtype=np.float32)
-    rise_x = 0.0
-    rise_y = 0.0
+    step_x = np.zeros(side, dtype=np.float32)
+    step_y = np.zeros(side, dtype=np.float32)
+    rise_x, rise_y = 0.0, 0.0
     for i in range(side):
         here, above = field[i], field[i - 1]
-        beside[0] = max(beside[0], abs(here[0, 0] - here[side - 1, 0]))
+        step_x[0] = max(step_x[0], abs(here[0, 0] - here[side - 1, 0]))
         for j in range(1, side):
-            beside[j] = max(beside[j], abs(here[j, 0] - here[j - 1, 0]))
+            step_x[j] = max(step_x[j], abs(here[j, 0] - here[j - 1, 0]))
         for j in range(side):
-            before[j] = max(before[j], abs(here[j, 0] - above[j, 0]))
+            step_y[j] = max(step_y[j], abs(here[j, 0] - above[j, 0]))
         if i % 64 == 63 or i == side - 1:
-            rise_x = float(beside.max())
-            rise_y = float(before.max())
-            if rise_x * along_x + rise_y * along_y > most:
+            rise_x = float(step_x.max())
+            rise_y = float(step_y.max())
+            if rise_x * along_x + rise_y * along_y > bound:
                 return math.inf, math.inf
     return rise_x, rise_y

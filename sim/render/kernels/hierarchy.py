@@ -1,24 +1,104 @@
-"""A bounding volume hierarchy over triangles: what stands in the way of a ray.
+"""A bounding volume hierarchy over triangles, and the intersection of rays with it.
 
-Triangles are sorted along a Morton curve and taken in runs of `LEAF` as the leaves of a complete binary tree, whose
-boxes are built bottom-up: a million triangles in a fraction of a second, the same tree every time.
+Triangles are sorted along a Morton curve; runs of `LEAF` are the leaves of a complete binary tree, whose boxes are
+built bottom-up: a million triangles in a fraction of a second, the same tree every time.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from marsyard.sim.render.kernels.structs import Array32, Longs, Ray
-from marsyard.sim.render.kernels.triangles import TriangleHit, nearer_hit
 from marsyard.sim.terrain.kernels import Array
+
+
+class TriangleHit(NamedTuple):
+    """Distance along a ray, number of the triangle, -1 for none, and weights of its second and third corner there."""
+
+    distance: float
+    triangle: int
+    second: float
+    third: float
+
+
+@njit(cache=True, inline="always")
+def hit_triangle(triangles: Array, n: int, ray: Ray) -> tuple[float, float, float]:
+    """Intersect a ray with a triangle's plane: distance, and weights of the second and third corner there.
+
+    Moeller & Trumbore (1997). The distance is infinite where the ray is parallel to the plane.
+    """
+    ax, ay, az = triangles[n, 0, 0], triangles[n, 0, 1], triangles[n, 0, 2]
+    ux, uy, uz = triangles[n, 1, 0] - ax, triangles[n, 1, 1] - ay, triangles[n, 1, 2] - az
+    vx, vy, vz = triangles[n, 2, 0] - ax, triangles[n, 2, 1] - ay, triangles[n, 2, 2] - az
+    px, py, pz = ray.dy * vz - ray.dz * vy, ray.dz * vx - ray.dx * vz, ray.dx * vy - ray.dy * vx
+    determinant = ux * px + uy * py + uz * pz
+    if abs(determinant) < 1e-18:
+        return math.inf, 0.0, 0.0
+    inverse = 1.0 / determinant
+    sx, sy, sz = ray.x - ax, ray.y - ay, ray.z - az
+    second = (sx * px + sy * py + sz * pz) * inverse
+    qx, qy, qz = sy * uz - sz * uy, sz * ux - sx * uz, sx * uy - sy * ux
+    third = (ray.dx * qx + ray.dy * qy + ray.dz * qz) * inverse
+    return (vx * qx + vy * qy + vz * qz) * inverse, second, third
+
+
+@njit(cache=True, inline="always")
+def nearer_hit(best: TriangleHit, triangles: Array, n: int, ray: Ray, slack: float) -> TriangleHit:
+    """Return the hit of the n-th triangle if it is nearer than the best so far, else the best; `slack` widens its
+    edges.
+    """
+    t, second, third = hit_triangle(triangles, n, ray)
+    inside = second >= -slack and third >= -slack and second + third <= 1.0 + slack
+    return TriangleHit(t, n, second, third) if 0.0 < t < best.distance and inside else best
+
+
+@njit(cache=True)
+def body_spheres(triangles: Array, first: Longs) -> Array:
+    """Centre of each body's bounding box, and the distance of its farthest corner from there."""
+    bodies = first.size - 1
+    spheres = np.empty((bodies, 4))
+    for body in range(bodies):
+        for axis in range(3):
+            low = math.inf
+            high = -math.inf
+            for n in range(first[body], first[body + 1]):
+                for corner in range(3):
+                    low = min(low, triangles[n, corner, axis])
+                    high = max(high, triangles[n, corner, axis])
+            spheres[body, axis] = 0.5 * (low + high)
+        farthest = 0.0
+        for n in range(first[body], first[body + 1]):
+            for corner in range(3):
+                x = triangles[n, corner, 0] - spheres[body, 0]
+                y = triangles[n, corner, 1] - spheres[body, 1]
+                z = triangles[n, corner, 2] - spheres[body, 2]
+                farthest = max(farthest, x * x + y * y + z * z)
+        spheres[body, 3] = math.sqrt(farthest)
+    return spheres
+
+
+@njit(cache=True)
+def select_facing(triangles: Array, numbers: Longs, x: float, y: float, z: float) -> Longs:
+    """Select the triangles, by number, whose outer side faces a position."""
+    kept = np.empty(numbers.size, dtype=np.int64)
+    count = 0
+    for n in numbers:
+        ax, ay, az = triangles[n, 0, 0], triangles[n, 0, 1], triangles[n, 0, 2]
+        ux, uy, uz = triangles[n, 1, 0] - ax, triangles[n, 1, 1] - ay, triangles[n, 1, 2] - az
+        vx, vy, vz = triangles[n, 2, 0] - ax, triangles[n, 2, 1] - ay, triangles[n, 2, 2] - az
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        kept[count] = n
+        count += nx * (x - ax) + ny * (y - ay) + nz * (z - az) > 0.0
+    return kept[:count]
+
 
 #: Triangles, their order along the curve, and the boxes of the tree's nodes: node k has the children 2 k + 1, 2 k + 2.
 Hierarchy = tuple[Array, Longs, Array32]
-#: A side of a frustum: its outward normal, where it lies along that, and which numbers of a box make its innermost
-#: corner.
+#: A side of a frustum: outward normal, offset along it, and the indices of a box's innermost corner.
 Plane = tuple[float, float, float, float, int, int, int]
 #: Triangles of a leaf.
 LEAF = 4
@@ -26,7 +106,7 @@ LEAF = 4
 
 @njit(cache=True)
 def _spread(value: int) -> int:
-    """The bits of a number of 20 bits, three apart."""
+    """Spread the bits of a number of 20 bits three apart."""
     value &= 0xFFFFF
     value = (value | value << 32) & 0x1F00000000FFFF
     value = (value | value << 16) & 0x1F0000FF0000FF
@@ -37,7 +117,7 @@ def _spread(value: int) -> int:
 
 @njit(cache=True)
 def morton_codes(triangles: Array) -> Longs:
-    """Place of each triangle's middle along a Morton curve through the cube that holds them all."""
+    """Morton code of each triangle's centroid in the cube that contains them all."""
     count = triangles.shape[0]
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
@@ -59,7 +139,7 @@ def morton_codes(triangles: Array) -> Longs:
 
 @njit(cache=True)
 def node_boxes(triangles: Array, order: Longs) -> Array32:
-    """Array32 (low x, y, z, high x, y, z) of a complete tree over the triangles in this order."""
+    """Boxes (low x, y, z, high x, y, z) of a complete tree over the triangles in this order."""
     leaves = 1
     while leaves * LEAF < order.size:
         leaves *= 2
@@ -67,7 +147,7 @@ def node_boxes(triangles: Array, order: Longs) -> Array32:
     for leaf in range(leaves):
         node = leaves - 1 + leaf
         if leaf > 0 and leaf * LEAF >= order.size:
-            # holds nothing: a point of the leaf before, which makes no box above it larger
+            # an empty leaf is a point of the leaf before, which enlarges no box above it
             boxes[node, :3] = boxes[node - 1, :3]
             boxes[node, 3:] = boxes[node - 1, :3]
             continue
@@ -91,7 +171,7 @@ def node_boxes(triangles: Array, order: Longs) -> Array32:
 
 @njit(cache=True, inline="always")
 def _next_node(node: int) -> int:
-    """The node after this one and all below it, depth first; 0 after the last."""
+    """The next node outside this one's subtree, depth first; 0 after the last."""
     while node > 0 and node % 2 == 0:
         node = (node - 1) // 2
     return node + 1 if node > 0 else 0
@@ -116,7 +196,7 @@ def _inverse(component: float) -> float:
 
 @njit(cache=True)
 def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
-    """The nearest triangle that a ray meets; `farthest` and the number -1 where none is nearer than that."""
+    """Find the nearest triangle that a ray meets; `farthest` and the number -1 where none is nearer than that."""
     triangles, order, boxes = tree
     best = TriangleHit(farthest, -1, 0.0, 0.0)
     if order.size == 0:
@@ -139,14 +219,14 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
 
 @njit(cache=True, inline="always")
 def _box_outside(boxes: Array32, node: int, plane: Plane) -> bool:
-    """Whether a node's box lies wholly outside a side of a frustum."""
+    """Whether a node's box lies entirely outside a side of a frustum."""
     nx, ny, nz, offset, ix, iy, iz = plane
     return bool(nx * boxes[node, ix] + ny * boxes[node, iy] + nz * boxes[node, iz] > offset)
 
 
 @njit(cache=True, inline="always")
 def _triangle_outside(triangles: Array, n: int, plane: Plane) -> bool:
-    """Whether a triangle lies wholly outside a side of a frustum."""
+    """Whether a triangle lies entirely outside a side of a frustum."""
     nx, ny, nz, offset, _ix, _iy, _iz = plane
     outside = True
     for corner in range(3):
@@ -156,24 +236,14 @@ def _triangle_outside(triangles: Array, n: int, plane: Plane) -> bool:
 
 @njit(cache=True, inline="always")
 def _plane(ray: Ray, nx: float, ny: float, nz: float, beyond: float) -> Plane:
-    """The plane across a direction, so far beyond a ray's origin along it."""
-    return (
-        nx,
-        ny,
-        nz,
-        nx * ray.x + ny * ray.y + nz * ray.z + beyond,
-        0 if nx > 0.0 else 3,
-        1 if ny > 0.0 else 4,
-        2 if nz > 0.0 else 5,
-    )
+    """The plane normal to a vector, displaced by `beyond` from a ray's origin."""
+    offset = nx * ray.x + ny * ray.y + nz * ray.z + beyond
+    return nx, ny, nz, offset, 0 if nx > 0.0 else 3, 1 if ny > 0.0 else 4, 2 if nz > 0.0 else 5
 
 
 @njit(cache=True)
 def list_in_beam(tree: Hierarchy, ray: Ray, spread: float, farthest: float, listed: Longs) -> int:
-    """List the triangles that rays from a ray's origin may meet whose directions differ from its by up to `spread`.
-
-    Returns how many there are, -1 where they are more than `listed` holds.
-    """
+    """List the triangles within an angle `spread` of a ray; return their number, or -1 where `listed` is too small."""
     triangles, order, boxes = tree
     if order.size == 0:
         return 0

@@ -1,28 +1,187 @@
-"""Compiled photometry of a strip of pixels: cosines of light and view, what dims the sun, reflection, and the sky."""
+"""Kernels of reflectance, sky brightness and surface texture."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
-from marsyard.sim.render.kernels.sky import sky_brightness
 from marsyard.sim.render.kernels.strips import ROW, STRIP
 from marsyard.sim.render.kernels.structs import Array32, Ints, Light
 from marsyard.sim.render.kernels.sun import cloud_cover, disc_overlap
 from marsyard.sim.terrain.kernels import Array
 
+#: Sine of the elevation below which the sky's brightness is constant.
+HORIZON = 1e-3
+
+
+@njit(cache=True)
+def single_scattering(cos_zenith: float, cos_sun_zenith: float, cos_g: float, depth: float, asymmetry: float) -> float:
+    """Single-scattering brightness of a plane layer of air seen from below over the sun's there, up to a constant.
+
+    ``P(g) mu0 / (mu0 - mu) (1 - exp(tau / mu0 - tau / mu))`` with the Henyey-Greenstein phase function P.
+    """
+    mu = max(cos_zenith, HORIZON)
+    mu0 = max(cos_sun_zenith, HORIZON)
+    # exact also where both elevations are equal
+    apart = depth / mu - depth / mu0
+    path = 1.0 - 0.5 * apart if abs(apart) < 1e-6 else -math.expm1(-apart) / apart
+    phase = (1.0 - asymmetry * asymmetry) / (1.0 + asymmetry * asymmetry - 2.0 * asymmetry * cos_g) ** 1.5
+    brightness: float = phase * path * depth / mu
+    return brightness
+
+
+@njit(cache=True)
+def sky_brightness(sky: Array, sun_z: float, sun_radius: float, dz: float, cos_g: float, pixel: float) -> float:
+    """Radiance factor of the sky in a direction, with the sun's disc where a dusty sky is given.
+
+    - sky: even radiance factor, factor of single scattering (0 for an even sky), its optical depth, asymmetry
+    - sun_z, sun_radius: sine of the sun's elevation, and its angular radius
+    - dz, cos_g: sine of the direction's elevation, and cosine of its angle from the sun
+    - pixel: angle that the pixel subtends: the width of the disc's edge
+    """
+    brightness: float = sky[0]
+    if sky[1] <= 0.0:
+        return brightness
+    brightness += sky[1] * single_scattering(dz, sun_z, cos_g, sky[2], sky[3])
+    if cos_g > 0.9:
+        inside = (sun_radius - math.acos(min(cos_g, 1.0))) / pixel + 0.5
+        # the ramp across the edge adds pixel**2 / 12 to the squared radius, on average
+        brightness += min(max(inside, 0.0), 1.0) / (sun_radius * sun_radius + pixel * pixel / 12.0)
+    return brightness
+
+
+@njit(cache=True)
+def scattered_irradiance(sun_z: float, depth: float, asymmetry: float) -> float:
+    """Irradiance of level ground over pi under a sky of `single_scattering`: ``1 / pi int L mu dOmega``.
+
+    Midpoints of 256 equal steps in the squared sine of elevation, by which irradiance is weighted, and of 256 steps of
+    azimuth over one half, as the other is the same.
+    """
+    steps = 256
+    beside = math.sqrt(max(1.0 - sun_z * sun_z, 0.0))
+    total = 0.0
+    for i in range(steps):
+        mu = math.sqrt((i + 0.5) / steps)
+        level = math.sqrt(1.0 - mu * mu)
+        for k in range(steps):
+            cos_g = mu * sun_z + level * beside * math.cos(math.pi * (k + 0.5) / steps)
+            total += single_scattering(mu, sun_z, cos_g, depth, asymmetry)
+    return total / (steps * steps)
+
+
+#: Mean square of `gradient_noise` over space.
+NOISE_VARIANCE = 0.0732
+#: Optics and pixel blur a picture as a Gaussian of half a pixel: contrast is 0.29 at Nyquist's frequency, as for flown
+#: cameras. Noise whose cells are c footprints wide, of 0.53 waves a cell in the median, keeps
+#: ``exp(-2 (0.53 pi 0.5 / c)^2)`` of its amplitude; ``(1 - FADING / c^2)^2`` is that to 0.04 down to 1.25 footprints a
+#: cell, less below, where sampling would alias, and ends where it is 0.
+FADING = 9.0 / 16.0
+#: Cell size, in footprints, at which an octave vanishes.
+MIN_CELLS = 0.75
+
+
+@njit(cache=True)
+def _hash_point(i: int, j: int, k: int, seed: int) -> np.uint32:
+    """Hash a lattice point (the finaliser of MurmurHash3 over a linear combination of its coordinates)."""
+    h = np.uint32(i) * np.uint32(0x8DA6B343)
+    h ^= np.uint32(j) * np.uint32(0xD8163841)
+    h ^= np.uint32(k) * np.uint32(0xCB1AB31F)
+    h ^= np.uint32(seed) * np.uint32(0x9E3779B1)
+    h ^= h >> np.uint32(16)
+    h *= np.uint32(0x85EBCA6B)
+    h ^= h >> np.uint32(13)
+    h *= np.uint32(0xC2B2AE35)
+    h ^= h >> np.uint32(16)
+    return h
+
+
+@njit(cache=True)
+def _gradient_product(h: np.uint32, x: float, y: float, z: float) -> float:
+    """Scalar product of an offset and one of Perlin's twelve gradients, four of them twice, by the last bits of a hash.
+
+    Written without a table, and with selections instead of branches, for vector instructions.
+    """
+    kind = h & np.uint32(15)
+    first = x if kind < np.uint32(8) else y
+    second = y if kind < np.uint32(4) else (x if kind & np.uint32(13) == np.uint32(12) else z)
+    return (-first if kind & np.uint32(1) else first) + (-second if kind & np.uint32(2) else second)
+
+
+@njit(cache=True, inline="always")
+def gradient_noise(x: float, y: float, z: float, seed: int) -> float:
+    """Perlin's improved noise (2002): smooth, of mean zero, with waves of about one to two units."""
+    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
+    i, j, k = int(fx), int(fy), int(fz)
+    x, y, z = x - fx, y - fy, z - fz
+    u = x * x * x * (x * (x * 6.0 - 15.0) + 10.0)
+    v = y * y * y * (y * (y * 6.0 - 15.0) + 10.0)
+    w = z * z * z * (z * (z * 6.0 - 15.0) + 10.0)
+    near = (1.0 - v) * (
+        (1.0 - u) * _gradient_product(_hash_point(i, j, k, seed), x, y, z)
+        + u * _gradient_product(_hash_point(i + 1, j, k, seed), x - 1.0, y, z)
+    ) + v * (
+        (1.0 - u) * _gradient_product(_hash_point(i, j + 1, k, seed), x, y - 1.0, z)
+        + u * _gradient_product(_hash_point(i + 1, j + 1, k, seed), x - 1.0, y - 1.0, z)
+    )
+    far = (1.0 - v) * (
+        (1.0 - u) * _gradient_product(_hash_point(i, j, k + 1, seed), x, y, z - 1.0)
+        + u * _gradient_product(_hash_point(i + 1, j, k + 1, seed), x - 1.0, y, z - 1.0)
+    ) + v * (
+        (1.0 - u) * _gradient_product(_hash_point(i, j + 1, k + 1, seed), x, y - 1.0, z - 1.0)
+        + u * _gradient_product(_hash_point(i + 1, j + 1, k + 1, seed), x - 1.0, y - 1.0, z - 1.0)
+    )
+    noise: float = (1.0 - w) * near + w * far
+    return noise
+
+
+@njit(cache=True, error_model="numpy")
+def _add_octave(
+    x: Array, y: Array, z: Array, footprint: Array, cell: float, amplitude: float, octave: int, change: Array
+) -> None:
+    """Add one octave of `add_texture`."""
+    for k in range(x.size):
+        ratio = footprint[k] / cell
+        share = max(1.0 - FADING * ratio * ratio, 0.0)
+        seen = amplitude * (share * share)
+        noise = gradient_noise(x[k] / cell, y[k] / cell, z[k] / cell, octave)
+        change[k] += seen * noise - 0.5 * NOISE_VARIANCE * seen**2
+
+
+@njit(cache=True)
+def add_texture(
+    x: Array, y: Array, z: Array, footprint: Array, coarsest: float, amplitudes: Array, change: Array
+) -> None:
+    """Add the logarithm of the albedo's relative change at positions, averaged over pixels' footprints, to `change`.
+
+    Octave n has lattice cells of ``coarsest / 2**n``. It fades as optics and pixels blur it (`FADING`), as slowly as
+    detail appears when a real camera nears a surface; faster, trackers see the texture change from picture to picture.
+    Half of each octave's variance is subtracted, so that albedo keeps its mean for any visible octaves. A footprint is
+    infinite where no texture is wanted.
+    """
+    finest = math.inf
+    for k in range(footprint.size):
+        finest = min(finest, footprint[k])
+    cell = coarsest
+    for octave in range(amplitudes.size):
+        if cell <= MIN_CELLS * finest:
+            break
+        if amplitudes[octave] != 0.0:
+            _add_octave(x, y, z, footprint, cell, amplitudes[octave], octave, change)
+        cell *= 0.5
+
+
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
-#: Rows of what is kept of a strip of pixels: the place seen and the direction to it, its pixel's footprint (infinite
-#: where no ground is seen), the terrain there, the normal, how texture changes albedo, cosines of incidence, emission
-#: and phase, and the share of the sun that is seen.
+#: Rows of a strip's buffer: position and direction of the line of sight, footprint (infinite without ground), terrain
+#: there, normal, log change of albedo by texture, cosines of incidence, emission and phase, visible sun fraction.
 X, Y, Z, DX, DY, DZ, FOOTPRINT, HEIGHT, SLOPE_X, SLOPE_Y, ALBEDO, NX, NY, NZ, CHANGE, COS_I, COS_E, COS_G, LIT = (
     ROW * n for n in range(19)
 )
-#: Rows of the ground's level: its samples to the metre, the share of the next coarser level, and the terrain there.
+#: Rows of the ground's level: samples per metre, weight of the next coarser level, and the terrain there.
 SCALE, BLEND, COARSE_HEIGHT, COARSE_SLOPE_X, COARSE_SLOPE_Y, COARSE_ALBEDO = (ROW * n for n in range(19, 25))
-#: Rows of objects alone: places, footprints and changes.
+#: Rows of objects alone: positions, footprints and changes of albedo.
 OBJECT_X, OBJECT_Y, OBJECT_Z, OBJECT_FOOTPRINT, OBJECT_CHANGE = (ROW * n for n in range(25, 30))
 ROWS = 30
 
@@ -54,7 +213,7 @@ def reflect(law: tuple[float, float, float, float, float, float], width: int, wo
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def dim_sun(light: Light, distance: Array, work: Array) -> None:
-    """What a round body at the camera's place and clouds leave of the sun."""
+    """Dim the sun by the shadow of a round body at the camera, and by clouds."""
     sun, law, drift, cover = light.sun, light.law, light.drift, light.cover
     for k in range(distance.size):
         if work[COS_I + k] <= 0.0:

@@ -1,4 +1,4 @@
-"""Compiled kernel of the picture: what each pixel's ray meets."""
+"""Kernel that traces the ray of each pixel to the ground or to a triangle."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from marsyard.sim.render.kernels.ground import CLOSING, first_ground
-from marsyard.sim.render.kernels.hierarchy import Hierarchy, nearest_hit
+from marsyard.sim.render.kernels.hierarchy import Hierarchy, TriangleHit, nearer_hit, nearest_hit
 from marsyard.sim.render.kernels.strips import (
     ROW,
     STRIP,
@@ -33,31 +33,30 @@ from marsyard.sim.render.kernels.structs import (
     Rays,
     Views,
 )
-from marsyard.sim.render.kernels.triangles import TriangleHit, nearer_hit
 from marsyard.sim.terrain.kernels import Array, Level
 
-#: Sine of the flattest angle at which a pixel's footprint on the ground is still drawn out in full.
+#: Smallest sine of the angle between ray and ground by which a footprint is elongated.
 FLATTEST = 0.01
-#: Samples of the terrain up to which a footprint is met by the terrain itself, not by a smoothed level of it.
+#: Footprint, in samples, up to which a ray is traced to the finest level of the terrain.
 FINE_UNTIL = 8.0
-#: Sine of the angle below which a ray may pass over crests that the mesh does not hold.
+#: Sine of the angle below which a ray may meet crests that the mesh does not resolve.
 GRAZING = 0.4
-#: Most steps of Newton's method, and the share of the first guess that they may change it by.
+#: Largest number of Newton steps, and the fraction by which they may change the first guess.
 STEPS, FARTHEST = 8, 0.05
-#: Slack of a triangle's edge, as a share: so that no ray slips between two triangles.
+#: Relative tolerance at a triangle's edges, so that no ray passes between two triangles.
 SLACK = 1e-9
-#: Rows of what is kept of a strip of rays: origins and directions in world axes; where in a view's picture they point
-#: (first counted in samples, then as shares between four of them), and how far forward; the depths of these four.
+#: Rows of a strip's buffer: origins and directions in world axes; positions in a view's picture (first in samples, then
+#: as fractions between four of them), and the component along its axis; the depths of these four.
 X0, Y0, Z0, DX, DY, DZ, U, V, FORWARD, UPPER_LEFT, UPPER_RIGHT, LOWER_LEFT, LOWER_RIGHT = (ROW * n for n in range(13))
-#: The first guess of each ray's distance, and the pixel's footprint along the line of sight there; then, while the
-#: ground is sought, the distance, where the search began, places, samples to the metre, and whether it goes on.
+#: The first guess of distance, and the pixel's footprint along the line of sight there; then, during the search for the
+#: ground, distance, initial distance, positions, samples per metre, and whether the search continues.
 GUESS, STRETCHED, MET, START, X, Y, SCALE, GOING = (ROW * n for n in range(13, 21))
 ROWS = 21
 
 
 class _Strip(NamedTuple):
-    """What is kept of a strip of rays: the rows above; the upper left of the four samples around each ray's place in
-    its view, and their triangles' numbers combined; the level on which it meets the ground; which rays are refined.
+    """Buffers of a strip of rays: rows of `work`, the upper left of the four samples around each ray in its view, their
+    triangle numbers combined by OR, the level on which it meets the ground, and the rays to refine.
     """
 
     work: Array
@@ -70,7 +69,7 @@ class _Strip(NamedTuple):
 
 @njit(cache=True, inline="always")
 def _nearest_depth(depth: Array32, ids: Ints, shown: int, face: int, i: int, j: int, fu: float, fv: float) -> float:
-    """Depth of the nearest sample of ground among the four around a place between samples; 0 where there is none.
+    """Depth of the nearest ground sample among the four around a position between samples; 0 where there is none.
 
     `shown` is 0 where none of them shows a triangle.
     """
@@ -81,17 +80,16 @@ def _nearest_depth(depth: Array32, ids: Ints, shown: int, face: int, i: int, j: 
             value = depth[face, i + di, j + dj]
             far = abs(fv - di) + abs(fu - dj)
             if value > 0.0 and far < least and (shown == 0 or ids[face, i + di, j + dj] == 0):
-                least = far
-                nearest = value
+                least, nearest = far, value
     return nearest
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _meet_object(ids: Ints, face: int, i: int, j: int, tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
-    """The nearest triangle that a ray meets among those that the four samples around it show.
+def _hit_object(ids: Ints, face: int, i: int, j: int, tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
+    """Intersect a ray with the triangles that the four samples around it show; return the nearest hit.
 
-    Where the samples show triangles and the ray meets none of them, it passes by an outline, or triangles are smaller
-    than samples: then the hierarchy is searched for one nearer than `farthest`.
+    Where samples show triangles and the ray meets none of them, it passes an outline, or triangles are smaller than
+    samples: then the hierarchy is searched for one nearer than `farthest`.
     """
     best = TriangleHit(math.inf, -1, 0.0, 0.0)
     last = 0
@@ -108,18 +106,18 @@ def _meet_object(ids: Ints, face: int, i: int, j: int, tree: Hierarchy, ray: Ray
 
 @njit(cache=True, inline="always")
 def _ray(work: Array, k: int) -> Ray:
-    """A strip's k-th ray."""
+    """Return a strip's k-th ray."""
     return Ray(work[X0 + k], work[Y0 + k], work[Z0 + k], work[DX + k], work[DY + k], work[DZ + k])
 
 
-# Fused multiplications round differently, but the same way every time on the same processor: below, "contract".
+# "contract" allows fused multiplications: they round differently, but always the same way on one processor.
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _aim(
+def _rotate_rays(
     rotation: Matrix, centre: tuple[float, float, float], origins: Array32, directions: Array32, width: int, work: Array
 ) -> None:
-    """Rays of a strip in world axes."""
+    """Rotate the rays of a strip to world axes."""
     for k in range(min(width, STRIP)):
         work[DX + k], work[DY + k], work[DZ + k] = times(
             rotation, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2]
@@ -134,7 +132,7 @@ def _aim(
 def _project(
     view: Matrix, focal: float, middle: float, directions: Array32, u: Array, v: Array, forward: Array
 ) -> None:
-    """Where rays meet a view's picture, and how far they go forward."""
+    """Project rays into a view's picture; `forward` is their component along its axis."""
     for k in range(min(u.size, STRIP)):
         x, y, z = times(view, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2])
         u[k] = focal * x / z + middle
@@ -143,8 +141,8 @@ def _project(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _guess(pixel_angles: Array32, width: int, work: Array) -> None:
-    """First guesses from four samples of one stretch of ground each, and footprints there; 0 where it is not one.
+def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None:
+    """First guesses of distance from four samples of continuous ground, and footprints there; 0 where it is not.
 
     Inverse depth, linear over a plane's picture, is interpolated.
     """
@@ -162,16 +160,16 @@ def _guess(pixel_angles: Array32, width: int, work: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _reach_out(width: int, work: Array) -> None:
-    """Where rays are at their distances."""
+def _update_positions(width: int, work: Array) -> None:
+    """Positions of rays at their distances."""
     for k in range(min(width, STRIP)):
         work[X + k] = work[X0 + k] + work[MET + k] * work[DX + k]
         work[Y + k] = work[Y0 + k] + work[MET + k] * work[DY + k]
 
 
 @njit(cache=True, error_model="numpy")
-def _step(near: Near, width: int, work: Array) -> None:
-    """One step of Newton's method for the rays that are followed; `GOING` marks those that continue, 1 or 0."""
+def _take_newton_step(near: Near, width: int, work: Array) -> None:
+    """Newton step of the followed rays; `GOING` is 1 for those that continue, else 0."""
     for k in range(min(width, STRIP)):
         height, slope_x, slope_y, _albedo = spline(near[0], near[1], k)
         t, start, scale, dz = work[MET + k], work[START + k], work[SCALE + k], work[DZ + k]
@@ -179,8 +177,7 @@ def _step(near: Near, width: int, work: Array) -> None:
         closing = dz - slope_x * scale * work[DX + k] - slope_y * scale * work[DY + k]
         step = miss / closing
         failed = closing > CLOSING or abs(t - step - start) > FARTHEST * start
-        # A step that short leaves, by the surface's greatest curvature of about one over its spacing, less than
-        # 1e-6 of the distance.
+        # after so short a step the error is below 1e-6 of the distance, as curvature is at most about 1 / spacing
         far = step * step >= 2e-6 * start / scale
         going = work[GOING + k] > 0.0
         work[MET + k] = (start if failed else t - step) if going else t
@@ -188,7 +185,7 @@ def _step(near: Near, width: int, work: Array) -> None:
 
 
 @njit(cache=True)
-def _meet_ground(
+def _refine_on_ground(
     levels: tuple[Level, ...],
     inverse_spacing: float,
     level_of: Longs,
@@ -198,22 +195,11 @@ def _meet_ground(
     work: Array,
     near: Near,
 ) -> None:
-    """Brings some rays of a strip from a first guess onto the ground by Newton's method; it stays where that fails.
+    """Bring rays of a strip from their first guess, `MET`, onto the ground by Newton's method; where it fails they
+    stay.
 
-    All rays take a step before any takes the next, so that the processor works on several at once.
-
-    Parameters
-    ----------
-    levels, inverse_spacing
-        The surface's pyramid, and samples of its level 0 to the metre.
-    level_of
-        The level on which each ray meets the ground.
-    going, count
-        Numbers of the rays that are followed, and how many; overwritten.
-    width, work
-        The strip, first guesses in `MET`; changed to where rays meet the ground.
-    near
-        Room for control values.
+    All rays take a step before any takes the next, so that the processor works on several at once. `going` holds the
+    numbers of the `count` followed rays; it is overwritten. `near` is a buffer for control values.
     """
     for k in range(width):
         work[START + k] = work[MET + k]
@@ -224,9 +210,9 @@ def _meet_ground(
     for _ in range(STEPS):
         if count == 0:
             break
-        _reach_out(width, work)
+        _update_positions(width, work)
         fetch_levels(levels, inverse_spacing, level_of, going, count, work[X : X + ROW], work[Y : Y + ROW], near)
-        _step(near, width, work)
+        _take_newton_step(near, width, work)
         left = 0
         for m in range(count):
             k = going[m]
@@ -237,14 +223,14 @@ def _meet_ground(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _sample_views(views: Views, directions: Array32, first: int, width: int, strip: _Strip) -> None:
-    """Where the rays of a strip meet their views, and what the four samples around there hold."""
+    """Project the rays of a strip into their views, and read the four samples around each."""
     depth, ids, view_of_pixel = views.depth, views.numbers, views.view_of_pixel
     work, row, column, shown = strip.work, strip.row, strip.column, strip.shown
     side = depth.shape[1]
     objects = ids.shape[1] > 0
     start = 0
     while start < width:
-        # pixels of one view stand in a row
+        # pixels of one view are contiguous
         face = view_of_pixel[first + start]
         end = start + 1
         while end < width and view_of_pixel[first + end] == face:
@@ -264,14 +250,10 @@ def _sample_views(views: Views, directions: Array32, first: int, width: int, str
         u, v = work[U + k], work[V + k]
         i = min(max(math.floor(v), 0), side - 2)
         j = min(max(math.floor(u), 0), side - 2)
-        row[k] = i
-        column[k] = j
-        work[U + k] = u - j
-        work[V + k] = v - i
-        work[UPPER_LEFT + k] = depth[face, i, j]
-        work[UPPER_RIGHT + k] = depth[face, i, j + 1]
-        work[LOWER_LEFT + k] = depth[face, i + 1, j]
-        work[LOWER_RIGHT + k] = depth[face, i + 1, j + 1]
+        row[k], column[k] = i, j
+        work[U + k], work[V + k] = u - j, v - i
+        work[UPPER_LEFT + k], work[UPPER_RIGHT + k] = depth[face, i, j], depth[face, i, j + 1]
+        work[LOWER_LEFT + k], work[LOWER_RIGHT + k] = depth[face, i + 1, j], depth[face, i + 1, j + 1]
         if objects:
             shown[k] = ids[face, i, j] | ids[face, i, j + 1] | ids[face, i + 1, j] | ids[face, i + 1, j + 1]
 
@@ -280,7 +262,7 @@ def _sample_views(views: Views, directions: Array32, first: int, width: int, str
 def _select_levels(
     spacing: float, top_level: int, views: Views, pixel_angles: Array32, first: int, width: int, strip: _Strip
 ) -> bool:
-    """Distance at which each ray of a strip meets the mesh, and the level of the ground there; whether any is flat."""
+    """Distance at which each ray of a strip meets the mesh, and the ground's level there; whether any is grazing."""
     depth, ids, view_of_pixel = views.depth, views.numbers, views.view_of_pixel
     work, row, column, shown, level_of = strip.work, strip.row, strip.column, strip.shown, strip.level
     flat = False
@@ -295,7 +277,7 @@ def _select_levels(
             work[GUESS + k] = -1.0
             work[MET + k] = math.inf
             continue
-        # Far away and at a flat angle a pixel covers many samples along its line of sight: it sees them smoothed.
+        # far away and at a flat angle a pixel covers many samples along its line of sight: a coarser level
         if work[STRETCHED + k] > FINE_UNTIL * spacing:
             level_of[k] = min(int(math.log2(work[STRETCHED + k] / (FINE_UNTIL * spacing))) + 1, top_level)
         work[MET + k] = work[GUESS + k]
@@ -304,8 +286,8 @@ def _select_levels(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _trace_flat_rays(ground: Ground, width: int, strip: _Strip) -> None:
-    """Bring the flat rays of a strip to the first place where they dip below the ground."""
+def _trace_grazing_rays(ground: Ground, width: int, strip: _Strip) -> None:
+    """Trace the grazing rays of a strip to the first position where they dip below the ground."""
     levels, ceilings, _top_level, spacing, extent = ground
     work, level_of = strip.work, strip.level
     for k in range(width):
@@ -317,7 +299,7 @@ def _trace_flat_rays(ground: Ground, width: int, strip: _Strip) -> None:
 
 @njit(cache=True)
 def _select_refined(width: int, strip: _Strip) -> int:
-    """Select the rays to be refined: where a flat ray dips below the ground, it is there already."""
+    """Select the rays for Newton's method: a grazing ray that dips below the ground is already there."""
     work, refined = strip.work, strip.refined
     count = 0
     for k in range(width):
@@ -327,8 +309,8 @@ def _select_refined(width: int, strip: _Strip) -> int:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _keep_hits(views: Views, tree: Hierarchy, first: int, width: int, strip: _Strip, hits: Hits) -> None:
-    """Write what the rays of a strip meet: the ground, or a triangle before it."""
+def _write_hits(views: Views, tree: Hierarchy, first: int, width: int, strip: _Strip, hits: Hits) -> None:
+    """Write the hits of a strip's rays: the ground, or a triangle before it."""
     ids, view_of_pixel = views.numbers, views.view_of_pixel
     work, row, column, shown, level_of, _refined = strip
     distance, triangle, weights, level = hits
@@ -340,29 +322,15 @@ def _keep_hits(views: Views, tree: Hierarchy, first: int, width: int, strip: _St
         distance[n] = t
         triangle[n] = -1
         if shown[k] != 0:
-            hit = _meet_object(ids, view_of_pixel[n], row[k], column[k], tree, _ray(work, k), t)
+            hit = _hit_object(ids, view_of_pixel[n], row[k], column[k], tree, _ray(work, k), t)
             if hit.triangle >= 0 and hit.distance < t:
-                distance[n] = hit.distance
-                triangle[n] = hit.triangle
-                weights[n, 0] = hit.second
-                weights[n, 1] = hit.third
+                distance[n], triangle[n] = hit.distance, hit.triangle
+                weights[n, 0], weights[n, 1] = hit.second, hit.third
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tree: Hierarchy, hits: Hits) -> None:
-    """Trace every pixel's ray to what it meets.
-
-    Parameters
-    ----------
-    ground, views
-        The ground, and first guesses.
-    pose, rays
-        The camera, and each pixel's ray.
-    tree
-        Triangles that stand on the ground, and their hierarchy.
-    hits
-        Output.
-    """
+    """Trace the ray of every pixel from first guesses in `views` to the ground or a triangle; `hits` is the output."""
     rotation = numbers(pose.rotation)
     centre = (pose.position[0], pose.position[1], pose.position[2])
     origins, directions = rays.origins.reshape(-1), rays.directions.reshape(-1)
@@ -381,11 +349,11 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
         width = min(STRIP, count - first)
         here = slice(3 * first, 3 * (first + width))
         angles = rays.pixel_angles[first : first + width]
-        _aim(rotation, centre, origins[here], directions[here], width, strip.work)
+        _rotate_rays(rotation, centre, origins[here], directions[here], width, strip.work)
         _sample_views(views, directions[here], first, width, strip)
-        _guess(angles, width, strip.work)
+        _interpolate_guesses(angles, width, strip.work)
         if _select_levels(spacing, ground.top_level, views, angles, first, width, strip):
-            _trace_flat_rays(ground, width, strip)
+            _trace_grazing_rays(ground, width, strip)
         refined = _select_refined(width, strip)
-        _meet_ground(levels, 1.0 / spacing, strip.level, strip.refined, refined, width, strip.work, near)
-        _keep_hits(views, tree, first, width, strip, hits)
+        _refine_on_ground(levels, 1.0 / spacing, strip.level, strip.refined, refined, width, strip.work, near)
+        _write_hits(views, tree, first, width, strip, hits)

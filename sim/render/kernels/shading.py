@@ -1,4 +1,4 @@
-"""Compiled kernel of the picture: how bright what each pixel sees is."""
+"""Kernel that computes the radiance of each pixel."""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ from marsyard.sim.render.kernels.photometry import (
     X,
     Y,
     Z,
+    add_texture,
     dim_sun,
     draw_sky,
     photometric_angles,
@@ -71,15 +72,14 @@ from marsyard.sim.render.kernels.sun import (
     shadow_clearance,
     visible_sun_fraction,
 )
-from marsyard.sim.render.kernels.texture import add_texture
 from marsyard.sim.terrain.kernels import Array, Level, sample
 
-#: Footprint, in samples, up to which the finest level is taken: the B-spline itself holds nothing finer than this.
+#: Footprint, in samples, up to which the finest level is used: the B-spline itself holds nothing finer.
 SHARP_UNTIL = 1.2
 
 
 class Occluders(NamedTuple):
-    """What hides the sun: the ground by its shadow, triangles by their lists, and where the latter may matter."""
+    """Occluders of the sun: the ground's shadow, lists of triangles, and the region these may shade."""
 
     shadow: GroundShadow
     casters: Casters
@@ -87,8 +87,8 @@ class Occluders(NamedTuple):
 
 
 class _Strip(NamedTuple):
-    """What is kept of a strip of pixels: the rows above; the level of the ground that each sees; numbers of the pixels
-    that see the ground, of those whose levels are blended, and of others; which places are hidden from the sun.
+    """Buffers of a strip: rows of `work`, the ground's level of each pixel, numbers of the pixels on the
+    ground, of those with blended levels, and of others, and which positions are hidden from the sun.
     """
 
     work: Array
@@ -101,7 +101,7 @@ class _Strip(NamedTuple):
 
 @njit(cache=True, inline="always")
 def _in_footprint(footprint: Footprint, x: float, y: float) -> bool:
-    """Whether an object may hide the sun from the ground at this place."""
+    """Whether an object may hide the sun from the ground at a position."""
     if footprint.per_metre == 0.0:
         return True
     cells = footprint.cells
@@ -110,11 +110,11 @@ def _in_footprint(footprint: Footprint, x: float, y: float) -> bool:
     return bool(0 <= row < cells.shape[0] and 0 <= column < cells.shape[1] and cells[row, column])
 
 
-# Fused multiplications round differently, but the same way every time on the same processor: below, "contract".
+# "contract" allows fused multiplications: they round differently, but always the same way on one processor.
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _place(
+def _locate_pixels(
     rotation: Matrix,
     centre: tuple[float, float, float],
     origins: Array32,
@@ -124,7 +124,7 @@ def _place(
     width: int,
     work: Array,
 ) -> None:
-    """Places that the pixels of a strip see, and footprints as on the ground; its sky is taken to be at the camera."""
+    """Positions of the pixels of a strip, and footprints as on the ground; the sky is placed at the camera."""
     for k in range(min(width, STRIP)):
         dx, dy, dz = times(rotation, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2])
         x, y, z = times(rotation, origins[3 * k], origins[3 * k + 1], origins[3 * k + 2])
@@ -132,24 +132,22 @@ def _place(
         work[X + k] = centre[0] + x + t * dx
         work[Y + k] = centre[1] + y + t * dy
         work[Z + k] = centre[2] + z + t * dz
-        work[DX + k] = dx
-        work[DY + k] = dy
-        work[DZ + k] = dz
+        work[DX + k], work[DY + k], work[DZ + k] = dx, dy, dz
         work[FOOTPRINT + k] = t * pixel_angles[k] / math.sqrt(max(-dz, FLATTEST))
         work[CHANGE + k] = 0.0
         work[LIT + k] = 1.0
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _ground(near: Near, width: int, out: Array) -> None:
-    """Height, slopes and albedo of the terrain at the places of a strip, a row of `out` each; slopes by sample."""
+def _evaluate_splines(near: Near, width: int, out: Array) -> None:
+    """Height, slopes by sample and albedo of the terrain at the positions of a strip, a row of `out` each."""
     for k in range(min(width, STRIP)):
         out[k], out[ROW + k], out[2 * ROW + k], out[3 * ROW + k] = spline(near[0], near[1], k)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _blend(width: int, work: Array) -> None:
-    """Mixes the terrain of the next coarser level into that of the finer, by shares."""
+def _blend_levels(width: int, work: Array) -> None:
+    """Blend the terrain of the next coarser level into that of the finer."""
     for k in range(min(width, STRIP)):
         blend, scale = work[BLEND + k], work[SCALE + k]
         slope_x, slope_y, albedo = work[SLOPE_X + k] * scale, work[SLOPE_Y + k] * scale, work[ALBEDO + k]
@@ -163,57 +161,49 @@ def _blend(width: int, work: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _face(width: int, work: Array) -> None:
-    """Normals of the ground, from its slopes."""
+def _compute_normals(width: int, work: Array) -> None:
+    """Normals of the ground from its slopes."""
     for k in range(min(width, STRIP)):
         slope_x, slope_y = work[SLOPE_X + k], work[SLOPE_Y + k]
         nz = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
-        work[NX + k] = -slope_x * nz
-        work[NY + k] = -slope_y * nz
-        work[NZ + k] = nz
+        work[NX + k], work[NY + k], work[NZ + k] = -slope_x * nz, -slope_y * nz, nz
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _interpolate_normal(normals: Array, triangle: int, second: float, third: float, k: int, work: Array) -> None:
-    """Normal of a triangle at a place with these weights of its second and third corner."""
+    """Interpolate a triangle's normal by the weights of its second and third corner."""
     rest = 1.0 - second - third
     nx = rest * normals[triangle, 0, 0] + second * normals[triangle, 1, 0] + third * normals[triangle, 2, 0]
     ny = rest * normals[triangle, 0, 1] + second * normals[triangle, 1, 1] + third * normals[triangle, 2, 1]
     nz = rest * normals[triangle, 0, 2] + second * normals[triangle, 1, 2] + third * normals[triangle, 2, 2]
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
-    work[NX + k] = nx / length
-    work[NY + k] = ny / length
-    work[NZ + k] = nz / length
+    work[NX + k], work[NY + k], work[NZ + k] = nx / length, ny / length, nz / length
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _object_footprint(across: float, k: int, work: Array) -> float:
-    """Footprint on an object of a pixel that is so wide across its line of sight."""
+    """Footprint on an object of a pixel of width `across` across its line of sight."""
     facing = -(work[DX + k] * work[NX + k] + work[DY + k] * work[NY + k] + work[DZ + k] * work[NZ + k])
     footprint: float = across / math.sqrt(max(facing, 0.05))
     return footprint
 
 
 @njit(cache=True)
-def _keep_normals(width: int, work: Array, normal: Array32) -> None:
-    """Writes the normals of a strip, three numbers each."""
+def _write_normals(width: int, work: Array, normal: Array32) -> None:
+    """Write the normals of a strip."""
     for k in range(min(width, STRIP)):
-        normal[3 * k] = work[NX + k]
-        normal[3 * k + 1] = work[NY + k]
-        normal[3 * k + 2] = work[NZ + k]
+        normal[3 * k], normal[3 * k + 1], normal[3 * k + 2] = work[NX + k], work[NY + k], work[NZ + k]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _select_levels(spacing: float, top_level: int, hits: Hits, strip: _Strip) -> tuple[int, int, int]:
-    """Select the level of the ground for each pixel: as far apart as its footprint, blended between the two nearest.
+    """Select the ground's level for each pixel by its footprint, blended between the two nearest.
 
     Returns how many pixels see the ground, how many of them blend levels, and how many do not see the ground.
     """
     work, level_of, of_ground, blended, other, _hidden = strip
     distance, triangle, level = hits.distance, hits.triangle, hits.level
-    n_ground = 0
-    n_blended = 0
-    n_other = 0
+    n_ground, n_blended, n_other = 0, 0, 0
     for k in range(distance.size):
         work[BLEND + k] = 0.0
         if distance[k] == math.inf or triangle[k] >= 0:
@@ -240,28 +230,28 @@ def _select_levels(spacing: float, top_level: int, hits: Hits, strip: _Strip) ->
 def _sample_ground(
     levels: tuple[Level, ...], per_metre: float, n_ground: int, n_blended: int, width: int, strip: _Strip, near: Near
 ) -> None:
-    """Slopes, albedo and normals of the ground that the pixels of a strip see."""
+    """Slopes, albedo and normals of the ground in the pixels of a strip."""
     work = strip.work
     if n_ground > 0:
         x, y = work[X : X + ROW], work[Y : Y + ROW]
         fetch_levels(levels, per_metre, strip.level, strip.ground, n_ground, x, y, near)
-        _ground(near, width, work[HEIGHT : HEIGHT + 4 * ROW])
+        _evaluate_splines(near, width, work[HEIGHT : HEIGHT + 4 * ROW])
         if n_blended > 0:
             for m in range(n_blended):
                 strip.level[strip.blended[m]] += 1
             fetch_levels(levels, per_metre, strip.level, strip.blended, n_blended, x, y, near)
-            _ground(near, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
-        _blend(width, work)
-    _face(width, work)
+            _evaluate_splines(near, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
+        _blend_levels(width, work)
+    _compute_normals(width, work)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _sample_objects(
     materials: Materials, hits: Hits, pixel_angles: Array32, n_other: int, strip: _Strip, body: Ints
 ) -> int:
-    """Normals, albedo and footprints where pixels of a strip see objects; the sky has none.
+    """Normals, albedo and footprints of the objects in the pixels of a strip; marks the sky.
 
-    Returns how many see objects; their numbers become the first of `strip.other`.
+    Returns how many pixels see objects; their numbers become the first of `strip.other`.
     """
     work, other = strip.work, strip.other
     distance, triangles, weights = hits.distance, hits.triangle, hits.weights
@@ -273,16 +263,12 @@ def _sample_objects(
         triangle = triangles[k]
         if distance[k] == math.inf:
             body[k] = SKY
-            work[NX + k] = 0.0
-            work[NY + k] = 0.0
-            work[NZ + k] = 0.0
+            work[NX + k], work[NY + k], work[NZ + k] = 0.0, 0.0, 0.0
             continue
         _interpolate_normal(normals, triangle, weights[k, 0], weights[k, 1], k, work)
         body[k] = body_of_triangle[triangle]
         work[ALBEDO + k] = albedo[body[k]]
-        work[OBJECT_X + seen] = work[X + k]
-        work[OBJECT_Y + seen] = work[Y + k]
-        work[OBJECT_Z + seen] = work[Z + k]
+        work[OBJECT_X + seen], work[OBJECT_Y + seen], work[OBJECT_Z + seen] = work[X + k], work[Y + k], work[Z + k]
         work[OBJECT_FOOTPRINT + seen] = _object_footprint(distance[k] * pixel_angles[k], k, work)
         work[OBJECT_CHANGE + seen] = 0.0
         other[seen] = k
@@ -320,7 +306,7 @@ def _cast_shadows(
     body: Ints,
     strip: _Strip,
 ) -> None:
-    """Fraction of the sun that each pixel's place sees past the ground and past objects.
+    """Fraction of the sun that each pixel's position sees past the ground and objects.
 
     `terrain` is the level on which the ground's shadow was swept.
     """
@@ -331,7 +317,7 @@ def _cast_shadows(
     shadowed = shadow.height.shape[0] > 1
     objects = casters[0].shape[0] > 0
     unsure = UNSURE * shadow.spacing
-    asked = 0
+    queried = 0
     for k in range(distance.size):
         if work[COS_I + k] <= 0.0 or body[k] == SKY:
             continue
@@ -341,7 +327,7 @@ def _cast_shadows(
         lit = 1.0
         if shadowed:
             if not on_object and not met:
-                # the terrain itself, where the pixel saw it smoothed: its own bumps must not shade a smooth ground
+                # where the pixel sees a smoothed level, the finest level's bumps must not shade it
                 height, _slope_x, _slope_y, _albedo = sample(terrain, 1.0 / shadow.spacing, x, y)
                 z = max(z, height)
                 work[Z + k] = z
@@ -356,21 +342,21 @@ def _cast_shadows(
                 lit = visible_sun_fraction(finest.field, finest.per_metre, shadow, (x, y, z), sun, radius)
         work[LIT + k] = lit
         if lit > 0.0 and objects and (on_object or _in_footprint(footprint, x, y)):
-            # lifted off its own facet, so that this and its neighbours do not shade it by rounding
+            # lifted off its own facet, so that it and its neighbours do not shade it by rounding
             lift = 1e-4 + (0.05 * distance[k] * pixel_angles[k] if on_object else 0.0)
-            work[OBJECT_X + asked] = x + lift * work[NX + k]
-            work[OBJECT_Y + asked] = y + lift * work[NY + k]
-            work[OBJECT_Z + asked] = z + lift * work[NZ + k]
-            other[asked] = k
-            asked += 1
-    if asked > 0:
+            work[OBJECT_X + queried] = x + lift * work[NX + k]
+            work[OBJECT_Y + queried] = y + lift * work[NY + k]
+            work[OBJECT_Z + queried] = z + lift * work[NZ + k]
+            other[queried] = k
+            queried += 1
+    if queried > 0:
         xs, ys, zs = (
-            work[OBJECT_X : OBJECT_X + asked],
-            work[OBJECT_Y : OBJECT_Y + asked],
-            work[OBJECT_Z : OBJECT_Z + asked],
+            work[OBJECT_X : OBJECT_X + queried],
+            work[OBJECT_Y : OBJECT_Y + queried],
+            work[OBJECT_Z : OBJECT_Z + queried],
         )
         sun_hidden(casters, xs, ys, zs, hidden)
-        for m in range(asked):
+        for m in range(queried):
             work[LIT + other[m]] *= 0.0 if hidden[m] else 1.0
 
 
@@ -385,19 +371,7 @@ def shade(
     materials: Materials,
     picture: Picture,
 ) -> None:
-    """Compute radiance factor and truth of every pixel: geometry, texture, illumination, then photometry.
-
-    Parameters
-    ----------
-    ground
-        The ground.
-    pose, rays, hits
-        The camera, each pixel's ray, and what it meets.
-    light, occluders, materials
-        The light, what hides the sun, and how surfaces look.
-    picture
-        Output.
-    """
+    """Compute radiance factor, body and normal of every pixel: geometry, texture, illumination, then photometry."""
     towards = (light.sun[0], light.sun[1], light.sun[2])
     rotation = numbers(pose.rotation)
     centre = (pose.position[0], pose.position[1], pose.position[2])
@@ -427,7 +401,7 @@ def shade(
         )
         body[:] = GROUND
         here, there = 3 * first, 3 * last
-        _place(rotation, centre, origins[here:there], directions[here:there], angles, met.distance, width, work)
+        _locate_pixels(rotation, centre, origins[here:there], directions[here:there], angles, met.distance, width, work)
         n_ground, n_blended, n_other = _select_levels(spacing, ground.top_level, met, strip)
         _sample_ground(levels, 1.0 / spacing, n_ground, n_blended, width, strip, near)
         seen = _sample_objects(materials, met, angles, n_other, strip, body)
@@ -437,5 +411,5 @@ def shade(
         if law[6] > 0.0 or light.drift[4] > 0.0:
             dim_sun(light, met.distance, work)
         reflect(reflectance, width, work, radiance)
-        _keep_normals(width, work, normals[here:there])
+        _write_normals(width, work, normals[here:there])
         draw_sky(light, angles, body, work, radiance)

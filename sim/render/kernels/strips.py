@@ -1,8 +1,8 @@
-"""Rays side by side: what compiled kernels keep of some rays, so that the processor works on several at once.
+"""Rays in strips: buffers that let the processor work on several rays at once.
 
-The compiler makes vector instructions of a loop over rays if the loop does not branch, reads and writes rows of one
-buffer that lie a fixed way apart, and has a fixed bound: `for k in range(min(width, STRIP))`. What a ray needs from
-somewhere in memory is therefore brought into rows first, one ray at a time, and worked on after that.
+The compiler vectorises a loop over rays if the loop does not branch, reads and writes rows of one buffer at a fixed
+distance, and has a fixed bound: `for k in range(min(width, STRIP))`. Values from elsewhere in memory are therefore
+copied into rows first, one ray at a time.
 """
 
 from __future__ import annotations
@@ -15,39 +15,30 @@ from numba import njit
 from marsyard.sim.render.kernels.structs import Array32, Longs
 from marsyard.sim.terrain.kernels import Array, Level, bspline_weights
 
-#: Control values around the places of a strip, the places' shares of their cells, and room for numbers of places.
+#: Control values around the positions of a strip, their fractions of a cell, and a buffer for numbers of positions.
 Near = tuple[Array32, Array, Longs]
 #: Nine numbers of a matrix, row by row.
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 
-#: Rays worked on side by side: what is kept of them stays in the nearest cache.
+#: Rays of a strip: their buffers stay in the nearest cache.
 STRIP = 128
-#: Numbers from one row of a buffer to the next: a little more, so that rows do not meet in the same lines of the cache.
+#: Distance from one row of a buffer to the next: a little more, so that rows do not share lines of the cache.
 ROW = STRIP + 8
-#: Control values around a place: heights and albedos, four rows of four.
+#: Control values around the positions: heights and albedos, four rows of four.
 CELLS = 2 * 16 * ROW
 
 
 @njit(cache=True)
 def no_cells() -> Near:
-    """Room for the control values around the places of a strip."""
+    """Allocate buffers for the control values around the positions of a strip."""
     return np.empty(CELLS, dtype=np.float32), np.empty(2 * ROW), np.empty(STRIP, dtype=np.int64)
 
 
 @njit(cache=True, inline="always")
 def numbers(matrix: Array) -> Matrix:
     """The numbers of a 3 x 3 matrix, read once before a loop."""
-    return (
-        matrix[0, 0],
-        matrix[0, 1],
-        matrix[0, 2],
-        matrix[1, 0],
-        matrix[1, 1],
-        matrix[1, 2],
-        matrix[2, 0],
-        matrix[2, 1],
-        matrix[2, 2],
-    )
+    (a, b, c), (d, e, f) = (matrix[0, 0], matrix[0, 1], matrix[0, 2]), (matrix[1, 0], matrix[1, 1], matrix[1, 2])
+    return a, b, c, d, e, f, matrix[2, 0], matrix[2, 1], matrix[2, 2]
 
 
 @njit(cache=True, inline="always")
@@ -64,18 +55,10 @@ def times(m: Matrix, x: float, y: float, z: float) -> tuple[float, float, float]
 def fetch_cells(
     field: Level, scale: float, x: Array, y: Array, which: Longs, count: int, cells: Array32, shares: Array
 ) -> None:
-    """Brings the sixteen control values around some places of a level into rows, and the places' shares of their cells.
+    """Copy the sixteen control values around positions of a level into rows, and their fractions of a cell.
 
-    Parameters
-    ----------
-    field, scale
-        The level and its samples to the metre.
-    x, y
-        Places, metres.
-    which, count
-        Numbers of the places that are wanted, and how many.
-    cells, shares
-        Outputs of `CELLS` and 2 `ROW` numbers, each place's at its own number.
+    `which` holds the numbers of the `count` positions; `scale` is samples per metre. `cells` and `shares` are outputs
+    of `CELLS` and 2 `ROW` numbers, each position's at its own number.
     """
     side = field.shape[0]
     mask = side - 1
@@ -83,14 +66,10 @@ def fetch_cells(
     kept = cells.view(np.int64)
     for m in range(count):
         k = which[m]
-        gx = x[k] * scale
-        gy = y[k] * scale
-        fx = math.floor(gx)
-        fy = math.floor(gy)
-        shares[k] = gx - fx
-        shares[ROW + k] = gy - fy
-        j = int(fx)
-        i = int(fy)
+        gx, gy = x[k] * scale, y[k] * scale
+        fx, fy = math.floor(gx), math.floor(gy)
+        shares[k], shares[ROW + k] = gx - fx, gy - fy
+        j, i = int(fx), int(fy)
         j0, j1, j2, j3 = (j - 1) & mask, j & mask, (j + 1) & mask, (j + 2) & mask
         for row in range(4):
             line = ((i + row - 1) & mask) * side
@@ -112,19 +91,7 @@ def fetch_levels(
     y: Array,
     near: Near,
 ) -> None:
-    """As `fetch_cells`, each place on a level of its own.
-
-    Parameters
-    ----------
-    levels, inverse_spacing
-        The surface's pyramid, and samples of its level 0 to the metre.
-    level_of
-        Each place's level.
-    which, count, x, y
-        As for `fetch_cells`.
-    near
-        Outputs `cells` and `shares` of `fetch_cells`; the last is overwritten.
-    """
+    """As `fetch_cells`, each position on its own level; the last array of `near` is overwritten."""
     cells, shares, alike = near
     lowest, highest = len(levels) - 1, 0
     for m in range(count):
@@ -140,16 +107,13 @@ def fetch_levels(
 
 @njit(cache=True, inline="always")
 def spline(cells: Array32, shares: Array, k: int) -> tuple[float, float, float, float]:
-    """Height, slopes along x and y by sample, and albedo, from the control values around the k-th place.
+    """Height, slopes along x and y by sample, and albedo at the k-th position.
 
-    The numbers are those of `marsyard.sim.terrain.kernels.sample`, by the same sums in the same order.
+    The same sums in the same order as `marsyard.sim.terrain.kernels.sample`.
     """
     wx0, wx1, wx2, wx3, dx0, dx1, dx2, dx3 = bspline_weights(shares[k])
     wy0, wy1, wy2, wy3, dy0, dy1, dy2, dy3 = bspline_weights(shares[ROW + k])
-    height = 0.0
-    slope_x = 0.0
-    slope_y = 0.0
-    albedo = 0.0
+    height, slope_x, slope_y, albedo = 0.0, 0.0, 0.0, 0.0
     for first, weight, change in ((0, wy0, dy0), (8 * ROW, wy1, dy1), (16 * ROW, wy2, dy2), (24 * ROW, wy3, dy3)):
         h0, a0 = cells[first + 2 * k], cells[first + 2 * k + 1]
         h1, a1 = cells[first + 2 * ROW + 2 * k], cells[first + 2 * ROW + 2 * k + 1]

@@ -1,6 +1,6 @@
-"""What compiled kernels take and return: small structs of arrays, by what they hold.
+"""Structs of arrays that kernels take and return.
 
-A loop over pixels takes the arrays out of their structs before it begins, and gives inlined functions arrays alone:
+A loop over pixels takes the arrays out of their structs before it begins, and passes only arrays to inlined functions:
 each copy of a struct counts a reference to every array in it, which takes longer than a pixel does.
 """
 
@@ -19,16 +19,15 @@ Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int32]
 Longs = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-#: Least and greatest x, least and greatest y, metres.
+#: Bounds of x, then of y, metres.
 Bounds = tuple[float, float, float, float]
-#: Where the ground that is drawn ends: these, and greatest z.
+#: Bounds of the visible ground in x, then in y, and its greatest z.
 Extent = tuple[float, float, float, float, float]
 
 
 class Ground(NamedTuple):
-    """The surface's pyramid (`marsyard.sim.render.pyramid`): levels, their ceilings, number of the coarsest level.
-
-    `spacing` is that of level 0, metres; `extent` is where the ground ends.
+    """The surface's pyramid (`marsyard.sim.render.mesh.pyramid`): levels, ceilings, number of the coarsest level,
+    spacing of level 0, metres, and extent of the ground.
     """
 
     levels: tuple[Level, ...]
@@ -39,7 +38,7 @@ class Ground(NamedTuple):
 
 
 class GroundLevel(NamedTuple):
-    """One level of the ground: control values, upper bounds of its height by block, samples to the metre."""
+    """One level of the ground: control values, upper bounds of its height by block, samples per metre."""
 
     field: Level
     ceiling: Array32
@@ -54,11 +53,7 @@ class Pose(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """Rays in body axes, relative to a camera's centre.
-
-    `origins` and `directions` have shape (rays, 3), float32; directions are unit vectors. `pixel_angles` is the angle
-    that the pixel of each ray takes, radians.
-    """
+    """Rays in body axes, relative to a camera's centre: origins, unit directions, angles of pixels, radians."""
 
     origins: Array32
     directions: Array32
@@ -77,11 +72,11 @@ class Ray(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """What rays meet.
+    """Hits of rays.
 
-    `distance` is along the ray, metres, infinite for the sky; `triangle` is the object's, -1 for none; `weights` are
-    those of its second and third corner there, empty where there are no triangles; `level` is that of the terrain on
-    which the ground was met, -1 where the mesh's own distance stands.
+    - distance: along the ray, metres, infinite for the sky
+    - triangle, weights: number of the object's triangle, -1 for none, and weights of its second and third corner
+    - level: that of the terrain on which the ray meets the ground, -1 where the mesh's distance stands
     """
 
     distance: Array
@@ -93,9 +88,10 @@ class Hits(NamedTuple):
 class Views(NamedTuple):
     """Pinhole views from a camera's position.
 
-    `depth` is along the axis, metres; `numbers` are those of triangles plus one, 0 for ground, empty where no triangles
-    were drawn. `focal` is in samples; `view_from_body` turns body axes to a view's (x right, y down, z forward).
-    `view_of_pixel` is the view that holds each pixel.
+    - depth: along the axis, metres
+    - numbers: those of triangles plus one, 0 for ground, empty where no triangles were drawn
+    - focal: in samples
+    - view_from_body: rotates body axes to a view's (x right, y down, z forward)
     """
 
     depth: Array32
@@ -108,10 +104,12 @@ class Views(NamedTuple):
 class GroundShadow(NamedTuple):
     """The ground's shadow on the grid of a level of the surface; one side is 1 where there is none.
 
-    Below `height` the ground hides the sun's middle; what casts the shadow is `reach` units of rows away
-    (`marsyard.sim.render.kernels.sun.sweep_shadow`). `along_x`: rows run along x. `spacing` and `level` are the grid's;
-    `row_m` is the distance along the sun's direction from one row to the next, and `across` that direction's horizontal
-    part. No ground stands above `highest`.
+    - height: height below which the ground hides the centre of the sun
+    - reach: distance of the shadow's caster (`marsyard.sim.render.kernels.sun.sweep_shadow`)
+    - along_x: whether rows run along x
+    - row_m: distance along the sun's direction from one row to the next
+    - across: horizontal component of the sun's direction
+    - highest: upper bound of the ground's height
     """
 
     height: Array32
@@ -125,7 +123,7 @@ class GroundShadow(NamedTuple):
 
 
 class Footprint(NamedTuple):
-    """Places on the ground that objects may shade: a grid, its west and south border, cells a metre; 0: everywhere."""
+    """Region of ground that objects may shade: a grid, its west and south border, cells per metre; 0: everywhere."""
 
     cells: Flags
     west: float
@@ -134,13 +132,13 @@ class Footprint(NamedTuple):
 
 
 class Light(NamedTuple):
-    """The light of a moment.
+    """The light at one time.
 
-    `sun` is the unit vector towards it. `law` holds lunar share, surge amplitude, surge width, normalisation, sky
-    share, light from the surrounding ground, diameter of a round body at the camera's place that casts a shadow, and
-    the sun's angular radius.
-    `sky` is as `sky_brightness` takes it. `cover` is that of a layer of clouds; `drift` holds its cells a metre,
-    height, drift to east and north, and the share of the sun that a cloud keeps, 0 where there are no clouds.
+    - sun: unit vector towards it
+    - law: lunar share, surge amplitude, surge width, normalisation, sky share, light from the surrounding ground,
+      diameter of a round body at the camera that casts a shadow, angular radius of the sun
+    - sky: see `sky_brightness`
+    - drift: of the clouds: cells per metre, height, drift to east and north, opacity, 0 without clouds
     """
 
     sun: Array
@@ -151,10 +149,7 @@ class Light(NamedTuple):
 
 
 class Materials(NamedTuple):
-    """How surfaces look: coarsest cell and amplitudes of the octaves of textures; what objects are made of.
-
-    `normals` are those at the corners of triangles, `body_of_triangle` the body of each, `albedo` that of each body.
-    """
+    """Textures (coarsest cell and amplitudes of octaves), normals at the corners of triangles, and albedo of bodies."""
 
     ground_texture: tuple[float, Array]
     object_texture: tuple[float, Array]
@@ -164,7 +159,7 @@ class Materials(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """Radiance factor, number of the body seen (or ground, sky), and unit normal in world axes of every pixel."""
+    """Radiance factor, body number (or ground, sky), and unit normal in world axes of every pixel."""
 
     radiance: Array32
     body: Ints
@@ -173,14 +168,14 @@ class Picture(NamedTuple):
 
 @njit(cache=True, inline="always")
 def world_ray(pose: Pose, rays: Rays, n: int) -> Ray:
-    """The n-th of some rays in world axes."""
-    x, y, z = _turned(pose.rotation, rays.origins, n)
-    dx, dy, dz = _turned(pose.rotation, rays.directions, n)
+    """Return the n-th of some rays in world axes."""
+    x, y, z = _rotate(pose.rotation, rays.origins, n)
+    dx, dy, dz = _rotate(pose.rotation, rays.directions, n)
     return Ray(pose.position[0] + x, pose.position[1] + y, pose.position[2] + z, dx, dy, dz)
 
 
 @njit(cache=True, inline="always")
-def _turned(rotation: Array, vectors: Array | Array32, n: int) -> tuple[float, float, float]:
+def _rotate(rotation: Array, vectors: Array | Array32, n: int) -> tuple[float, float, float]:
     x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,

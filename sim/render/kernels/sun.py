@@ -1,4 +1,4 @@
-"""How much of the sun's disc a place sees: past the ground, past a round body, and through clouds."""
+"""Visible fraction of the sun's disc: past the ground, past a round body, and through clouds."""
 
 from __future__ import annotations
 
@@ -10,21 +10,19 @@ from numba import njit
 from marsyard.sim.render.kernels.structs import Array32, Bytes, GroundShadow, Longs
 from marsyard.sim.terrain.kernels import Array, Level, sample
 
-#: Rows of the grid that one unit of a shadow's stored reach stands for.
+#: Rows of the grid per unit of a shadow's stored reach.
 REACH_ROWS = 4
-#: Height over a shadow's edge, in spacings of its grid, within which the grid is not believed.
+#: Height over a shadow's edge, in spacings of its grid, within which the grid is too coarse.
 UNSURE = 0.3
-
-
-#: Posts along a side of the blocks in which a grid is turned: both sides of a block stay in the nearest cache.
+#: Posts along a side of the blocks in which a grid is transposed: both sides of a block stay in the nearest cache.
 BLOCK = 32
 
 
 @njit(cache=True)
 def heights_in_rows(field: Level, rows: Longs, columns: Longs, along_x: bool) -> Array32:
-    """Control values of height at as many rows as columns of a level, their rows along y or along x.
+    """Control values of height at some rows and columns of a level, with rows along y or along x.
 
-    Where they are as many as the level has they are taken in order.
+    As many as the level has are taken in order.
     """
     side = rows.size
     heights = np.empty((side, side), dtype=np.float32)
@@ -46,27 +44,13 @@ def heights_in_rows(field: Level, rows: Longs, columns: Longs, along_x: bool) ->
 
 @njit(cache=True)
 def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach: int) -> tuple[Array32, Bytes]:
-    """Height of the shadow over every post of a periodic grid: below it the ground hides the sun's middle.
+    """Height of the shadow over every post of a periodic grid: below it the ground hides the centre of the sun.
 
-    The sun stands towards growing rows. A shadow falls by `drop` and shifts by `-slip` columns from one row to the one
-    before; a row's shadow is cast by the ground and the shadow of the row after it.
+    A shadow falls by `drop` metres and shifts by `-slip` columns from one row to the one before, away from the sun; the
+    ground and the shadow of a row cast the shadow of the row before. Rows run towards the sun where `along` is 1.0,
+    away from it where it is -1.0. The longest shadow covers `reach` rows: the sweep starts as many before the first.
 
-    Parameters
-    ----------
-    height
-        Heights, shape (rows, columns); rows run towards the sun.
-    along
-        1.0 where rows run towards the sun as stored, -1.0 where they run away from it.
-    drop
-        How far a shadow falls from one row to the next, metres.
-    slip
-        Columns by which the sun's direction moves along from one row to the next.
-    reach
-        Rows that the longest shadow covers: the sweep starts as many before the first.
-
-    Returns
-    -------
-    The shadow's height, and how many rows away what casts it is, in units of `REACH_ROWS`, rounded up.
+    Returns the shadow's height, and the distance of its caster in units of `REACH_ROWS` rows, rounded up.
     """
     rows, columns = height.shape
     row_mask, column_mask = rows - 1, columns - 1
@@ -100,21 +84,15 @@ def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach:
 
 
 @njit(cache=True, inline="always")
-def _between(
+def _interpolate(
     field: Array32, inverse_spacing: float, x: float, y: float
 ) -> tuple[float, tuple[int, int], tuple[int, int]]:
-    """A periodic field between its posts, bilinear, and the rows and columns of the four posts around."""
+    """Interpolate a periodic field bilinearly; return the value, and rows and columns of the four posts around."""
     mask = field.shape[0] - 1
-    gx = x * inverse_spacing
-    gy = y * inverse_spacing
-    j = math.floor(gx)
-    i = math.floor(gy)
-    fx = gx - j
-    fy = gy - i
-    i0 = i & mask
-    i1 = (i + 1) & mask
-    j0 = j & mask
-    j1 = (j + 1) & mask
+    gx, gy = x * inverse_spacing, y * inverse_spacing
+    j, i = math.floor(gx), math.floor(gy)
+    fx, fy = gx - j, gy - i
+    i0, i1, j0, j1 = i & mask, (i + 1) & mask, j & mask, (j + 1) & mask
     south = (1.0 - fx) * field[i0, j0] + fx * field[i0, j1]
     north = (1.0 - fx) * field[i1, j0] + fx * field[i1, j1]
     return (1.0 - fy) * south + fy * north, (i0, i1), (j0, j1)
@@ -122,9 +100,9 @@ def _between(
 
 @njit(cache=True, inline="always")
 def shadow_clearance(shadow: GroundShadow, x: float, y: float, z: float) -> tuple[float, float]:
-    """How far a place lies above the ground's shadow, metres, and how many rows away what casts the shadow is."""
+    """Height of a position above the ground's shadow, metres, and distance of the shadow's caster in rows."""
     across, along = (y, x) if shadow.along_x else (x, y)
-    edge, (i0, i1), (j0, j1) = _between(shadow.height, 1.0 / shadow.spacing, across, along)
+    edge, (i0, i1), (j0, j1) = _interpolate(shadow.height, 1.0 / shadow.spacing, across, along)
     away = shadow.reach
     farthest = max(max(away[i0, j0], away[i0, j1]), max(away[i1, j0], away[i1, j1]))
     return z - edge, float(farthest * REACH_ROWS)
@@ -132,13 +110,13 @@ def shadow_clearance(shadow: GroundShadow, x: float, y: float, z: float) -> tupl
 
 @njit(cache=True, inline="always")
 def penumbra(shadow: GroundShadow, radius: float, distance: float, rows: float) -> float:
-    """Half the depth of the penumbra that the sun's disc casts past what is a distance and some rows away, metres."""
+    """Half the depth, metres, of the penumbra past an occluder at a distance plus some rows."""
     return radius * (distance + rows * shadow.row_m) / shadow.across
 
 
 @njit(cache=True, inline="always")
 def disc_above(offset: float) -> float:
-    """Share of a disc above a straight line that lies `offset` radii below its middle."""
+    """Fraction of a disc above a straight line that lies `offset` radii below its centre."""
     if offset >= 1.0:
         return 1.0
     if offset <= -1.0:
@@ -148,7 +126,7 @@ def disc_above(offset: float) -> float:
 
 @njit(cache=True, inline="always")
 def disc_overlap(first: float, second: float, apart: float) -> float:
-    """Share of the second disc that the first covers; radii and distance of their centres."""
+    """Fraction of the second disc that the first covers; radii and distance of their centres."""
     if apart >= first + second:
         return 0.0
     if apart <= abs(first - second):
@@ -163,7 +141,7 @@ def disc_overlap(first: float, second: float, apart: float) -> float:
 def _lowest_near(
     field: Level, per_metre: float, place: tuple[float, float, float], sun: Array, nearest: float
 ) -> float:
-    """Least clearance over distance of the line to the sun about a place on it: the vertex of a parabola there."""
+    """Least clearance over distance of the line to the sun near a distance: the vertex of a parabola."""
     x, y, z = place
     step = min(0.25 / per_metre, 0.5 * nearest)
     before, middle, after = 0.0, 0.0, 0.0
@@ -190,22 +168,12 @@ def _lowest_near(
 def visible_sun_fraction(
     field: Level, per_metre: float, shadow: GroundShadow, place: tuple[float, float, float], sun: Array, radius: float
 ) -> float:
-    """Fraction of the sun's disc that a place on the ground sees over the ground, by steps towards the sun.
+    """Fraction of the sun's disc that a position on the ground sees over the ground, by steps towards the sun.
 
-    The smallest angle between the sun's middle and the ground below it, in radii of the sun, gives the fraction, as if
-    the skyline were straight and level across the disc. Ground turned from the sun's middle has none of it. The search
-    ends where the swept shadow shows that all the rest is clear.
-
-    Parameters
-    ----------
-    field, per_metre
-        The finest level, and its samples to the metre.
-    shadow
-        The ground's shadow.
-    place
-        World coordinates.
-    sun, radius
-        Unit vector to the sun, and the angle that half its disc takes.
+    The smallest angle between the sun's centre and the ground below it, in radii of the sun, gives the fraction, as if
+    the skyline were straight and level across the disc; ground turned away from the sun's centre has none. The search
+    ends where the swept shadow shows that the remaining path is clear. `field` is the finest level, `radius` the
+    angular radius of the disc.
     """
     x, y, z = place
     spacing = 1.0 / per_metre
@@ -219,9 +187,7 @@ def visible_sun_fraction(
     steps = 0
     farthest = (shadow.highest - z) / max(sun[2] - radius, 1e-3)
     while t < farthest:
-        px = x + t * sun[0]
-        py = y + t * sun[1]
-        pz = z + t * sun[2]
+        px, py, pz = x + t * sun[0], y + t * sun[1], z + t * sun[2]
         height, _slope_x, _slope_y, _albedo = sample(field, per_metre, px, py)
         clearance = pz - height
         if clearance * across / t < lowest:
@@ -244,6 +210,6 @@ def visible_sun_fraction(
 
 @njit(cache=True, inline="always")
 def cloud_cover(cover: Array32, inverse_cell: float, x: float, y: float) -> float:
-    """Cover of a periodic layer of clouds at one place, bilinear between its cells."""
-    between: float = _between(cover, inverse_cell, x, y)[0]
+    """Cover of a periodic layer of clouds at one position, bilinear between its cells."""
+    between: float = _interpolate(cover, inverse_cell, x, y)[0]
     return between

@@ -1,4 +1,4 @@
-"""The grid that the landforms build on."""
+"""The work grids of a terrain that is being synthesised."""
 
 from __future__ import annotations
 
@@ -7,29 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from marsyard.sim.parameters import Parameters
 from marsyard.sim.terrain.landforms.kernels import add_refined
 
 #: Smallest side of a grid on which a landform is made.
 SMALLEST_SIDE = 16
 
 
-class LandformParameters(Parameters):
-    """What all landforms' parameters have in common."""
-
-
 @dataclass(frozen=True)
 class Ground:
-    """Work grids of a terrain that is being made; landforms change them in place.
+    """Heights and tones of a terrain, which landforms change in place.
 
-    Attributes
-    ----------
-    height
-        Control values of the heights, metres.
-    tone
-        Natural logarithm of albedo over its mean.
-    spacing_m
-        Distance between samples.
+    - height: control values, metres
+    - tone: natural logarithm of albedo over its mean
     """
 
     height: Float32[np.ndarray, "side side"]
@@ -43,30 +32,31 @@ class Ground:
 
     @property
     def period_m(self) -> float:
-        """The distance after which the ground repeats."""
+        """Distance after which the ground repeats."""
         return float(self.side * self.spacing_m)
 
     def coarser(self, feature_m: float) -> Ground:
-        """An empty ground of the same extent whose samples are at most `feature_m` apart, but not denser than these.
+        """Return an empty ground of the same extent with samples at most `feature_m` apart, but not denser than these.
 
-        What is made on it is brought back by `add`; a landform without details so fine costs less there.
+        A landform without finer detail costs less there; `add` brings it back.
         """
         side = self.side
         while side > SMALLEST_SIDE and self.period_m / (side // 2) <= feature_m:
             side //= 2
-        return Ground(
-            np.zeros((side, side), dtype=np.float32), np.zeros((side, side), dtype=np.float32), self.period_m / side
-        )
+        height, tone = np.zeros((2, side, side), dtype=np.float32)
+        return Ground(height, tone, self.period_m / side)
 
     def add(self, part: Ground, *, tone: bool = True) -> None:
-        """Adds a ground made on a coarser grid; the surfaces add up exactly, for a B-spline refines exactly."""
-        _add(self.height, part.height)
-        if tone:
-            _add(self.tone, part.tone)
+        """Add a ground made on a coarser grid; the sum of the surfaces is exact, as refining a B-spline is."""
+        for total, grid in ((self.height, part.height), (self.tone, part.tone))[: 1 + tone]:
+            if grid.shape == total.shape:
+                total += grid
+            else:
+                add_refined(total, refined(grid, total.shape[0] // 2))
 
 
-def finer(coarse: Float32[np.ndarray, "coarse coarse"], side: int) -> Float32[np.ndarray, "side side"]:
-    """Control values of the same surface on a grid of this side, which is the coarse one's times a power of two."""
+def refined(coarse: Float32[np.ndarray, "coarse coarse"], side: int) -> Float32[np.ndarray, "side side"]:
+    """Control values of the same surface on a grid of this side: the coarse one's times a power of two."""
     while coarse.shape[0] < side:
         doubled = np.zeros((2 * coarse.shape[0], 2 * coarse.shape[0]), dtype=np.float32)
         add_refined(doubled, np.ascontiguousarray(coarse))
@@ -74,25 +64,18 @@ def finer(coarse: Float32[np.ndarray, "coarse coarse"], side: int) -> Float32[np
     return coarse
 
 
-def fitted(field: Float32[np.ndarray, "own own"], side: int) -> Float32[np.ndarray, "side side"]:
-    """A smooth field on a grid of this side: refined, or thinned."""
+def resampled(field: Float32[np.ndarray, "own own"], side: int) -> Float32[np.ndarray, "side side"]:
+    """A smooth field on a grid of this side: refined, or decimated."""
     step = max(field.shape[0] // side, 1)
-    return finer(np.ascontiguousarray(field[::step, ::step]), side)
-
-
-def _add(total: Float32[np.ndarray, "side side"], part: Float32[np.ndarray, "coarse coarse"]) -> None:
-    if part.shape == total.shape:
-        total += part
-    else:
-        add_refined(total, finer(part, total.shape[0] // 2))
+    return refined(np.ascontiguousarray(field[::step, ::step]), side)
 
 
 def smooth_pair(
     period_m: float, length_across_m: float, length_along_m: float, azimuth_rad: float, rng: np.random.Generator
 ) -> Float32[np.ndarray, "side side 2"]:
-    """Two independent smooth random fields of unit mean square together: control values on a grid of their own.
+    """Draw two independent smooth random fields whose squares sum to a unit mean: control values on their own grid.
 
-    Their spectrum is Gaussian with correlation lengths (1/e of the amplitude spectrum at wavenumber sqrt(2)/length)
+    The spectrum is Gaussian with correlation lengths (1/e of the amplitude spectrum at wavenumber sqrt(2)/length)
     across and along a direction (azimuth of "along", counter-clockwise from x).
     """
     shortest = min(length_across_m, length_along_m)

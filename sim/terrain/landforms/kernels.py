@@ -16,10 +16,8 @@ Line = NDArray[np.float32]
 
 
 class Bedforms(NamedTuple):
-    """A train of dunes.
-
-    `wave_x` and `wave_y` are the plane wave's wavenumbers, rad/m; `crest_m` the RMS height of crest over trough,
-    `steepest` the slope of the slip face, `contrast` the logarithm of crests' albedo over troughs'.
+    """A train of dunes: wavenumbers of the plane wave, rad/m, RMS height of crest over trough, slope of the slip face,
+    logarithm of crests' albedo over troughs'.
     """
 
     wave_x: float
@@ -31,12 +29,10 @@ class Bedforms(NamedTuple):
 
 @njit(cache=True)
 def add_refined(fine: Grid, coarse: Grid) -> None:
-    """Adds to control values the control values of the same cubic B-spline on a grid half as coarse, exactly."""
+    """Add a cubic B-spline from a grid of half as many samples along each side, exactly."""
     side = coarse.shape[0]
     row = np.empty(side, dtype=np.float32)
-    eighth = np.float32(0.125)
-    six = np.float32(0.75)
-    half = np.float32(0.5)
+    eighth, six_eighths, half = np.float32(0.125), np.float32(0.75), np.float32(0.5)
     for i in range(2 * side):
         k = i // 2
         here = coarse[k]
@@ -44,21 +40,21 @@ def add_refined(fine: Grid, coarse: Grid) -> None:
         if i % 2 == 0:
             before = coarse[k - 1]
             for j in range(side):
-                row[j] = eighth * (before[j] + after[j]) + six * here[j]
+                row[j] = eighth * (before[j] + after[j]) + six_eighths * here[j]
         else:
             for j in range(side):
                 row[j] = half * (here[j] + after[j])
         out = fine[i]
         for j in range(side - 1):
-            out[2 * j] += eighth * (row[j - 1] + row[j + 1]) + six * row[j]
+            out[2 * j] += eighth * (row[j - 1] + row[j + 1]) + six_eighths * row[j]
             out[2 * j + 1] += half * (row[j] + row[j + 1])
-        out[2 * side - 2] += eighth * (row[side - 2] + row[0]) + six * row[side - 1]
+        out[2 * side - 2] += eighth * (row[side - 2] + row[0]) + six_eighths * row[side - 1]
         out[2 * side - 1] += half * (row[side - 1] + row[0])
 
 
 @njit(cache=True)
 def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reach: float) -> None:
-    """Adds bowls, rims and ejecta to height and to the logarithm of albedo, in order.
+    """Add bowls, rims and ejecta of craters to height and to the logarithm of albedo, in order.
 
     `craters` has rows (x, y, radius, depth below the surroundings, rim height, rounding of the rim in metres, share of
     the depth that is filled, tone of the ejecta, then three pairs of cosine and sine terms of the outline for two,
@@ -81,15 +77,11 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                 d = math.sqrt(dx * dx + dy * dy)
                 if d >= extent:
                     continue
-                c = dx / max(d, 1e-9)
-                s = dy / max(d, 1e-9)
+                c, s = dx / max(d, 1e-9), dy / max(d, 1e-9)
                 # cosines and sines of twice, three and five times the azimuth
-                cc = c * c - s * s
-                ss = 2.0 * c * s
-                ccc = cc * c - ss * s
-                sss = ss * c + cc * s
-                c5t = ccc * cc - sss * ss
-                s5t = sss * cc + ccc * ss
+                cc, ss = c * c - s * s, 2.0 * c * s
+                ccc, sss = cc * c - ss * s, ss * c + cc * s
+                c5t, s5t = ccc * cc - sss * ss, sss * cc + ccc * ss
                 r = d / (radius * (1.0 + c2 * cc + s2 * ss + c3 * ccc + s3 * sss + c5 * c5t + s5 * s5t))
                 if r >= reach:
                     continue
@@ -99,13 +91,12 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                 rays = 0.0
                 if r > 1.0:
                     # seven and twelve rays: cosines of 7 and 12 times the azimuth, each with a phase
-                    c7t = c5t * cc - s5t * ss
-                    s7t = s5t * cc + c5t * ss
+                    c7t, s7t = c5t * cc - s5t * ss, s5t * cc + c5t * ss
                     rays = c7t * cos_7 - s7t * sin_7
                     rays += (c7t * c5t - s7t * s5t) * cos_12 - (s7t * c5t + c7t * s5t) * sin_12
                     blanket *= 1.0 + 0.25 * rays * min(2.0 * (r - 1.0), 1.0)
                 change = blanket
-                # outside, the bowl's wall goes on so steeply that it soon leaves the blanket below it
+                # outside, the bowl's wall continues so steeply that it soon rises above the blanket
                 if r <= 1.0 or (rim + bottom) * r * r - bottom < blanket + rounding:
                     bowl = (rim + bottom) * r**2.2 - bottom
                     if fill > 0.0:
@@ -114,8 +105,7 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                         bowl = max(bowl, -depth) + meeting * meeting / (4.0 * soft_floor)
                     overlap = max(rounding - abs(bowl - blanket), 0.0)
                     change = min(bowl, blanket) - overlap * overlap / (4.0 * max(rounding, 1e-9))
-                row = i & mask
-                column = j & mask
+                row, column = i & mask, j & mask
                 height[row, column] += change
                 if bright != 0.0:
                     light = fade * fade * (1.0 + 0.5 * rays) if r > 1.0 else 1.0
@@ -123,10 +113,9 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
 
 
 @njit(cache=True, inline="always")
-def _angle(x: float, y: float) -> float:
+def _arctan2(x: float, y: float) -> float:
     """Arctangent of y / x in its quadrant to 1e-7, by the polynomial of Cephes' atanf; without branches or calls."""
-    wide = abs(x)
-    high = abs(y)
+    wide, high = abs(x), abs(y)
     larger = max(wide, high, 1e-30)
     ratio = min(wide, high) / larger
     turned = ratio > 0.41421356237309503
@@ -158,7 +147,7 @@ def _add_row_of_dunes(
     for j in range(height.shape[0]):
         strength = math.sqrt(real[j] * real[j] + imaginary[j] * imaginary[j])
         high = crest * min(strength, 1.6)
-        turns = (first_phase + j * phase_step + _angle(real[j], imaginary[j])) / (2.0 * math.pi)
+        turns = (first_phase + j * phase_step + _arctan2(real[j], imaginary[j])) / (2.0 * math.pi)
         u = turns - np.floor(turns)
         slip = min(max(slip_of_height * high, 0.01), 0.5)
         v = u / (1.0 - slip)
@@ -200,7 +189,7 @@ def add_dunes(height: Grid, tone: Grid, spacing: float, modulation: Level, dunes
 
 @njit(cache=True)
 def stamp_lobes(height: Grid, tone: Grid, spacing: float, lobes: Array, warp_x: Grid, warp_y: Grid) -> None:
-    """Stacks lava lobes: each a plateau with a steep, crenulated margin and a slightly sunken middle.
+    """Stack lava lobes: each a plateau with a steep, crenulated margin and a slightly sunken middle.
 
     `lobes` has rows (x, y, half length, half width, thickness, cosine and sine of its direction, tone). The warps are
     displacements in half widths that make the outlines irregular. Every lobe covers the tone of those below.
@@ -230,57 +219,47 @@ def stamp_lobes(height: Grid, tone: Grid, spacing: float, lobes: Array, warp_x: 
 def add_cracks(
     height: Grid, tone: Grid, spacing: float, points: Array, cell: float, width: float, depth: float, contrast: float
 ) -> None:
-    """Adds polygonal cracks: the borders between the Voronoi cells of one point in each square of a periodic grid.
+    """Add polygonal cracks: the borders between the Voronoi cells of one point in each square of a periodic grid.
 
-    `points` has shape (count, count, 2): the place of each point within its square, from 0 to 1.
+    `points` has shape (count, count, 2): the position of each point within its square, from 0 to 1.
     """
     count = points.shape[0]
-    # the points' places, with those beyond the border
-    places = np.empty((count + 2, count + 2, 2))
+    # the points' positions, with those beyond the border
+    positions = np.empty((count + 2, count + 2, 2))
     for row in range(-1, count + 1):
         for column in range(-1, count + 1):
             point = points[row % count, column % count]
-            places[row + 1, column + 1, 0] = column + point[0]
-            places[row + 1, column + 1, 1] = row + point[1]
+            positions[row + 1, column + 1, 0] = column + point[0]
+            positions[row + 1, column + 1, 1] = row + point[1]
     for i in range(height.shape[0]):
         y = i * spacing / cell
         row = int(y)
         for j in range(height.shape[0]):
             x = j * spacing / cell
             column = int(x)
-            nearest = 1e9
-            nx = 0.0
-            ny = 0.0
-            second = 1e9
-            sx = 0.0
-            sy = 0.0
+            nearest, nx, ny = 1e9, 0.0, 0.0
+            second, sx, sy = 1e9, 0.0, 0.0
             for di in range(3):
                 for dj in range(3):
-                    dx = places[row + di, column + dj, 0] - x
-                    dy = places[row + di, column + dj, 1] - y
+                    dx = positions[row + di, column + dj, 0] - x
+                    dy = positions[row + di, column + dj, 1] - y
                     far = dx * dx + dy * dy
                     if far < nearest:
-                        second = nearest
-                        sx = nx
-                        sy = ny
-                        nearest = far
-                        nx = dx
-                        ny = dy
+                        second, sx, sy = nearest, nx, ny
+                        nearest, nx, ny = far, dx, dy
                     elif far < second:
-                        second = far
-                        sx = dx
-                        sy = dy
+                        second, sx, sy = far, dx, dy
             apart = math.sqrt((sx - nx) ** 2 + (sy - ny) ** 2)
             border = 0.5 * (second - nearest) / max(apart, 1e-6) * cell
             if border < width:
-                share = 1.0 - border / width
-                height[i, j] -= depth * share
-                tone[i, j] += contrast * share
+                strength = 1.0 - border / width
+                height[i, j] -= depth * strength
+                tone[i, j] += contrast * strength
 
 
 @njit(cache=True)
 def cut_channels(cut: Grid, spacing: float, discs: Array, sharpness: float) -> None:
-    """Deepest cut of channels given as rows of discs (x, y, half width, depth): ``depth (1 - (d / w)**sharpness)``."""
+    """Cut channels, rows of discs (x, y, half width, depth), each ``depth (1 - (d / w)**sharpness)`` deep."""
     mask = cut.shape[0] - 1
     for n in range(discs.shape[0]):
         x, y, half, depth = discs[n]
@@ -299,7 +278,7 @@ def cut_channels(cut: Grid, spacing: float, discs: Array, sharpness: float) -> N
 def raise_cones(
     height: Grid, cover: Grid, spacing: float, apexes: Array, slope: float, concavity: float, rounding: float
 ) -> None:
-    """Adds the union of cones with rows (x, y, radius) that flatten towards their toes; `cover` is 1 on them.
+    """Add the union of cones with rows (x, y, radius) that flatten towards their toes; `cover` is 1 on them.
 
     A cone is ``slope R / concavity (1 - r / R)**concavity`` high: `slope` steep at its apex, which is rounded.
     """
@@ -327,7 +306,7 @@ def raise_cones(
 
 @njit(cache=True)
 def pack(height: Grid, albedo: Grid, scale: float, samples: Level) -> None:
-    """Interleaves height and albedo; the albedo is scaled and kept below 1."""
+    """Interleave height and albedo; the albedo is scaled and limited to 1."""
     for i in range(height.shape[0]):
         for j in range(height.shape[0]):
             samples[i, j, 0] = height[i, j]

@@ -25,12 +25,12 @@ class Placements(NamedTuple):
 
 @njit(cache=True)
 def place_discs(
-    radii: Array, taken: Array, period: float, cell_m: float, most_tries: int, rng: np.random.Generator
+    radii: Array, occupied: Array, period: float, cell_m: float, max_tries: int, rng: np.random.Generator
 ) -> Array:
-    """Positions of discs on a periodic square, uniform where they do not overlap one another; rows (x, y).
+    """Draw positions (x, y) of discs on a periodic square, uniform where they do not overlap.
 
-    Discs are placed in the order given, the largest first, each at the first of its random places that is free. `taken`
-    has rows (x, y, radius) of discs that are there already. A disc that finds no place in `most_tries` gets NaN.
+    Discs are placed in order, the largest first, each at the first of its random positions that is free. `occupied` has
+    rows (x, y, radius) of existing discs. A disc without a free position after `max_tries` gets NaN.
     """
     side = max(int(period / cell_m), 1)
     cell = period / side
@@ -38,27 +38,24 @@ def place_discs(
     for n in range(radii.size):
         across = min(int(2.0 * radii[n] / cell) + 2, side)
         entries += across * across
-    for n in range(taken.shape[0]):
-        across = min(int(2.0 * taken[n, 2] / cell) + 2, side)
+    for n in range(occupied.shape[0]):
+        across = min(int(2.0 * occupied[n, 2] / cell) + 2, side)
         entries += across * across
     first = np.full(side * side, -1, dtype=np.int32)
     following = np.empty(entries, dtype=np.int32)
     member = np.empty(entries, dtype=np.int32)
-    discs = np.empty((taken.shape[0] + radii.size, 3), dtype=np.float64)
+    discs = np.empty((occupied.shape[0] + radii.size, 3), dtype=np.float64)
     placed = np.full((radii.size, 2), np.nan, dtype=np.float64)
-    used = 0
-    count = 0
-    for n in range(taken.shape[0] + radii.size):
-        given = n < taken.shape[0]
-        radius = taken[n, 2] if given else radii[n - taken.shape[0]]
-        x = 0.0
-        y = 0.0
+    used, count = 0, 0
+    for n in range(occupied.shape[0] + radii.size):
+        given = n < occupied.shape[0]
+        radius = occupied[n, 2] if given else radii[n - occupied.shape[0]]
+        x, y = 0.0, 0.0
         free = given
         if given:
-            x = taken[n, 0] % period
-            y = taken[n, 1] % period
+            x, y = occupied[n, 0] % period, occupied[n, 1] % period
         tries = 0
-        while not free and tries < most_tries:
+        while not free and tries < max_tries:
             tries += 1
             x = rng.random() * period
             y = rng.random() * period
@@ -74,8 +71,7 @@ def place_discs(
                         other = member[entry]
                         dx = abs(discs[other, 0] - x)
                         dy = abs(discs[other, 1] - y)
-                        dx = min(dx, period - dx)
-                        dy = min(dy, period - dy)
+                        dx, dy = min(dx, period - dx), min(dy, period - dy)
                         apart = discs[other, 2] + radius
                         if dx * dx + dy * dy < apart * apart:
                             free = False
@@ -88,11 +84,8 @@ def place_discs(
         if not free:
             continue
         if not given:
-            placed[n - taken.shape[0], 0] = x
-            placed[n - taken.shape[0], 1] = y
-        discs[count, 0] = x
-        discs[count, 1] = y
-        discs[count, 2] = radius
+            placed[n - occupied.shape[0], 0], placed[n - occupied.shape[0], 1] = x, y
+        discs[count, 0], discs[count, 1], discs[count, 2] = x, y, radius
         span = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
         width = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
         for di in range(span):
@@ -109,10 +102,10 @@ def place_discs(
 
 @njit(cache=True)
 def assemble(rocks: Placements, unit_vertices: Array, unit_normals: Array) -> tuple[Array, Array]:
-    """Vertices and normals of rocks in world axes, one rock after the other.
+    """Compute vertices and normals of rocks in world axes, one rock after the other.
 
-    Each rock's unit shape is stretched by `scale`, turned by `yaw` about its own vertical, stood along `up` (the
-    shortest rotation from the vertical) and moved to `position`. Both have shape (rocks * vertices of a shape, 3).
+    Each rock's unit shape is stretched by `scale`, rotated by `yaw` about its own vertical, then from the vertical to
+    `up` by the shortest rotation, and moved to `position`.
     """
     shape, position, scale, yaw, up = rocks
     each = unit_vertices.shape[1]
@@ -120,25 +113,17 @@ def assemble(rocks: Placements, unit_vertices: Array, unit_normals: Array) -> tu
     normals = np.empty((shape.size * each, 3))
     for n in range(shape.size):
         kind = shape[n]
-        c = math.cos(yaw[n])
-        s = math.sin(yaw[n])
-        ux = up[n, 0]
-        uy = up[n, 1]
-        uz = up[n, 2]
+        c, s = math.cos(yaw[n]), math.sin(yaw[n])
+        ux, uy, uz = up[n, 0], up[n, 1], up[n, 2]
         # the rotation that takes z to up, about the axis z x up
         f = 1.0 / (1.0 + uz)
-        r00 = 1.0 - ux * ux * f
-        r01 = -ux * uy * f
-        r11 = 1.0 - uy * uy * f
-        sx = scale[n, 0]
-        sy = scale[n, 1]
-        sz = scale[n, 2]
+        r00, r01, r11 = 1.0 - ux * ux * f, -ux * uy * f, 1.0 - uy * uy * f
+        sx, sy, sz = scale[n, 0], scale[n, 1], scale[n, 2]
         for v in range(each):
             a = unit_vertices[kind, v, 0] * sx
             b = unit_vertices[kind, v, 1] * sy
             z = unit_vertices[kind, v, 2] * sz
-            x = c * a - s * b
-            y = s * a + c * b
+            x, y = c * a - s * b, s * a + c * b
             row = n * each + v
             vertices[row, 0] = position[n, 0] + r00 * x + r01 * y + ux * z
             vertices[row, 1] = position[n, 1] + r01 * x + r11 * y + uy * z

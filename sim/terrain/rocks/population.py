@@ -1,4 +1,4 @@
-"""How many rocks of which size lie on the ground, and where."""
+"""Parameters of a rock population, and its size-frequency distribution."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pydantic import Field, model_validator
 
 from marsyard.sim.parameters import Parameters, Positive
 
-#: Rocks beyond this number on one terrain are a mistake of the configuration.
-MOST_ROCKS = 2_000_000
+#: Largest number of rocks on one terrain; more are an error of the configuration.
+MAX_ROCKS = 2_000_000
 
 
 class PlacedRock(Parameters):
-    """A rock put at a stated place: a rover's target, a landing hazard."""
+    """A rock at a stated position: a rover's target, a landing hazard."""
 
     name: Annotated[str, Field(min_length=1, description="what scenarios call it; unique on its terrain")]
     east_m: Annotated[float, Field(description="x of its centre, m, on the periodic terrain")]
@@ -34,7 +34,7 @@ class RockParameters(Parameters):
     """Rocks of a terrain: the size-frequency distribution of Golombek & Rapp (1997), and rocks at stated places.
 
     The share of the ground covered by rocks of at least diameter D is ``F_k(D) = k exp(-q D)``,
-    ``q = 1.79 + 0.152 / k`` (D in metres), fitted to the Viking landing sites and used for all Mars landers since.
+    ``q = 1.79 + 0.152 / k`` (D in metres), fitted to the Viking landing sites.
     The number of rocks per area and diameter follows: ``n(D) = -dF/dD / (pi D**2 / 4)``.
     """
 
@@ -53,13 +53,13 @@ class RockParameters(Parameters):
     placed: Annotated[tuple[PlacedRock, ...], Field(description="rocks at stated places")] = ()
 
     @model_validator(mode="after")
-    def _makes_sense(self) -> RockParameters:
+    def _check_consistency(self) -> RockParameters:
         if self.largest_m <= self.smallest_m:
             raise ValueError(f"largest_m is {self.largest_m:g}; it must be larger than smallest_m, {self.smallest_m:g}")
         names = [rock.name for rock in self.placed]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"more than one placed rock is called {', '.join(twice)}; names must be unique")
+        duplicates = sorted({name for name in names if names.count(name) > 1})
+        if duplicates:
+            raise ValueError(f"more than one placed rock is called {', '.join(duplicates)}; names must be unique")
         return self
 
 
@@ -71,7 +71,7 @@ def decay_per_m(abundance: float) -> float:
 def _cumulative(
     abundance: float, smallest_m: float, largest_m: float
 ) -> tuple[Float64[np.ndarray, "grid"], Float64[np.ndarray, "grid"]]:
-    """Diameters and the number per square metre from the smallest up to them, by Simpson's rule in the logarithm."""
+    """Diameters, and the number of smaller rocks per square metre, by Simpson's rule in the logarithm."""
     if abundance == 0.0:
         return np.array([smallest_m, largest_m]), np.zeros(2)
     diameter = np.geomspace(smallest_m, largest_m, 2001)
@@ -87,17 +87,17 @@ def _cumulative(
 
 
 def draw_diameters(parameters: RockParameters, area_m2: float, rng: np.random.Generator) -> Float64[np.ndarray, "n"]:
-    """Diameters of the rocks on an area, metres, the largest first; their number is Poisson.
+    """Draw the diameters of the rocks on an area, metres, the largest first; their number is Poisson.
 
-    Raises ValueError where there would be more than `MOST_ROCKS`.
+    Raises ValueError where there would be more than `MAX_ROCKS`.
     """
     diameter, number = _cumulative(parameters.abundance, parameters.smallest_m, parameters.largest_m)
     expected = number[-1] * area_m2
-    if expected > MOST_ROCKS:
+    if expected > MAX_ROCKS:
         raise ValueError(
             f"{expected:.3g} rocks of at least {parameters.smallest_m:g} m on {area_m2:.3g} m2; at most "
-            f"{MOST_ROCKS:g} can be made: choose a larger rocks.smallest_m"
+            f"{MAX_ROCKS:g} can be made: choose a larger rocks.smallest_m"
         )
-    share = rng.random(int(rng.poisson(expected)))
-    drawn = np.exp(np.interp(share * number[-1], number, np.log(diameter)))
+    quantile = rng.random(int(rng.poisson(expected)))
+    drawn = np.exp(np.interp(quantile * number[-1], number, np.log(diameter)))
     return np.asarray(np.sort(drawn)[::-1])

@@ -1,4 +1,4 @@
-"""Irregular rock shapes, made once from seeds, at several resolutions: blocks cut by planes, and jagged clinker."""
+"""Irregular rock shapes from seeds, at several levels of detail: blocks cut by planes, and jagged clinker."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int32
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
-#: Number of different shapes of each form. Of the blocks the first are angular, the last rounded.
+#: Shapes of each form; the first blocks are angular, the last rounded.
 SHAPES_OF_FORM = 16
 #: Forms in the order of their shapes' numbers: blocks, and the rough clinker of a'a.
 FORMS = ("block", "clinker")
@@ -18,13 +18,13 @@ SHAPES = SHAPES_OF_FORM * len(FORMS)
 #: Subdivisions of the icosahedron at each level of detail: 80, 320, 1280 and 5120 triangles.
 SUBDIVISIONS = (1, 2, 3, 4)
 COARSE, MEDIUM, FINE, FINEST = range(4)
-#: How far a rock may be seen to deviate from its finest shape, rms, in pixels.
+#: Allowed RMS deviation of a rock's image from its finest shape, pixels.
 DEVIATION_PX = 0.25
 #: Height above the ground over diameter of the unit shapes. Each rock is stretched to its own.
 UNIT_HEIGHT = 0.5
 #: Exponents of the cuts' union, which rounds their edges, from the most angular to the most rounded.
 _SHARPEST, _ROUNDEST = 200.0, 10.0
-#: Least and most share of a form's height that is under the ground.
+#: Range of the fraction of a form's height that is under the ground.
 _BURIED = {"block": (0.15, 0.4), "clinker": (0.3, 0.5)}
 #: Bumps in bands of wavenumber (radians per radius): number of waves, and each form's RMS height over the radius.
 _BUMP_WAVENUMBERS, _BUMP_WAVES = (3.0, 6.5, 13.0, 24.0), (10, 16, 24, 32)
@@ -33,19 +33,14 @@ _BUMP_RMS = {"block": (0.03, 0.015, 0.008, 0.004), "clinker": (0.1, 0.045, 0.022
 
 @dataclass(frozen=True)
 class ShapeSet:
-    """All shapes at one level of detail. They share their triangles, for each is a displaced icosphere.
+    """All shapes at one level of detail; each is a displaced icosphere, so they share their triangles.
 
     A unit shape stands on the ground plane z = 0, part of it below; seen from above, the mean of its longest and its
     shortest diameter is 1, and it is `UNIT_HEIGHT` high.
 
-    Attributes
-    ----------
-    vertices, normals
-        Shape (shapes, vertices, 3). Normals are those of the smooth shape, not of the triangles.
-    faces
-        Vertex numbers of each triangle, counter-clockwise seen from outside.
-    reach
-        Largest horizontal distance of each shape's surface from its origin.
+    - normals: those of the smooth shape, not of the triangles
+    - faces: vertex numbers of each triangle, counter-clockwise seen from outside
+    - reach: largest horizontal distance of each shape's surface from its origin
     """
 
     vertices: Float64[np.ndarray, "shapes vertices 3"]
@@ -56,7 +51,7 @@ class ShapeSet:
 
 @cache
 def rock_shapes(detail: int) -> ShapeSet:
-    """The shapes at a level of detail, 0 (`COARSE`) to 3 (`FINEST`); coarser ones deviate least from the finest."""
+    """Return the shapes at a level of detail, 0 (`COARSE`) to 3 (`FINEST`); coarser ones are fitted to the finest."""
     directions, faces = _icosphere(detail)
     vertices = _vertices(detail)
     normals = np.stack([block.normals(directions) for block in _blocks()])
@@ -65,21 +60,22 @@ def rock_shapes(detail: int) -> ShapeSet:
 
 
 @cache
-def pixels_held(bound_px: float = DEVIATION_PX) -> Float64[np.ndarray, "shapes levels"]:
-    """Up to how many pixels across each shape may be at each level but the finest: larger, it is seen to deviate.
+def max_pixels(bound_px: float = DEVIATION_PX) -> Float64[np.ndarray, "shapes levels"]:
+    """Largest size in pixels at which each shape may be drawn at each level except the finest.
 
-    Deviation is the distance from the finest shape along its normals, rms over what is above the ground.
+    The deviation is the distance from the finest shape along its normals, RMS over the part above the ground.
     """
     shapes = rock_shapes(FINEST)
-    held = np.empty((SHAPES, FINEST))
+    limits = np.empty((SHAPES, FINEST))
     for number, block in enumerate(_blocks()):
         finest, normals = shapes.vertices[number], shapes.normals[number]
         for detail in range(FINEST):
-            flat = block.flat(_parts_of_corners(detail) @ _fitted(number, detail))
-            away = np.sum((flat - finest) * normals, axis=1)[finest[:, 2] > 0.0]
-            held[number, detail] = bound_px / np.sqrt(np.mean(away**2))
-    held.setflags(write=False)
-    return held
+            inverse = _corner_weights(detail) @ _fitted_inverse_radii(number, detail)
+            flat = block.to_unit_shape(_icosphere(FINEST)[0] / inverse[:, None])
+            deviation = np.sum((flat - finest) * normals, axis=1)[finest[:, 2] > 0.0]
+            limits[number, detail] = bound_px / np.sqrt(np.mean(deviation**2))
+    limits.setflags(write=False)
+    return limits
 
 
 @cache
@@ -95,14 +91,16 @@ def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarra
 @cache
 def _vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
     directions, _ = _icosphere(detail)
-    if detail == FINEST:
-        vertices = np.stack([block.surface(directions) for block in _blocks()])
-    else:
-        vertices = np.stack(
-            [block.placed(directions / _fitted(number, detail)[:, None]) for number, block in enumerate(_blocks())]
-        )
-    vertices.setflags(write=False)
-    return vertices
+    vertices = []
+    for number, block in enumerate(_blocks()):
+        if detail == FINEST:
+            points = directions * block.radius(directions)[:, None]
+        else:
+            points = directions / _fitted_inverse_radii(number, detail)[:, None]
+        vertices.append(block.to_unit_shape(points))
+    stacked = np.stack(vertices)
+    stacked.setflags(write=False)
+    return stacked
 
 
 @cache
@@ -131,10 +129,10 @@ class _Block:
     wave_heights: Float64[np.ndarray, "waves"]
     folded: bool
     axes: Float64[np.ndarray, "3"]
-    buried_share: float
+    buried_fraction: float
 
     @classmethod
-    def drawn(cls, number: int) -> _Block:
+    def draw(cls, number: int) -> _Block:
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(0x70C6, spawn_key=(number,))))
         form = FORMS[number // SHAPES_OF_FORM]
         roundness = number % SHAPES_OF_FORM / (SHAPES_OF_FORM - 1)
@@ -153,101 +151,86 @@ class _Block:
             wave_heights=bumps,
             folded=form == "clinker",
             axes=np.array([1.0, rng.uniform(0.65, 0.95), rng.uniform(0.6, 0.85)]),
-            buried_share=float(rng.uniform(*_BURIED[form])),
+            buried_fraction=float(rng.uniform(*_BURIED[form])),
         )
 
-    def surface(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """Points of the unit shape along directions of the block's own axes."""
-        shift, stretch = self.frame
-        return np.asarray((self._raw(directions) - shift) * stretch)
-
-    def fitted(self, detail: int) -> Float64[np.ndarray, "corners"]:
-        """Inverse distances of a level's corners whose flat triangles deviate least, in mean square, from the finest.
-
-        Along a direction that is a sum of three corners' directions with weights c, a triangle lies at the distance
-        1 / sum(c / r): its inverse is linear in the inverse distances of its corners.
-        """
-        parts, radius = _parts_of_corners(detail), self.finest_radius
-        weighed = parts.multiply(radius[:, None] ** 4).tocsc()
-        return np.asarray(splu((parts.T @ weighed).tocsc()).solve(weighed.T @ (1.0 / radius)))
-
-    def flat(self, inverse: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
-        """Points at these inverse distances along the finest shape's directions."""
-        return self.placed(_icosphere(FINEST)[0] / inverse[:, None])
-
-    def placed(self, own: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """Points of the unit shape, given before the block is stretched."""
+    def to_unit_shape(self, own: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """Points of the unit shape from points in the block's own axes before stretching."""
         shift, stretch = self.frame
         return np.asarray((own * self.axes - shift) * stretch)
 
     def normals(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """Outward unit normals there, by differences of the implicit surface ``|x| - r(x / |x|)``."""
-        points = self._raw(directions)
-        own = points / self.axes
+        """Outward unit normals along directions, by differences of the implicit surface ``|x| - r(x / |x|)``."""
+        own = directions * self.radius(directions)[:, None] * self.axes / self.axes
         step = 1e-4
         gradient = np.empty_like(own)
         for axis in range(3):
             offset = step * np.eye(3)[axis]
-            gradient[:, axis] = (self._beyond(own + offset) - self._beyond(own - offset)) / (2.0 * step)
+            gradient[:, axis] = (self._implicit(own + offset) - self._implicit(own - offset)) / (2.0 * step)
         gradient /= self.axes * self.frame[1]
         return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
-    def _beyond(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+    def _implicit(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
         length = np.linalg.norm(points, axis=1)
-        return np.asarray(length - self._radius(points / length[:, None]))
+        return np.asarray(length - self.radius(points / length[:, None]))
 
-    def _radius(self, d: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-        towards = np.maximum(_products(d, self.cut_normals), 0.0) / self.cut_distances
+    def radius(self, d: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+        """Distance of the surface along directions, in the block's own axes."""
+        towards = np.maximum(_dot_products(d, self.cut_normals), 0.0) / self.cut_distances
         radius = (1.0 + np.sum(towards**self.sharpness, axis=1)) ** (-1.0 / self.sharpness)
-        phase = _products(d, self.waves) + self.wave_phases
+        phase = _dot_products(d, self.waves) + self.wave_phases
         wave = np.cos(phase)
         if self.folded:
-            # of the same mean square, 1/2, about the mean 0; the cusps outwards
+            # same mean square, 1/2, about the mean 0; cusps outwards
             wave = (2.0 / np.pi - np.abs(wave)) / np.sqrt(1.0 - 8.0 / np.pi**2)
         return np.asarray(radius * (1.0 + np.sum(self.wave_heights * wave, axis=1)))
 
-    def _raw(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        return np.asarray(directions * self._radius(directions)[:, None] * self.axes)
-
     @cached_property
     def finest_radius(self) -> Float64[np.ndarray, "n"]:
-        """Distance of the surface along the finest shapes' directions, in the block's own axes."""
-        return self._radius(_icosphere(FINEST)[0])
+        """Radii along the finest shapes' directions."""
+        return self.radius(_icosphere(FINEST)[0])
 
     @cached_property
     def frame(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Origin on the ground plane and scale that make the block a unit shape."""
         points = _icosphere(FINEST)[0] * self.finest_radius[:, None] * self.axes
         lowest, highest = points[:, 2].min(), points[:, 2].max()
-        ground = lowest + self.buried_share * (highest - lowest)
-        seen = points[points[:, 2] >= ground, :2]
+        ground = lowest + self.buried_fraction * (highest - lowest)
+        visible = points[points[:, 2] >= ground, :2]
         azimuth = np.linspace(0.0, np.pi, 180, endpoint=False)
-        along = seen[:, :1] * np.cos(azimuth) + seen[:, 1:] * np.sin(azimuth)
+        along = visible[:, :1] * np.cos(azimuth) + visible[:, 1:] * np.sin(azimuth)
         diameters = np.ptp(along, axis=0)
-        middle = 0.5 * (seen.max(axis=0) + seen.min(axis=0))
+        middle = 0.5 * (visible.max(axis=0) + visible.min(axis=0))
         across = 2.0 / (diameters.max() + diameters.min())
         return np.array([*middle, ground]), np.array([across, across, UNIT_HEIGHT / (highest - ground)])
 
 
-def _products(d: Float64[np.ndarray, "n 3"], vectors: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "n m"]:
-    """Scalar products of each with each, written out so that no BLAS with its own order of summation takes part."""
+def _dot_products(d: Float64[np.ndarray, "n 3"], vectors: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "n m"]:
+    """All scalar products, written out because the order of summation of BLAS differs between machines."""
     x, y, z = (d[:, axis, None] * vectors[:, axis] for axis in range(3))
     return np.asarray(x + y + z)
 
 
 @cache
 def _blocks() -> tuple[_Block, ...]:
-    return tuple(_Block.drawn(number) for number in range(SHAPES))
+    return tuple(_Block.draw(number) for number in range(SHAPES))
 
 
 @cache
-def _fitted(number: int, detail: int) -> Float64[np.ndarray, "corners"]:
-    return _blocks()[number].fitted(detail)
+def _fitted_inverse_radii(number: int, detail: int) -> Float64[np.ndarray, "corners"]:
+    """Inverse radii of a level's corners whose flat triangles deviate least, in mean square, from the finest shape.
+
+    Along a direction that is a sum of three corners' directions with weights c, a triangle lies at the distance
+    1 / sum(c / r): its inverse is linear in the inverse radii of its corners.
+    """
+    corners, radius = _corner_weights(detail), _blocks()[number].finest_radius
+    weighted = corners.multiply(radius[:, None] ** 4).tocsc()
+    return np.asarray(splu((corners.T @ weighted).tocsc()).solve(weighted.T @ (1.0 / radius)))
 
 
 @cache
-def _parts_of_corners(detail: int) -> csc_matrix:
-    """Each direction of the finest shapes as a sum of the directions of the corners of a level's triangle there."""
+def _corner_weights(detail: int) -> csc_matrix:
+    """Weights that express each direction of the finest shapes by the corners of a level's triangle there."""
     directions, faces = _icosphere(detail)
     finest = _icosphere(FINEST)[0]
     middles = directions[faces].sum(axis=1)
@@ -255,8 +238,8 @@ def _parts_of_corners(detail: int) -> csc_matrix:
     near = np.argsort(-(finest @ middles.T), axis=1, kind="stable")[:, :4]
     solved = np.linalg.inv(directions[faces].transpose(0, 2, 1))
     weights = np.einsum("nkij,nj->nki", solved[near], finest)
-    every = np.arange(len(finest))
+    rows = np.arange(len(finest))
     best = np.argmax(weights.min(axis=2), axis=1)
-    corners = faces[near[every, best]]
-    places = (np.repeat(every, 3), corners.ravel())
-    return csc_matrix((weights[every, best].ravel(), places), (len(finest), len(directions)))
+    corners = faces[near[rows, best]]
+    entries = (np.repeat(rows, 3), corners.ravel())
+    return csc_matrix((weights[rows, best].ravel(), entries), (len(finest), len(directions)))

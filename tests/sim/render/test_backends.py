@@ -4,6 +4,7 @@ import ctypes
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ np.savez(sys.argv[2], radiance=frame.radiance, distance=frame.range_m, depth=dep
 LIBRARIES = {"osmesa": "libOSMesa.so.8", "egl": "libEGL.so.1"}
 
 
-def _draw(backend: str, folder) -> dict[str, np.ndarray]:
+def _draw(backend: str, folder: Path) -> dict[str, np.ndarray]:
     try:
         ctypes.CDLL(LIBRARIES[backend])
     except OSError:
@@ -52,7 +53,7 @@ def _draw(backend: str, folder) -> dict[str, np.ndarray]:
     return dict(np.load(path))
 
 
-def test_osmesa_and_egl_draw_the_same_picture(tmp_path) -> None:
+def test_osmesa_and_egl_draw_the_same_picture(tmp_path: Path) -> None:
     osmesa, egl = _draw("osmesa", tmp_path), _draw("egl", tmp_path)
     # Where a ray grazes a crest, two depths a rounding apart can lead to this side of it or the other.
     assert np.mean(np.abs(egl["distance"] / osmesa["distance"] - 1.0) < 1e-6) > 0.999
@@ -62,14 +63,16 @@ def test_osmesa_and_egl_draw_the_same_picture(tmp_path) -> None:
     assert np.abs(egl["depth"] - osmesa["depth"]).mean() < 1e-3
 
 
-def test_an_unknown_backend_is_named(monkeypatch) -> None:
+def test_an_unknown_backend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_GL", "vulkan")
     with pytest.raises(RenderingError, match="'vulkan'; allowed: osmesa, egl"):
         default_backend()
 
 
 @pytest.mark.parametrize(("installed", "chosen"), [(("OSMesa", "EGL"), "osmesa"), (("EGL",), "egl"), ((), "osmesa")])
-def test_without_a_choice_the_installed_backend_is_taken(monkeypatch, installed, chosen) -> None:
+def test_without_a_choice_the_installed_backend_is_taken(
+    monkeypatch: pytest.MonkeyPatch, installed: tuple[str, ...], chosen: str
+) -> None:
     from marsyard.sim.render import backend
 
     monkeypatch.delenv("MARSYARD_GL", raising=False)

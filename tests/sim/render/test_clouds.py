@@ -1,11 +1,13 @@
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from marsyard.sim.camera import Cahvor, CameraModel
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import CloudLayer, CloudParameters, Frame, Photometry, PixelRays, Scene, Sun
+from marsyard.sim.render import CloudLayer, CloudParameters, Frame, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.terrain import Surface
 
 ALBEDO = 0.3
@@ -21,20 +23,22 @@ def _flat() -> Surface:
 
 
 def _layer(seed: int = 1, **changes: float) -> CloudLayer:
-    return CloudLayer.drawn(CloudParameters(**changes), np.random.default_rng(seed))
+    return CloudLayer.draw(CloudParameters(**changes), np.random.default_rng(seed))
 
 
 def _scene(clouds: CloudLayer | None, photometry: Photometry = LAMBERT) -> Scene:
     return Scene(_flat(), (0.0, 0.0), SUN, photometry, clouds=clouds, edge_rays=1)
 
 
-def _from_above(renderer, scene: Scene, camera, time_s: float = 0.0, at=(100.0, 300.0)) -> Frame:
+def _from_above(
+    renderer: Renderer, scene: Scene, camera: CameraModel, time_s: float = 0.0, at: tuple[float, float] = (100.0, 300.0)
+) -> Frame:
     pose = rigid(Rotation.from_euler("z", 25.0, degrees=True), np.array([*at, 2000.0]))
     return renderer.render(scene, PixelRays.of(camera), pose, time_s)
 
 
 @pytest.mark.parametrize("cover", [0.1, 0.3, 0.6])
-def test_cover_and_size_are_what_was_asked_for(cover) -> None:
+def test_cover_and_size_are_what_was_asked_for(cover: float) -> None:
     layers = [_layer(seed, cover=cover, size_m=900.0, edge_m=20.0) for seed in range(4)]
     assert np.mean([layer.cover.mean() for layer in layers]) == pytest.approx(cover, rel=0.01)
     inside = np.stack([layer.cover > 0.5 for layer in layers])
@@ -43,7 +47,9 @@ def test_cover_and_size_are_what_was_asked_for(cover) -> None:
     assert inside.sum() / entries * layers[0].cell_m == pytest.approx(900.0, rel=0.05)
 
 
-def test_clouds_dim_the_direct_sun_by_their_optical_depth(renderer, descent_camera) -> None:
+def test_clouds_dim_the_direct_sun_by_their_optical_depth(
+    renderer: Renderer, descent_camera: Callable[..., Cahvor]
+) -> None:
     layer = _layer(cover=0.4, optical_depth=1.0, edge_m=10.0)
     frame = _from_above(renderer, _scene(layer), descent_camera(128))
     elevation = np.radians(50.0)
@@ -53,7 +59,9 @@ def test_clouds_dim_the_direct_sun_by_their_optical_depth(renderer, descent_came
     assert frame.radiance.min() == pytest.approx(clear * np.exp(-1.0 / np.sin(elevation)) + more, rel=1e-3)
 
 
-def test_the_picture_shows_the_transmittance_that_truth_states(renderer, descent_camera) -> None:
+def test_the_picture_shows_the_transmittance_that_truth_states(
+    renderer: Renderer, descent_camera: Callable[..., Cahvor]
+) -> None:
     scene = _scene(_layer(seed=3, asymmetry=0.0, optical_depth=100.0))
     frame = _from_above(renderer, scene, descent_camera(128), time_s=12.0)
     assert scene.clouds is not None
@@ -63,7 +71,7 @@ def test_the_picture_shows_the_transmittance_that_truth_states(renderer, descent
     assert 0.1 < np.mean(passed < 0.5) < 0.9
 
 
-def test_shadows_move_with_the_wind(renderer, descent_camera) -> None:
+def test_shadows_move_with_the_wind(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     """Seen from a place that drifts with the wind, the shadows on an even ground stand still."""
     scene, camera = _scene(_layer(wind_east_m_s=9.0, wind_north_m_s=-4.0)), descent_camera(128)
     first = _from_above(renderer, scene, camera, 5.0)
@@ -75,7 +83,9 @@ def test_shadows_move_with_the_wind(renderer, descent_camera) -> None:
     assert np.abs(stayed.radiance - first.radiance).max() > 0.05
 
 
-def test_no_cover_is_no_clouds_to_the_last_bit(renderer, descent_camera, rough) -> None:
+def test_no_cover_is_no_clouds_to_the_last_bit(
+    renderer: Renderer, descent_camera: Callable[..., Cahvor], rough: Surface
+) -> None:
     camera = PixelRays.of(descent_camera(128))
     pose = rigid(Rotation.identity(), np.array([380.0, 200.0, 900.0]))
     bare = Scene(rough, (380.0, 200.0), SUN, Photometry())

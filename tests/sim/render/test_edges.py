@@ -10,10 +10,10 @@ from benchmarks.validation.motion import View, supersampled
 from benchmarks.validation.raycast import meet_triangles
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Objects, Photometry, PixelRays, Scene, Sun
-from marsyard.sim.render.edges import edge_pixels, rays_within
+from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.kernels.hierarchy import nearest_hit
 from marsyard.sim.render.kernels.structs import Ray
+from marsyard.sim.render.renderer import edge_pixels, rays_within
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
@@ -59,7 +59,7 @@ def rocky() -> View:
 
 
 @pytest.fixture(scope="module")
-def reference(renderer, rocky: View) -> np.ndarray:
+def reference(renderer: Renderer, rocky: View) -> np.ndarray:
     """The rocks by 256 rays a pixel, each of which sees ground and texture as smooth as the pixel."""
     single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
     return supersampled(renderer, replace(single, footprint=float(SAMPLES)), SAMPLES)
@@ -80,7 +80,7 @@ def test_rays_within_a_pixel_are_spread_evenly_about_its_middle() -> None:
         np.testing.assert_allclose(steps, 1.0 / 9.0, atol=2e-3)
 
 
-def test_the_nearest_triangle_is_that_of_an_exhaustive_search(rocky) -> None:
+def test_the_nearest_triangle_is_that_of_an_exhaustive_search(rocky: View) -> None:
     objects, pose = rocky.scene.objects, rocky.world_from_body
     rays = pose.rotation.apply(rocky.rays(rocky.camera).directions[::37].astype(np.float64))
     starts = np.broadcast_to(pose.translation, rays.shape)
@@ -91,7 +91,9 @@ def test_the_nearest_triangle_is_that_of_an_exhaustive_search(rocky) -> None:
 
 
 @pytest.mark.parametrize(("side", "share"), [(2, 0.5), (3, 0.4)])
-def test_outlines_are_those_of_256_rays_a_pixel(renderer, rocky, reference, side: int, share: float) -> None:
+def test_outlines_are_those_of_256_rays_a_pixel(
+    renderer: Renderer, rocky: View, reference: np.ndarray, side: int, share: float
+) -> None:
     single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
     rays = rocky.rays(rocky.camera)
     one = renderer.render(single.scene, rays, rocky.world_from_body)
@@ -108,7 +110,7 @@ def test_outlines_are_those_of_256_rays_a_pixel(renderer, rocky, reference, side
     assert abs(at_edges) < 0.1 * error(one.radiance)
 
 
-def test_truth_is_that_of_the_pixels_middles(renderer, rocky) -> None:
+def test_truth_is_that_of_the_pixels_middles(renderer: Renderer, rocky: View) -> None:
     rays = rocky.rays(rocky.camera)
     one = renderer.render(replace(rocky.scene, edge_rays=1), rays, rocky.world_from_body)
     several = renderer.render(rocky.scene, rays, rocky.world_from_body)
@@ -118,7 +120,7 @@ def test_truth_is_that_of_the_pixels_middles(renderer, rocky) -> None:
     assert np.isin(changed, edge_pixels(one.radiance, one.range_m, one.body)).all()
 
 
-def test_the_horizon_of_a_plane_is_where_its_mesh_ends(renderer) -> None:
+def test_the_horizon_of_a_plane_is_where_its_mesh_ends(renderer: Renderer) -> None:
     """A rolled camera over a plane: the share of ground in each column is that below the mesh's border.
 
     The mesh ends 200 m away, 5 mrad or 3.3 pixels below the plane's own horizon.

@@ -1,5 +1,7 @@
 """Where things appear in rendered pictures, against analytic truth and an independent ray cast."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -9,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from benchmarks.validation.raycast import Ground
 from marsyard.sim.camera import Cahvor
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Objects, Photometry, PixelRays, Scene, Sun
+from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.kernels.ground import cross_ground, skip_empty_blocks, way_in, way_out
+from marsyard.sim.render.kernels.ground import cross_ground, entry_distance, exit_distance, skip_empty_blocks
 from marsyard.sim.render.kernels.structs import GroundLevel, Ray
-from marsyard.sim.render.pyramid import NO_CEILING
+from marsyard.sim.render.mesh import NO_CEILING
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 
@@ -51,7 +53,7 @@ def _centroid(radiance: np.ndarray, near: np.ndarray) -> np.ndarray:
     border = np.concatenate([patch[0], patch[-1], patch[:, 0], patch[:, -1]])
     weight = np.clip(patch - np.median(border), 0.0, None)
     v, u = np.mgrid[v0 - 8 : v0 + 9, u0 - 8 : u0 + 9]
-    return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
+    return np.asarray(np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum())
 
 
 def _expected_centroid(camera: Cahvor, spot: np.ndarray) -> np.ndarray:
@@ -66,10 +68,12 @@ def _expected_centroid(camera: Cahvor, spot: np.ndarray) -> np.ndarray:
     variance = (2.5**2 + 1.0 / 3.0) * 1.5**2
     weight = area * np.exp(-(dx**2 + dy**2) / (2.0 * variance))
     pixels, _ = camera.project(points)
-    return (weight[..., None] * pixels).sum(axis=(0, 1)) / weight.sum()
+    return np.asarray((weight[..., None] * pixels).sum(axis=(0, 1)) / weight.sum())
 
 
-def test_a_pattern_on_a_plane_is_found_where_the_camera_model_puts_it(renderer, descent_camera) -> None:
+def test_a_pattern_on_a_plane_is_found_where_the_camera_model_puts_it(
+    renderer: Renderer, descent_camera: Callable[..., Cahvor]
+) -> None:
     """The bar: 0.05 px rms through a strongly distorted CAHVOR camera, tilted and rolled."""
     surface, spots = _marked_plane(height_m=7.0)
     camera = descent_camera(r=STRONG)
@@ -93,7 +97,9 @@ def test_a_pattern_on_a_plane_is_found_where_the_camera_model_puts_it(renderer, 
 
 
 @pytest.mark.parametrize("height_m", [500.0, 2000.0])
-def test_world_points_lie_on_the_plane_and_on_their_rays(renderer, descent_camera, height_m) -> None:
+def test_world_points_lie_on_the_plane_and_on_their_rays(
+    renderer: Renderer, descent_camera: Callable[..., Cahvor], height_m: float
+) -> None:
     surface, _ = _marked_plane(height_m=-3.0)
     camera = descent_camera(r=STRONG)
     pose = rigid(TILTED, np.array([100.0, 50.0, height_m - 3.0]))
@@ -117,7 +123,7 @@ def _cast(surface: Surface, origin: np.ndarray, ray: np.ndarray, reach: float) -
         ground = map_coordinates(
             control, [y / surface.spacing_m, x / surface.spacing_m], order=3, mode="grid-wrap", prefilter=False
         )
-        return z - ground
+        return np.asarray(z - ground)
 
     t = np.arange(0.5 * reach, 1.5 * reach, 0.3)
     first = int(np.argmax(clearance(t) < 0.0))
@@ -125,7 +131,9 @@ def _cast(surface: Surface, origin: np.ndarray, ray: np.ndarray, reach: float) -
     return float(brentq(lambda s: clearance(s).item(), t[first - 1], t[first], xtol=1e-9))
 
 
-def test_ranges_agree_with_an_independent_ray_cast_over_rough_ground(renderer, rough, descent_camera) -> None:
+def test_ranges_agree_with_an_independent_ray_cast_over_rough_ground(
+    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+) -> None:
     rays = PixelRays.of(descent_camera())
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
     frame = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, PAINT), rays, pose)
@@ -139,7 +147,7 @@ def test_ranges_agree_with_an_independent_ray_cast_over_rough_ground(renderer, r
 
 
 @pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
-def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough, bounded: bool) -> None:
+def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough: Surface, bounded: bool) -> None:
     """Rays that graze rough ground hundreds of samples away, against steps of a thirtieth of a sample."""
     rng = np.random.default_rng(3)
     count, ground = 400, Ground(rough)
@@ -162,7 +170,7 @@ def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough, bounded
 
 
 @pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
-def test_ground_is_met_up_to_the_very_end_of_the_search_and_none_beyond(rough, bounded: bool) -> None:
+def test_ground_is_met_up_to_the_very_end_of_the_search_and_none_beyond(rough: Surface, bounded: bool) -> None:
     """Without ceilings steps are longer than what is left: ground before a thing was passed over with the thing."""
     rng = np.random.default_rng(4)
     ground = Ground(rough)
@@ -178,15 +186,15 @@ def test_ground_is_met_up_to_the_very_end_of_the_search_and_none_beyond(rough, b
 
 def test_a_ray_meets_no_ground_before_it_is_as_low_as_the_highest() -> None:
     extent = (-10.0, 10.0, -20.0, 20.0, 3.0)
-    assert way_in(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, -0.1)) == pytest.approx(20.0)
-    assert way_in(extent, Ray(0.0, 0.0, 3.0, 1.0, 0.0, -0.1)) == 0.0
-    assert way_in(extent, Ray(0.0, 0.0, 1.0, 1.0, 0.0, 0.1)) == 0.0
-    assert way_in(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, 0.1)) == np.inf
-    assert way_in(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, 0.0)) == np.inf
-    assert way_out(extent, Ray(2.0, -1.0, 0.0, 0.5, -0.1, 0.0)) == pytest.approx(16.0)
+    assert entry_distance(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, -0.1)) == pytest.approx(20.0)
+    assert entry_distance(extent, Ray(0.0, 0.0, 3.0, 1.0, 0.0, -0.1)) == 0.0
+    assert entry_distance(extent, Ray(0.0, 0.0, 1.0, 1.0, 0.0, 0.1)) == 0.0
+    assert entry_distance(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, 0.1)) == np.inf
+    assert entry_distance(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, 0.0)) == np.inf
+    assert exit_distance(extent, Ray(2.0, -1.0, 0.0, 0.5, -0.1, 0.0)) == pytest.approx(16.0)
 
 
-def test_a_ray_skips_the_blocks_of_ground_that_it_is_clear_of(rough) -> None:
+def test_a_ray_skips_the_blocks_of_ground_that_it_is_clear_of(rough: Surface) -> None:
     """To the first block whose ceiling it is not above, in all directions and over the border of the period."""
     ceiling = rough.ceilings[0]
     level, block = GroundLevel(rough.levels[0], ceiling, 1.0 / rough.spacing_m), CEILING_BLOCK * rough.spacing_m
@@ -204,7 +212,9 @@ def test_a_ray_skips_the_blocks_of_ground_that_it_is_clear_of(rough) -> None:
         assert below[(t > clear) & (t < clear + 2.0 * block)].any()
 
 
-def test_the_mesh_only_starts_the_search(renderer, rough, descent_camera) -> None:
+def test_the_mesh_only_starts_the_search(
+    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+) -> None:
     """A mesh three times as coarse gives the same picture: geometry is the terrain's, not the triangles'."""
     rays = PixelRays.of(descent_camera(256))
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
@@ -214,7 +224,9 @@ def test_the_mesh_only_starts_the_search(renderer, rough, descent_camera) -> Non
     assert same.mean() > 0.995
 
 
-def test_pixels_above_the_horizon_see_the_sky(renderer, rough, descent_camera) -> None:
+def test_pixels_above_the_horizon_see_the_sky(
+    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+) -> None:
     level = rigid(Rotation.from_euler("x", 90.0, degrees=True), np.array([0.0, 0.0, 500.0]))
     frame = renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, PAINT), PixelRays.of(descent_camera(128)), level)
     upper, lower = frame.range_m[:60], frame.range_m[-40:]
@@ -224,7 +236,9 @@ def test_pixels_above_the_horizon_see_the_sky(renderer, rough, descent_camera) -
     assert np.isnan(frame.points_world()[:60]).all()
 
 
-def test_what_is_out_of_view_does_not_change_the_picture(renderer, rough, descent_camera) -> None:
+def test_what_is_out_of_view_does_not_change_the_picture(
+    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+) -> None:
     """Where nothing but ground is in view no triangle is drawn: the search for one must not read what is not there."""
     position = np.array([100.0, 200.0, 300.0])
     corners = position + np.array([[0.0, 0.0, 100.0], [1.0, 0.0, 100.0], [0.0, 1.0, 100.0]])
@@ -243,13 +257,17 @@ def test_what_is_out_of_view_does_not_change_the_picture(renderer, rough, descen
     np.testing.assert_array_equal(with_it.radiance, without.radiance)
 
 
-def test_refuses_a_camera_below_the_ground(renderer, rough, descent_camera) -> None:
+def test_refuses_a_camera_below_the_ground(
+    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+) -> None:
     buried = rigid(Rotation.identity(), np.array([0.0, 0.0, -1000.0]))
     with pytest.raises(RenderingError, match="below the ground"):
         renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, PAINT), PixelRays.of(descent_camera(64)), buried)
 
 
-def test_same_picture_whatever_was_drawn_before(renderer, rough, descent_camera) -> None:
+def test_same_picture_whatever_was_drawn_before(
+    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+) -> None:
     rays = PixelRays.of(descent_camera(256))
     sun = Sun(direction(np.radians(100.0), np.radians(40.0)))
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))

@@ -7,7 +7,7 @@ SIZE = 20_000_000
 #: Frees as much as some pictures take, and tells how much more memory is in use then, and after it has gone back.
 SCRIPT = f"""
 import os, sys
-from marsyard.sim.render.heap import keep_freed_memory, return_freed_memory
+from marsyard.sim.render.process import keep_freed_memory, return_freed_memory
 
 def used():
     with open("/proc/self/statm") as file:

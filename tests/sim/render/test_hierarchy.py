@@ -24,7 +24,7 @@ def thicket() -> Objects:
 
 def _rays(rng: np.random.Generator, count: int) -> np.ndarray:
     rays = rng.normal(size=(count, 3))
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def test_the_nearest_triangle_is_that_of_all(thicket: Objects) -> None:

@@ -1,9 +1,12 @@
+from collections.abc import Callable
+
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.sim.camera import Cahvor, CameraModel
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Photometry, PixelRays, Scene, Sun
+from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.terrain import Surface
 
 NADIR = rigid(Rotation.identity(), np.array([0.0, 0.0, 1000.0]))
@@ -19,18 +22,23 @@ def _surface(heights: np.ndarray, albedo: float = 0.2) -> Surface:
 FLAT = _surface(np.zeros((256, 256)))
 
 
-def _render(renderer, camera, surface: Surface, sun: Sun, law: Photometry, pose=NADIR) -> np.ndarray:
-    return renderer.render(Scene(surface, (0.0, 0.0), sun, law), PixelRays.of(camera), pose).radiance
+def _render(
+    renderer: Renderer, camera: CameraModel, surface: Surface, sun: Sun, law: Photometry, pose: RigidTransform = NADIR
+) -> np.ndarray:
+    radiance: np.ndarray = renderer.render(Scene(surface, (0.0, 0.0), sun, law), PixelRays.of(camera), pose).radiance
+    return radiance
 
 
-def test_a_lambert_plane_is_as_bright_as_the_cosine_says(renderer, descent_camera) -> None:
+def test_a_lambert_plane_is_as_bright_as_the_cosine_says(
+    renderer: Renderer, descent_camera: Callable[..., Cahvor]
+) -> None:
     sun = Sun(direction(np.radians(70.0), np.radians(35.0)))
     law = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0)
     radiance = _render(renderer, descent_camera(128), FLAT, sun, law)
     np.testing.assert_allclose(radiance, 0.2 * np.sin(np.radians(35.0)), rtol=1e-5)
 
 
-def test_lunar_lambert_against_the_formula(renderer, descent_camera) -> None:
+def test_lunar_lambert_against_the_formula(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     camera = descent_camera(64)
     sun = Sun(direction(np.radians(200.0), np.radians(50.0)))
     law = Photometry(lunar_share=0.6, surge_amplitude=0.8, surge_width=0.05, sky_share=0.2, surrounding_albedo=0.0)
@@ -38,7 +46,7 @@ def test_lunar_lambert_against_the_formula(renderer, descent_camera) -> None:
     cos_i, cos_e = sun.direction[2], -to_ground[..., 2]
     phase = np.arccos(-to_ground @ sun.direction)
 
-    def surge(g):
+    def surge(g: np.ndarray) -> np.ndarray:
         return 1 + 0.8 / (1 + np.tan(g / 2) / 0.05)
 
     disc = 0.6 * 2 * cos_i / (cos_i + cos_e) + 0.4 * cos_i
@@ -46,7 +54,9 @@ def test_lunar_lambert_against_the_formula(renderer, descent_camera) -> None:
     np.testing.assert_allclose(_render(renderer, camera, FLAT, sun, law), expected, rtol=1e-4)
 
 
-def test_the_opposition_spot_is_at_the_antisolar_point(renderer, descent_camera) -> None:
+def test_the_opposition_spot_is_at_the_antisolar_point(
+    renderer: Renderer, descent_camera: Callable[..., Cahvor]
+) -> None:
     camera = descent_camera()
     sun = Sun(direction(np.radians(30.0), np.radians(80.0)))
     law = Photometry(lunar_share=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
@@ -58,7 +68,7 @@ def test_the_opposition_spot_is_at_the_antisolar_point(renderer, descent_camera)
     assert np.abs(np.array(peak[::-1]) - at).max() <= 0.51
 
 
-def test_slopes_facing_the_sun_are_brighter(renderer, descent_camera) -> None:
+def test_slopes_facing_the_sun_are_brighter(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     x = np.arange(256) * 8.0
     heights = np.broadcast_to(20.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
     law = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0)
@@ -71,7 +81,7 @@ def test_slopes_facing_the_sun_are_brighter(renderer, descent_camera) -> None:
     assert frame.radiance[facing_east].min() > frame.radiance[facing_west].max()
 
 
-def test_ground_turned_from_the_sun_has_only_the_sky(renderer, descent_camera) -> None:
+def test_ground_turned_from_the_sun_has_only_the_sky(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     x = np.arange(256) * 8.0
     heights = np.broadcast_to(40.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
     low = Sun(direction(np.radians(90.0), np.radians(5.0)))
@@ -83,7 +93,7 @@ def test_ground_turned_from_the_sun_has_only_the_sky(renderer, descent_camera) -
     assert lit.min() > 0.15 * 0.2 * 0.9
 
 
-def test_a_distant_ground_is_averaged_not_sampled(renderer, descent_camera) -> None:
+def test_a_distant_ground_is_averaged_not_sampled(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     """Stripes four times finer than a pixel fade to their mean instead of aliasing."""
     samples = np.zeros((512, 512, 2), dtype=np.float32)
     samples[..., 1] = 0.2

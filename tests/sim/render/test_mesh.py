@@ -4,6 +4,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from marsyard.sim.render.mesh import cells_in_hull, graded_offsets, ground_mesh
+from marsyard.sim.terrain import Surface
 
 
 @given(finest=st.floats(0.5, 20.0), stretch=st.floats(1.01, 1000.0), count=st.integers(8, 200).map(lambda n: 2 * n + 1))
@@ -22,7 +23,7 @@ def test_refuses_more_lines_than_fit() -> None:
         graded_offsets(100.0, 10.0, 101)
 
 
-def test_mesh_is_closed_faces_up_and_follows_the_ground(rough) -> None:
+def test_mesh_is_closed_faces_up_and_follows_the_ground(rough: Surface) -> None:
     offsets = graded_offsets(2000.0, 6.0, 65)
     mesh = ground_mesh(rough, 120.0 + offsets, -40.0 + offsets)
     assert len(mesh.faces) == 2 * 64 * 64
@@ -55,7 +56,7 @@ def test_cells_of_a_hull_hold_all_of_it_and_little_else(corners: list[tuple[floa
         assert lines[spans[strip, 1]] >= low[0]
 
 
-def test_some_cells_of_a_mesh_are_those_of_the_whole(rough) -> None:
+def test_some_cells_of_a_mesh_are_those_of_the_whole(rough: Surface) -> None:
     """The spans leave strips out, overlap by a corner, and do not touch at all."""
     lines = graded_offsets(300.0, 5.0, 17)
     spans = np.zeros((16, 2), dtype=int)

@@ -1,15 +1,17 @@
 """A picture moves as its camera does: quick versions of the bars that `make validate` measures in full."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.estimators import PATCH, SmoothPicture, symmetric_shifts
 from benchmarks.validation.motion import View, measure, patch_grid
-from marsyard.sim.camera import Cahv
+from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Objects, Photometry, Scene, Sun, Texture
-from marsyard.sim.terrain import TerrainParameters, synthesise
+from marsyard.sim.render import Objects, Photometry, Renderer, Scene, Sun, Texture
+from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
 SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
@@ -38,7 +40,9 @@ def test_the_estimator_finds_a_known_shift() -> None:
     np.testing.assert_allclose(shifts.expected(everywhere), np.broadcast_to(shift, shifts.found.shape), atol=1e-9)
 
 
-def test_a_descent_picture_moves_as_the_camera_does(renderer, rough, descent_camera) -> None:
+def test_a_descent_picture_moves_as_the_camera_does(
+    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+) -> None:
     texture = Texture(3.0, (0.03,) * 6)
     scene = Scene(rough, (380.0, 200.0), SUN, Photometry(), ground_texture=texture)
     camera = descent_camera().cropped(256, 256, (512, 512))
@@ -50,7 +54,7 @@ def test_a_descent_picture_moves_as_the_camera_does(renderer, rough, descent_cam
 
 
 @pytest.mark.parametrize("distance_m", [5.0, 2.0])
-def test_a_rock_from_a_mast_moves_as_the_camera_does(renderer, distance_m) -> None:
+def test_a_rock_from_a_mast_moves_as_the_camera_does(renderer: Renderer, distance_m: float) -> None:
     parameters = TerrainParameters(
         samples=512, spacing_m=0.05, rms_slope_deg=3.0, slope_baseline_m=1.0, outer_scale_m=10.0, craters_per_km2=0.0
     )

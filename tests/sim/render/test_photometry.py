@@ -1,5 +1,6 @@
 """The reflectance law as rendered: reciprocity, albedo by an independent integration, and the opposition peak."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from marsyard.sim.camera import Cahv, Cahvore
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Photometry, PixelRays, Scene, Sun
+from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.terrain import Surface
 
 ALBEDO = 0.2
@@ -28,7 +29,7 @@ def flat() -> Surface:
     return Surface.from_samples(samples, 64.0)
 
 
-def _brightness(renderer, flat: Surface, law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) -> float:
+def _brightness(renderer: Renderer, flat: Surface, law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) -> float:
     """Radiance factor of flat ground in the direct sun alone."""
     camera = Cahv.from_field_of_view(
         horizontal_rad=0.002,
@@ -43,7 +44,7 @@ def _brightness(renderer, flat: Surface, law: Photometry, to_sun: np.ndarray, to
 
 
 @each_law
-def test_sun_and_eye_can_change_places(renderer, flat, law) -> None:
+def test_sun_and_eye_can_change_places(renderer: Renderer, flat: Surface, law: Photometry) -> None:
     rng = np.random.default_rng(9)
     for _ in range(3):
         azimuths, heights = rng.uniform(0.0, 2.0 * np.pi, 2), np.arcsin(rng.uniform(0.15, 1.0, 2))
@@ -54,7 +55,7 @@ def test_sun_and_eye_can_change_places(renderer, flat, law) -> None:
 
 
 @each_law
-def test_the_law_returns_the_stated_share_of_light(law) -> None:
+def test_the_law_returns_the_stated_share_of_light(law: Photometry) -> None:
     """Sun and eye drawn in proportion to their cosines: the mean of I/F over cos i is the spherical albedo."""
     one, two, turn = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(17).T
     cos_i, cos_e = np.sqrt(1.0 - one), np.sqrt(1.0 - two)
@@ -77,7 +78,9 @@ def _hazcam() -> Cahvore:
 
 
 @pytest.mark.parametrize("wide", [False, True])
-def test_the_opposition_peak_is_opposite_the_sun(renderer, flat, descent_camera, wide) -> None:
+def test_the_opposition_peak_is_opposite_the_sun(
+    renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], wide: float
+) -> None:
     """The peak's centre, found in the picture alone, within half a pixel."""
     camera = _hazcam() if wide else descent_camera(512)
     law = Photometry(lunar_share=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)

@@ -9,14 +9,15 @@ from marsyard.scenarios.views import Eye, SiteGround, mast_pose, nadir_pose, sit
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
-from marsyard.sim.render.reach import EVERYWHERE, shadow_footprint
+from marsyard.sim.render.kernels.structs import Footprint
+from marsyard.sim.render.shadows import EVERYWHERE, shadow_footprint
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import RockParameters, TerrainParameters, site
 
 ROCKY = TerrainParameters(samples=512, spacing_m=3.0, rocks=RockParameters(abundance=0.15, smallest_m=1.0))
 
 
-def _inside(footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _inside(footprint: Footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     cells, west, south, per_metre = footprint
     column = np.floor((x - west) * per_metre).astype(int)
     row = np.floor((y - south) * per_metre).astype(int)
@@ -27,7 +28,7 @@ def _inside(footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("elevation", [0.2, 0.7, 1.5])
-def test_every_place_in_a_shadow_is_in_reach(elevation) -> None:
+def test_every_place_in_a_shadow_is_in_reach(elevation: float) -> None:
     """Rays to the sun that pass through a sphere, from ground of any height above the lowest; and few others."""
     rng = np.random.default_rng(0)
     spheres = np.column_stack(

@@ -1,17 +1,25 @@
 """Cast shadows against an independent ray cast: SciPy's B-spline for the ground, brute force for triangles."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.raycast import Ground, meet_triangles
-from marsyard.sim.camera import Cahv
+from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Scene, Sun
-from marsyard.sim.render.ground_shadow import NO_SHADOW, ground_in_cones, ground_shadow, slope_bounds, sun_over_slopes
+from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.kernels.casters import sun_hidden
 from marsyard.sim.render.kernels.ground import height_range
-from marsyard.sim.render.reach import casters_towards
+from marsyard.sim.render.shadows import (
+    NO_SHADOW,
+    casters_towards,
+    ground_in_cones,
+    ground_shadow,
+    slope_bounds,
+    sun_over_slopes,
+)
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
 
@@ -44,7 +52,9 @@ def _agreement(frame: Frame, scene: Scene, count: int, step: float) -> tuple[flo
 
 
 @pytest.mark.parametrize("azimuth_deg", [110.0, 200.0])
-def test_shadows_of_rough_ground_under_a_low_sun(renderer, rough, descent_camera, azimuth_deg) -> None:
+def test_shadows_of_rough_ground_under_a_low_sun(
+    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor], azimuth_deg: float
+) -> None:
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(12.0)))
     scene = Scene(_even(rough), (380.0, 200.0), sun, LAMBERT, edge_rays=1)
     pose = rigid(Rotation.from_euler("zxy", [30.0, 12.0, 5.0], degrees=True), np.array([380.0, 200.0, 1500.0]))
@@ -54,7 +64,7 @@ def test_shadows_of_rough_ground_under_a_low_sun(renderer, rough, descent_camera
     assert agree >= BAR
 
 
-def test_shadows_of_rocks(renderer) -> None:
+def test_shadows_of_rocks(renderer: Renderer) -> None:
     parameters = TerrainParameters(
         samples=256, spacing_m=0.1, rms_slope_deg=2.0, slope_baseline_m=2.0, outer_scale_m=15.0, craters_per_km2=0.0
     )
@@ -78,7 +88,7 @@ def test_shadows_of_rocks(renderer) -> None:
     assert agree >= BAR
 
 
-def test_penumbra_of_a_ridge(renderer, descent_camera) -> None:
+def test_penumbra_of_a_ridge(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     """The edge of a shadow 55 m long is as soft as the part of the sun's disc above the ridge says."""
     spacing, elevation = 0.5, np.radians(20.0)
     heights = np.zeros((256, 256)) + np.maximum(20.0 - spacing * np.abs(np.arange(256.0) - 60.0), 0.0)

@@ -7,8 +7,8 @@ from scipy.stats import qmc
 
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import DustySky, Frame, Photometry, PixelRays, Scene, Sun
-from marsyard.sim.render.kernels.sky import sky_brightness
+from marsyard.sim.render import DustySky, Frame, Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render.kernels.photometry import sky_brightness
 from marsyard.sim.terrain import Surface
 
 DUSTY = Photometry(sky_share=0.25, sky=DustySky(0.5, 0.95, 0.65))
@@ -32,17 +32,17 @@ def _ahead(size: int = 200) -> Cahv:
     )
 
 
-def _from_mast(renderer, camera: Cahv, sun: Sun, photometry: Photometry) -> Frame:
+def _from_mast(renderer: Renderer, camera: Cahv, sun: Sun, photometry: Photometry) -> Frame:
     scene = Scene(_flat(), (0.0, 0.0), sun, photometry, mesh_finest_m=0.5, mesh_reach_m=5000.0)
     return renderer.render(scene, PixelRays.of(camera), rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5])))
 
 
 @pytest.mark.parametrize("elevation_deg", [15.0, 40.0, 90.0])
 @pytest.mark.parametrize("depth", [0.1, 0.9, 3.0])
-def test_the_sky_lights_a_level_ground_as_its_share_says(elevation_deg, depth) -> None:
+def test_the_sky_lights_a_level_ground_as_its_share_says(elevation_deg: float, depth: float) -> None:
     law = replace(DUSTY, sky=DustySky(depth, 0.95, 0.65))
     sun = Sun(direction(0.3, np.radians(elevation_deg)))
-    numbers = law.sky_numbers(sun)
+    numbers = law.sky_coefficients(sun)
     squared, turn = qmc.Sobol(2, rng=np.random.default_rng(2)).random_base2(14).T
     up, level, azimuth = np.sqrt(squared), np.sqrt(1.0 - squared), 2.0 * np.pi * turn
     looks = np.stack([level * np.sin(azimuth), level * np.cos(azimuth), up], axis=1)
@@ -57,7 +57,7 @@ def test_the_sky_lights_a_level_ground_as_its_share_says(elevation_deg, depth) -
     assert numbers[0] + (1.0 - 0.65**2) * once == pytest.approx(0.25, rel=0.01)
 
 
-def test_the_sky_against_the_formula(renderer) -> None:
+def test_the_sky_against_the_formula(renderer: Renderer) -> None:
     camera, sun = _ahead(), Sun(direction(np.radians(160.0), np.radians(35.0)))
     frame = _from_mast(renderer, camera, sun, DUSTY)
     _, looks = camera.rays(camera.pixel_grid())
@@ -73,7 +73,7 @@ def test_the_sky_against_the_formula(renderer) -> None:
     np.testing.assert_allclose(rest, rest.mean(), atol=1e-4)
 
 
-def test_the_sky_is_brighter_towards_the_sun_and_the_horizon(renderer) -> None:
+def test_the_sky_is_brighter_towards_the_sun_and_the_horizon(renderer: Renderer) -> None:
     camera = _ahead()
     even = replace(DUSTY, sky=DustySky(0.1, 0.95, 0.0))
     ahead, behind, unbent = (
@@ -86,7 +86,7 @@ def test_the_sky_is_brighter_towards_the_sun_and_the_horizon(renderer) -> None:
     assert unbent[low] > unbent[middle] > unbent[top]
 
 
-def test_the_suns_disc_carries_the_direct_sun(renderer) -> None:
+def test_the_suns_disc_carries_the_direct_sun(renderer: Renderer) -> None:
     camera = _ahead(400)
     sun = Sun(direction(np.radians(3.0), np.radians(14.0)))
     frame = _from_mast(renderer, camera, sun, DUSTY)
@@ -100,7 +100,7 @@ def test_the_suns_disc_carries_the_direct_sun(renderer) -> None:
     assert np.abs([columns.mean() - at[0], rows.mean() - at[1]]).max() < 0.25
 
 
-def test_an_even_sky_has_no_sun_in_it(renderer) -> None:
+def test_an_even_sky_has_no_sun_in_it(renderer: Renderer) -> None:
     sun = Sun(direction(np.radians(3.0), np.radians(14.0)))
     frame = _from_mast(renderer, _ahead(), sun, Photometry(sky_radiance=0.3))
     assert set(frame.radiance[~np.isfinite(frame.range_m)]) == {np.float32(0.3)}
@@ -110,6 +110,6 @@ def test_an_even_sky_has_no_sun_in_it(renderer) -> None:
     ("depth", "albedo", "asymmetry"),
     [(0.0, 0.9, 0.6), (-1.0, 0.9, 0.6), (0.5, 0.9, 1.0), (0.5, 0.9, -0.1), (0.5, 0.0, 0.6), (0.5, 1.1, 0.6)],
 )
-def test_refuses_a_sky_that_cannot_be(depth, albedo, asymmetry) -> None:
+def test_refuses_a_sky_that_cannot_be(depth: float, albedo: float, asymmetry: float) -> None:
     with pytest.raises(ValueError, match="dusty sky of optical depth"):
         DustySky(depth, albedo, asymmetry)

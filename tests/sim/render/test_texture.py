@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from marsyard.sim.render.kernels.texture import CELLS_LEAST, NOISE_VARIANCE, add_texture, gradient_noise
+from marsyard.sim.render.kernels.photometry import MIN_CELLS, NOISE_VARIANCE, add_texture, gradient_noise
 from marsyard.sim.terrain import sites
 
 PLACES = np.random.default_rng(5).uniform(-500.0, 500.0, (60000, 3))
@@ -28,7 +28,7 @@ def test_detail_finer_than_a_footprint_is_left_out() -> None:
     octaves = np.array([0.2, 0.3])
     change = np.zeros(3)
     place = np.array([[0.3], [0.4], [0.1]]) @ np.ones((1, 3))
-    add_texture(*place, np.array([1.001 / CELLS_LEAST, 0.2, np.inf]), 1.0, octaves, change)
+    add_texture(*place, np.array([1.001 / MIN_CELLS, 0.2, np.inf]), 1.0, octaves, change)
     assert change[0] == 0.0
     assert change[1] != 0.0
     assert change[2] == 0.0

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from marsyard.sim.camera import Cahvor
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture, threads
+from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun, Texture, process
+from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
 
@@ -20,7 +23,7 @@ def test_every_pixel_belongs_to_one_part(pixels: int, count: int) -> None:
     def visit(part: slice) -> None:
         visits[part] += 1
 
-    threads.in_parts(visit, pixels, count)
+    process.in_parts(visit, pixels, count)
     np.testing.assert_array_equal(visits, 1)
 
 
@@ -30,10 +33,12 @@ def test_a_thread_that_fails_is_heard() -> None:
             raise ValueError("the second half")
 
     with pytest.raises(ValueError, match="the second half"):
-        threads.in_parts(fail, 100_000, 2)
+        process.in_parts(fail, 100_000, 2)
 
 
-def test_pictures_do_not_depend_on_threads(renderer, rough, descent_camera, monkeypatch) -> None:
+def test_pictures_do_not_depend_on_threads(
+    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor], monkeypatch: pytest.MonkeyPatch
+) -> None:
     rock = PlacedRock(name="rock", east_m=380.0, north_m=205.0, diameter_m=30.0, shape=3, yaw_deg=20.0)
     field = RockField.on(rough, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
     mesh = field.near(380.0, 205.0, 60.0, above_m=200.0)
@@ -44,10 +49,10 @@ def test_pictures_do_not_depend_on_threads(renderer, rough, descent_camera, monk
     )
     rays = PixelRays.of(descent_camera().cropped(400, 400, (161, 161)))
     pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
-    monkeypatch.setattr("marsyard.sim.render.renderer.in_parts", partial(threads.in_parts, threads=1))
+    monkeypatch.setattr("marsyard.sim.render.renderer.in_parts", partial(process.in_parts, threads=1))
     alone = renderer.render(scene, rays, pose)
     assert np.any(alone.body >= 0)
-    monkeypatch.setattr("marsyard.sim.render.renderer.in_parts", partial(threads.in_parts, threads=3))
+    monkeypatch.setattr("marsyard.sim.render.renderer.in_parts", partial(process.in_parts, threads=3))
     shared = renderer.render(scene, rays, pose)
     for name in ("radiance", "range_m", "body", "normal"):
         np.testing.assert_array_equal(getattr(alone, name), getattr(shared, name))

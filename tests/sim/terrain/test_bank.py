@@ -74,7 +74,12 @@ def test_a_file_is_verified_once_by_a_process(cache: Path, monkeypatch: pytest.M
     monkeypatch.setattr("marsyard.sim.cache._VERIFIED", {})
     summed: list[int] = []
     checksum = cache_module._checksum
-    monkeypatch.setattr("marsyard.sim.cache._checksum", lambda array: summed.append(array.size) or checksum(array))
+
+    def count(array: np.ndarray) -> object:
+        summed.append(array.size)
+        return checksum(array)
+
+    monkeypatch.setattr("marsyard.sim.cache._checksum", count)
     assert [_bytes(bank, 0), _bytes(bank, 0)] == [built, built]
     assert len(summed) == 1
 
@@ -82,10 +87,17 @@ def test_a_file_is_verified_once_by_a_process(cache: Path, monkeypatch: pytest.M
 def test_a_terrain_is_synced_before_it_gets_its_name(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: list[str] = []
     replace, sync = Path.replace, os.fsync
-    monkeypatch.setattr(
-        "os.fsync", lambda file: steps.append(str(Path(f"/proc/self/fd/{file}").readlink())) or sync(file)
-    )
-    monkeypatch.setattr(Path, "replace", lambda self, path: steps.append("named") or replace(self, path))
+
+    def record_sync(file: int) -> None:
+        steps.append(str(Path(f"/proc/self/fd/{file}").readlink()))
+        sync(file)
+
+    def record_rename(self: Path, path: Path) -> Path:
+        steps.append("named")
+        return replace(self, path)
+
+    monkeypatch.setattr("os.fsync", record_sync)
+    monkeypatch.setattr(Path, "replace", record_rename)
     TerrainBank(SMALL, seed=1).terrain(0)
     assert [Path(step).suffix or Path(step).name for step in steps] == [".part", "named", "terrain"]
 

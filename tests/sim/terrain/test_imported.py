@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
-from marsyard.sim.terrain.embedding import embed, grid_for
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, filled, read_rasters
+from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, embed, filled, grid_for, read_rasters
 from marsyard.sim.terrain.statistics import terrain_statistics
 
 ROWS, COLUMNS = 90, 110
@@ -16,7 +15,7 @@ ROWS, COLUMNS = 90, 110
 
 def dem() -> np.ndarray:
     y, x = np.mgrid[:ROWS, :COLUMNS]
-    return 100.0 + 3.0 * np.sin(x / 9.0) + 2.0 * np.cos(y / 7.0) + 0.05 * x
+    return np.asarray(100.0 + 3.0 * np.sin(x / 9.0) + 2.0 * np.cos(y / 7.0) + 0.05 * x)
 
 
 @pytest.fixture
@@ -41,7 +40,7 @@ def around(source: RealTerrain, **changes: object) -> TerrainParameters:
         "source": source,
         **changes,
     }
-    return TerrainParameters(**values)
+    return TerrainParameters.model_validate(values)
 
 
 def made(parameters: TerrainParameters) -> Surface:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -11,10 +12,10 @@ from scipy.spatial import cKDTree
 
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
-from marsyard.sim.terrain.landforms.ground import finer, smooth_pair
+from marsyard.sim.terrain.landforms.ground import refined, smooth_pair
 from marsyard.sim.terrain.landforms.kernels import Bedforms, add_cracks, add_dunes, stamp_craters
+from marsyard.sim.terrain.random_fields import substream
 from marsyard.sim.terrain.statistics import mean_slope_deg
-from marsyard.sim.terrain.substreams import substream
 
 SMOOTH = TerrainParameters(samples=512, rms_slope_deg=0.0, craters_per_km2=0.0, albedo_contrast=0.0)
 
@@ -122,7 +123,7 @@ def test_lava_is_rough_at_metres_and_gentle_beyond() -> None:
 
 @pytest.mark.parametrize("slope_deg", [8.0, 17.5, 25.0])
 @pytest.mark.parametrize("uphill", ["east", "north"])
-def test_a_ramp_has_its_slope_where_told(slope_deg: float, uphill: str) -> None:
+def test_a_ramp_has_its_slope_where_told(slope_deg: float, uphill: Literal["east", "north"]) -> None:
     ramp = Ramp(slope_deg=slope_deg, length_m=20.0, uphill=uphill)
     surface = synthesise(made(spacing_m=0.2, ramp=ramp), np.random.default_rng(0))
     period = surface.period_m
@@ -167,7 +168,7 @@ def test_gullies_have_steep_walls() -> None:
 def test_refinement_keeps_the_surface_exactly() -> None:
     rng = np.random.default_rng(0)
     coarse = rng.normal(size=(16, 16)).astype(np.float32)
-    fine = finer(coarse, 64)
+    fine = refined(coarse, 64)
     x, y = rng.uniform(0, 16, 200), rng.uniform(0, 16, 200)
     theirs = map_coordinates(coarse.astype(float), [y, x], order=3, mode="grid-wrap", prefilter=False)
     ours = map_coordinates(fine.astype(float), [4 * y, 4 * x], order=3, mode="grid-wrap", prefilter=False)
@@ -187,7 +188,7 @@ def test_landforms_on_a_coarser_grid_come_back_in_place() -> None:
     assert (part.side, part.spacing_m, part.period_m) == (16, 4.0, 64.0)
     part.height[4, 8] = 1.0
     ground.add(part)
-    assert np.unravel_index(ground.height.argmax(), (64, 64)) == (16, 32)
+    assert tuple(map(int, np.unravel_index(ground.height.argmax(), (64, 64)))) == (16, 32)
 
 
 def test_substreams_depend_on_their_name_alone() -> None:
@@ -265,7 +266,9 @@ def test_cracks_are_the_borders_of_a_periodic_voronoi_diagram() -> None:
     row, column = np.mgrid[:count, :count]
     places = (points + np.stack([column, row], axis=-1)).reshape(-1, 2)
     y, x = np.mgrid[:side, :side] * spacing / cell
-    distance, number = cKDTree(places, boxsize=count).query(np.stack([x, y], axis=-1), k=2)
+    distance, number = map(
+        np.asarray, cKDTree(places, boxsize=np.full(2, float(count))).query(np.stack([x, y], axis=-1), k=2)
+    )
     between = (places[number[..., 1]] - places[number[..., 0]] + count / 2) % count - count / 2
     border = 0.5 * (distance[..., 1] ** 2 - distance[..., 0] ** 2) / np.linalg.norm(between, axis=-1) * cell
     share = np.clip(1.0 - border / width, 0.0, None)

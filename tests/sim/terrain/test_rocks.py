@@ -16,7 +16,7 @@ from marsyard.sim.terrain.rocks.shapes import (
     SHAPES_OF_FORM,
     UNIT_HEIGHT,
     ShapeSet,
-    pixels_held,
+    max_pixels,
     rock_shapes,
 )
 
@@ -34,7 +34,8 @@ def ground() -> Surface:
 
 
 def make(ground: Surface, seed: int = 1, **changes: object) -> RockField:
-    parameters = RockParameters(**{"abundance": 0.2, "smallest_m": 0.1, "placed": (TARGET,), **changes})
+    values = {"abundance": 0.2, "smallest_m": 0.1, "placed": (TARGET,), **changes}
+    parameters = RockParameters.model_validate(values)
     return RockField.on(ground, parameters, np.random.default_rng(seed))
 
 
@@ -109,7 +110,7 @@ def test_sizes_follow_golombek(abundance: float) -> None:
 def test_no_two_rocks_overlap(field: RockField) -> None:
     """Every pair in reach of one another, across the border as well; rocks stay apart in plan."""
     reach = rock_shapes(COARSE).reach[field.shape] * field.diameter_m
-    tree = cKDTree(field.position_m[:, :2], boxsize=field.period_m)
+    tree = cKDTree(field.position_m[:, :2], boxsize=np.full(2, field.period_m))
     pairs = tree.query_pairs(2 * reach.max(), output_type="ndarray")
     apart = np.abs(field.position_m[pairs[:, 0], :2] - field.position_m[pairs[:, 1], :2])
     apart = np.minimum(apart, field.period_m - apart)
@@ -228,7 +229,7 @@ def test_faces_are_turned_outwards(field: RockField) -> None:
 )
 def test_refuses_impossible_rocks(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
-        RockParameters(**wrong)
+        RockParameters.model_validate(wrong)
 
 
 def test_refuses_more_rocks_than_fit_in_memory_and_unknown_shapes(ground: Surface) -> None:
@@ -249,7 +250,7 @@ def test_a_coarse_rock_cannot_be_told_from_the_finest(number: int, detail: int) 
     finest = finest[finest[:, 2] > 0.0]
     nearest = cKDTree(samples).query(finest)[1]
     away = np.sum((finest - samples[nearest]) * coarse.face_normals[triangles[nearest]], axis=1)
-    assert 0.15 < np.sqrt(np.mean(away**2)) * pixels_held()[number, detail] < 0.28
+    assert 0.15 < np.sqrt(np.mean(away**2)) * max_pixels()[number, detail] < 0.28
 
 
 def test_rocks_are_drawn_as_finely_as_the_camera_sees(field: RockField) -> None:
@@ -260,5 +261,5 @@ def test_rocks_are_drawn_as_finely_as_the_camera_sees(field: RockField) -> None:
             detail = faces.index(int(count))
             away = np.hypot(np.hypot(*(field.position_m[rock, :2] - 32.0)), 1.5)
             across_px = field.diameter_m[rock] / (away - 0.5 * field.diameter_m[rock]) / pixel_rad
-            held = np.concatenate([[0.0], pixels_held()[field.shape[rock]], [np.inf]])
+            held = np.concatenate([[0.0], max_pixels()[field.shape[rock]], [np.inf]])
             assert held[detail] < across_px <= held[detail + 1]

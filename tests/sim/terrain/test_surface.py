@@ -20,7 +20,9 @@ def places() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_is_the_cubic_b_spline_that_scipy_evaluates(surface, places, level) -> None:
+def test_is_the_cubic_b_spline_that_scipy_evaluates(
+    surface: Surface, places: tuple[np.ndarray, np.ndarray], level: int
+) -> None:
     x, y = places
     spacing = surface.spacing_m * 2**level
     for channel, ours in ((0, surface.height(x, y, level)), (1, surface.albedo(x, y, level))):
@@ -29,7 +31,7 @@ def test_is_the_cubic_b_spline_that_scipy_evaluates(surface, places, level) -> N
         np.testing.assert_allclose(ours, theirs, atol=1e-12)
 
 
-def test_gradient_is_the_derivative_of_height(surface, places) -> None:
+def test_gradient_is_the_derivative_of_height(surface: Surface, places: tuple[np.ndarray, np.ndarray]) -> None:
     x, y = places
     # central differences of a piecewise cubic: the error is h^2/6 times a third derivative of order 1
     step = 1e-4
@@ -39,7 +41,7 @@ def test_gradient_is_the_derivative_of_height(surface, places) -> None:
 
 
 @pytest.mark.parametrize("level", [0, 2])
-def test_ceilings_bound_the_height(surface, level: int) -> None:
+def test_ceilings_bound_the_height(surface: Surface, level: int) -> None:
     """Nowhere higher than the control values around a block, and no higher than the highest of these."""
     ceiling, spacing = surface.ceilings[level], surface.spacing_m * 2.0**level
     block = CEILING_BLOCK * spacing
@@ -54,7 +56,7 @@ def test_ceilings_bound_the_height(surface, level: int) -> None:
         assert ceiling[row, column] == samples[np.ix_(*around)].max()
 
 
-def test_repeats_with_its_period(surface, places) -> None:
+def test_repeats_with_its_period(surface: Surface, places: tuple[np.ndarray, np.ndarray]) -> None:
     x, y = places
     np.testing.assert_allclose(
         surface.height(x + surface.period_m, y - 2 * surface.period_m), surface.height(x, y), atol=1e-11
@@ -77,6 +79,6 @@ def test_levels_of_a_smooth_ground_agree_in_place() -> None:
 
 
 @pytest.mark.parametrize("shape", [(8, 8, 2), (48, 48, 2), (64, 32, 2)])
-def test_refuses_shapes_it_cannot_halve(shape) -> None:
+def test_refuses_shapes_it_cannot_halve(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="power of two"):
         Surface.from_samples(np.zeros(shape, dtype=np.float32), 1.0)

@@ -3,9 +3,9 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.sim.terrain import TerrainParameters, synthesise
-from marsyard.sim.terrain.landforms.craters import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
 from marsyard.sim.terrain.landforms.kernels import stamp_craters
-from marsyard.sim.terrain.spectrum import Spectrum
+from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
+from marsyard.sim.terrain.random_fields import Spectrum
 
 
 def test_same_stream_same_bytes() -> None:
@@ -26,7 +26,7 @@ def test_variance_is_as_expected_on_average() -> None:
 
 
 @pytest.mark.parametrize("hurst", [0.5, 0.8])
-def test_slope_over_the_baseline_and_hurst_exponent(hurst) -> None:
+def test_slope_over_the_baseline_and_hurst_exponent(hurst: float) -> None:
     """The structure function gives the RMS slope asked for at the baseline, and grows with the Hurst exponent."""
     parameters = TerrainParameters(
         samples=1024, hurst=hurst, rms_slope_deg=3.0, slope_baseline_m=30.0, outer_scale_m=20000.0, craters_per_km2=0.0
@@ -80,7 +80,7 @@ def test_a_fresh_crater_has_its_depth_rim_and_place_across_the_border() -> None:
     stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
     centred = np.roll(height, (128, 128), axis=(0, 1))
     assert centred[128, 128] == pytest.approx(-depth)
-    assert np.unravel_index(centred.argmin(), centred.shape) == (128, 128)
+    assert tuple(map(int, np.unravel_index(centred.argmin(), centred.shape))) == (128, 128)
     assert centred[128, 128 + 20] == pytest.approx(rim)
     assert centred[128 - 20, 128] == pytest.approx(rim)
     assert np.count_nonzero(centred[:, :60]) == 0
@@ -103,6 +103,6 @@ def test_refuses_crater_sizes_in_the_wrong_order() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"samples": 4}, {"spacing_m": -1.0}, {"hurst": 1.5}, {"relief": 3.0}])
-def test_refuses_impossible_parameters(wrong) -> None:
+def test_refuses_impossible_parameters(wrong: dict[str, float]) -> None:
     with pytest.raises(ValidationError):
-        TerrainParameters(**wrong)
+        TerrainParameters.model_validate(wrong)

@@ -1,7 +1,8 @@
-"""Random fields with a stated spectrum on a periodic grid."""
+"""Named random substreams, and random fields of a power-law spectrum on a periodic grid."""
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,18 +10,27 @@ import scipy.fft
 from jaxtyping import Float32, Float64
 
 
+def substream(rng: np.random.Generator, name: str) -> np.random.Generator:
+    """Derive the generator of this name from the seed of `rng`.
+
+    It depends on that seed and the name alone, not on draws or spawns from `rng`, which stays unchanged. Raises
+    TypeError for a generator that was not made from a `SeedSequence`.
+    """
+    seed = rng.bit_generator.seed_seq
+    if not isinstance(seed, np.random.SeedSequence):
+        raise TypeError(f"a generator seeded by a SeedSequence is needed, not by {type(seed).__name__}")
+    digest = hashlib.sha256(name.encode()).digest()
+    words = tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
+    child = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, *words), pool_size=seed.pool_size)
+    return np.random.Generator(np.random.PCG64(child))
+
+
 @dataclass(frozen=True)
 class Spectrum:
     """A power-law spectrum on a periodic grid, from which random fields of unit expected variance are drawn.
 
-    Attributes
-    ----------
-    amplitude
-        Amplitude of each mode of the half spectrum, shape (samples, samples // 2 + 1).
-    spacing_m
-        Distance between the grid's samples.
-    column_power
-        Sum of the squared amplitudes along y for each wavenumber along x, counting the conjugate modes.
+    `amplitude` holds the modes of the half spectrum; `column_power` is the sum of their squares along y for each
+    wavenumber along x, conjugate modes included.
     """
 
     amplitude: Float32[np.ndarray, "samples half"]
@@ -39,20 +49,20 @@ class Spectrum:
         amplitude = np.exp(np.float32(-(hurst + 1.0) / 2.0) * np.log(squared))
         amplitude[0, 0] = 0.0
         power = np.einsum("ij,ij->j", amplitude, amplitude, dtype=np.float64)
-        # A mode of the half spectrum stands for itself and its conjugate, except in the first and the last column.
+        # a mode of the half spectrum counts for itself and its conjugate, except in the first and the last column
         power[1:-1] *= 2.0
         return cls(amplitude, spacing_m, power)
 
     def field(self, rng: np.random.Generator, scale: float) -> Float32[np.ndarray, "samples samples"]:
-        """A Gaussian field whose expected variance is ``scale**2``.
+        """Draw a Gaussian field of expected variance ``scale**2``: white noise shaped in the frequency domain.
 
-        White noise in the frequency domain is shaped and transformed; the variance is normalised by its expectation, so
-        that terrains differ as draws do. One thread, so that the bytes do not depend on how many there are.
+        The variance is normalised by its expectation, so it varies from draw to draw. One thread, so the bytes do not
+        depend on the number of threads.
         """
         samples, half = self.amplitude.shape
         noise = rng.standard_normal((samples, half, 2), dtype=np.float32).view(np.complex64)[..., 0]
         noise *= self.amplitude
-        # irfft2 keeps only the real part of what these two columns give: half the power of their modes
+        # irfft2 keeps the real part only of these two columns: half the power of their modes
         noise[:, 0] *= np.float32(np.sqrt(2.0))
         noise[:, -1] *= np.float32(np.sqrt(2.0))
         field: Float32[np.ndarray, "samples samples"] = scipy.fft.irfft2(

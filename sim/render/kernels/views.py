@@ -1,0 +1,165 @@
+"""Kernels of camera rays, of the depth of pinhole views, and of the ground's mesh."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from marsyard.sim.render.kernels.structs import Array32, Longs
+from marsyard.sim.terrain.kernels import Array, Level, sample
+
+
+@njit(cache=True, error_model="numpy")
+def pixel_angles(directions: Array) -> Array32:
+    """Square root of each pixel's solid angle, radians, from the unit vectors along all rays, (rows, columns, 3).
+
+    A pixel's sides are half the difference of its neighbours on both sides, at the border the difference to the only
+    one.
+    """
+    rows, columns = directions.shape[:2]
+    angles = np.empty((rows, columns), dtype=np.float32)
+    for i in range(rows):
+        above, below = max(i - 1, 0), min(i + 1, rows - 1)
+        down = float(below - above)
+        for j in range(columns):
+            left, right = max(j - 1, 0), min(j + 1, columns - 1)
+            across = float(right - left)
+            ax = (directions[i, right, 0] - directions[i, left, 0]) / across
+            ay = (directions[i, right, 1] - directions[i, left, 1]) / across
+            az = (directions[i, right, 2] - directions[i, left, 2]) / across
+            bx = (directions[below, j, 0] - directions[above, j, 0]) / down
+            by = (directions[below, j, 1] - directions[above, j, 1]) / down
+            bz = (directions[below, j, 2] - directions[above, j, 2]) / down
+            x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            angles[i, j] = math.sqrt(math.sqrt(x * x + y * y + z * z))
+    return angles
+
+
+@njit(cache=True)
+def sum_of_vectors(directions: Array32) -> tuple[float, float, float]:
+    """Sum of vectors, shape (n, 3)."""
+    x, y, z = 0.0, 0.0, 0.0
+    for n in range(directions.shape[0]):
+        x += directions[n, 0]
+        y += directions[n, 1]
+        z += directions[n, 2]
+    return x, y, z
+
+
+@njit(cache=True)
+def min_component(directions: Array32, axis: Array) -> float:
+    """Least component of vectors, shape (n, 3), along an axis."""
+    least = math.inf
+    for n in range(directions.shape[0]):
+        least = min(least, directions[n, 0] * axis[0] + directions[n, 1] * axis[1] + directions[n, 2] * axis[2])
+    return least
+
+
+@njit(cache=True, error_model="numpy")
+def max_image_radius(directions: Array, view: Array) -> float:
+    """Largest image coordinate, across or down from the centre, of rays (rows, columns, 3) at a focal length of 1.
+
+    `view` holds right, down and forward of the view, one row each.
+    """
+    most = 0.0
+    for i in range(directions.shape[0]):
+        for j in range(directions.shape[1]):
+            x, y, z = directions[i, j, 0], directions[i, j, 1], directions[i, j, 2]
+            right = view[0, 0] * x + view[0, 1] * y + view[0, 2] * z
+            down = view[1, 0] * x + view[1, 1] * y + view[1, 2] * z
+            forward = view[2, 0] * x + view[2, 1] * y + view[2, 2] * z
+            most = max(most, abs(right / forward), abs(down / forward))
+    return most
+
+
+@njit(cache=True, error_model="numpy")
+def depth_in_metres(drawn: Array32, near: float, far: float) -> Array32:
+    """Convert OpenGL's depths to depth along the axis, metres, 0 where nothing was drawn; reverse the order of rows.
+
+    `drawn` is 0 at `near`, 1 at `far` and where nothing is, its lowest row first.
+    """
+    rows, columns = drawn.shape
+    depth = np.empty((rows, columns), dtype=np.float32)
+    # single precision from the first to the last
+    minus_two, one, nothing = np.float32(-2.0), np.float32(1.0), np.float32(0.0)
+    span, both, product = np.float32(far - near), np.float32(far + near), np.float32(2.0 * near * far)
+    for i in range(rows):
+        line, above = drawn[rows - 1 - i], depth[i]
+        for j in range(columns):
+            value = product / ((minus_two * line[j] + one) * span + both)
+            above[j] = nothing if line[j] == one else value
+    return depth
+
+
+@njit(cache=True)
+def spans_in_hull(x: Array, y: Array, hull: Array) -> Longs:
+    """First cell of each strip between two lines of y that reaches into a convex polygon, and the end of these cells.
+
+    The lines increase; `hull` holds the polygon's corners in order, shape (corners, 2).
+    """
+    spans = np.empty((y.size - 1, 2), dtype=np.int64)
+    for strip in range(y.size - 1):
+        low, high = y[strip], y[strip + 1]
+        least, greatest = math.inf, -math.inf
+        for k in range(hull.shape[0]):
+            x0, y0 = hull[k - 1, 0], hull[k - 1, 1]
+            x1, y1 = hull[k, 0], hull[k, 1]
+            if min(y0, y1) > high or max(y0, y1) < low:
+                continue
+            # a side of the polygon, from where it enters the strip to where it leaves it
+            for level, end in ((low, x0), (high, x1)):
+                at = end if y0 == y1 else x0 + min(max((level - y0) / (y1 - y0), 0.0), 1.0) * (x1 - x0)
+                least = min(least, at)
+                greatest = max(greatest, at)
+        first = min(max(int(np.searchsorted(x, least, side="right")) - 1, 0), x.size - 1)
+        spans[strip, 0] = first
+        spans[strip, 1] = min(max(int(np.searchsorted(x, greatest)), first), x.size - 1)
+    return spans
+
+
+@njit(cache=True)
+def build_mesh(
+    levels: tuple[Level, ...], spacing: float, x: Array, y: Array, level_of_x: Longs, level_of_y: Longs, spans: Longs
+) -> tuple[Array, NDArray[np.uint32]]:
+    """Vertices, metres, and faces, counter-clockwise from above, of some cells of a grid, two triangles each.
+
+    Heights come from the coarser level of the two lines at a vertex. `spans` are those of `spans_in_hull`.
+    """
+    lines = y.size
+    # a line has the corners of the selected cells to both its sides
+    left = np.full(lines, x.size, dtype=np.int64)
+    right = np.full(lines, -1, dtype=np.int64)
+    cells = 0
+    for strip in range(lines - 1):
+        first, end = spans[strip, 0], spans[strip, 1]
+        cells += end - first
+        for line in range(strip, strip + 2):
+            if end > first:
+                left[line] = min(left[line], first)
+                right[line] = max(right[line], end)
+    starts = np.empty(lines, dtype=np.int64)
+    count = 0
+    for line in range(lines):
+        starts[line] = count - left[line]
+        count += max(right[line] + 1 - left[line], 0)
+    corners = np.empty((count, 3))
+    for line in range(lines):
+        for column in range(left[line], right[line] + 1):
+            level = max(level_of_x[column], level_of_y[line])
+            inverse_spacing = 1.0 / (spacing * 2.0**level)
+            height, _slope_x, _slope_y, _albedo = sample(levels[level], inverse_spacing, x[column], y[line])
+            n = starts[line] + column
+            corners[n, 0], corners[n, 1], corners[n, 2] = x[column], y[line], height
+    faces = np.empty((2 * cells, 3), dtype=np.uint32)
+    n = 0
+    for strip in range(lines - 1):
+        for cell in range(spans[strip, 0], spans[strip, 1]):
+            corner, above = starts[strip] + cell, starts[strip + 1] + cell
+            # a cell's two triangles are adjacent: OpenGL then transforms shared corners once
+            faces[n, 0], faces[n, 1], faces[n, 2] = corner, corner + 1, above + 1
+            faces[n + 1, 0], faces[n + 1, 1], faces[n + 1, 2] = corner, above + 1, above
+            n += 2
+    return corners, faces
