@@ -61,7 +61,6 @@ def bca(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], 
 
 
 def _widened(confidence: float, n: int) -> float:
-    """The level at which the normal quantile is Student's, times sqrt(n / (n - 1)): Hesterberg 2015, section 5."""
     quantile = float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1)) * math.sqrt(n / (n - 1.0))
     # below 1, which the bootstrap does not take
     return min(2.0 * float(stats.norm.cdf(quantile)) - 1.0, 1.0 - 1e-6)
@@ -79,12 +78,8 @@ def is_shared(groups: Int[np.ndarray, " n"] | None) -> bool:
 def shared_mean(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
     """Two-sided interval of the mean of values on shared terrains; NaN for fewer than five terrains.
 
-    Parameters
-    ----------
-    values, groups
-        Finite values, and the number of the terrain of each.
-    confidence
-        Of the interval.
+    values, groups: finite values, and the number of the terrain of each.
+    confidence: of the interval.
     """
     index = terrain_index(groups)
     sizes, sums = np.bincount(index).astype(np.float64), np.bincount(index, weights=values)
@@ -168,7 +163,6 @@ def _student(confidence: float, terrains: int) -> float:
 
 
 def _deviation_of_mean(residuals: Float[np.ndarray, " terrains"], n: int) -> float:
-    """Standard deviation of a mean over n values, from the terrains' sums of residuals."""
     terrains = residuals.size
     return math.sqrt(terrains / (terrains - 1.0) * float((residuals**2).sum())) / n
 
@@ -200,14 +194,9 @@ def quantile_bounds(
 ) -> Interval:
     """One-sided lower and upper order-statistic bounds of a quantile, each at the confidence.
 
-    Returns
-    -------
-    lower, upper
-        The bounds; -inf or inf where the sample is too small to give one (for the upper bound of the 99 % quantile at
-        95 % confidence: fewer than 299 values).
+    The bounds; -inf or inf where the sample is too small to give one (for the upper bound of the 99 % quantile at 95
+    % confidence: fewer than 299 values).
 
-    Notes
-    -----
     Wilks 1941. The r-th smallest of n values lies at or above the quantile q with probability
     P(Bin(n, q) <= r - 1): the upper bound is the smallest such value with that probability at the confidence.
     """
@@ -223,7 +212,6 @@ def quantile_bounds(
 
 
 def _upper_order_bound(ordered: Float[np.ndarray, " n"], quantile: float, confidence: float) -> float:
-    """The smallest of the ordered values that bounds the quantile from above at the confidence."""
     n = ordered.size
     # `ppf` gives the smallest k with P(Bin <= k) >= confidence; the value of 1-based rank k + 1 is the bound.
     rank = int(stats.binom.ppf(confidence, n, quantile))
@@ -301,24 +289,14 @@ class Quantile:
 class ErrorSummary:
     """What a sample of errors says; NaN where it has too few values to say it.
 
-    Attributes
-    ----------
-    n, missing
-        Finite values, and those that were not finite (no answer was reported).
-    mean, mean_lower, mean_upper
-        Mean and its two-sided interval at `confidence`.
-    sd, sd_lower, sd_upper
-        Standard deviation (n - 1) and its two-sided interval at `confidence`.
-    rms, median
-        Root mean square about zero, median.
-    robust_sd
-        Median absolute deviation about the median times 1.4826: the standard deviation of a normal core.
-    largest
-        The largest magnitude.
-    quantiles
-        Quantiles with order-statistic bounds at `confidence`.
-    confidence
-        Confidence of the bounds.
+    n, missing: finite values, and those that were not finite (no answer was reported).
+    mean, mean_lower, mean_upper: mean and its two-sided interval at `confidence`.
+    sd, sd_lower, sd_upper: standard deviation (n - 1) and its two-sided interval at `confidence`.
+    rms, median: root mean square about zero, median.
+    robust_sd: median absolute deviation about the median times 1.4826: the standard deviation of a normal core.
+    largest: the largest magnitude.
+    quantiles: quantiles with order-statistic bounds at `confidence`.
+    confidence: confidence of the bounds.
     """
 
     n: int

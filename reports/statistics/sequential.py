@@ -72,18 +72,14 @@ class LaterLook:
 
     Events are failures for PASS, successes for FAIL: few of them show it. Under the rate at the edge of the
     requirement, `rate`, the likelihood ratio of `_log_ratio` is a martingale, and under any higher rate a
-    supermartingale. By Ville's inequality it ever reaches c with a chance of at most its value at the first look, by c,
+    supermartingale. By Ville's inequality it ever reaches c with a chance of at most its value at the first look, by
+    c,
     whatever decides when to look: also the number of events seen. The threshold c is chosen so that the chance of a
     verdict at the first look, by the ordinary bound, and that of one at any later look add up to `risk`.
 
-    Attributes
-    ----------
-    rate
-        Chance of an event in a case at the edge of the requirement: 1 - probability for PASS, probability for FAIL.
-    risk
-        Chance of a false verdict that all looks together may have: 1 - confidence.
-    first
-        Cases of the first look, whole terrains where these are counted.
+    rate: chance of an event in a case at the edge of the requirement: 1 - probability for PASS, probability for FAIL.
+    risk: chance of a false verdict that all looks together may have: 1 - confidence.
+    first: cases of the first look, whole terrains where these are counted.
     """
 
     rate: float
