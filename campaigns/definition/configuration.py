@@ -87,7 +87,7 @@ class Retain(Parameters):
     showcase: Literal["worst", "first", "none"] = "worst"
     products: Literal["none", "failed", "worst", "every", "all"] = Field(
         default="none",
-        description="of no case beside the showcase, of those that fail a requirement, of the `worst` by the metric of "
+        description="of no case except the showcase, of those that fail a requirement, of the `worst` by the metric of "
         "the first requirement with a bound, of `every` so manieth, or of all",
     )
     worst: Annotated[int, Field(strict=True, ge=1)] = 10

@@ -167,7 +167,7 @@ def _continue_campaign(
     """Run the missing cases of a stored campaign, and those to be retried."""
     configuration, stored = campaign.configuration, record.read(directory)
     if "identity" not in stored:
-        raise StoreError(f"{directory} was run by an earlier version, which kept no rows to go on from; run it anew")
+        raise StoreError(f"{directory} was run by an earlier version, which stored no rows to continue from; run it again")
     before, identity = Identity.read(stored["identity"]), identity_of(configuration)
     changes = _identity_changes(directory, before, identity, allow_changed)
     if before.inputs is None and identity.inputs:
@@ -210,7 +210,7 @@ def _identity_changes(directory: Path, before: Identity, now: Identity, allow_ch
         listed = "\n  ".join(changes)
         raise CampaignError(
             f"{directory} was run with another program, configuration or input files; rows would not belong together. "
-            f"Changed:\n  {listed}\nTo go on nevertheless, and have it recorded: --allow-changed"
+            f"Changed:\n  {listed}\nTo continue nevertheless, with a note in the record: --allow-changed"
         )
     return changes
 

@@ -104,7 +104,7 @@ def scored_campaign(exported: Exported, answers: Path) -> Campaign:
     manifest = _manifest(exported.directory)
     stored = record.stored_configuration(exported.truth)
     if record.read(exported.truth)["state"] != "finished":
-        raise CampaignError(f"{exported.truth} is not finished: export again to go on")
+        raise CampaignError(f"{exported.truth} is not finished: export again to continue")
     if (manifest["campaign"], manifest["cases"]) != (stored.name, stored.total_cases):
         raise CampaignError(f"{exported.directory} and {exported.truth} belong to different exports")
     exporting = Campaign(stored, scenario(stored.scenario))

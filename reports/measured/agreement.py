@@ -32,7 +32,7 @@ _TEXT = (
     "are what matching alone leaves, more is the poses' or the camera's."
 )
 _INERTIAL = (
-    "Velocities beside the inertial one hold its own constant error; the discrepancy of pairs, the change of velocity "
+    "Velocities compared with the inertial one contain its constant error; the discrepancy of pairs, the change of velocity "
     "from the first pair of pictures to the second against the inertial one, does not. Without measured positions the "
     "residual is that of the answer: its velocity stands for the inertial one's constant part. "
 )

@@ -29,7 +29,7 @@ _WITHOUT_TRUTH = ("fig1-tracks", "fig3-epipolar", "fig4-elevation")
 _LEGEND = (
     "Features matched between one picture and the next, coloured by how far they lie from where the measured poses "
     "allow them; grey crosses: matches that no rigid motion explains, which are left out. Offsets are those of the "
-    "later picture: spread tells of the matching and of the lens, a common offset of an attitude that is off. "
+    "later picture: their spread shows errors of matching and lens, a common offset an attitude error. "
 )
 
 

@@ -76,7 +76,7 @@ def test_other_programs_do_not_go_on_unasked(done: Path, watch: Silence, monkeyp
     real = package_versions()
     monkeypatch.setattr("marsyard.campaigns.definition.identity.package_versions", lambda: {**real, "numpy": "0.9"})
     before = {path: path.read_bytes() for path in done.glob("c*.*")}
-    said = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo go on nevertheless.*--allow-changed"
+    said = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo continue nevertheless.*--allow-changed"
     acts: tuple[Callable[[], None], ...] = (
         lambda: resume_campaign(done, ExecutorConfig(1), watch),
         lambda: append_cases(done, 2, ExecutorConfig(1), watch),

@@ -60,7 +60,7 @@ def test_a_changed_file_is_noticed_by_resume_and_append(done: Path, table: Path,
         lambda: append_cases(done, 1, ExecutorConfig(1), watch),
     )
     for act in acts:
-        with pytest.raises(CampaignError, match=r"Changed:\n  .*table.csv \(\w{12}, now \w{12}\)\nTo go on"):
+        with pytest.raises(CampaignError, match=r"Changed:\n  .*table.csv \(\w{12}, now \w{12}\)\nTo continue"):
             act()
     assert replay(done, 0).changed[0].startswith(str(table))
     append_cases(done, 1, ExecutorConfig(1), watch, allow_changed=True)

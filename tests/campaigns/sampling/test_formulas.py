@@ -86,8 +86,8 @@ def test_what_is_no_arithmetic_is_refused(text: str) -> None:
         ("wind.east_m_s ** 0.5", "has no value"),
         ("9.0 ** 9 ** 9", "has no value"),
         ("1e308 * 10", "it comes to inf"),
-        ("site + 1", "reckons with site, which is 'gusev' and no number"),
-        ("on + 1", "reckons with on, which is True and no number"),
+        ("site + 1", "uses site, which is 'gusev' and not a number"),
+        ("on + 1", "uses on, which is True and not a number"),
     ],
 )
 def test_formulas_without_a_value_say_where(text: str, said: str) -> None:
