@@ -167,7 +167,9 @@ def _continue_campaign(
     """Run the missing cases of a stored campaign, and those to be retried."""
     configuration, stored = campaign.configuration, record.read(directory)
     if "identity" not in stored:
-        raise StoreError(f"{directory} was run by an earlier version, which stored no rows to continue from; run it again")
+        raise StoreError(
+            f"{directory} was run by an earlier version, which stored no rows to continue from; run it again"
+        )
     before, identity = Identity.read(stored["identity"]), identity_of(configuration)
     changes = _identity_changes(directory, before, identity, allow_changed)
     if before.inputs is None and identity.inputs:

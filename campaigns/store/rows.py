@@ -121,7 +121,9 @@ class RowStore:
         """Error in one sentence, with advice."""
         text = str(error)
         if "full" in text:
-            return StoreError(f"{self._path}: the disk is full; the rows before that are safe: free disk space and resume")
+            return StoreError(
+                f"{self._path}: the disk is full; the rows before that are safe: free disk space and resume"
+            )
         if "malformed" in text or "not a database" in text:
             return StoreError(f"{self._path} is damaged: {text}; nothing was written to it")
         return StoreError(f"{self._path}: {text}")

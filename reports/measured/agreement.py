@@ -32,8 +32,9 @@ _TEXT = (
     "are what matching alone leaves, more is the poses' or the camera's."
 )
 _INERTIAL = (
-    "Velocities compared with the inertial one contain its constant error; the discrepancy of pairs, the change of velocity "
-    "from the first pair of pictures to the second against the inertial one, does not. Without measured positions the "
+    "Velocities compared with the inertial one contain its constant error; the discrepancy of pairs, the change of "
+    "velocity from the first pair of pictures to the second against the inertial one, does not. Without measured "
+    "positions the "
     "residual is that of the answer: its velocity stands for the inertial one's constant part. "
 )
 _NO_DRAWS = "Cases that were measured are no random draws: nothing here is a probability."
