@@ -1,4 +1,4 @@
-"""What a user must mend: each error here is printed as one message, without a traceback, and ends with status 2."""
+"""Errors that a user can fix: each is printed as one message, without a traceback, and ends with status 2."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from dataclasses import dataclass
 
 
 class CampaignError(Exception):
-    """Base of the errors that a user can mend."""
+    """Base class of the errors that a user can fix."""
 
 
 class StoreError(CampaignError):
-    """A campaign's folder that cannot be written, or does not hold what is asked of it."""
+    """A campaign folder that cannot be written, or lacks the requested contents."""
 
 
 @contextmanager
 def writing(what: object) -> Iterator[None]:
-    """Raise StoreError, which names what cannot be written, where the system refuses it inside the context."""
+    """Raise StoreError that names `what` where the system refuses to write it inside the context."""
     try:
         yield
     except OSError as error:
@@ -27,26 +27,20 @@ def writing(what: object) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong: where it stands (a file or an option), under which key, and what is allowed."""
+    """One problem: its location (a file or an option), its key, and a message with the allowed values."""
 
     where: str
     key: str
     message: str
 
     def __str__(self) -> str:
-        """One line; what a file holds of control characters does not reach the terminal."""
+        """One line, with the control characters of a file escaped."""
         text = ": ".join(part for part in (self.where, self.key, self.message) if part)
         return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
 class ConfigurationError(CampaignError):
-    """A campaign that cannot be run as it is written.
-
-    Parameters
-    ----------
-    problems
-        Everything that is wrong with it, at least one thing.
-    """
+    """A campaign that cannot be run as written; `problems` lists all that is wrong, at least one."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(problems)
@@ -54,14 +48,13 @@ class ConfigurationError(CampaignError):
 
 
 def near_match(word: str, allowed: Iterable[str]) -> str:
-    """``(did you mean 'x'?)`` with a leading blank where one of the allowed words is near, otherwise nothing."""
+    """``(did you mean 'x'?)`` with a leading blank where an allowed word is similar, otherwise empty."""
     matches = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.6)
     return f" (did you mean '{matches[0]}'?)" if matches else ""
 
 
 def not_allowed(what: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
-    """States that a word is unknown, which one is near, and which are allowed; of very many, those worth listing."""
+    """Message that a word is unknown, with a similar word and the allowed ones, or those of `listed_only`."""
     known = sorted(allowed)
-    shown = known if listed_only is None else sorted(listed_only)
-    listed = ", ".join(shown) if shown else "none"
+    listed = ", ".join(known if listed_only is None else sorted(listed_only)) or "none"
     return f"unknown {what} '{word}'{near_match(word, known)}; allowed: {listed}"

@@ -1,5 +1,4 @@
-"""Outcomes of cases that did not come to an end, or whose algorithm failed to answer
-(`marsyard.algorithms.faults.Fault`).
+"""Outcomes of unfinished cases, and of algorithms without a valid answer (`marsyard.algorithms.faults.Fault`).
 
 No estimate may use these names.
 """
@@ -8,19 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-#: The case raised, or took its worker process down.
+#: The case raised an exception, or its worker process died.
 CRASHED = "CRASHED"
-#: The case ran longer than its limit, in Python or in C.
+#: The case exceeded its time limit.
 TIMED_OUT = "TIMED_OUT"
-#: The case asked for more memory than there is, or than its worker may have.
+#: The case needed more memory than available, or than its limit.
 OUT_OF_MEMORY = "OUT_OF_MEMORY"
-#: The case wrote more to its standard output and error than its limit.
+#: The case exceeded its limit of standard output and error.
 TOO_MUCH_OUTPUT = "TOO_MUCH_OUTPUT"
 
-#: The algorithm's answer was not of the form that its interface states.
+#: The algorithm's answer violated its interface.
 BAD_ANSWER = "BAD_ANSWER"
 
-#: All of them, in the words of the command line.
+#: All of them, by the names on the command line.
 RETRYABLE: Mapping[str, str] = {
     "crashed": CRASHED,
     "timed-out": TIMED_OUT,
@@ -29,23 +28,17 @@ RETRYABLE: Mapping[str, str] = {
     "bad-answer": BAD_ANSWER,
 }
 
-#: Cases with these outcomes count as failures of requirements on all cases, and make the exit status 1.
+#: Cases with these outcomes fail requirements on all cases, and cause exit status 1.
 UNFINISHED = frozenset(RETRYABLE.values())
 
 
 class CaseEndedError(Exception):
-    """A task that was ended, by itself or by its watcher, with the process that it ran in.
+    """A task that ended together with its process.
 
-    Parameters
-    ----------
-    outcome
-        One of this module's.
-    reason
-        The same words each time that the task ends so.
-    trace
-        Where in Python the process stood, and the last that it wrote, as far as that is known.
-    note
-        What the task had left by `worker_process.leave_note`.
+    outcome: one of this module's.
+    reason: the same text each time that the task ends in this way.
+    trace: where the process stood in Python, and its last output, as far as known.
+    note: text that the task left through `worker_process.leave_note`.
     """
 
     def __init__(self, outcome: str, reason: str, trace: str, note: str = "") -> None:

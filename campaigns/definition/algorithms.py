@@ -1,8 +1,7 @@
-"""The algorithms under test as a campaign's record names them: class, version, options, and a hash of the sources."""
+"""Algorithms under test as described in a campaign's record: class, version, options, and a hash of the sources."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, is_dataclass
@@ -14,25 +13,19 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.exchange import command_of
 from marsyard.campaigns.definition.campaign import Campaign, value_at
-from marsyard.campaigns.definition.identity import chosen_algorithms, foreign_sources
+from marsyard.campaigns.definition.identity import custom_sources, hash_sources, selected_algorithms
 from marsyard.scenarios.dotted import found_at, sources_at
 from marsyard.scenarios.estimators import Task, installed
 from marsyard.scenarios.interface import TakesAlgorithms
 from marsyard.scenarios.offline import is_offline
 
-#: Digits of a source hash; as many as tell any two sources apart that a reader may hold side by side.
-_DIGITS = 16
-
 
 def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
-    """Describe the algorithms that a campaign runs, the one that is judged first.
+    """Describe the algorithms that a campaign runs, the judged one first; empty where the scenario takes none.
 
-    Returns
-    -------
-    A table for each algorithm: `spec` (as the campaign names it), `role` (`judged` or `compared`), `path` (class as
-    ``module:name``, or the program's or table's file), `version` (of the installed distribution, or the `version`
-    attribute of the class; None where there is neither), `options` and `source_hash` (SHA-256, shortened). Empty where
-    the scenario has no choice of algorithms.
+    Keys of each entry: `spec` (the campaign's name for it), `role` (`judged` or `compared`), `path` (class as
+    ``module:name``, or the file of the program or table), `version` (of the installed distribution, or the class's
+    `version` attribute; None where there is neither), `options` and `source_hash` (SHA-256, 16 digits).
     """
     scenario = campaign.scenario
     if not isinstance(scenario, TakesAlgorithms):
@@ -49,44 +42,36 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
         {
             "spec": spec,
             "role": "compared" if spec in compared else "judged",
-            **_described(scenario.task, spec, parameters),
+            **_describe(scenario.task, spec, parameters),
             "source_hash": _source_hash(scenario.task, spec),
         }
-        for spec in chosen_algorithms(campaign.configuration)
+        for spec in selected_algorithms(campaign.configuration)
     ]
 
 
-def _described(task: Task[Any, Any], spec: str, parameters: BaseModel) -> dict[str, Any]:
+def _describe(task: Task[Any, Any], spec: str, parameters: BaseModel) -> dict[str, Any]:
     """Class or file, version and options of an algorithm."""
     if spec in task.shipped:
         stated = (value for _, value in parameters if isinstance(value, task.options))
-        made = task.shipped[spec](next(stated, task.options()))
-        kind = type(made)
-        return {
-            "path": f"{kind.__module__}:{kind.__qualname__}",
-            "version": _distribution_version("marsyard"),
-            "options": _plain_options(getattr(made, "options", None)),
-        }
+        algorithm = task.shipped[spec](next(stated, task.options()))
+        kind = type(algorithm)
+        path, version = f"{kind.__module__}:{kind.__qualname__}", _distribution_version("marsyard")
+        return {"path": path, "version": version, "options": _plain_options(getattr(algorithm, "options", None))}
     command = command_of(spec)
-    if command is not None:
-        return {"path": command.words[0], "version": None, "options": {}}
-    if is_offline(spec):
-        return {"path": spec.partition(":")[2], "version": None, "options": {}}
+    if command is not None or is_offline(spec):
+        path = spec.partition(":")[2] if command is None else command.words[0]
+        return {"path": path, "version": None, "options": {}}
     point = installed().get(spec)
-    path, found = (spec, found_at(spec)) if point is None else (point.value, point.load())
-    return {
-        "path": path,
-        "version": _version(path, found),
-        "options": _plain_options(getattr(found, "options", None)),
-    }
+    path, target = (spec, found_at(spec)) if point is None else (point.value, point.load())
+    options = _plain_options(getattr(target, "options", None))
+    return {"path": path, "version": _custom_version(path, target), "options": options}
 
 
-def _version(path: str, found: object) -> str | None:
-    """The version of a user's own algorithm: its distribution's, or its `version` attribute."""
+def _custom_version(path: str, target: object) -> str | None:
+    """Version of a custom algorithm: that of its distribution, or its `version` attribute."""
     top = path.partition(":")[0].partition(".")[0]
-    named = metadata.packages_distributions().get(top, [])
-    versions = (_distribution_version(name) for name in named)
-    version = next((one for one in versions if one is not None), None) or getattr(found, "version", None)
+    versions = (_distribution_version(name) for name in metadata.packages_distributions().get(top, []))
+    version = next((one for one in versions if one is not None), None) or getattr(target, "version", None)
     return version if isinstance(version, str) else None
 
 
@@ -98,7 +83,7 @@ def _distribution_version(name: str) -> str | None:
 
 
 def _plain_options(options: object) -> dict[str, Any]:
-    """Options as JSON has them; empty where there are none, or JSON cannot hold them."""
+    """Options as JSON values; empty where there are none, or JSON cannot hold them."""
     try:
         if isinstance(options, BaseModel):
             options = options.model_dump(mode="json")
@@ -107,17 +92,12 @@ def _plain_options(options: object) -> dict[str, Any]:
         if not isinstance(options, Mapping):
             return {}
         plain: dict[str, Any] = json.loads(json.dumps({str(key): value for key, value in options.items()}, default=str))
-    except Exception:  # values of a user's own may raise anything, and no campaign fails for its record's sake
+    except Exception:  # custom values may raise anything, and the record must not stop a campaign
         return {}
     return plain
 
 
 def _source_hash(task: Task[Any, Any], spec: str) -> str | None:
-    """A hash of the names and contents of an algorithm's sources; None where it has none that can be read."""
-    sources = list(sources_at("algorithms:") if spec in task.shipped else foreign_sources(spec))
-    digest = hashlib.sha256()
-    for name, path in sources:
-        contents = Path(path).read_bytes()
-        digest.update(f"{name}\0{len(contents)}\0".encode())
-        digest.update(contents)
-    return digest.hexdigest()[:_DIGITS] if sources else None
+    """Hash of the names and contents of an algorithm's sources; None where no source can be read."""
+    sources = list(sources_at("algorithms:") if spec in task.shipped else custom_sources(spec))
+    return hash_sources((name, Path(path)) for name, path in sources)[:16] if sources else None

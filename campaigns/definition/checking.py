@@ -1,74 +1,80 @@
-"""Holds what a campaign disperses against what its scenario takes, before any case is run."""
+"""Checks of a campaign against its scenario before any case runs: dispersions, and columns of requirements."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
-from marsyard.campaigns.definition.configuration import Key, key_text, problems_of
+from marsyard.campaigns.definition.configuration import POPULATIONS, Key, key_text, problems_of
+from marsyard.campaigns.definition.identity import selected_algorithms
 from marsyard.campaigns.errors import not_allowed
 from marsyard.campaigns.sampling.dispersion import Dispersion
-from marsyard.campaigns.sampling.levels import Choice, Fixed, Grid
+from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
+from marsyard.scenarios.columns import StatedColumns, stated_columns
+from marsyard.scenarios.estimators import labels
+from marsyard.scenarios.interface import TakesParts
+from marsyard.scenarios.parts.named import SCORE
 
-#: Cases whose draws are tried together before a campaign starts; the reach of each dispersion is tried in full.
-TRIED_CASES = 32
-#: The most varying parameters in the formulas of one dispersion: both ends of each are tried with those of the others.
-MOST_VARYING = 8
+#: Cases whose draws are validated before a campaign starts; the range of each dispersion is checked in full.
+_CHECKED_CASES = 32
+#: Maximum number of dispersed parameters in the formulas of one dispersion: all combinations of extremes are checked.
+_MAX_VARYING = 8
+#: Columns that the engine writes.
+_ENGINE_FLAGS, _ENGINE_NUMBERS = ("answered",), ("wall_time_s", "cpu_time_s")
 
 
 def sampling_problems(campaign: Campaign) -> list[tuple[Key, str]]:
-    """All that is wrong with how a campaign's parameters are drawn: keys, and what is wrong and allowed there."""
+    """Problems of the campaign's dispersions: keys, and messages with the allowed values."""
     problems = [*campaign.configuration.sampling_problems(), *_name_problems(campaign)]
-    return problems or _reach_problems(campaign) or _draw_problems(campaign)
+    return problems or _range_problems(campaign) or _draw_problems(campaign)
 
 
 def _name_problems(campaign: Campaign) -> list[tuple[Key, str]]:
-    """Dispersions of what is no parameter, and formulas over what is none."""
-    known = dict(leaves(campaign.configuration.parameters))
+    """Unknown parameters that dispersions or formulas name, and cycles of formulas."""
+    parameters = dict(leaves(campaign.configuration.parameters))
     dispersions = campaign.configuration.dispersions
     problems: list[tuple[Key, str]] = []
     for path, dispersion in dispersions.items():
-        message = _path_problem(path, dispersion, known)
+        message = _path_problem(path, dispersion, parameters)
         if message:
             problems.append((("dispersions", path), message))
-        for key, one in dispersion.formulas.items():
-            wrong = (_formula_name_problem(name, dispersions, known) for name in one.names)
-            problems += [(("dispersions", path, *key), message) for message in wrong if message]
+        for key, formula in dispersion.formulas.items():
+            messages = (_formula_name_problem(name, dispersions, parameters) for name in formula.names)
+            problems += [(("dispersions", path, *key), message) for message in messages if message]
     if not problems:
         try:
-            campaign.order  # noqa: B018  (works it out)
+            campaign.order  # noqa: B018  (evaluates the property)
         except ValueError as error:
             problems.append((("dispersions",), str(error)))
     return problems
 
 
-def _path_problem(path: str, dispersion: Dispersion, known: Mapping[str, Any]) -> str:
-    """What is wrong with what a dispersion is of; empty if nothing is."""
-    if path in known:
+def _path_problem(path: str, dispersion: Dispersion, parameters: Mapping[str, Any]) -> str:
+    if path in parameters:
         return ""
-    if not any(leaf.startswith(f"{path}.") for leaf in known):
-        return not_allowed("parameter", path, known, _beside(path, known))
+    if not any(leaf.startswith(f"{path}.") for leaf in parameters):
+        return not_allowed("parameter", path, parameters, _siblings(path, parameters))
     if isinstance(dispersion, Choice | Fixed) or (isinstance(dispersion, Grid) and dispersion.values is not None):
         return ""
     return "is a table; disperse one of its values, or choose between tables"
 
 
-def _formula_name_problem(name: str, dispersions: Mapping[str, Any], known: Mapping[str, Any]) -> str:
-    """What is wrong with a name in a formula; empty if nothing is."""
-    inside = next((path for path in dispersions if name.startswith(f"{path}.")), None)
-    if inside is not None:
-        return f"'{name}' lies within '{inside}', which is dispersed as a whole"
-    return "" if name in known else not_allowed("parameter", name, known, _beside(name, known))
+def _formula_name_problem(name: str, dispersions: Mapping[str, Any], parameters: Mapping[str, Any]) -> str:
+    parent = next((path for path in dispersions if name.startswith(f"{path}.")), None)
+    if parent is not None:
+        return f"'{name}' lies within '{parent}', which is dispersed as a whole"
+    return "" if name in parameters else not_allowed("parameter", name, parameters, _siblings(name, parameters))
 
 
-def _beside(path: str, known: Iterable[str]) -> list[str]:
-    """The parameters in the innermost table on a path that there is, further tables in it by their names alone."""
-    names = list(known)
+def _siblings(path: str, parameters: Iterable[str]) -> list[str]:
+    """Parameters in the innermost existing table of a path; its subtables by name only."""
+    names = list(parameters)
     table = path
     while table:
         table = table.rpartition(".")[0]
@@ -79,96 +85,148 @@ def _beside(path: str, known: Iterable[str]) -> list[str]:
     return names
 
 
-def _reach_problems(campaign: Campaign) -> list[tuple[Key, str]]:
-    """Draws that a parameter refuses, and formulas that have no value, at the ends of what can be drawn."""
+def _range_problems(campaign: Campaign) -> list[tuple[Key, str]]:
+    """Values that a parameter refuses, and formulas without a value, at the extremes of the dispersions."""
     problems: list[tuple[Key, str]] = []
-    reach: dict[str, list[Any]] = {}
+    extremes: dict[str, list[Any]] = {}
     for path in campaign.order:
-        if any(name in campaign.marginals and name not in reach for name in campaign.marginals[path].names):
-            continue  # what it depends on is wrong already
-        found, message = _reach(campaign, path, reach)
+        if any(name in campaign.marginals and name not in extremes for name in campaign.marginals[path].names):
+            continue  # a dispersion that it depends on has a problem already
+        values, message = _check_extremes(campaign, path, extremes)
         if message:
             problems.append((("dispersions", path), message))
-        else:
-            reach[path] = _ends(found)
+            continue
+        numbers = [value for value in values if isinstance(value, int | float) and not isinstance(value, bool)]
+        all_numbers = len(numbers) == len(values)
+        extremes[path] = list(dict.fromkeys((min(numbers), max(numbers)))) if all_numbers else values
     return problems
 
 
-def _reach(campaign: Campaign, path: str, reach: Mapping[str, list[Any]]) -> tuple[list[Any], str]:
-    """Values that stand for all that a dispersion can draw; and what is wrong with one of them, empty if nothing is."""
-    found: list[Any] = []
-    for given, values in _met(campaign, path, reach):
+def _check_extremes(campaign: Campaign, path: str, extremes: Mapping[str, list[Any]]) -> tuple[list[Any], str]:
+    """Extreme values of a dispersion, and the problem of one of them; empty if there is none."""
+    checked: list[Any] = []
+    for given, values in _possible_distributions(campaign, path, extremes):
         if isinstance(given, str):
-            return found, given
+            return checked, given
         try:
-            extremes = given.extremes()
+            candidates = given.extremes()
         except ValueError as error:
-            return found, _said(error)
-        for value in extremes:
+            return checked, _plain_message(error)
+        for value in candidates:
             refused = _refusal(campaign, {**values, path: value})
             if refused:
                 where = "".join(f" where {name} = {one}" for name, one in values.items())
                 text = f"{given.describe()} reaches {value!r}{where}, which the parameter does not take: {refused}"
-                return found, text
-            found.append(value)
-    return found, ""
+                return checked, text
+            checked.append(value)
+    return checked, ""
 
 
-def _met(
-    campaign: Campaign, path: str, reach: Mapping[str, list[Any]]
+def _possible_distributions(
+    campaign: Campaign, path: str, extremes: Mapping[str, list[Any]]
 ) -> Iterator[tuple[Dispersion | str, dict[str, Any]]]:
-    """The distributions that a dispersion can become, with the drawn values that do it; a text where it is none."""
-    dispersion = campaign.marginals[path]
-    varying = [name for name in dispersion.names if name in reach]
-    if len(varying) > MOST_VARYING:
-        yield f"its formulas name {len(varying)} parameters that vary; allowed: up to {MOST_VARYING}", {}
+    """Distributions at all combinations of the extremes that formulas name; a text for an invalid one."""
+    dispersion, parameters = campaign.marginals[path], campaign.configuration.parameters
+    varying = [name for name in dispersion.names if name in extremes]
+    if len(varying) > _MAX_VARYING:
+        yield f"its formulas name {len(varying)} parameters that vary; allowed: up to {_MAX_VARYING}", {}
         return
-    fixed = {
-        name: value_at(campaign.configuration.parameters, name) for name in dispersion.names if name not in varying
-    }
-    for corner in itertools.product(*(reach[name] for name in varying)):
+    fixed = {name: value_at(parameters, name) for name in dispersion.names if name not in varying}
+    for corner in itertools.product(*(extremes[name] for name in varying)):
         values = dict(zip(varying, corner, strict=True))
         try:
             yield dispersion.given({**fixed, **values}), values
         except ValueError as error:
-            yield _said(error), values
-
-
-def _ends(values: list[Any]) -> list[Any]:
-    """The least and the greatest of numbers; other values as they are."""
-    numbers = [value for value in values if isinstance(value, int | float) and not isinstance(value, bool)]
-    return list(dict.fromkeys((min(numbers), max(numbers)))) if len(numbers) == len(values) else values
+            yield _plain_message(error), values
 
 
 def _draw_problems(campaign: Campaign) -> list[tuple[Key, str]]:
-    """The first case whose draws are refused together, if there is one early on."""
+    """First of the checked cases whose drawn values the scenario refuses."""
     if not campaign.configuration.dispersions:
         return []
-    for case in range(min(campaign.configuration.cases, TRIED_CASES)):
+    for case in range(min(campaign.configuration.cases, _CHECKED_CASES)):
         try:
             refused = _refusal(campaign, campaign.draws(case))
         except ValueError as error:
-            refused = _said(error)
+            refused = _plain_message(error)
         if refused:
             return [(("dispersions",), f"the draws of case {case} are refused together: {refused}")]
     return []
 
 
 def _refusal(campaign: Campaign, values: Mapping[str, Any]) -> str:
-    """Why the scenario refuses its parameters with these values; empty where it takes them."""
-    endless = [path for path, value in values.items() if isinstance(value, float) and not math.isfinite(value)]
-    if endless:
-        return f"{endless[0]} must be finite"
+    """Reason why the scenario refuses its parameters with these values; empty where it accepts them."""
+    infinite = [path for path, value in values.items() if isinstance(value, float) and not math.isfinite(value)]
+    if infinite:
+        return f"{infinite[0]} must be finite"
     try:
         campaign.with_values(values)
     except ValidationError as error:
-        found = problems_of(error, campaign.scenario.parameters_type)
-        return "; ".join(f"{key_text(key)}: {message}" if key else message for key, message in found)
+        problems = problems_of(error, campaign.scenario.parameters_type)
+        return "; ".join(f"{key_text(key)}: {message}" if key else message for key, message in problems)
     return ""
 
 
-def _said(error: ValueError) -> str:
-    """What an error says, without pydantic's frame."""
+def _plain_message(error: ValueError) -> str:
+    """Message of an error without pydantic's frame."""
     if isinstance(error, ValidationError):
         return "; ".join(str(detail["msg"]).removeprefix("Value error, ") for detail in error.errors())
     return str(error)
+
+
+def metric_problems(campaign: Campaign) -> list[tuple[Key, str]]:
+    """Columns that requirements name and the scenario does not state: keys, and messages with the allowed columns.
+
+    Columns of custom scores are accepted by their prefix. Columns of a custom scenario are unknown here: its first
+    finished case is checked instead (`marsyard.campaigns.running.engine.check_metrics`).
+    """
+    try:
+        columns = _stated_columns(campaign)
+    except ValueError as error:
+        return [(("scenario",), str(error))]
+    if columns is None:
+        return []
+    problems: list[tuple[Key, str]] = []
+    compared = labels(selected_algorithms(campaign.configuration))[1:]
+
+    def unlabelled(name: str) -> str:
+        return next((name.removeprefix(f"{one}.") for one in compared if name.startswith(f"{one}.")), name)
+
+    for index, asked in enumerate(campaign.configuration.requirements):
+        by_bound = asked.bound is not None
+        allowed, has = (columns.numbers, columns.has_number) if by_bound else (columns.flags, columns.has_flag)
+        kind = "column of numbers" if by_bound else "column of true and false"
+        unknown = [name for name in asked.metric_columns if not has(unlabelled(name))]
+        problems += [(("requirements", index, "metric"), not_allowed(kind, name, allowed)) for name in unknown]
+        unknown = [name for name in asked.population_columns if not columns.has_flag(unlabelled(name))]
+        flags = (*POPULATIONS, *columns.flags)
+        key = ("requirements", index, "population")
+        problems += [(key, not_allowed("column of true and false", name, flags)) for name in unknown]
+    return problems
+
+
+def _stated_columns(campaign: Campaign) -> StatedColumns | None:
+    """Columns of the scenario and of the campaign's parameters; None where they are not known."""
+    configuration = campaign.configuration
+    stated = stated_columns(configuration.scenario)
+    if stated is None:
+        return None
+    scores: list[str] = []
+    keys = campaign.scenario.part_keys if isinstance(campaign.scenario, TakesParts) else {}
+    for path in (path for path, kind in keys.items() if kind is SCORE):
+        if path in configuration.dispersions:
+            return None
+        scores += [f"{label}_*" for label in labels(_value(campaign, path))]
+    named = [str(one["name"]) for one in _value(campaign, stated.named_flags)] if stated.named_flags else []
+    return replace(
+        stated,
+        flags=(*stated.flags, *_ENGINE_FLAGS, *named, *scores),
+        numbers=(*stated.numbers, *_ENGINE_NUMBERS, *scores),
+    )
+
+
+def _value(campaign: Campaign, path: str) -> Any:
+    try:
+        return value_at(campaign.configuration.parameters, path)
+    except ValueError:
+        return ()

@@ -1,4 +1,4 @@
-"""A campaign as its file states it: scenario, number of cases, parameters, dispersions, requirements, what is kept."""
+"""Contents of a campaign file: scenario, number of cases, parameters, dispersions, requirements, retention, limits."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from marsyard.campaigns.errors import ConfigurationError, Problem, near_match
 from marsyard.campaigns.sampling.correlation import Correlation
 from marsyard.campaigns.sampling.design import Design
-from marsyard.campaigns.sampling.dispersions import FRIENDLY, AnyDispersion
-from marsyard.campaigns.sampling.levels import Grid
-from marsyard.campaigns.sampling.ranges import Normal
+from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Grid, Normal
 from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters
 
@@ -25,26 +23,24 @@ Model = TypeVar("Model", bound=BaseModel)
 #: A key in nested tables and lists, part by part.
 Key = tuple[str | int, ...]
 
-#: The most cases a campaign may have: numbers of cases are stored as 64-bit integers, and a slip of the keyboard shows.
+#: Maximum number of cases of a campaign.
 MAX_CASES = 1_000_000_000
 
 
-#: Populations that every campaign has; any other name in a population is a column of true and false.
+#: Populations of every campaign; any other name in a population is a column of true and false.
 POPULATIONS = ("all", "completed", "valid")
 
 
 class Requirement(Parameters):
-    """What must hold in a stated fraction of a population of cases, with a stated confidence.
+    """A condition on a stated fraction of a population of cases, at a stated confidence.
 
-    With a `bound`, that the metric's absolute value is at most the bound; a case without a number fails. Without one
-    the metric is a column of true and false (`answered`, say) that must be true.
+    With a `bound`, the metric's absolute value must not exceed it; a case without a number fails. Without one, the
+    metric is a column of true and false (`answered`, for example) that must be true.
 
-    `population` is `all`, `completed`, `valid` (the cases with an answer) or any column of true and false; several are
-    joined by " and ", as in `valid and room`. A metric with a bound may be a sum of columns, joined by " + ", and is
-    multiplied by `scale` before it is held against the bound. `decide_by = "estimate"` compares the rate that was seen
-    with the probability, whatever its interval, which is stated beside it: for requirements that are not asked at a
-    confidence. They are at best MET BY RATE, with the exit status 3, which `accept_rate` makes 0. `source` and `kind`
-    say whose requirement it is.
+    `population` is `all`, `completed`, `valid` (cases with an answer) or a column of true and false; several are joined
+    by " and ". A metric with a bound may be a sum of columns, joined by " + "; it is multiplied by `scale` before the
+    comparison. `decide_by = "estimate"` compares the observed rate with the probability, regardless of its interval,
+    for requirements without a confidence. Its best verdict is MET BY RATE, with exit status 3, or 0 with `accept_rate`.
     """
 
     id: Annotated[str, Field(min_length=1)]
@@ -65,33 +61,33 @@ class Requirement(Parameters):
     scale: Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)] = 1.0
 
     @model_validator(mode="after")
-    def _rate_is_accepted_where_it_decides(self) -> Requirement:
+    def _check_accept_rate(self) -> Requirement:
         if self.accept_rate and self.decide_by != "estimate":
             raise ValueError('accept_rate needs decide_by = "estimate"')
         return self
 
     @property
     def metric_columns(self) -> tuple[str, ...]:
-        """Columns that the metric is made of: one of true and false, or those of numbers that are summed."""
+        """Columns of the metric: one of true and false, or the summands."""
         return (self.metric,) if self.bound is None else tuple(self.metric.split(" + "))
 
     @property
     def population_columns(self) -> tuple[str, ...]:
-        """Columns of true and false that the population takes its members from."""
+        """Columns of true and false that define the population."""
         return tuple(part for part in self.population.split(" and ") if part not in POPULATIONS)
 
 
 class Retain(Parameters):
-    """Which cases keep their products (histories, pictures, intermediate results) beside their rows.
+    """Cases that keep their products (histories, pictures, intermediate results); rows are always kept.
 
-    Rows are always kept. `showcase` is the case that the report shows: the answered case with the worst metric of the
-    first requirement, the first case, or none.
+    `showcase` is the case shown in the report: the answered case with the worst metric of the first requirement, the
+    first case, or none.
     """
 
     showcase: Literal["worst", "first", "none"] = "worst"
     products: Literal["none", "failed", "worst", "every", "all"] = Field(
         default="none",
-        description="of no case beside the showcase, of those that fail a requirement, of the `worst` by the metric of "
+        description="of no case except the showcase, of those that fail a requirement, of the `worst` by the metric of "
         "the first requirement with a bound, of `every` so manieth, or of all",
     )
     worst: Annotated[int, Field(strict=True, ge=1)] = 10
@@ -101,12 +97,11 @@ class Retain(Parameters):
     )
 
 
-#: A number above zero, of seconds or bytes.
 _Amount = Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)]
 
 
 class Limits(Parameters):
-    """What one case may use before it is ended; rows of cases that were ended say so in their outcome."""
+    """Limits of one case. A case that exceeds one is ended, and its outcome names the limit."""
 
     case_time_s: _Amount = Field(default=600.0, description="wall-clock time of a case")
     prepare_time_s: _Amount = Field(default=3600.0, description="wall-clock time of building a shared input")
@@ -118,7 +113,7 @@ class Limits(Parameters):
 
 
 class CampaignConfiguration(Parameters):
-    """Everything that a campaign's rows depend on, apart from the program and the machine."""
+    """Everything on which a campaign's rows depend, apart from the program and the machine."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
     scenario: Annotated[str, Field(min_length=1)]
@@ -143,11 +138,11 @@ class CampaignConfiguration(Parameters):
 
     @property
     def total_cases(self) -> int:
-        """Cases of all blocks."""
+        """Number of cases of all blocks."""
         return self.cases + sum(self.appended)
 
     @model_validator(mode="after")
-    def _requirements_are_told_apart(self) -> CampaignConfiguration:
+    def _check_unique_ids(self) -> CampaignConfiguration:
         ids = [requirement.id for requirement in self.requirements]
         repeated = sorted({name for name in ids if ids.count(name) > 1})
         if repeated:
@@ -156,34 +151,34 @@ class CampaignConfiguration(Parameters):
 
     @property
     def grids(self) -> dict[str, Grid]:
-        """The dispersions that are swept, in the file's order."""
+        """Swept dispersions, in the file's order."""
         return {path: one for path, one in self.dispersions.items() if isinstance(one, Grid)}
 
     @property
     def grid_size(self) -> int:
-        """Points of the full factorial over the grids; 1 where there are none."""
+        """Number of points of the full factorial over the grids; 1 where there are none."""
         return math.prod(len(grid.points) for grid in self.grids.values())
 
     @property
     def blocks(self) -> tuple[int, ...]:
-        """Sizes of the blocks of cases, the first one's before those appended."""
+        """Sizes of the blocks of cases, the first before the appended ones."""
         return (self.cases, *self.appended)
 
     def sampling_problems(self) -> list[tuple[Key, str]]:
-        """What is wrong with design, correlated groups and their dispersions together: keys, and what is allowed."""
+        """Problems of the design, the correlated groups and their dispersions: keys and messages."""
         problems: list[tuple[Key, str]] = []
-        unlaid = self.design.problem(self.blocks, self.grid_size)
-        if unlaid is not None:
-            block, message = unlaid
+        design_problem = self.design.problem(self.blocks, self.grid_size)
+        if design_problem is not None:
+            block, message = design_problem
             problems.append((("appended", block - 1) if block else ("cases",), message))
         grouped: dict[str, int] = {}
         for number, group in enumerate(self.correlations):
-            for place, path in enumerate(group.parameters):
+            for index, path in enumerate(group.parameters):
                 wrong = self._member_problem(group, path)
                 if path in grouped:
                     wrong = f"'{path}' is in correlations[{grouped[path]}] already"
                 if wrong:
-                    problems.append((("correlations", number, "parameters", place), wrong))
+                    problems.append((("correlations", number, "parameters", index), wrong))
                 grouped[path] = number
         stated = {path for group in self.correlations if group.covariance for path in group.parameters}
         for path, dispersion in self.dispersions.items():
@@ -195,7 +190,7 @@ class CampaignConfiguration(Parameters):
         return problems
 
     def _member_problem(self, group: Correlation, path: str) -> str:
-        """What keeps a dispersion from being correlated; empty if nothing does."""
+        """Reason why a dispersion cannot be correlated; empty if it can."""
         dispersion = self.dispersions.get(path)
         if dispersion is None:
             return f"'{path}' is not dispersed{near_match(path, self.dispersions)}"
@@ -213,34 +208,33 @@ class CampaignConfiguration(Parameters):
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file. Raises ConfigurationError where it cannot be read, or is none."""
+    """Read the tables of a TOML file. Raises ConfigurationError where it cannot be read, or is not valid."""
     try:
         check_regular(path)
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
-    except (ValueError, RecursionError) as error:  # a ValueError of its own too for numbers of thousands of digits
+    except (ValueError, RecursionError) as error:  # ValueError: also numbers of thousands of digits
         raise ConfigurationError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
 
 
 def read_table(path: Path, model: type[Model]) -> Model:
-    """What a TOML file states as a whole. Raises ConfigurationError, every problem with its key."""
+    """Read a whole TOML file into a model. Raises ConfigurationError, every problem with its key."""
     try:
         return model.model_validate(read_tables(path))
     except ValidationError as error:
-        found = [Problem(str(path), key_text(key), message) for key, message in problems_of(error, model)]
-        raise ConfigurationError(found) from error
+        problems = [Problem(str(path), key_text(key), message) for key, message in problems_of(error, model)]
+        raise ConfigurationError(problems) from error
 
 
 def problems_of(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:
-    """What a validation found: each with its key as written in the file, and what is wrong and allowed there."""
-    return [
-        (_written(model, detail["loc"]), _message(dict(detail), model)) for detail in error.errors(include_url=False)
-    ]
+    """Problems of a validation: keys as written in the file, and messages with the allowed values."""
+    details = error.errors(include_url=False)
+    return [(_written_key(model, detail["loc"]), _message(dict(detail), model)) for detail in details]
 
 
 def key_text(key: Iterable[str | int]) -> str:
-    """A key as TOML writes it: ``dispersions."wind.east_m_s".low`` or ``requirements[0].bound``."""
+    """A key in TOML's notation: ``dispersions."wind.east_m_s".low`` or ``requirements[0].bound``."""
     text = ""
     for part in key:
         if isinstance(part, int):
@@ -251,24 +245,24 @@ def key_text(key: Iterable[str | int]) -> str:
     return text
 
 
-def _written(model: type[BaseModel], location: Sequence[str | int]) -> Key:
-    """The key as written: without the names of the kind that pydantic adds where one of several models is chosen."""
+def _written_key(model: type[BaseModel], location: Sequence[str | int]) -> Key:
+    """Key as written in the file, without the names that pydantic adds for alternative models."""
     if model is CampaignConfiguration and len(location) > 2 and location[0] == "dispersions":
         return (*location[:2], *location[3:])
-    here: Any = model
+    node: Any = model
     written: list[str | int] = []
     for part in location:
-        if not any(kind.__name__ == part for kind in _models(here)):
+        if not any(kind.__name__ == part for kind in _models(node)):
             written.append(part)
-        here = _inner(here, part)
+        node = _inner(node, part)
     return tuple(written)
 
 
 def _message(detail: Mapping[str, Any], model: type[BaseModel]) -> str:
-    """What is wrong at one place and what is allowed there."""
+    """Problem at one key, with the allowed values."""
     location, given = detail["loc"], detail["input"]
     if detail["type"] == "extra_forbidden":
-        allowed = fields_at(model, location[:-1])
+        allowed = _field_names(model, location[:-1])
         return f"unknown key{near_match(str(location[-1]), allowed)}; allowed: {', '.join(allowed)}"
     if detail["type"] == "missing":
         return "required, but missing"
@@ -280,49 +274,45 @@ def _message(detail: Mapping[str, Any], model: type[BaseModel]) -> str:
     return f"{message}, got {given!r}" if shown else f"{message}, got {type(given).__name__}"
 
 
-def fields_at(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
-    """Names of the fields of the model found at a location inside a model; empty where there is none."""
-    here: Any = model
+def _field_names(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
+    """Names of the fields of the model at a location inside a model; empty where there is none."""
+    node: Any = model
     for part in location:
-        here = _inner(here, part)
-    return sorted({name for kind in _models(here) for name in kind.model_fields})
+        node = _inner(node, part)
+    return sorted({name for kind in _models(node) for name in kind.model_fields})
 
 
 def description_at(model: type[BaseModel], path: str) -> str:
-    """What a model says of its field at a dotted path; empty where it says nothing."""
+    """Description of a model's field at a dotted path; empty where it has none."""
     *tables, name = path.split(".")
-    here: Any = model
+    node: Any = model
     for part in tables:
-        here = _inner(here, int(part) if part.isdigit() else part)
-    for kind in _alternatives(here):
-        if isinstance(kind, type) and issubclass(kind, BaseModel) and name in kind.model_fields:
-            return kind.model_fields[name].description or ""
-    return ""
+        node = _inner(node, int(part) if part.isdigit() else part)
+    return next((kind.model_fields[name].description or "" for kind in _models(node) if name in kind.model_fields), "")
 
 
 def _inner(kind: Any, part: str | int) -> Any:
-    """The type found under one part of a location."""
-    found: list[Any] = []
+    """Type below one part of a location."""
+    types_below: list[Any] = []
     for choice in _alternatives(kind):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             if part in choice.model_fields:
-                found.append(choice.model_fields[str(part)].annotation)
-            elif choice.__name__ == part or (part in FRIENDLY and choice is FRIENDLY[str(part)]):
-                found.append(choice)
+                types_below.append(choice.model_fields[str(part)].annotation)
+            elif choice.__name__ == part or (part in BUILT_IN and choice is BUILT_IN[str(part)]):
+                types_below.append(choice)
         elif get_origin(choice) in (list, tuple, set, frozenset) and isinstance(part, int):
-            found.append(get_args(choice)[0])
+            types_below.append(get_args(choice)[0])
         elif get_origin(choice) in (dict, Mapping) and isinstance(part, str):
-            found.append(get_args(choice)[1])
-    return Union[tuple(found)] if found else None  # noqa: UP007
+            types_below.append(get_args(choice)[1])
+    return Union[tuple(types_below)] if types_below else None  # noqa: UP007
 
 
 def _models(kind: Any) -> list[type[BaseModel]]:
-    """The models among the members of a union."""
     return [one for one in _alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)]
 
 
 def _alternatives(kind: Any) -> list[Any]:
-    """The members of a union, through annotations."""
+    """Members of a union, through annotations."""
     origin = get_origin(kind)
     if origin is Annotated:
         return _alternatives(get_args(kind)[0])

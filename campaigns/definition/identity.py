@@ -1,4 +1,4 @@
-"""What a campaign's rows depend on beside the case's number: configuration, code, packages' versions, input files."""
+"""Identity of a campaign: hashes and versions of everything besides the case number on which its rows depend."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import platform
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import metadata
@@ -20,40 +20,33 @@ from marsyard.algorithms.exchange import command_of
 from marsyard.campaigns.definition.campaign import leaves, value_at
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.sampling.levels import Choice, Fixed, Grid
+from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
 from marsyard.scenarios.dotted import relative_to
 from marsyard.scenarios.estimators import sources_of
-from marsyard.scenarios.interface import TakesAlgorithms, TakesParts
+from marsyard.scenarios.interface import Scenario, TakesAlgorithms, TakesParts
 from marsyard.scenarios.offline import answers_file
 from marsyard.scenarios.own_files import input_files
 from marsyard.scenarios.registry import UnknownScenarioError, scenario, scenario_source
 
-#: Folders of ours whose code rows depend on; what reports and commands do changes no row.
+#: Packages on whose code rows depend; reports and commands change no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")
 
-#: Keys of a configuration that change no row of a case that comes to its end.
-_OF_NO_EFFECT = frozenset({"appended", "description", "limits", "most_cases", "requirements", "retain"})
+#: Keys of a configuration that change no row of a finished case.
+_KEYS_WITHOUT_EFFECT = frozenset({"appended", "description", "limits", "most_cases", "requirements", "retain"})
 
 _HOME = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
 class Identity:
-    """What must be the same for two runs of a case to give the same row, on one machine.
+    """Everything that must be equal for two runs of a case to give the same row, on one machine.
 
-    Attributes
-    ----------
-    configuration
-        Hash of what the configuration states about cases.
-    code
-        Hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of the user's own scenario, algorithms
-        and parts.
-    versions
-        Of Python, Marsyard and the packages that it requires.
-    inputs
-        Hashes of the contents of the files that the parameters name, by their paths as stated: terrain models, cameras,
-        datasheets, flights, meshes, measured cases. Files that are gone are left out. None where an earlier version
-        kept none: whether they have changed is then not known.
+    configuration: hash of the statements about cases.
+    code: hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of custom scenarios, algorithms and
+    parts.
+    versions: of Python, Marsyard and the packages that it requires.
+    inputs: hashes of the files that the parameters name, by path as stated; missing files are left out. None where an
+    earlier version stored none, so that changes are unknown.
     """
 
     configuration: str
@@ -62,12 +55,12 @@ class Identity:
     inputs: Mapping[str, str] | None = None
 
     def plain(self) -> dict[str, Any]:
-        """As it stands in the record."""
+        """As stored in the record."""
         return asdict(self)
 
     @classmethod
     def read(cls, stored: Mapping[str, Any]) -> Self:
-        """The identity in a record."""
+        """Identity stored in a record."""
         inputs = stored.get("inputs")
         return cls(
             str(stored["configuration"]),
@@ -77,44 +70,40 @@ class Identity:
         )
 
     def differences(self, other: Identity) -> list[str]:
-        """In what another identity differs from this one, each in a few words."""
-        pairs = {what: (getattr(self, what)[:12], getattr(other, what)[:12]) for what in ("configuration", "code")}
+        """Differences from another identity, each in a few words."""
+        pairs = {name: (getattr(self, name)[:12], getattr(other, name)[:12]) for name in ("configuration", "code")}
         for name in sorted({*self.versions, *other.versions}):
             pairs[name] = (str(self.versions.get(name)), str(other.versions.get(name)))
         before, now = self.inputs or {}, other.inputs or {}
         pairs.update({name: (before[name][:12], now[name][:12]) for name in sorted({*before} & {*now})})
-        return [f"{what} ({before}, now {now})" for what, (before, now) in pairs.items() if before != now]
+        return [f"{name} ({old}, now {new})" for name, (old, new) in pairs.items() if old != new]
 
 
 def identity_of(configuration: CampaignConfiguration) -> Identity:
-    """The identity of a campaign if it were run now.
+    """Identity of a campaign if it were run now.
 
-    Raises
-    ------
-    CampaignError
-        Where a file that the parameters name cannot be used any more.
+    Raises CampaignError where a file that the parameters name cannot be used any more.
     """
-    named = (scenario_source(configuration.scenario), *chosen_algorithms(configuration), *chosen_parts(configuration))
+    named = (scenario_source(configuration.scenario), *selected_algorithms(configuration))
+    named = (*named, *selected_parts(configuration))
     return Identity(
         configuration_hash(configuration), code_hash(named), package_versions(), input_hashes(configuration)
     )
 
 
 def input_hashes(configuration: CampaignConfiguration) -> dict[str, str]:
-    """SHA-256 of each file that the parameters name, by its path; those that are dispersed over among them.
+    """SHA-256 of each file that the parameters or their dispersions name, by path.
 
-    Raises
-    ------
-    CampaignError
-        Where the scenario refuses the parameters, as where a file is gone or has changed since the campaign was made.
+    Raises CampaignError where the scenario refuses the parameters, for example because a file is missing or has
+    changed.
     """
     try:
         parameters = scenario(configuration.scenario).parameters_type.model_validate(configuration.parameters)
     except UnknownScenarioError:
         return {}
     except ValidationError as error:
-        said = "; ".join(one["msg"].removeprefix("Value error, ") for one in error.errors(include_url=False))
-        raise CampaignError(f"the campaign's parameters cannot be used any more: {said}") from error
+        reasons = "; ".join(one["msg"].removeprefix("Value error, ") for one in error.errors(include_url=False))
+        raise CampaignError(f"the campaign's parameters cannot be used any more: {reasons}") from error
     dispersed = [one for one in configuration.dispersions.values() if isinstance(one, Choice | Fixed | Grid)]
     stated = [value for one in dispersed for extreme in one.extremes() for _, value in leaves(extreme)]
     names = [*input_files(parameters), *(value for value in stated if isinstance(value, str) and Path(value).is_file())]
@@ -122,7 +111,6 @@ def input_hashes(configuration: CampaignConfiguration) -> dict[str, str]:
 
 
 def _file_hash(path: Path) -> str:
-    """SHA-256 of a file's contents. Raises CampaignError where it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -130,84 +118,87 @@ def _file_hash(path: Path) -> str:
         raise CampaignError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def chosen_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
-    """The algorithms under test that a configuration names, those that it disperses over among them."""
-    try:
-        found = scenario(configuration.scenario)
-    except UnknownScenarioError:
-        return ()
-    if not isinstance(found, TakesAlgorithms):
+def selected_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
+    """Algorithms under test that a configuration or its dispersions name."""
+    used = _scenario(configuration)
+    if not isinstance(used, TakesAlgorithms):
         return ()
     table: Any = configuration.parameters
-    for part in found.algorithm_table:
+    for part in used.algorithm_table:
         table = table.get(part, {})
-    path = ".".join((*found.algorithm_table, "algorithm"))
+    path = ".".join((*used.algorithm_table, "algorithm"))
     dispersed = configuration.dispersions.get(path)
     varied = [] if dispersed is None else [str(value) for value in dispersed.extremes()]
     stated = [table.get("algorithm", ""), *table.get("compared", ()), *varied]
     return tuple(str(spec) for spec in dict.fromkeys(stated) if spec)
 
 
-def chosen_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
-    """Where the user's own parts are that a configuration names, as ``module:name``, dispersed ones among them."""
-    try:
-        found = scenario(configuration.scenario)
-    except UnknownScenarioError:
-        return ()
-    if not isinstance(found, TakesParts):
+def selected_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
+    """Import paths (``module:name``) of the custom parts that a configuration or its dispersions name."""
+    used = _scenario(configuration)
+    if not isinstance(used, TakesParts):
         return ()
     trees = [configuration.parameters]
     for path, dispersion in configuration.dispersions.items():
-        values = dispersion.extremes() if any(f"{key}.".startswith(f"{path}.") for key in found.part_keys) else ()
+        values = dispersion.extremes() if any(f"{key}.".startswith(f"{path}.") for key in used.part_keys) else ()
         trees += [_nested(path, value) for value in values]
-    paths = [kind.path(spec) for tree in trees for key, kind in found.part_keys.items() for spec in _named(tree, key)]
+    paths = [kind.path(spec) for tree in trees for key, kind in used.part_keys.items() for spec in _names_at(tree, key)]
     return tuple(dict.fromkeys(paths))
 
 
+def _scenario(configuration: CampaignConfiguration) -> Scenario | None:
+    try:
+        return scenario(configuration.scenario)
+    except UnknownScenarioError:
+        return None
+
+
 def _nested(path: str, value: Any) -> dict[str, Any]:
-    """A tree that holds one value."""
     for part in reversed(path.split(".")):
         value = {part: value}
     return dict(value)
 
 
-def _named(tree: Any, path: str) -> list[str]:
-    """The name, or the names, at a path of a tree; none where it has none."""
+def _names_at(tree: Any, path: str) -> list[str]:
+    """Name, or names, at a path of a tree; empty where there is none."""
     try:
-        found = value_at(tree, path)
+        value = value_at(tree, path)
     except ValueError:
         return []
-    return [found] if isinstance(found, str) else [str(one) for one in found or ()]
+    return [value] if isinstance(value, str) else [str(one) for one in value or ()]
 
 
 def configuration_hash(configuration: CampaignConfiguration) -> str:
-    """A hash of what a configuration states about cases."""
-    stated = configuration.model_dump(mode="json")
-    kept = {name: value for name, value in stated.items() if name not in _OF_NO_EFFECT}
-    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+    """Hash of a configuration's statements about cases."""
+    stated = configuration.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
+    return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
 
 
 @cache
 def code_hash(named: tuple[str, ...]) -> str:
-    """A hash of the sources that rows depend on, names and contents; `named` are scenario, algorithms and parts."""
+    """Hash of the sources on which rows depend; `named` are the scenario, algorithms and parts."""
+    custom = [source for one in named for source in custom_sources(one)]
+    return hash_sources((*_package_sources(), *custom))
+
+
+def hash_sources(sources: Iterable[tuple[str, Path]]) -> str:
+    """SHA-256 of the names and contents of source files."""
     digest = hashlib.sha256()
-    foreign = [source for one in named for source in foreign_sources(one)]
-    for name, path in (*_own_sources(), *foreign):
+    for name, path in sources:
         contents = path.read_bytes()
         digest.update(f"{name}\0{len(contents)}\0".encode())
         digest.update(contents)
     return digest.hexdigest()
 
 
-def _own_sources() -> Iterator[tuple[str, Path]]:
-    """Our code, and the constants that lie beside it."""
+def _package_sources() -> Iterator[tuple[str, Path]]:
     for folder in _CODE:
-        yield from relative_to(_HOME, sorted((_HOME / folder).rglob("*.py")))
-        yield from relative_to(_HOME, sorted((_HOME / folder).rglob("*.json")))
+        for pattern in ("*.py", "*.json"):
+            yield from relative_to(_HOME, sorted((_HOME / folder).rglob(pattern)))
 
 
-def foreign_sources(named: str) -> Iterator[tuple[str, Path]]:
-    """The package or module of what is given as `module:Class` or by an entry point; a program's or a table's file."""
+def custom_sources(named: str) -> Iterator[tuple[str, Path]]:
+    """Source files of a custom scenario, algorithm or part: package or module, program, or table of answers."""
     table = answers_file(named)
     if table is not None:
         yield table.name, table
@@ -221,7 +212,7 @@ def foreign_sources(named: str) -> Iterator[tuple[str, Path]]:
         words = [Path(word) for word in (program, *command.words[1:]) if word is not None]
         yield from ((path.name, path) for path in words if path.is_file())
         return
-    # a scenario of one's own is named in the same way
+
     yield from sources_of(named)
 
 

@@ -1,4 +1,4 @@
-"""Requirements as data: one file states them, campaigns name them, and stored rows can be judged by them anew."""
+"""Files of requirements: campaigns name requirements by id, and stored rows can be judged by them again."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
 from marsyard.scenarios.systems import systems
 from marsyard.sim.parameters import Parameters
 
-#: What a campaign that names a stated requirement may say of it anew.
-RESTATED = ("statement", "population", "probability", "confidence", "decide_by", "accept_rate")
+#: Keys that a campaign may change in a requirement that it names.
+_CHANGEABLE = ("statement", "population", "probability", "confidence", "decide_by", "accept_rate")
 
 
 class StatedRequirement(Requirement):
-    """A requirement in a file of requirements, with the campaigns that show it: patterns of their names."""
+    """A requirement in a file of requirements, with name patterns of the campaigns that verify it."""
 
     campaigns: Annotated[tuple[str, ...], Field(strict=False)] = ()
 
     def applies_to(self, campaign: str) -> bool:
-        """Whether a campaign of that name shows it."""
+        """Whether a campaign of that name verifies it."""
         return any(fnmatchcase(campaign, pattern) for pattern in self.campaigns)
 
     def plain(self) -> dict[str, Any]:
-        """As a campaign states it."""
+        """As stated in a campaign."""
         return self.model_dump(mode="json", exclude={"campaigns"})
 
 
@@ -38,12 +38,9 @@ class _File(Parameters):
 
 
 def read_requirements(path: Path) -> tuple[StatedRequirement, ...]:
-    """The requirements that a file states.
+    """Read the requirements of a file.
 
-    Raises
-    ------
-    ConfigurationError
-        Where it cannot be read, or states something that is none; every problem with its key.
+    Raises ConfigurationError where it cannot be read, or is not valid; every problem with its key.
     """
     stated = read_table(path, _File)
     ids = [one.id for one in stated.requirements]
@@ -55,13 +52,13 @@ def read_requirements(path: Path) -> tuple[StatedRequirement, ...]:
 
 @cache
 def shipped_requirements() -> Mapping[str, StatedRequirement]:
-    """The requirements of all systems, by id; where two systems share an id, the one that is read first."""
-    return _stated()[0]
+    """Requirements of all systems, by id; of equal ids the first that is read."""
+    return _read_shipped()[0]
 
 
 @cache
-def _stated() -> tuple[Mapping[str, StatedRequirement], tuple[str, ...]]:
-    """The requirements of the systems' files, and what is wrong with files that cannot be used."""
+def _read_shipped() -> tuple[Mapping[str, StatedRequirement], tuple[str, ...]]:
+    """Requirements of the systems' files, and the problems of unusable files."""
     found: dict[str, StatedRequirement] = {}
     problems: list[str] = []
     for path in dict.fromkeys(system.requirements for system in systems() if system.requirements):
@@ -73,30 +70,32 @@ def _stated() -> tuple[Mapping[str, StatedRequirement], tuple[str, ...]]:
 
 
 def applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:
-    """Those of the requirements that a campaign of that name shows, as campaigns state them."""
+    """Requirements that a campaign of that name verifies, as campaigns state them."""
     return [one.plain() for one in stated if one.applies_to(campaign)]
 
 
 def completed(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key, str]]]:
-    """A campaign's tables with the requirements that it names filled in, and what is wrong with how it names them.
+    """Tables of a campaign with its named requirements filled in, and the problems of the names.
 
-    An entry without a metric names a stated requirement by its `id`, and may restate what `RESTATED` lists.
+    An entry without a metric names a requirement by its `id`, and may change the keys in `_CHANGEABLE`.
     """
     entries = tables.get("requirements")
     if not isinstance(entries, list):
         return dict(tables), []
     problems: list[tuple[Key, str]] = []
     filled = []
-    for place, entry in enumerate(entries):
+    for index, entry in enumerate(entries):
         if not isinstance(entry, Mapping) or "metric" in entry or "id" not in entry:
             filled.append(entry)
             continue
         named = shipped_requirements().get(str(entry["id"]))
-        wrong = [key for key in entry if key not in ("id", *RESTATED)]
+        wrong = [key for key in entry if key not in ("id", *_CHANGEABLE)]
         if named is None:
-            message = "; ".join((not_allowed("requirement", str(entry["id"]), shipped_requirements()), *_stated()[1]))
-            problems.append((("requirements", place, "id"), f"{message}; or state a metric"))
-        problems += [(("requirements", place, key), "is stated in requirements.toml already") for key in wrong]
+            message = "; ".join(
+                (not_allowed("requirement", str(entry["id"]), shipped_requirements()), *_read_shipped()[1])
+            )
+            problems.append((("requirements", index, "id"), f"{message}; or state a metric"))
+        problems += [(("requirements", index, key), "is stated in requirements.toml already") for key in wrong]
         if named is not None and not wrong:
             filled.append({**named.plain(), **entry})
     return {**tables, "requirements": filled}, problems

@@ -1,4 +1,4 @@
-"""How one case runs in a worker process: the only place where a scenario is called."""
+"""Execution of one case in a worker process: the only module that calls a scenario."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 import time
 import traceback
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -15,37 +16,36 @@ from typing import Any
 from marsyard.algorithms.faults import describe_error
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
-from marsyard.campaigns.execution.state_notes import StateNotes
-from marsyard.campaigns.execution.work import Work, Workers, WorkLimits
+from marsyard.campaigns.execution.work import Executor, Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import (
     LOADING_S,
-    Done,
+    TaskResult,
+    accept_process_state,
     leave_note,
     limit_threads,
     request_fresh_worker,
-    settle,
     start_clock,
 )
 from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
-from marsyard.campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.campaigns.store.products import PackedProducts, pack_products
 from marsyard.campaigns.store.retention import Keep
+from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
 from marsyard.scenarios.registry import scenario
 from marsyard.sim.cache import CacheWarning
 
-#: Bits of the largest integers that are stored: all of these have a float64, whose maximum is below 2 ** 1024.
+#: Maximum bit length of stored integers: a float64 is below 2 ** 1024.
 _MAX_INT_BITS = 1023
 
-#: Characters of an error's text, or of a traceback, that a row keeps: its beginning and its end.
-_TEXT_LENGTH = 8000
+#: Maximum length of an error's text, or of a traceback, in a row: beginning and end.
+_MAX_TEXT = 8000
 
 
 @dataclass(frozen=True)
 class CompletedCase:
-    """A case's row and, where they are kept, the products of the scenario.
+    """Row of a case and, where they are kept, the products of its scenario.
 
-    `note` is why products that were to be kept could not be, and what the case changed in its worker process.
+    `note` states why products could not be kept, and changes of the worker process by the case.
     """
 
     row: Row
@@ -54,33 +54,26 @@ class CompletedCase:
 
 
 def configuration_text(configuration: CampaignConfiguration) -> str:
-    """The configuration as it travels to the workers and into `campaign.json`."""
+    """Configuration as sent to the workers and stored in `campaign.json`."""
     return configuration.model_dump_json()
 
 
 @lru_cache(maxsize=1)
 def _campaign(configuration: str) -> Campaign:
-    """The campaign that a worker works on; a pure function of its text, kept because reading it takes time."""
+    """Campaign of a configuration, cached since loading takes time."""
     start_clock(grace_s=LOADING_S)
     stated = CampaignConfiguration.model_validate_json(configuration)
     found = scenario(stated.scenario)
     limit_threads()
-    settle()
+    accept_process_state()
     start_clock()
     return Campaign(stated, found)
 
 
 def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
-    """Runs one case; whatever it raises becomes part of its row.
+    """Run one case of a `configuration_text`; any exception becomes part of its row.
 
-    Parameters
-    ----------
-    configuration
-        From `configuration_text`.
-    keep
-        Whether the scenario's products come back with the row.
-    case
-        The case's number.
+    `keep` decides whether the scenario's products are returned with the row.
     """
     wall, cpu = time.perf_counter(), time.process_time()
     products: Mapping[str, Any] = {}
@@ -95,13 +88,12 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
         wall, cpu = time.perf_counter(), time.process_time()
         with conditions_recorded_by(record):
             result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
-        row = _scored(case, result, campaign.configuration.requirements)
+        row = _finished_row(case, result, campaign.configuration.requirements)
         products = result.products
     except BaseException as error:
         outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
         row = unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), conditions)
-    times = {"wall_time_s": time.perf_counter() - wall, "cpu_time_s": time.process_time() - cpu}
-    row = {**row, **times}
+    row = {**row, "wall_time_s": time.perf_counter() - wall, "cpu_time_s": time.process_time() - cpu}
     if row["outcome"] in (CRASHED, OUT_OF_MEMORY):
         request_fresh_worker()
     if not products or not keep.wants(row):
@@ -113,7 +105,7 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
 
 
 def prepare_input(configuration: str, shared_input: int) -> str:
-    """Builds one input that many cases share, or verifies it; returns what the cache warned of, empty if nothing."""
+    """Build or verify one input that cases share; return the warnings of the cache, empty if there are none."""
     campaign = _campaign(configuration)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CacheWarning)
@@ -122,63 +114,63 @@ def prepare_input(configuration: str, shared_input: int) -> str:
 
 
 def run_cases(
-    workers: Workers,
+    executor: Executor,
     configuration: CampaignConfiguration,
     cases: Iterable[int],
     *,
     keep: Keep,
     total: int | None = None,
 ) -> Iterator[list[CompletedCase]]:
-    """Runs cases, and yields them as they end; one that takes its worker down, or must be ended, has a row as well."""
+    """Run cases, and yield them as they end; a case whose worker died or was ended has a row as well."""
     task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), keep)
     state_notes = StateNotes()
-    for ended in workers.run(Work(task, cases, case_limits(configuration.limits), total)):
-        yield [_with_note(_completed(done), state_notes.of(done)) for done in ended]
-
-
-def _with_note(completed: CompletedCase, note: str) -> CompletedCase:
-    return replace(completed, note="; ".join(filter(None, (completed.note, note)))) if note else completed
+    for ended in executor.run(Work(task, cases, case_limits(configuration.limits), total)):
+        completed = []
+        for done in ended:
+            one = _completed_case(done)
+            note = "; ".join(filter(None, (one.note, state_notes.describe(done))))
+            completed.append(replace(one, note=note))
+        yield completed
 
 
 def case_limits(limits: Limits) -> WorkLimits:
-    """What one case may use."""
+    """Limits of one case."""
     memory = None if limits.memory_gb is None else limits.memory_gb * 1e9
     return WorkLimits(limits.case_time_s, memory, limits.output_mb * 1e6)
 
 
 def prepare_limits(limits: Limits) -> WorkLimits:
-    """What building one shared input may use."""
+    """Limits of building one shared input."""
     return WorkLimits(limits.prepare_time_s, case_limits(limits).memory_bytes, limits.output_mb * 1e6)
 
 
-def _completed(done: Done[CompletedCase]) -> CompletedCase:
-    """What became of a case, as a row in any event."""
+def _completed_case(done: TaskResult[CompletedCase]) -> CompletedCase:
+    """Row of a case, also of one that did not return."""
     if done.result is not None:
         return done.result
     error = done.error
-    times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
     if isinstance(error, CaseEndedError):
         conditions = _recorded_conditions(done.item, error.note)
-        row = unfinished_row(done.item, error.outcome, str(error), _above(error.trace), conditions)
+        row = unfinished_row(done.item, error.outcome, str(error), _crop_trace(error.trace), conditions)
     else:
         row = unfinished_row(done.item, CRASHED, describe_error(error), "")
-    return CompletedCase({**row, **times})
+    return CompletedCase({**row, "wall_time_s": float("nan"), "cpu_time_s": float("nan")})
 
 
 def _recorded_conditions(case: int, note: str) -> Mapping[str, Scalar]:
-    """The columns that a case recorded before its process ended."""
+    """Columns that a case recorded before its process ended."""
     try:
         left = json.loads(note)
         return _scenario_columns(left["conditions"]) if left["case"] == case else {}
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
-        # the process ended while it wrote, or something else wrote there
+        # the process ended while writing, or other code wrote there
         return {}
 
 
 def unfinished_row(
     case: int, outcome: str, error: str, trace: str, conditions: Mapping[str, Scalar] | None = None
 ) -> Row:
-    """The row of a case that did not come to an end, with what it had recorded of its conditions."""
+    """Row of an unfinished case, with the conditions that it had recorded."""
     return {
         "case": case,
         "outcome": outcome,
@@ -189,32 +181,29 @@ def unfinished_row(
     }
 
 
-def _above(trace: str) -> str:
-    """A dump of frames without those above the one in which the engine called the scenario."""
+def _crop_trace(trace: str) -> str:
+    """Stack trace without the frames above the engine's call of the scenario."""
     lines = trace.splitlines()
-    called = next((place for place, line in enumerate(lines) if line.endswith(" in run_case")), None)
-    if called is None:
+    call = next((index for index, line in enumerate(lines) if line.endswith(" in run_case")), None)
+    if call is None:
         return trace
-    after = next((k for k in range(called + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines))
-    return "\n".join([*lines[: called + 1], *lines[after:]])
+    after = next((k for k in range(call + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines))
+    return "\n".join([*lines[: call + 1], *lines[after:]])
 
 
 def _plain_text(text: str) -> str:
-    """Text that any file takes, cut where it is long, without addresses of objects: they change from run to run."""
-    if len(text) > _TEXT_LENGTH:
-        half = _TEXT_LENGTH // 2
+    """Text in UTF-8, shortened, without object addresses, which change from run to run."""
+    if len(text) > _MAX_TEXT:
+        half = _MAX_TEXT // 2
         text = f"{text[:half]}\n... {len(text) - 2 * half} characters left out ...\n{text[-half:]}"
     text = re.sub(r"\b0x[0-9a-fA-F]{4,}\b", "0x...", text)
     return _utf8(text)
 
 
-def _scored(case: int, result: CaseResult, requirements: Sequence[Requirement]) -> Row:
-    """The row of a case that came to an end, in plain Python values.
+def _finished_row(case: int, result: CaseResult, requirements: Sequence[Requirement]) -> Row:
+    """Row of a finished case, in plain Python values.
 
-    Raises
-    ------
-    TypeError, ValueError
-        Where a column holds what cannot be stored, or what a requirement cannot be judged by.
+    Raises TypeError or ValueError where a column cannot be stored, or cannot be judged by a requirement.
     """
     failure = result.failure
     if (result.outcome in UNFINISHED) != (failure is not None):
@@ -228,7 +217,7 @@ def _scored(case: int, result: CaseResult, requirements: Sequence[Requirement]) 
 
 
 def _scenario_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
-    """Columns of a scenario in plain Python values; raises ValueError or TypeError where they cannot be stored."""
+    """Columns of a scenario in plain Python values. Raises ValueError or TypeError where they cannot be stored."""
     clashes = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(row))
     if clashes:
         raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(clashes)}")
@@ -236,9 +225,9 @@ def _scenario_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
 
 
 def _check_requirements(columns: Mapping[str, Scalar], requirements: Sequence[Requirement]) -> None:
-    """Raises TypeError where a requirement's metric or population is a column of another kind in this case.
+    """Raise TypeError where a metric or population column has another type in this case.
 
-    One such value would make the stored column one of texts, and the requirement undecidable for all cases.
+    One such value would make the whole stored column text, and the requirement undecidable.
     """
     for asked in requirements:
         flags = (*asked.population_columns, *(asked.metric_columns if asked.bound is None else ()))
@@ -256,7 +245,7 @@ def _utf8(text: str) -> str:
 
 
 def _plain(column: str, value: Any) -> Scalar:
-    """A value as one of Python's own; NumPy's scalars are unwrapped."""
+    """Value as a plain Python scalar; NumPy scalars are unwrapped."""
     plain = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
     if type(plain) is int and plain.bit_length() > _MAX_INT_BITS:
         raise ValueError(f"column {column} holds an integer of {plain.bit_length()} bits, beyond what a float can hold")
@@ -265,3 +254,31 @@ def _plain(column: str, value: Any) -> Scalar:
     if type(plain) is str:
         return _utf8(plain)
     raise TypeError(f"column {column} holds a {type(value).__name__}; allowed: float, int, str, bool")
+
+
+#: Maximum number of cases that are named for each kind of change.
+_MAX_NOTED = 3
+
+
+class StateNotes:
+    """Notes on cases that changed their worker process, limited per kind of change, for one run."""
+
+    def __init__(self) -> None:
+        self._noted: Counter[str] = Counter()
+
+    def describe(self, done: TaskResult[Any]) -> str:
+        """Note on a case; empty where it changed nothing, or enough cases of the same kind were noted."""
+        notes = [
+            self._limit(name.partition(" (")[0], f"case {done.item} changed its worker process: {name}")
+            for name in done.changed
+        ]
+        if done.spoiled_by is not None:
+            text = f"case {done.item} crashed in the worker that had run case {done.spoiled_by}, and not in a fresh one"
+            notes.append(self._limit("spoiled", f"{text}: an earlier case changed the state of that worker"))
+        return "; ".join(filter(None, notes))
+
+    def _limit(self, kind: str, text: str) -> str:
+        self._noted[kind] += 1
+        if self._noted[kind] > _MAX_NOTED:
+            return ""
+        return f"{text} (further cases of this kind are not named)" if self._noted[kind] == _MAX_NOTED else text

@@ -1,11 +1,10 @@
-"""Cases on a Dask cluster, as safe as on one machine.
+"""Execution of cases on a Dask cluster, with the same isolation as on one machine.
 
-No case runs in a Dask worker's own process. What is sent there is a watcher: it keeps worker processes like those of
-one machine, one for each of the Dask worker's threads, and runs its batch in one with the same limits
-(`marsyard.campaigns.execution.workers`). A case that hangs, takes the memory or kills its process so costs that process
-alone, and its cause is identified as on one machine. Where a Dask worker itself is lost, Dask gives its batches to
-others; a batch that lost several (Dask's `allowed-failures`, by default 3) comes back, is cut into single cases, and
-only a case that does so again counts as crashed.
+A Dask worker runs no case in its own process. It monitors one worker process per thread, and runs its batches there
+with the same limits (`marsyard.campaigns.execution.workers`). A case that hangs, exhausts memory or kills its process
+thus affects that process only, and its cause is identified as on one machine. Where a Dask worker itself is lost, Dask
+gives its batches to others. A batch that lost several (Dask's `allowed-failures`, by default 3) is divided into single
+cases; a case that fails in this way again counts as crashed.
 """
 
 from __future__ import annotations
@@ -22,10 +21,9 @@ from typing import Any, Self, TypeVar
 
 from marsyard.campaigns.definition.identity import code_hash, package_versions
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.batches import Batches
-from marsyard.campaigns.execution.work import Work
-from marsyard.campaigns.execution.worker_process import Done
-from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.execution.work import Batches, Work
+from marsyard.campaigns.execution.worker_process import TaskResult
+from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.outcomes import CRASHED, CaseEndedError
 
 Result = TypeVar("Result")
@@ -33,26 +31,19 @@ Result = TypeVar("Result")
 #: Seconds to wait for a scheduler, and for a first worker.
 _REACH_S = 30
 
-#: Batches that each Dask worker has at hand, so that none waits for the network.
-_BATCHES_AHEAD = 2
+#: Batches queued at each Dask worker, so that none waits for the network.
+_QUEUED_BATCHES = 2
 
 _LOCAL = "local:"
 
-_here = threading.local()
+_thread_state = threading.local()
 
 
-class ClusterWorkers:
-    """The workers of a Dask cluster, as a context.
+class ClusterExecutor:
+    """Workers of a Dask cluster, as a context.
 
-    Parameters
-    ----------
-    address
-        Of a scheduler (`tcp://host:8786`), or `local:N` for a cluster of N workers on this machine.
-
-    Raises
-    ------
-    CampaignError
-        Where Dask is missing, there is no such cluster, or its workers run other code than this program.
+    address: of a scheduler (`tcp://host:8786`), or `local:N` for a cluster of N workers on this machine.
+    Raises CampaignError where Dask is missing, the cluster cannot be reached, or its workers run other code.
     """
 
     def __init__(self, address: str) -> None:
@@ -64,8 +55,8 @@ class ClusterWorkers:
         self._cluster: Any = _local_cluster(address) if address.startswith(_LOCAL) else None
         try:
             if self._cluster is None:
-                # Dask never closes a client that fails over its address. Garbage collection does, and where that comes
-                # upon it in the thread of the next client, both wait for each other for 10 s and fail.
+                # Checked first: Dask leaves a client with a bad address to garbage collection, which can deadlock with
+                # the next client for 10 s.
                 distributed.comm.get_address_host_port(address)
             self._client = distributed.Client(self._cluster or address, timeout=_REACH_S, set_as_default=False)
         except (OSError, ValueError, ImportError) as error:
@@ -81,8 +72,8 @@ class ClusterWorkers:
             raise
 
     def _check_code(self) -> None:
-        """Refuses workers whose rows would be others."""
-        own = code_hash(""), package_versions()
+        """Refuse workers with other code or package versions."""
+        own = _code_and_versions()
         for worker, (code, versions) in self._client.run(_code_and_versions).items():
             if code != own[0]:
                 raise CampaignError(f"worker {worker} has other code of Marsyard than this program")
@@ -104,32 +95,32 @@ class ClusterWorkers:
         if self._cluster is not None:
             self._cluster.close()
 
-    def run(self, work: Work[Result]) -> Iterator[list[Done[Result]]]:
-        """See `Workers.run`."""
+    def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
+        """See `Executor.run`."""
         threads = sum(self._client.nthreads().values())
-        sharers = self._threads_of_the_fullest_machine()
+        sharers = self._max_threads_per_machine()
         batches = Batches(work.items, work.total, threads)
-        coming = self._distributed.as_completed(loop=self._client.loop)
+        pending = self._distributed.as_completed(loop=self._client.loop)
         sent: dict[Any, Sequence[int]] = {}
 
         def send(batch: Sequence[int]) -> None:
             future = self._client.submit(
-                _watch_batch, replace(work, items=tuple(batch), total=len(batch)), sharers, pure=False
+                _run_batch_isolated, replace(work, items=tuple(batch), total=len(batch)), sharers, pure=False
             )
             sent[future] = batch
-            coming.add(future)
+            pending.add(future)
 
         def send_next() -> None:
             if batch := batches.next():
                 send(batch)
 
         try:
-            for _ in range(_BATCHES_AHEAD * threads):
+            for _ in range(_QUEUED_BATCHES * threads):
                 send_next()
             while sent:
-                future = next(coming)
+                future = next(pending)
                 batch = sent.pop(future)
-                done = self._ended(future, batch, batches)
+                done = self._collect(future, batch, batches)
                 if done is None:
                     for item in batch:
                         send((item,))
@@ -141,31 +132,31 @@ class ClusterWorkers:
         finally:
             self._client.cancel(list(sent))
 
-    def _threads_of_the_fullest_machine(self) -> int:
-        """Among how many watchers the memory of a machine is shared."""
-        found: Counter[str] = Counter()
+    def _max_threads_per_machine(self) -> int:
+        """Largest number of threads that share the memory of one machine."""
+        threads: Counter[str] = Counter()
         for worker in self._client.scheduler_info(n_workers=-1)["workers"].values():
-            found[worker["host"]] += worker["nthreads"]
-        return max(found.values(), default=1)
+            threads[worker["host"]] += worker["nthreads"]
+        return max(threads.values(), default=1)
 
-    def _ended(self, future: Any, batch: Sequence[int], batches: Batches) -> list[Done[Any]] | None:
-        """What became of a batch; None where it was lost with its workers and its cases must be sent one by one."""
+    def _collect(self, future: Any, batch: Sequence[int], batches: Batches) -> list[TaskResult[Any]] | None:
+        """Results of a batch; None where it was lost with its workers and must be divided into single cases."""
         error = future.exception() if future.status != "cancelled" else CancelledError("the cluster gave it up")
         if error is None:
             seconds, done = future.result()
-            batches.took(len(batch), seconds)
+            batches.record_time(len(batch), seconds)
             return list(done)
         if isinstance(error, CampaignError):
             raise error
         if len(batch) > 1:
             return None
-        lost = isinstance(error, (self._distributed.scheduler.KilledWorker, CancelledError))
-        known = CaseEndedError(CRASHED, "its Dask workers died one after another", "") if lost else error
-        return [Done(batch[0], None, known if isinstance(known, Exception) else RuntimeError(repr(known)))]
+        if isinstance(error, (self._distributed.scheduler.KilledWorker, CancelledError)):
+            error = CaseEndedError(CRASHED, "its Dask workers died one after another", "")
+        return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
 
 def _local_cluster(address: str) -> Any:
-    """A cluster of so many workers on this machine."""
+    """Cluster of N workers on this machine."""
     from distributed import LocalCluster
 
     number = address.removeprefix(_LOCAL)
@@ -176,29 +167,29 @@ def _local_cluster(address: str) -> Any:
         threads_per_worker=1,
         processes=True,
         dashboard_address=None,
-        # of the watchers, which hold next to nothing; that of cases is limited by the watchers
+        # of the Dask workers; the memory of cases is limited in their worker processes
         memory_limit=0,
         silence_logs="ERROR",
     )
 
 
 def _code_and_versions() -> tuple[str, dict[str, str]]:
-    return code_hash(""), package_versions()
+    return code_hash(()), package_versions()
 
 
-def _watch_batch(work: Work[Result], sharers: int) -> tuple[float, list[Done[Result]]]:
-    """Runs a batch beside a Dask worker, in a process that belongs to the thread that this is called in."""
+def _run_batch_isolated(work: Work[Result], sharers: int) -> tuple[float, list[TaskResult[Result]]]:
+    """Run a batch in the worker process of this Dask thread; return the seconds and the results."""
     began = time.perf_counter()
-    done = [one for ended in _own_workers(sharers).run(work) for one in ended]
+    done = [one for ended in _thread_executor(sharers).run(work) for one in ended]
     return time.perf_counter() - began, done
 
 
-def _own_workers(sharers: int) -> LocalWorkers:
-    """The worker process of this thread."""
-    workers: LocalWorkers | None = getattr(_here, "workers", None)
+def _thread_executor(sharers: int) -> LocalExecutor:
+    """Executor of this thread."""
+    workers: LocalExecutor | None = getattr(_thread_state, "workers", None)
     if workers is None:
-        # Dask's workers are daemons to `multiprocessing`, which may have no children, as those would be left over. Ours
-        # are not: the kernel ends them with the thread that started them.
+        # Dask's workers are daemons of `multiprocessing`, which may not have children. The kernel ends ours with the
+        # thread that started them.
         multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
-        workers = _here.workers = LocalWorkers(1, sharers)
+        workers = _thread_state.workers = LocalExecutor(1, sharers)
     return workers

@@ -1,40 +1,40 @@
-"""The process between the parent and a worker: it outlives the worker, and leaves nothing of what the worker started.
+"""Supervisor process between the parent and a worker: it outlives the worker and kills all that the worker started.
 
-A worker may end at any moment, and so may the parent. The supervisor runs no code of cases, adopts whatever loses its
-parent below it, and ends only after it has killed all of that. The parent signals the supervisor alone, whose number it
-knows from the executor.
+A worker and the parent may end at any moment. The supervisor runs no code of cases, adopts orphaned processes below it,
+and ends only after it has killed them all. The parent signals only the supervisor, whose number it knows from the
+executor.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import signal
 import sys
+import time
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
-from marsyard.campaigns.execution.process_tree import adopt_orphans, end_with_parent, kill_descendants
+from marsyard.algorithms.processes import descendants
 
-#: Makes a worker write down where it stands; the supervisor passes it on.
+#: Makes a worker write its stack trace; the supervisor forwards it.
 DUMP_SIGNAL = signal.SIGUSR2
 
-#: Has the supervisor kill everything and end.
+#: Makes the supervisor kill everything and end.
 END_SIGNAL = signal.SIGTERM
 
-#: Sent by Linux where the parent ends; it also wakes a supervisor that a case has stopped.
+#: Sent by Linux when the parent ends; it also wakes a supervisor that a case has stopped.
 _PARENT_SIGNAL = signal.SIGCONT
 
 
 def become_supervised(parent: int, folder: Path) -> None:
-    """Divides this process into a supervisor, which does not return, and a worker, which does.
+    """Fork into a supervisor, which does not return, and a worker, which does.
 
-    Parameters
-    ----------
-    parent
-        The process that started this one: where it ends, all ends.
-    folder
-        Of all workers of the parent; removed where the parent ended before it could do so.
+    parent: the process that started this one; when it ends, all end.
+    folder: of all workers of the parent; removed where the parent ended without doing so.
     """
     if sys.platform != "linux":
         return
@@ -53,7 +53,7 @@ def become_supervised(parent: int, folder: Path) -> None:
 
 
 def _supervise(worker: int, parent: int, folder: Path, handled: set[signal.Signals]) -> NoReturn:
-    """Waits for the worker's end, or for the signal to end it; then kills what is left and ends as the worker did."""
+    """Wait for the worker's end or the signal to end it; then kill all descendants and end with the worker's status."""
     status: int | None = None
     while status is None:
         number = signal.sigwait(handled)
@@ -73,19 +73,17 @@ def _supervise(worker: int, parent: int, folder: Path, handled: set[signal.Signa
 
 
 def _exit_status(worker: int) -> int | None:
-    """How the worker ended, None while it has not; other children that have ended are reaped."""
-    found = None
-    try:
+    """Exit status of the worker, None while it runs; other ended children are reaped."""
+    status = None
+    with suppress(ChildProcessError):
         while (ended := os.waitpid(-1, os.WNOHANG))[0]:
             if ended[0] == worker:
-                found = os.waitstatus_to_exitcode(ended[1])
-    except ChildProcessError:
-        pass
-    return found
+                status = os.waitstatus_to_exitcode(ended[1])
+    return status
 
 
 def _end_by(number: int) -> None:
-    """Ends this process by a signal, without a dump of its memory."""
+    """End this process by a signal, without a core dump."""
     import resource
 
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
@@ -93,3 +91,62 @@ def _end_by(number: int) -> None:
         signal.signal(number, signal.SIG_DFL)
     os.kill(os.getpid(), number)
     os._exit(128 + number)
+
+
+#: Options of Linux's `prctl`: signal at the parent's death, and adoption of orphaned descendants.
+_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
+
+#: Seconds during which killing is repeated, since processes may start others meanwhile.
+_KILLING_S = 10.0
+
+#: Seconds between two checks of killed processes.
+_PAUSE_S = 0.005
+
+
+def adopt_orphans() -> None:
+    """Make this process the parent of every orphaned descendant, in any session."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def end_with_parent(parent: int, number: int) -> None:
+    """Request a signal when the parent ends; end now where it has ended already."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+        if os.getppid() != parent:
+            os._exit(1)
+
+
+def kill(processes: Iterable[int]) -> None:
+    """Kill processes; never the first process, and no process group."""
+    for process in processes:
+        if process > 1:
+            with suppress(ProcessLookupError, PermissionError):
+                os.kill(process, signal.SIGKILL)
+
+
+def kill_descendants() -> None:
+    """Kill all descendants, and wait until this process has no children."""
+    end = time.monotonic() + _KILLING_S
+    while time.monotonic() < end:
+        kill(descendants(os.getpid()))
+        try:
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+        except ChildProcessError:
+            return
+        time.sleep(_PAUSE_S)
+
+
+def marked_processes(mark: str) -> list[int]:
+    """Processes with a variable (`NAME=value`) in their environment, and processes forked from them.
+
+    Finds those that lost their supervisor, but none that was started with another environment.
+    """
+    found = []
+    wanted = mark.encode() + b"\0"
+    for process in Path("/proc").glob("[1-9]*"):
+        with suppress(OSError):
+            if wanted in (process / "environ").read_bytes():
+                found.append(int(process.name))
+    return found

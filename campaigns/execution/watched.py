@@ -1,4 +1,4 @@
-"""A worker process that is watched: ended where its task is over a limit, replaced where it died."""
+"""Monitored worker process: ended when its task exceeds a limit, replaced when it died."""
 
 from __future__ import annotations
 
@@ -17,17 +17,15 @@ from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from marsyard.algorithms.processes import descendants, used_memory
-from marsyard.campaigns.execution import worker_process
-from marsyard.campaigns.execution.process_tree import kill, marked_processes
-from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL
+from marsyard.campaigns.execution import supervisor, worker_process
+from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, kill, marked_processes
 from marsyard.campaigns.execution.work import WorkLimits
-from marsyard.campaigns.execution.worker_process import FILES_CLOSED, BatchEnd, Board, run_batch
+from marsyard.campaigns.execution.worker_process import FILES_CLOSED, BatchResult, StatusBoard, run_batch
 from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 Result = TypeVar("Result")
 
-#: Set before a worker loads any library: one thread each, an order of sets that does not change from run to run, and
-#: assertions kept.
+#: Set before a worker loads any library: one thread each, reproducible order of sets, and assertions enabled.
 WORKER_ENVIRONMENT: Mapping[str, str] = {
     **dict.fromkeys(
         (
@@ -43,37 +41,27 @@ WORKER_ENVIRONMENT: Mapping[str, str] = {
         "1",
     ),
     "PYTHONHASHSEED": "0",
-    # pyrender makes calls of GL inside assertions, which `python -O` leaves out.
+    # pyrender calls GL inside assertions, which `python -O` removes
     "PYTHONOPTIMIZE": "",
 }
 
-#: Seconds between two looks at a worker.
-LOOK_S = 0.05
+#: Seconds between two checks of a worker.
+POLL_INTERVAL_S = 0.05
 
-#: Characters kept of what a process wrote before it died.
-_KEPT_OUTPUT = 2000
-
-#: Bytes read of the note that a task left.
-_MAX_NOTE = 1_000_000
-
-#: Seconds that a worker gets to write down where it stands.
+#: Bytes kept of the last output of a dead process, and bytes read of a task's note.
+_MAX_OUTPUT, _MAX_NOTE = 2000, 1_000_000
+#: Seconds that a worker has to write its stack trace.
 _DUMP_S = 0.3
-
-#: Seconds that a worker gets to end by itself where all work is done, and that its supervisor gets to kill everything.
-_LEAVING_S, _KILLING_S = 5.0, 2.0
-
-#: Seconds between two looks at a process that is to end.
-_PAUSE_S = 0.005
-
-#: Variable in the environment of a worker, by which what it started is found even without its supervisor.
+#: Seconds that a worker has to end by itself after all work, and that its supervisor has to kill everything.
+_EXIT_S, _KILLING_S = 5.0, 2.0
+#: Environment variable of a worker, which identifies its descendants even without their supervisor.
 _MARK = "MARSYARD_WORKER"
 
 
 class WatchedWorker:
-    """One process, watched, and replaced when it dies.
+    """One worker process, monitored, and replaced when it dies.
 
-    Signals go to the process that the executor started, the supervisor of the worker, and to nothing that a case could
-    name; the supervisor ends after all that is below it.
+    Signals go only to the process that the executor started, the worker's supervisor; it ends after its descendants.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -83,23 +71,23 @@ class WatchedWorker:
         self._start()
 
     def _start(self) -> None:
-        """Makes ready for another process, in a folder of its own; loky starts it with the first batch."""
+        """Prepare another process, with a folder of its own; loky starts it with the first batch."""
         self._generation += 1
         self._folder = self._home / str(self._generation)
         (self._folder / "tmp").mkdir(parents=True)
-        self._board = Board.create(self._folder / "board")
+        self._board = StatusBoard.create(self._folder / "board")
         self._ended: tuple[int, CaseEndedError] | None = None
-        self._looked_s = -math.inf
+        self._checked_s = -math.inf
         self._process: Any = None
         self._executor: Any = ProcessPoolExecutor(
             max_workers=1,
-            initializer=worker_process.begin,
+            initializer=worker_process.start_worker,
             initargs=(os.getpid(), str(self._folder)),
             env={**WORKER_ENVIRONMENT, _MARK: str(self._folder), "TMPDIR": str(self._folder / "tmp")},
         )
 
-    def submit(self, task: Callable[[int], Result], batch: Sequence[int]) -> Future[BatchEnd[Result]]:
-        """Gives the worker a batch; in a fresh process where the last one died while idle."""
+    def submit(self, task: Callable[[int], Result], batch: Sequence[int]) -> Future[BatchResult[Result]]:
+        """Submit a batch; start a fresh process where the last one died while idle."""
         try:
             future: Future[Any] = self._executor.submit(run_batch, task, batch)
         except BrokenProcessPool:
@@ -109,46 +97,37 @@ class WatchedWorker:
             self._process = next(iter(list(self._executor._processes.values())), None)
         return future
 
-    def look(self, limits: WorkLimits, memory_bytes: float) -> None:
-        """Ends the process where its task is over a limit."""
+    def enforce_limits(self, limits: WorkLimits, memory_bytes: float) -> None:
+        """End the process where its task exceeds a limit."""
         now = time.monotonic()
-        if self._ended is not None or now - self._looked_s < LOOK_S:
+        if self._ended is not None or now - self._checked_s < POLL_INTERVAL_S:
             return
-        self._looked_s = now
+        self._checked_s = now
         if not self._alive():
-            # loky waits for a pipe that whatever outlived its supervisor holds open
+            # loky waits for a pipe that any process that outlived its supervisor holds open
             kill(marked_processes(self._mark))
             return
-        stands = self._board.read()
-        if stands.item is None:
+        status = self._board.read()
+        if status.item is None:
             return
-        if now - stands.since_s > limits.time_s:
-            self._end(stands.item, TIMED_OUT, f"took longer than its limit of {limits.time_s:g} s")
-        elif self._uses_more(memory_bytes):
-            limit = "its share" if limits.memory_bytes is None else f"its limit of {memory_bytes / 1e9:g} GB"
-            self._end(stands.item, OUT_OF_MEMORY, f"took more memory than {limit}")
-        elif self._output_size() > limits.output_bytes:
-            self._end(stands.item, TOO_MUCH_OUTPUT, f"wrote more than its limit of {limits.output_bytes / 1e6:g} MB")
-
-    def _uses_more(self, memory_bytes: float) -> bool:
-        return used_memory(descendants(self._process.pid), memory_bytes) > memory_bytes
-
-    def _output_size(self) -> int:
         output = self._folder / "output"
-        return output.stat().st_size if output.exists() else 0
+        if now - status.since_s > limits.time_s:
+            self._end(status.item, TIMED_OUT, f"took longer than its limit of {limits.time_s:g} s")
+        elif used_memory(descendants(self._process.pid), memory_bytes) > memory_bytes:
+            limit = "its share" if limits.memory_bytes is None else f"its limit of {memory_bytes / 1e9:g} GB"
+            self._end(status.item, OUT_OF_MEMORY, f"took more memory than {limit}")
+        elif output.exists() and output.stat().st_size > limits.output_bytes:
+            self._end(status.item, TOO_MUCH_OUTPUT, f"wrote more than its limit of {limits.output_bytes / 1e6:g} MB")
 
     def _end(self, item: int, outcome: str, reason: str) -> None:
-        """Has the process say where it stands, and kills it."""
-        words = self._folder / "words"
+        """Have the process write its stack trace, and kill it."""
+        trace = self._folder / "words"
         self._signal(DUMP_SIGNAL)
         deadline = time.monotonic() + _DUMP_S
-        while not self._has_words(words) and time.monotonic() < deadline:
+        while not (trace.exists() and trace.stat().st_size > 0) and time.monotonic() < deadline:
             time.sleep(0.01)
-        self._ended = (item, CaseEndedError(outcome, reason, self._last_words(with_output=False)))
+        self._ended = (item, CaseEndedError(outcome, reason, self._last_trace(with_output=False)))
         self._kill()
-
-    def _has_words(self, words: Path) -> bool:
-        return words.exists() and words.stat().st_size > 0
 
     @property
     def _mark(self) -> str:
@@ -158,60 +137,55 @@ class WatchedWorker:
         return self._process is not None and self._process.is_alive()
 
     def _signal(self, number: int) -> None:
-        """Signals the supervisor, whose number stays its own until the executor's object knows of its end."""
+        """Signal the supervisor; its number cannot be reused before the executor's object has seen its end."""
         if self._alive():
             with suppress(ProcessLookupError):
                 os.kill(self._process.pid, number)
 
     def _kill(self) -> None:
-        """Kills the process and what it started, and waits until that is done."""
+        """Kill the process and its descendants, and wait for their end."""
         self._signal(END_SIGNAL)
         if self._process is None or self._ends_within(_KILLING_S):
             return
-        # its supervisor was stopped or is busy
+        # the supervisor was stopped or is busy
         kill([*descendants(self._process.pid), self._process.pid, *marked_processes(self._mark)])
 
     def _ends_within(self, seconds: float) -> bool:
         deadline = time.monotonic() + seconds
         while self._alive() and time.monotonic() < deadline:
-            time.sleep(_PAUSE_S)
+            time.sleep(0.005)
         return not self._alive()
 
-    def death(self, error: BaseException) -> tuple[int | None, CaseEndedError]:
-        """Which task the process died of, None if it had none, and how; leaves another process in its place."""
-        died = self._ended
-        if died is None:
-            reason = _reason(error)
-            found = CaseEndedError(CRASHED, reason, self._last_words(with_output=True))
-            item = self._board.read().item
+    def handle_death(self, error: BaseException) -> tuple[int | None, CaseEndedError]:
+        """Identify the task that the process died of (None if it had none) and the cause; prepare another process."""
+        if self._ended is not None:
+            item: int | None = self._ended[0]
+            cause = self._ended[1]
         else:
-            item, found = died
+            cause = CaseEndedError(CRASHED, _death_reason(error), self._last_trace(with_output=True))
+            item = self._board.read().item
         self._kill()
-        found.note = self._note()
-        self.replace()
-        return item, found
-
-    def _note(self) -> str:
-        """The note that the task left; empty where there is none."""
         note = self._folder / "note"
-        return note.read_bytes()[:_MAX_NOTE].decode(errors="replace") if note.exists() else ""
+        cause.note = note.read_bytes()[:_MAX_NOTE].decode(errors="replace") if note.exists() else ""
+        self.replace()
+        return item, cause
 
-    def _last_words(self, *, with_output: bool) -> str:
-        """What the process wrote of where it stood: the reason, the thread in which it happened, and its output."""
-        words, output = (self._folder / name for name in ("words", "output"))
-        text = words.read_text(errors="replace") if words.exists() else ""
+    def _last_trace(self, *, with_output: bool) -> str:
+        """Fatal error, stack of the thread in which it happened, and last output of the process."""
+        trace, output = (self._folder / name for name in ("words", "output"))
+        text = trace.read_text(errors="replace") if trace.exists() else ""
         parts = [part.strip() for part in text.split("\n\n") if part.strip()]
-        current = [part for part in parts if "(most recent call first)" in part.partition("\n")[0]]
-        current.sort(key=lambda part: not part.startswith("Current thread"))
-        reason = [parts[0]] if parts and parts[0].startswith("Fatal") else []
-        said = []
+        stacks = [part for part in parts if "(most recent call first)" in part.partition("\n")[0]]
+        stacks.sort(key=lambda part: not part.startswith("Current thread"))
+        lines = [parts[0]] if parts and parts[0].startswith("Fatal") else []
+        lines += stacks[:1]
         if with_output and output.exists():
-            tail = output.read_bytes()[-_KEPT_OUTPUT:].decode(errors="replace").strip()
-            said = [f"Its output:\n{tail}"] if tail else []
-        return "\n".join([*reason, *current[:1], *said])
+            tail = output.read_bytes()[-_MAX_OUTPUT:].decode(errors="replace").strip()
+            lines += [f"Its output:\n{tail}"] if tail else []
+        return "\n".join(lines)
 
     def replace(self) -> None:
-        """Kills the process, if it lives, and makes ready for another."""
+        """Kill the process, if it lives, and prepare another."""
         self._kill()
         self._executor.shutdown(wait=False)
         self._board.close()
@@ -219,34 +193,25 @@ class WatchedWorker:
         self._start()
 
     def stop(self, *, kill: bool) -> None:
-        """Ends the process, by itself if it does so within seconds, and waits until it is gone."""
+        """End the process, which has some seconds to do so by itself, and wait for its end."""
         manager = self._executor._executor_manager_thread
         if kill:
             self._kill()
         self._executor.shutdown(wait=False)
-        if not self._ends_within(_LEAVING_S):
+        if not self._ends_within(_EXIT_S):
             self._kill()
         if manager is not None:
             manager.join(_KILLING_S)
             if manager.is_alive():
-                _kill_all(marked_processes(self._mark))
+                supervisor.kill(marked_processes(self._mark))
                 manager.join(_KILLING_S)
         self._board.close()
 
 
-#: The function, where a parameter has its name.
-_kill_all = kill
-
-
-def _reason(error: BaseException) -> str:
-    """How a worker ended, in words."""
-    status = _exit_status(error)
+def _death_reason(error: BaseException) -> str:
+    """Cause of a worker's death from loky's message: ``the worker process died: SIGABRT (-6)``."""
+    codes = re.findall(r"([A-Z]+)\((-?\d+)\)", str(error))
+    status = ", ".join(f"{name} ({code})" for name, code in codes) or "exit status unknown"
     if status == f"EXIT ({FILES_CLOSED})":
         return "the case closed or replaced the worker's file descriptors"
     return f"the worker process died: {status}"
-
-
-def _exit_status(error: BaseException) -> str:
-    """How a worker ended, from loky's account of it: ``SIGABRT (-6)``."""
-    codes = re.findall(r"([A-Z]+)\((-?\d+)\)", str(error))
-    return ", ".join(f"{name} ({code})" for name, code in codes) or "exit status unknown"

@@ -1,4 +1,4 @@
-"""What happens inside a worker process: it is set up, runs batches, and lets its watcher see where it stands."""
+"""Code inside a worker process: its setup, its batches, and its status for the monitoring parent."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, become_supervis
 
 Result = TypeVar("Result")
 
-#: What Linux adds to a worker's badness (of 1000) when memory runs out: workers go before their watcher.
+#: Added by Linux to a worker's badness (of 1000) when memory runs out: workers are killed before their parent.
 _OOM_SCORE = 800
 
-#: Time that loading a campaign's code may take beyond the case's own limit.
+#: Time for loading a campaign's code, in addition to the case's limit.
 LOADING_S = 300.0
 
-#: Time of items that are checked together for what they changed in their process: a check takes some 0.1 ms.
+#: Duration of items that are checked together for changes of their process: a check takes 0.1 ms.
 _CHECKED_TOGETHER_S = 0.005
 
-#: Exit status of a worker whose files an item has closed.
+#: Exit status of a worker whose files were closed by an item.
 FILES_CLOSED = 97
 
 _LAYOUT = struct.Struct("=qd")
@@ -44,21 +44,13 @@ _NOTHING = -1
 
 
 @dataclass(frozen=True)
-class Done(Generic[Result]):
-    """A task that ended: its item, and its result or the error that kept it from one.
+class TaskResult(Generic[Result]):
+    """Result of a task for one item, or the error that prevented it.
 
-    Attributes
-    ----------
-    item, result, error
-        One of the latter two is None.
-    changed
-        What the task changed in the state of its process, by name.
-    crashed
-        Whether the task asked for a fresh worker (`request_fresh_worker`).
-    before
-        The item that ran before it in the same process; None where it was the first.
-    spoiled_by
-        The item after which it crashed, where it did not crash in a fresh process: its result is from there.
+    changed: names of the parts of the process state that the task changed.
+    crashed: whether the task requested a fresh worker (`request_fresh_worker`).
+    before: item that ran before it in the same process; None where it was the first.
+    spoiled_by: item after which it crashed, where it did not crash in a fresh process; its result is from there.
     """
 
     item: int
@@ -71,75 +63,68 @@ class Done(Generic[Result]):
 
 
 @dataclass(frozen=True)
-class BatchEnd(Generic[Result]):
-    """What became of a batch.
+class BatchResult(Generic[Result]):
+    """Results of a batch.
 
-    Attributes
-    ----------
-    seconds
-        How long it ran.
-    done
-        Items that ended.
-    alone
-        Items to be run again one by one: they were checked together, and one of them changed their process.
-    rest
-        Items that were not begun.
-    spent
-        Whether the process must run no further item.
+    seconds: duration.
+    done: results of the items that ended.
+    alone: items to be run again one by one: they were checked together, and one of them changed their process.
+    rest: items that were not begun.
+    spent: whether the process must run no further item.
     """
 
     seconds: float
-    done: list[Done[Result]]
+    done: list[TaskResult[Result]]
     alone: Sequence[int] = ()
     rest: Sequence[int] = ()
     spent: bool = False
 
 
 @dataclass(frozen=True)
-class Standing:
-    """Where a worker stands: the item it works on (None between items), and since when (monotonic)."""
+class WorkerStatus:
+    """Item that a worker runs (None between items), and its start time (monotonic)."""
 
     item: int | None
     since_s: float
 
 
-class Board:
-    """A few bytes that a worker writes and its watcher reads, also when the worker is stuck or gone."""
+class StatusBoard:
+    """Shared memory that a worker writes and its parent reads, also when the worker hangs or has died."""
 
     def __init__(self, path: Path) -> None:
         with path.open("r+b") as file:
             self._bytes = mmap.mmap(file.fileno(), _LAYOUT.size)
 
     @staticmethod
-    def create(path: Path) -> Board:
-        """A board on which nothing stands."""
+    def create(path: Path) -> StatusBoard:
+        """Board of an idle worker."""
         path.write_bytes(_LAYOUT.pack(_NOTHING, math.inf))
-        return Board(path)
+        return StatusBoard(path)
 
-    def write(self, standing: Standing) -> None:
-        """Shows where the worker stands."""
+    def write(self, standing: WorkerStatus) -> None:
+        """Publish the worker's status."""
         item = _NOTHING if standing.item is None else standing.item
         self._bytes[:] = _LAYOUT.pack(item, standing.since_s)
 
-    def read(self) -> Standing:
-        """Where the worker stands; read until two readings agree, as the worker may be writing."""
-        seen = bytes(self._bytes)
-        while (again := bytes(self._bytes)) != seen:
-            seen = again
-        item, since_s = _LAYOUT.unpack(seen)
-        return Standing(None if item == _NOTHING else item, since_s)
+    def read(self) -> WorkerStatus:
+        """Worker's status; read until two readings agree, as the worker may be writing."""
+        first = bytes(self._bytes)
+        while (second := bytes(self._bytes)) != first:
+            first = second
+        item, since_s = _LAYOUT.unpack(first)
+        return WorkerStatus(None if item == _NOTHING else item, since_s)
 
     def close(self) -> None:
-        """Leaves the board."""
+        """Release the memory."""
         self._bytes.close()
 
 
 @dataclass
-class _Place:
-    """The process's own board, the file that its output goes to, and the state that items are to leave as it was."""
+class _WorkerContext:
+    """Context of this worker process: status board, output and trace files, and reference of the process state."""
 
-    board: Board
-    words: Path
+    board: StatusBoard
+    trace: Path
     output: int
     note: Path
     files: OpenFiles
@@ -149,17 +134,17 @@ class _Place:
     crashed: bool = False
 
 
-_place: _Place | None = None
+_context: _WorkerContext | None = None
 
 
-def begin(parent: int, folder: str) -> None:
-    """Sets a fresh worker process up.
+def start_worker(parent: int, folder: str) -> None:
+    """Set up a fresh worker process.
 
-    It leads a process group of its own, below a supervisor that ends with the parent and leaves nothing of what the
-    worker started (`marsyard.campaigns.execution.supervisor`); a process that dies of a signal writes down where it
-    stood; and what it prints goes to a file.
+    It leads a process group of its own, below a supervisor (`marsyard.campaigns.execution.supervisor`) that ends with
+    the parent and kills the worker's descendants. A fatal signal makes it write its stack trace. Its output goes to a
+    file.
     """
-    global _place
+    global _context
     os.setpgid(0, 0)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     output = os.open(Path(folder, "output"), os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
@@ -169,98 +154,98 @@ def begin(parent: int, folder: str) -> None:
     if sys.platform == "linux":
         os.setpgid(0, 0)
         Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE))
-    words = Path(folder, "words")
-    written = os.open(words, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
+    trace = Path(folder, "words")
+    written = os.open(trace, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
     faulthandler.enable(written)
     faulthandler.register(DUMP_SIGNAL, written, all_threads=False, chain=False)
-    _leave_memory_to_the_watcher()
-    _place = _Place(Board(Path(folder, "board")), words, output, Path(folder, "note"), OpenFiles())
-    _place.board.write(Standing(None, math.inf))
+    _disable_loky_memory_limit()
+    _context = _WorkerContext(StatusBoard(Path(folder, "board")), trace, output, Path(folder, "note"), OpenFiles())
+    _context.board.write(WorkerStatus(None, math.inf))
 
 
-def _leave_memory_to_the_watcher() -> None:
-    """Keeps loky from ending workers that hold 300 MB more than at first: terrains are kept so, and limits are ours."""
+def _disable_loky_memory_limit() -> None:
+    """Keep loky from ending workers that grow by 300 MB: cached terrains take more, and the parent enforces limits."""
     from joblib.externals.loky import process_executor
 
     process_executor._USE_PSUTIL = False
 
 
-def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchEnd[Result]:
-    """Runs a task on each item, until they end or the process is spent.
+def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResult[Result]:
+    """Run a task on each item, until all end or the process is spent.
 
-    After each item the state of the process is compared with what it was; items of less than some milliseconds are
-    checked together, and are run again one by one where that shows a difference.
+    After each item the process state is compared with its earlier state. Items of some milliseconds are checked
+    together, and run again one by one where the check shows a change.
     """
     began = checked = time.perf_counter()
-    done: list[Done[Result]] = []
-    group: list[Done[Result]] = []
-    for place, item in enumerate(items):
+    done: list[TaskResult[Result]] = []
+    group: list[TaskResult[Result]] = []
+    for index, item in enumerate(items):
         if not group:
             seed_generators(item)
-        group.append(_attempt(task, item))
-        ends = place + 1 == len(items) or _must_check() or time.perf_counter() - checked > _CHECKED_TOGETHER_S
+        group.append(_run_item(task, item))
+        ends = index + 1 == len(items) or _must_check() or time.perf_counter() - checked > _CHECKED_TOGETHER_S
         if not ends:
             continue
-        spent, found = _checked([one.item for one in group])
-        rest = items[place + 1 :] if spent else ()
-        if found is None:
+        spent, changed = _check_state([one.item for one in group])
+        if changed is None:
             alone = [one.item for one in group]
-            return BatchEnd(time.perf_counter() - began, done, alone, items[place + 1 :], spent)
-        done += [replace(group[0], changed=found)] if found else group
+            return BatchResult(time.perf_counter() - began, done, alone, items[index + 1 :], spent)
+        done += [replace(group[0], changed=changed)] if changed else group
         if spent:
-            return BatchEnd(time.perf_counter() - began, done, (), rest, spent)
+            return BatchResult(time.perf_counter() - began, done, (), items[index + 1 :], spent)
         group, checked = [], time.perf_counter()
-    if _place is not None:
-        _place.board.write(Standing(None, math.inf))
-    return BatchEnd(time.perf_counter() - began, done)
+    if _context is not None:
+        _context.board.write(WorkerStatus(None, math.inf))
+    return BatchResult(time.perf_counter() - began, done)
 
 
 def _must_check() -> bool:
-    return _place is not None and (_place.checks_each or _place.crashed)
+    return _context is not None and (_context.checks_each or _context.crashed)
 
 
-def _checked(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
-    """Whether the process is spent after some items, and what was changed; None where it is open which item did so."""
-    if _place is None:
+def _check_state(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
+    """Whether the process is spent after some items, and the changes; None where it is open which item made them."""
+    if _context is None:
         return False, ()
-    if not _place.files.intact():
-        # nothing can be delivered any more: the board says of which item the process ends
-        _place.words.write_text("Fatal: the files that the worker process needs were closed\n")
+    if not _context.files.intact():
+        # no result can be delivered any more: the status board names the item
+        _context.trace.write_text("Fatal: the files that the worker process needs were closed\n")
         os._exit(FILES_CLOSED)
-    found: Differences = _place.state.differences()
-    spent = bool(found.lasting) or _place.crashed
-    if len(group) > 1 and (found.names or generators_were_used(group[0])):
-        _place.checks_each = True
+    differences: Differences = _context.state.differences()
+    spent = bool(differences.lasting) or _context.crashed
+    names = (*differences.restored, *differences.lasting)
+    if len(group) > 1 and (names or generators_were_used(group[0])):
+        _context.checks_each = True
         return spent, None
-    return spent, found.names
+    return spent, names
 
 
-def _attempt(task: Callable[[int], Result], item: int) -> Done[Result]:
-    """Runs a task on one item."""
-    if _place is None:
+def _run_item(task: Callable[[int], Result], item: int) -> TaskResult[Result]:
+    """Run a task on one item."""
+    if _context is None:
         return _outcome(task, item)
-    _forget_output(_place.output)
-    before, _place.item, _place.crashed = _place.item, item, False
+    _clear_output(_context.output)
+    before, _context.item, _context.crashed = _context.item, item, False
     start_clock()
     done = _outcome(task, item)
-    return replace(done, crashed=True, before=before) if _place.crashed else done
+    return replace(done, crashed=True, before=before) if _context.crashed else done
 
 
-def _outcome(task: Callable[[int], Result], item: int) -> Done[Result]:
+def _outcome(task: Callable[[int], Result], item: int) -> TaskResult[Result]:
     try:
-        return Done(item, task(item), None)
+        return TaskResult(item, task(item), None)
     except Exception as error:
-        return Done(item, None, error)
+        return TaskResult(item, None, error)
 
 
 def request_fresh_worker() -> None:
-    """Has no further item run in this process: the one that is worked on crashed, and nobody knows what it left."""
-    if _place is not None:
-        _place.crashed = True
+    """Run no further item in this process: the current one crashed, and the process state is unknown."""
+    if _context is not None:
+        _context.crashed = True
 
 
-def _forget_output(output: int) -> None:
-    """Empties the file of the output, so that its size is that of the item's own."""
+def _clear_output(output: int) -> None:
+    """Empty the output file, so that its size is that of the item's output."""
     for stream in (sys.stdout, sys.stderr):
         if stream is not None and not stream.closed:
             stream.flush()
@@ -269,30 +254,30 @@ def _forget_output(output: int) -> None:
 
 
 def start_clock(grace_s: float = 0.0) -> None:
-    """Lets the time limit of the item that is being worked on count from now, or from later."""
-    if _place is not None:
-        _place.board.write(Standing(_place.item, time.monotonic() + grace_s))
+    """Start the time limit of the current item now, or `grace_s` later."""
+    if _context is not None:
+        _context.board.write(WorkerStatus(_context.item, time.monotonic() + grace_s))
 
 
 def leave_note(text: str) -> None:
-    """Leaves a text that the watcher finds where the task ends with its process; it replaces the one before."""
-    if _place is not None:
-        _place.note.write_text(text)
+    """Leave a text for the parent in case the task ends with its process; it replaces the previous one."""
+    if _context is not None:
+        _context.note.write_text(text)
 
 
-def settle() -> None:
-    """Takes what is loaded by now for the state that items leave as it is.
+def accept_process_state() -> None:
+    """Take the current process state as the reference that items must preserve.
 
-    It is spared from every later search for garbage, which would cost some 5 % of short cases.
+    Loaded objects are excluded from garbage collection, which would cost 5 % of short cases.
     """
     gc.collect()
     gc.freeze()
-    if _place is not None:
-        _place.state = ProcessState()
+    if _context is not None:
+        _context.state = ProcessState()
 
 
 def limit_threads() -> None:
-    """Keeps the numerical libraries that are loaded by now to one thread; the environment does so for later ones."""
+    """Limit the loaded numerical libraries to one thread; the environment limits later ones."""
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1)

@@ -1,4 +1,4 @@
-"""Progress reports while the first cases on a machine compile numeric kernels, which nothing else shows."""
+"""Progress reports while the first cases on a machine compile numeric kernels."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 from marsyard.scenarios.systems import scenario_paths
 from marsyard.sim.kernel_cache import compiled_functions, kernels_are_ready
@@ -15,35 +14,27 @@ from marsyard.sim.kernel_cache import compiled_functions, kernels_are_ready
 REPORT_INTERVAL_S = 10.0
 
 
-class Notes(Protocol):
-    """Where reports go."""
-
-    def note(self, text: str) -> None:
-        """Report a text to the user; may be called from another thread."""
-        ...
-
-
 @contextmanager
-def compilation_reported(scenario: str, watch: Notes) -> Iterator[Callable[[], None]]:
-    """Reports until the context ends that kernels are compiled; nothing where they are compiled already.
+def compilation_reported(scenario: str, note: Callable[[str], None]) -> Iterator[Callable[[], None]]:
+    """Report the compilation of kernels until the context ends; nothing where they are compiled already.
 
-    Gives a function to be called when the first case has ended: from then on nothing is compiled.
+    Yields a function to be called when the first case has ended and compilation is complete.
     """
     if scenario not in scenario_paths() or kernels_are_ready(scenario):
         yield lambda: None
         return
-    watch.note("compiling numeric kernels once on this machine, about two minutes (ahead of time: marsyard compile)")
+    note("compiling numeric kernels once on this machine, about two minutes (ahead of time: marsyard compile)")
     ended, began, before = threading.Event(), time.monotonic(), compiled_functions()
 
     def report() -> None:
         while not ended.wait(REPORT_INTERVAL_S):
             number = compiled_functions() - before
-            watch.note(f"compiling numeric kernels: {number} functions so far, {time.monotonic() - began:.0f} s")
+            note(f"compiling numeric kernels: {number} functions so far, {time.monotonic() - began:.0f} s")
 
     def finish() -> None:
         if not ended.is_set():
             ended.set()
-            watch.note(f"numeric kernels are compiled, {time.monotonic() - began:.0f} s")
+            note(f"numeric kernels are compiled, {time.monotonic() - began:.0f} s")
 
     thread = threading.Thread(target=report, daemon=True)
     thread.start()

@@ -1,4 +1,4 @@
-"""What a campaign would take, in time and on disk, from a few of its cases run on trial."""
+"""Estimate of a campaign's time and disk space from a few trial cases."""
 
 from __future__ import annotations
 
@@ -17,42 +17,32 @@ from marsyard.campaigns.execution.cases import (
     prepare_limits,
     run_cases,
 )
-from marsyard.campaigns.execution.crew import Crew, hire
-from marsyard.campaigns.execution.work import Work, Workers
+from marsyard.campaigns.execution.work import Executor, Work
+from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.outcomes import UNFINISHED
 from marsyard.campaigns.running.inputs import plan_inputs
 from marsyard.campaigns.store.retention import KEEP_ALL
 from marsyard.scenarios.interface import SelectsInputs
 
-#: Cases run on trial, at most; the first is left out of the mean as it loads what the others find.
-TRIAL_CASES = 9
-
+#: Maximum number of trial cases; the first is excluded from the mean, since it loads code and terrains.
+_MAX_TRIALS = 9
 #: Seconds after which no further trial case is begun.
-TRIAL_S = 20.0
-
-#: Bytes of SQLite and of the table for each byte of a row's text: pages and index above it, and the compressed columns.
+_TRIAL_S = 20.0
+#: Bytes of SQLite and of the table for each byte of a row's text: pages, index and compressed columns.
 _ROW_OVERHEAD = 1.6
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a campaign would take.
+    """Time and disk space of a campaign.
 
-    Attributes
-    ----------
-    trials, unfinished
-        Cases run on trial, and those of them that did not come to their end.
-    case_s, case_range_s
-        Mean wall-clock time of a trial case on one worker, and the shortest and the longest.
-    inputs, input_s, inputs_bytes
-        Shared inputs (terrains) of the cases that are not built yet, the mean time that building one took, and what
-        they take on disk together (0 where the scenario does not state it).
-    cache_limit_bytes
-        Size limit of the cache that keeps them.
-    time_s
-        Of the whole campaign with the crew that was asked for, as long as it has a core for each worker.
-    rows_bytes, products_bytes
-        On disk: SQLite and table; kept products (within their budget).
+    trials, unfinished: number of trial cases, and of unfinished ones among them.
+    case_s, case_range_s: mean wall-clock time of a trial case on one worker, and its range.
+    inputs, input_s, inputs_bytes: shared inputs (terrains) to be built, mean time of building one, and bytes on disk
+    together (0 where the scenario does not state it).
+    cache_limit_bytes: size limit of their cache.
+    time_s: of the whole campaign with the requested workers, if there is a core for each.
+    rows_bytes, products_bytes: on disk: SQLite and table; kept products (within their budget).
     """
 
     trials: int
@@ -69,22 +59,19 @@ class Estimate:
 
 
 def estimate(campaign: Campaign, jobs: int) -> Estimate:
-    """Runs some cases on trial, in one worker, and keeps nothing of them but the shared inputs built for them.
-
-    The cases are spread evenly over the campaign.
-    """
+    """Run trial cases, evenly spread over the campaign, in one worker; keep only the shared inputs built for them."""
     configuration = campaign.configuration
     plan = plan_inputs(campaign, range(configuration.total_cases))
     inputs = len(plan.to_build)
-    with hire(Crew()) as workers:
-        trials, built = _trials(campaign, workers)
+    with create_executor(ExecutorConfig()) as executor:
+        trials, built = _trials(campaign, executor)
     input_s = statistics.fmean(built) if built else 0.0
     times = [seconds for _, seconds in (trials[1:] or trials)]
     case_s = statistics.fmean(times)
     size = statistics.fmean(len(json.dumps(list(one.row.values()))) for one, _ in trials)
     product = statistics.fmean(one.products.size if one.products else 0 for one, _ in trials)
     rows = configuration.total_cases
-    kept = _kept_share(configuration) * product
+    kept = _kept_cases(configuration) * product
     return Estimate(
         trials=len(trials),
         unfinished=sum(one.row["outcome"] in UNFINISHED for one, _ in trials),
@@ -100,30 +87,30 @@ def estimate(campaign: Campaign, jobs: int) -> Estimate:
     )
 
 
-def _trials(campaign: Campaign, workers: Workers) -> tuple[list[tuple[CompletedCase, float]], list[float]]:
-    """Cases run on trial with the time that each took, and the times of the shared inputs built for them."""
-    ran: list[tuple[CompletedCase, float]] = []
+def _trials(campaign: Campaign, executor: Executor) -> tuple[list[tuple[CompletedCase, float]], list[float]]:
+    """Trial cases with their times, and the times of the shared inputs built for them."""
+    trials: list[tuple[CompletedCase, float]] = []
     built: list[float] = []
     configuration = campaign.configuration
     total = configuration.total_cases
-    number = min(TRIAL_CASES, total)
+    number = min(_MAX_TRIALS, total)
     began = time.monotonic()
-    for place in range(number):
+    for index in range(number):
         start = time.monotonic()
-        if ran and start - began > TRIAL_S:
+        if trials and start - began > _TRIAL_S:
             break
-        case = place * total // number
-        built += _build_inputs(campaign, workers, case)
+        case = index * total // number
+        built += _build_inputs(campaign, executor, case)
         start = time.monotonic()
-        ((completed,),) = run_cases(workers, configuration, [case], keep=KEEP_ALL)
-        ran.append((completed, time.monotonic() - start))
-    return ran, built
+        ((completed,),) = run_cases(executor, configuration, [case], keep=KEEP_ALL)
+        trials.append((completed, time.monotonic() - start))
+    return trials, built
 
 
-def _build_inputs(campaign: Campaign, workers: Workers, case: int) -> list[float]:
-    """Builds what a case shares with others and what is not there; returns the time that each input took.
+def _build_inputs(campaign: Campaign, executor: Executor, case: int) -> list[float]:
+    """Build the missing shared inputs of a case; return the time of each.
 
-    Of a scenario that does not state what a case uses, the first input stands for all, and is built for case 0.
+    Where the scenario does not state the inputs of a case, the first input stands for all, and is built for case 0.
     """
     missing = list(plan_inputs(campaign, [case]).to_build)
     if not isinstance(campaign.scenario, SelectsInputs):
@@ -133,13 +120,13 @@ def _build_inputs(campaign: Campaign, workers: Workers, case: int) -> list[float
     times = []
     for number in missing:
         began = time.monotonic()
-        list(workers.run(Work(task, [number], limits)))
+        list(executor.run(Work(task, [number], limits)))
         times.append(time.monotonic() - began)
     return times
 
 
-def _kept_share(configuration: CampaignConfiguration) -> float:
-    """Cases whose products are kept; all of them where only their rows will say."""
+def _kept_cases(configuration: CampaignConfiguration) -> float:
+    """Number of cases with kept products; all of them where only their rows will decide."""
     retain, total = configuration.retain, configuration.total_cases
     show = int(retain.showcase != "none")
     number = {"none": 0, "worst": retain.worst, "every": -(-total // retain.every), "all": total, "failed": total}

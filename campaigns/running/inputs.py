@@ -1,4 +1,4 @@
-"""Which shared inputs (terrains) the cases of a campaign use, and what building them takes on disk."""
+"""Shared inputs (terrains) that the cases of a campaign use, and the disk space for building them."""
 
 from __future__ import annotations
 
@@ -13,17 +13,11 @@ from marsyard.sim.cache import cache_directory, kept_bytes, limit_bytes
 
 @dataclass(frozen=True)
 class InputPlan:
-    """The shared inputs that cases use.
+    """Shared inputs that cases use.
 
-    Attributes
-    ----------
-    present
-        Numbers of those that are on disk, as far as the scenario states that.
-    to_build
-        Numbers of those to be built, each with the bytes that it takes on disk (0 where the scenario does not state
-        it).
-    limit_bytes
-        Size limit of the cache.
+    present: numbers of those on disk, where the scenario states that.
+    to_build: numbers of those to be built, each with its bytes on disk (0 where the scenario does not state it).
+    limit_bytes: size limit of the cache.
     """
 
     present: tuple[int, ...]
@@ -32,31 +26,28 @@ class InputPlan:
 
     @property
     def build_bytes(self) -> int:
-        """Bytes on disk of all that are to be built."""
+        """Bytes on disk of all inputs to be built."""
         return sum(self.to_build.values())
 
     @property
     def to_prepare(self) -> tuple[int, ...]:
-        """Inputs to be prepared before the cases: those on disk are verified first, then others built up to the limit.
+        """Inputs to be prepared before the cases: existing ones, to be verified, then others up to the cache's limit.
 
-        The cases build the others when they need them.
+        The cases build the rest when they need it.
         """
-        chosen, size = list(self.present), 0
+        selected, size = list(self.present), 0
         for number, one in self.to_build.items():
             size += one
             if size > self.limit_bytes:
                 break
-            chosen.append(number)
-        return tuple(chosen)
+            selected.append(number)
+        return tuple(selected)
 
 
 def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
     """Plan the shared inputs of some of a campaign's cases.
 
-    Raises
-    ------
-    CampaignError
-        Where the cache's limit is not a number, or its folder cannot be made.
+    Raises CampaignError where the cache's limit is not a number, or its folder cannot be created.
     """
     numbers = used_inputs(campaign, cases)
     if not numbers:
@@ -78,8 +69,8 @@ def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
 def used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...]:
     """Numbers of the shared inputs that cases use, ascending; all where the scenario does not state those of a case.
 
-    Draws are a function of the case's number. The search ends when all inputs are found: of a bank of 250 terrains that
-    takes about 1,500 cases, two milliseconds each.
+    Draws are a function of the case's number. The search ends when all inputs occur: for 250 terrains after about 1,500
+    cases of two milliseconds each.
     """
     every = campaign.scenario.shared_inputs(campaign.base_parameters())
     if not every or not isinstance(campaign.scenario, SelectsInputs):

@@ -1,8 +1,7 @@
-"""Campaigns whose algorithm is run elsewhere: cases written down without their truth, and answers to them scored.
+"""Offline campaigns: cases are exported without their truth, and answers to them are scored.
 
-Both are campaigns as any other. The one that exports lies in the folder of the truth: its rows hold what is true of
-each case, and make it known which cases are written. The one that scores runs the same cases again, with the answers
-of a table in an algorithm's place.
+Both are ordinary campaigns. The exporting one lies in the folder of the truth: its rows hold the truth of each case.
+The scoring one runs the same cases again, with a table of answers in place of the algorithm.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from marsyard.campaigns.definition.campaign import Campaign, replaced
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
 from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError, writing
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import Watch, resume_campaign, run_campaign
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import TABLE_FILE, read_rows
@@ -26,71 +25,49 @@ from marsyard.scenarios.interface import TakesAlgorithms
 from marsyard.scenarios.offline import ANSWERS, CASES, answers_of
 from marsyard.scenarios.registry import scenario
 
-#: What an exported folder says of itself, and to whoever answers.
+#: Description of an exported folder for programs, and for the team that answers.
 MANIFEST_FILE, README_FILE = "export.json", "README.md"
 SCHEMA = 1
-
-#: Cases named in a message, at most.
-_NAMED = 8
 
 
 @dataclass(frozen=True)
 class Exported:
-    """Where cases are written, and where what is true of them."""
+    """Folders of exported cases and of their truth."""
 
     directory: Path
     truth: Path
 
 
 def truth_folder(directory: Path) -> Path:
-    """Where the truth of an exported folder lies, if nobody says otherwise: beside it."""
+    """Default folder of the truth: next to the exported folder."""
     return directory.with_name(f"{directory.name}-truth")
 
 
-def export_campaign(campaign: Campaign, exported: Exported, crew: Crew, watch: Watch) -> None:
-    """Writes a campaign's cases down; goes on where an earlier export of the same campaign was interrupted.
+def export_campaign(campaign: Campaign, exported: Exported, executor: ExecutorConfig, watch: Watch) -> None:
+    """Export a campaign's cases; continue where an earlier export of the same campaign was interrupted.
 
-    Parameters
-    ----------
-    campaign
-        Its algorithm is `export:` and the folder.
-    exported
-        The folders, of which neither need be there.
-    crew, watch
-        Who does it, and who is told.
-
-    Raises
-    ------
-    CampaignError
-        Where the folders hold something else, or cannot be written.
+    The campaign's algorithm is `export:` with the folder. Raises CampaignError where the folders hold other contents,
+    or cannot be written.
     """
-    _check_apart(exported)
+    if exported.truth.resolve().is_relative_to(exported.directory.resolve()):
+        raise CampaignError(f"--truth {exported.truth}: lies within {exported.directory}, which is handed away")
     if (exported.truth / record.RECORD_FILE).is_file():
         stored = record.stored_configuration(exported.truth)
         if configuration_hash(stored) != configuration_hash(campaign.configuration):
             raise StoreError(f"{exported.truth} holds the truth of another export; choose other folders")
-        resume_campaign(exported.truth, crew, watch)
+        resume_campaign(exported.truth, executor, watch)
     else:
-        _check_empty(exported.directory)
-        run_campaign(campaign, exported.truth, crew, watch)
+        directory = exported.directory
+        if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+            raise StoreError(f"{directory} is there already, and is not empty; name a new folder with --out")
+        run_campaign(campaign, exported.truth, executor, watch)
     _write_manifest(campaign, exported.directory)
-
-
-def _check_apart(exported: Exported) -> None:
-    """Refuses to put the truth where it would be handed away."""
-    if exported.truth.resolve().is_relative_to(exported.directory.resolve()):
-        raise CampaignError(f"--truth {exported.truth}: lies within {exported.directory}, which is handed away")
-
-
-def _check_empty(directory: Path) -> None:
-    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise StoreError(f"{directory} is there already, and is not empty; name a new folder with --out")
 
 
 def _write_manifest(campaign: Campaign, directory: Path) -> None:
     form = _task(campaign).offline
     columns = () if form is None else form.columns
-    told = {
+    manifest = {
         "schema": SCHEMA,
         "campaign": campaign.configuration.name,
         "task": _task(campaign).name,
@@ -115,36 +92,36 @@ def _write_manifest(campaign: Campaign, directory: Path) -> None:
         ]
     )
     with writing(directory):
-        (directory / MANIFEST_FILE).write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+        (directory / MANIFEST_FILE).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         (directory / README_FILE).write_text(text, encoding="utf-8")
 
 
 def scored_campaign(exported: Exported, answers: Path) -> Campaign:
-    """The exported campaign with a table's answers in its algorithm's place.
+    """Exported campaign with the answers of a table in place of its algorithm.
 
-    Raises
-    ------
-    CampaignError
-        Where the folders hold no finished export, or the table does not answer each case once.
+    Raises CampaignError where the folders hold no finished export, or the table does not answer each case once.
     """
     manifest = _manifest(exported.directory)
     stored = record.stored_configuration(exported.truth)
     if record.read(exported.truth)["state"] != "finished":
-        raise CampaignError(f"{exported.truth} is not finished: export again to go on")
+        raise CampaignError(f"{exported.truth} is not finished: export again to continue")
     if (manifest["campaign"], manifest["cases"]) != (stored.name, stored.total_cases):
         raise CampaignError(f"{exported.directory} and {exported.truth} belong to different exports")
     exporting = Campaign(stored, scenario(stored.scenario))
     _check_answers(exporting, answers)
-    return _answered(exporting, answers)
+    table = exporting.scenario.algorithm_table if isinstance(exporting.scenario, TakesAlgorithms) else ()
+    parameters = replaced(stored.parameters, [*table, "algorithm"], f"{ANSWERS}{answers.resolve()}")
+    changed = stored.model_copy(update={"parameters": parameters, "retain": Retain()})
+    return Campaign(CampaignConfiguration.model_validate(changed.model_dump()), exporting.scenario)
 
 
 def _manifest(directory: Path) -> dict[str, Any]:
     path = directory / MANIFEST_FILE
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        if told["schema"] != SCHEMA:
-            raise ValueError(f"has schema {told['schema']}; this version of Marsyard reads {SCHEMA}")
-        return {"campaign": str(told["campaign"]), "cases": int(told["cases"])}
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        if manifest["schema"] != SCHEMA:
+            raise ValueError(f"has schema {manifest['schema']}; this version of Marsyard reads {SCHEMA}")
+        return {"campaign": str(manifest["campaign"]), "cases": int(manifest["cases"])}
     except OSError as error:
         raise StoreError(f"{directory} holds no finished export: {path.name}: {error.strerror or error}") from error
     except (KeyError, TypeError, ValueError) as error:
@@ -152,7 +129,7 @@ def _manifest(directory: Path) -> dict[str, Any]:
 
 
 def _check_answers(campaign: Campaign, answers: Path) -> None:
-    """Refuses a table that cannot be read, lacks cases or has too many."""
+    """Refuse a table that cannot be read, lacks cases or has unknown ones."""
     form = _task(campaign).offline
     if form is None:
         raise CampaignError(f"{campaign.configuration.name} cannot be answered in a table")
@@ -174,16 +151,8 @@ def _check_answers(campaign: Campaign, answers: Path) -> None:
 
 
 def _some(cases: Sequence[int]) -> str:
-    more = ", ..." if len(cases) > _NAMED else ""
-    return ", ".join(str(case) for case in cases[:_NAMED]) + more
-
-
-def _answered(campaign: Campaign, answers: Path) -> Campaign:
-    configuration = campaign.configuration
-    table = campaign.scenario.algorithm_table if isinstance(campaign.scenario, TakesAlgorithms) else ()
-    parameters = replaced(configuration.parameters, [*table, "algorithm"], f"{ANSWERS}{answers.resolve()}")
-    changed = configuration.model_copy(update={"parameters": parameters, "retain": Retain()})
-    return Campaign(CampaignConfiguration.model_validate(changed.model_dump()), campaign.scenario)
+    """First eight cases as text."""
+    return ", ".join(str(case) for case in cases[:8]) + (", ..." if len(cases) > 8 else "")
 
 
 def _task(campaign: Campaign) -> Task[Any, Any]:
@@ -193,7 +162,7 @@ def _task(campaign: Campaign) -> Task[Any, Any]:
 
 
 def other_pictures(truth: Path, scored: Path) -> list[int]:
-    """Cases whose pictures were others when they were scored than when they were exported."""
+    """Cases whose pictures differed between export and scoring."""
     exported = {row["case"]: row.get("image_hash") for row in read_rows(truth / TABLE_FILE)}
     rows = read_rows(scored / TABLE_FILE)
     return [int(row["case"]) for row in rows if row.get("image_hash") != exported.get(row["case"])]

@@ -1,14 +1,14 @@
-"""Groups of dispersions that are drawn together: by a covariance, a correlation or a rank correlation.
+"""Groups of correlated dispersions: by a covariance, a correlation or a rank correlation.
 
-All three are one Gaussian copula (Nelsen, An Introduction to Copulas, 2006, section 2.3): each member's own uniform
-number u becomes a normal one, z = Phi^-1(u); the group's are mixed, z' = L z with L L^T = R the correlation of the
-normals (Cholesky); and Phi(z') takes the place of u. Every member keeps its distribution whatever R is. As L is lower
-triangular the first member draws as it would alone, and a member added at the end changes none before it.
+All three are one Gaussian copula (Nelsen, An Introduction to Copulas, 2006, section 2.3). The independent uniform
+numbers u of the members become normal, z = Phi^-1(u). The normals are mixed, z' = L z with the Cholesky factor
+L L^T = R of their correlation. Phi(z') replaces u. Every member keeps its distribution for any R. As L is lower
+triangular, the first member draws as it would alone, and a member added at the end changes no earlier one.
 
-- ``covariance`` and ``correlation`` (Pearson's) are for normal dispersions that are not cut, whose draws then are
-  exactly multivariate normal: R is the correlation itself. A covariance states the standard deviations too.
+- ``covariance`` and ``correlation`` (Pearson's) are for normal dispersions without truncation, whose draws are exactly
+  multivariate normal: R is the correlation itself. A covariance also states the standard deviations.
 - ``rank`` (Spearman's) is for any continuous dispersions: R = 2 sin(pi/6 rank), exactly (Kruskal 1958, J. Am. Stat.
-  Assoc. 53, 814-861; ranks do not change with the marginals).
+  Assoc. 53, 814-861; ranks do not depend on the marginals).
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from pydantic import Field, model_validator
 
 from marsyard.sim.parameters import Parameters
 
-Entry = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-#: Up to this share of their size two entries that mirror each other may differ: digits that a file was rounded to.
+_Matrix = tuple[tuple[Annotated[float, Field(strict=True, allow_inf_nan=False)], ...], ...]
+#: Relative tolerance of symmetry: files state rounded numbers.
 _ROUNDING = 1e-9
-#: Least eigenvalue of a correlation, or its members are as good as functions of one another.
-_LEAST_EIGENVALUE = 1e-10
+#: Minimum eigenvalue of a correlation; below it, members are numerically functions of one another.
+_MIN_EIGENVALUE = 1e-10
 
 KINDS = ("covariance", "correlation", "rank")
 
 
 class Correlation(Parameters):
-    """Dispersed parameters that are drawn together, with one matrix over them in their order."""
+    """Dispersed parameters that are drawn together, with one matrix in their order."""
 
     parameters: Annotated[tuple[str, ...], Field(min_length=1, max_length=200)]
-    covariance: tuple[tuple[Entry, ...], ...] | None = None
-    correlation: tuple[tuple[Entry, ...], ...] | None = None
-    rank: tuple[tuple[Entry, ...], ...] | None = None
+    covariance: _Matrix | None = None
+    correlation: _Matrix | None = None
+    rank: _Matrix | None = None
     source: str = ""
 
     @model_validator(mode="after")
-    def _one_sound_matrix(self) -> Self:
+    def _check_statement(self) -> Self:
         given = [name for name in KINDS if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"one of {', '.join(KINDS)} is needed, got {', '.join(given) or 'none'}")
@@ -64,17 +64,17 @@ class Correlation(Parameters):
             raise ValueError(f"{self.kind} must be 1 along its diagonal")
         if self.kind != "covariance" and np.any(np.abs(matrix) > 1.0 + _ROUNDING):
             raise ValueError(f"{self.kind} has an entry that is not between -1 and 1")
-        normals = self.of_normals
-        least = float(np.linalg.eigvalsh(normals)[0]) if np.isfinite(normals).all() else float("nan")
-        if not least > _LEAST_EIGENVALUE:
+        normals = self.normal_correlation
+        smallest = float(np.linalg.eigvalsh(normals)[0]) if np.isfinite(normals).all() else float("nan")
+        if not smallest > _MIN_EIGENVALUE:
             raise ValueError(
-                f"{self.kind} is that of no group: the normals' correlation, of least eigenvalue {least:.3g}, "
+                f"{self.kind} is not valid for a group: the normals' correlation, of least eigenvalue {smallest:.3g}, "
                 "is not positive definite"
             )
 
     @property
     def kind(self) -> str:
-        """Which of the matrices is stated."""
+        """Name of the matrix that is stated."""
         return next(name for name in KINDS if getattr(self, name) is not None)
 
     @property
@@ -82,7 +82,7 @@ class Correlation(Parameters):
         return np.array(getattr(self, self.kind), dtype=np.float64)
 
     @property
-    def of_normals(self) -> Float64[np.ndarray, "n n"]:
+    def normal_correlation(self) -> Float64[np.ndarray, "n n"]:
         """Correlation R of the normal numbers behind the draws."""
         matrix = self._matrix
         symmetric: Float64[np.ndarray, "n n"] = 0.5 * (matrix + matrix.T)
@@ -97,12 +97,12 @@ class Correlation(Parameters):
     @cached_property
     def factor(self) -> Float64[np.ndarray, "n n"]:
         """Lower triangular L with L L^T = R."""
-        lower: Float64[np.ndarray, "n n"] = np.linalg.cholesky(self.of_normals)
+        lower: Float64[np.ndarray, "n n"] = np.linalg.cholesky(self.normal_correlation)
         return lower
 
     def standard_deviation(self, parameter: str) -> float | None:
-        """A member's standard deviation where the group states it; None otherwise."""
+        """Standard deviation of a member where the group states a covariance; None otherwise."""
         if self.covariance is None or parameter not in self.parameters:
             return None
-        place = self.parameters.index(parameter)
-        return float(np.sqrt(self.covariance[place][place]))
+        index = self.parameters.index(parameter)
+        return float(np.sqrt(self.covariance[index][index]))

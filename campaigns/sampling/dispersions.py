@@ -1,26 +1,299 @@
-"""Every dispersion that a campaign's file may state: our own by their names, others by theirs in `scipy.stats`."""
+"""Dispersions of a campaign file: the built-in ones by name, others by their names in `scipy.stats`."""
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
 from marsyard.campaigns.errors import near_match
-from marsyard.campaigns.sampling.dispersion import Dispersion
-from marsyard.campaigns.sampling.levels import Choice, Derived, Fixed, Grid
-from marsyard.campaigns.sampling.ranges import Integer, InTurn, Normal, Uniform
-from marsyard.campaigns.sampling.shapes import Frozen, Shape, parameters_of, scipy_distributions, truncated_quantile
-from marsyard.campaigns.sampling.stated import Limits, Number, limits_of
+from marsyard.campaigns.sampling.dispersion import (
+    Dispersion,
+    Limits,
+    Literally,
+    Number,
+    PositiveNumber,
+    Weight,
+    WholeNumber,
+    interval_of,
+)
+from marsyard.campaigns.sampling.shapes import (
+    STANDARD_NORMAL,
+    ScipyShape,
+    Shape,
+    scipy_distributions,
+    scipy_parameters,
+    truncated_quantile,
+)
+
+#: Maximum number of levels of one grid.
+MAX_LEVELS = 100_000
+
+_Bound = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+
+
+def _check_range(low: float, high: float) -> None:
+    if not low < high:
+        raise ValueError(f"low = {low} must be below high = {high}")
+    if not math.isfinite(high - low):
+        raise ValueError(f"from low = {low} to high = {high} is too far")
+
+
+class _Levels(Dispersion):
+    """A dispersion over listed values."""
+
+    @property
+    def points(self) -> Sequence[Any]:
+        raise NotImplementedError
+
+    def bounds(self) -> tuple[float, float] | None:
+        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in self.points):
+            return None
+        try:
+            return float(min(self.points)), float(max(self.points))
+        except OverflowError:
+            return None
+
+    def extremes(self) -> tuple[Any, ...]:
+        return tuple(self.points)
+
+
+class Choice(_Levels):
+    """One of `values`, with equal probabilities or in proportion to `weights`, which need not sum to one.
+
+    If the parameter is a table, each value is a whole table; keys that it does not set keep their defaults.
+    """
+
+    distribution: Literal["choice"]
+    values: Annotated[list[Literally], Field(min_length=1)]
+    weights: list[Weight] | None = None
+
+    @model_validator(mode="after")
+    def _check_weights(self) -> Self:
+        if self.weights is not None and len(self.weights) != len(self.values):
+            raise ValueError(f"{len(self.weights)} weights for {len(self.values)} values; give one for each value")
+        if not math.isfinite(self._cumulative[-1]):
+            raise ValueError("the weights are too large to be summed")
+        return self
+
+    @cached_property
+    def _cumulative(self) -> list[float]:
+        return list(itertools.accumulate(self.weights or [1.0] * len(self.values)))
+
+    @property
+    def points(self) -> Sequence[Any]:
+        """The values."""
+        return self.values
+
+    def quantile(self, probability: float) -> Any:
+        """See `Dispersion.quantile`."""
+        index = bisect.bisect_right(self._cumulative, probability * self._cumulative[-1])
+        return self.values[min(index, len(self.values) - 1)]
+
+
+class Fixed(_Levels):
+    """The same value in every case: a parameter that is listed with its source next to the dispersed ones."""
+
+    distribution: Literal["fixed"]
+    value: Literally
+
+    @property
+    def points(self) -> Sequence[Any]:
+        """The value."""
+        return (self.value,)
+
+    def quantile(self, probability: float) -> Any:
+        """See `Dispersion.quantile`."""
+        return self.value
+
+
+class Derived(Dispersion):
+    """A value computed by a formula from other parameters of the case."""
+
+    distribution: Literal["derived"]
+    formula: Number
+
+    def quantile(self, probability: float) -> float:
+        """See `Dispersion.quantile`."""
+        return float(self.formula)
+
+    def bounds(self) -> tuple[float, float] | None:
+        """See `Dispersion.bounds`."""
+        return interval_of(self.formula, self.formula)
+
+
+class Grid(_Levels):
+    """Levels of a full factorial: every combination of the levels of all grids occurs equally often.
+
+    Either `values`, or the range from `low` to `high`, both included, with a number of `levels` or a `step`.
+    """
+
+    distribution: Literal["grid"]
+    values: Annotated[list[Literally], Field(min_length=1, max_length=MAX_LEVELS)] | None = None
+    low: _Bound | None = None
+    high: _Bound | None = None
+    levels: Annotated[int, Field(strict=True, ge=2, le=MAX_LEVELS)] | None = None
+    step: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)] | None = None
+
+    @model_validator(mode="after")
+    def _check_statement(self) -> Self:
+        given = {name for name in ("values", "low", "high", "levels", "step") if getattr(self, name) is not None}
+        if given not in ({"values"}, {"low", "high", "levels"}, {"low", "high", "step"}):
+            listed = ", ".join(sorted(given)) or "none of them"
+            raise ValueError(f"a grid takes values, or low, high and levels, or low, high and step; got {listed}")
+        if self.low is not None and self.high is not None:
+            _check_range(self.low, self.high)
+        if self.step is not None:
+            steps = (self.high - self.low) / self.step  # type: ignore[operator]  # both are given, see above
+            if not 0.5 <= steps < MAX_LEVELS or abs(steps - round(steps)) > 1e-6:
+                raise ValueError(
+                    f"step = {self.step} does not divide the range from {self.low} to {self.high} "
+                    f"into 1 to {MAX_LEVELS - 1} whole steps"
+                )
+        return self
+
+    @cached_property
+    def points(self) -> tuple[Any, ...]:
+        """The levels, in order."""
+        if self.values is not None:
+            return tuple(self.values)
+        low, high = float(self.low or 0.0), float(self.high or 0.0)
+        steps = round((high - low) / self.step) if self.step is not None else (self.levels or 2) - 1
+        return tuple(low + (high - low) * index / steps for index in range(steps + 1))
+
+    def quantile(self, probability: float) -> Any:
+        """Level at a probability, for levels drawn with equal probabilities."""
+        return self.points[min(int(len(self.points) * probability), len(self.points) - 1)]
+
+
+class Uniform(Dispersion):
+    """Uniform distribution between `low` and `high`."""
+
+    continuous = True
+
+    distribution: Literal["uniform"]
+    low: Number
+    high: Number
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> Self:
+        if (interval := self.bounds()) is not None:
+            _check_range(*interval)
+        return self
+
+    def quantile(self, probability: float) -> float:
+        """See `Dispersion.quantile`."""
+        low, high = float(self.low), float(self.high)
+        return min(low + (high - low) * probability, high)
+
+    def bounds(self) -> tuple[float, float] | None:
+        """See `Dispersion.bounds`."""
+        return interval_of(self.low, self.high)
+
+
+class Normal(Dispersion):
+    """Normal distribution with mean `mean` and standard deviation `sd`, truncated to `truncate` where given.
+
+    `sd` is omitted where a group states a covariance (`marsyard.campaigns.sampling.correlation`), and nowhere else.
+    """
+
+    continuous = True
+
+    distribution: Literal["normal"]
+    mean: Number
+    sd: PositiveNumber | None = None
+    truncate: Limits | None = None
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> Self:
+        if self.sd is not None and not self.formulas:
+            truncated_quantile(STANDARD_NORMAL, self._standard_limits, 0.5)
+        return self
+
+    @cached_property
+    def _standard_limits(self) -> tuple[float, float] | None:
+        if self.truncate is None:
+            return None
+        low, high = ((float(limit) - float(self.mean)) / self._sd for limit in self.truncate)
+        return low, high
+
+    @property
+    def _sd(self) -> float:
+        if self.sd is None:
+            raise ValueError("the standard deviation is stated by a group's covariance only")
+        return float(self.sd)
+
+    def quantile(self, probability: float) -> float:
+        """See `Dispersion.quantile`."""
+        standard = truncated_quantile(STANDARD_NORMAL, self._standard_limits, probability)
+        value = float(self.mean) + self._sd * standard
+        if self.truncate is None:
+            return value
+        return min(max(value, float(self.truncate[0])), float(self.truncate[1]))
+
+    def bounds(self) -> tuple[float, float] | None:
+        """See `Dispersion.bounds`."""
+        return (-math.inf, math.inf) if self.truncate is None else interval_of(*self.truncate)
+
+
+class _WholeNumbers(Dispersion):
+    """Whole numbers from `low` to `high`, both included."""
+
+    low: WholeNumber
+    high: WholeNumber
+
+    @model_validator(mode="before")
+    @classmethod
+    def _convert_whole_floats(cls, stated: Any) -> Any:
+        if not isinstance(stated, Mapping):
+            return stated
+        floats = {key: stated[key] for key in ("low", "high") if isinstance(stated.get(key), float)}
+        return {**stated, **{key: int(value) for key, value in floats.items() if value.is_integer()}}
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if self.bounds() is not None and not int(self.low) <= int(self.high):
+            raise ValueError(f"low = {self.low} must not be above high = {self.high}")
+        return self
+
+    def quantile(self, probability: float) -> int:
+        low, high = int(self.low), int(self.high)
+        return min(low + int((high - low + 1) * probability), high)
+
+    def bounds(self) -> tuple[float, float] | None:
+        return interval_of(self.low, self.high)
+
+
+class Integer(_WholeNumbers):
+    """Every whole number from `low` to `high`, both included, with equal probabilities."""
+
+    distribution: Literal["integer"]
+
+
+class InTurn(_WholeNumbers):
+    """The whole numbers from `low` to `high`, both included, one case after the other, then from `low` again.
+
+    No number repeats before all have occurred: a campaign visits as many terrains as possible. If the number only
+    selects one of many independent terrains, cases with different numbers are independent.
+    """
+
+    distribution: Literal["in-turn"]
+
+    def value(self, case: int) -> int:
+        """Number that a case takes."""
+        low, high = int(self.low), int(self.high)
+        return low + case % (high - low + 1)
 
 
 class Scipy(Dispersion):
-    """A distribution of `scipy.stats` by its name there, with its parameters and cut to `truncate`.
+    """A distribution of `scipy.stats` by its name, with its parameters, truncated to `truncate` where given.
 
-    Discrete ones (`poisson`, `binom`, ...) give whole numbers; their limits are included.
+    Discrete distributions (`poisson`, `binom`, ...) give whole numbers; their limits are included.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -31,53 +304,54 @@ class Scipy(Dispersion):
 
     @field_validator("distribution")
     @classmethod
-    def _known(cls, name: str) -> str:
+    def _check_name(cls, name: str) -> str:
         names = scipy_distributions()
         if name not in names:
-            hint = near_match(name, [*FRIENDLY, *names])
+            hint = near_match(name, [*BUILT_IN, *names])
             raise ValueError(
-                f"unknown distribution '{name}'{hint}; allowed: {', '.join(FRIENDLY)}, "
+                f"unknown distribution '{name}'{hint}; allowed: {', '.join(BUILT_IN)}, "
                 "or a distribution of one variable of scipy.stats by its name there (norm, beta, poisson, ...)"
             )
         return name
 
     @model_validator(mode="after")
-    def _drawable(self) -> Self:
+    def _check_parameters(self) -> Self:
         given = self.__pydantic_extra__ or {}
-        required, allowed = parameters_of(self.distribution)
+        required, allowed = scipy_parameters(self.distribution)
         problems = [f"unknown parameter '{name}'{near_match(name, allowed)}" for name in given if name not in allowed]
         problems += [f"parameter '{name}' is missing" for name in required if name not in given]
         if problems:
             raise ValueError(f"{', '.join(problems)}; {self.distribution} takes {', '.join(allowed)}")
         if not self.formulas:
-            truncated_quantile(self._shape, limits_of(self.truncate), 0.5)
+            self.quantile(0.5)
         return self
 
     @property
-    def continuous(self) -> bool:  # type: ignore[override]  # known only with the distribution's name
-        """Whether it is a density's."""
+    def continuous(self) -> bool:  # type: ignore[override]  # depends on the distribution's name
+        """Whether the distribution has a density."""
         return not scipy_distributions()[self.distribution]
 
     @cached_property
     def _shape(self) -> Shape:
-        stated = {name: float(value) for name, value in (self.__pydantic_extra__ or {}).items()}
-        return Frozen(self.distribution, stated)
+        parameters = {name: float(value) for name, value in (self.__pydantic_extra__ or {}).items()}
+        return ScipyShape(self.distribution, parameters)
 
     def quantile(self, probability: float) -> float | int:
         """See `Dispersion.quantile`."""
-        return truncated_quantile(self._shape, limits_of(self.truncate), probability)
+        limits = None if self.truncate is None else (float(self.truncate[0]), float(self.truncate[1]))
+        return truncated_quantile(self._shape, limits, probability)
 
     def bounds(self) -> tuple[float, float] | None:
         """See `Dispersion.bounds`."""
         if self.formulas:
             return None
         low, high = self._shape.support()
-        limits = limits_of(self.truncate) or (-math.inf, math.inf)
-        return max(low, limits[0]), min(high, limits[1])
+        limits = self.truncate or (-math.inf, math.inf)
+        return max(low, float(limits[0])), min(high, float(limits[1]))
 
 
-#: The distributions with their own names and parameters; every other name is looked up in `scipy.stats`.
-FRIENDLY: Mapping[str, type[Dispersion]] = {
+#: Distributions with names and parameters of their own; any other name is looked up in `scipy.stats`.
+BUILT_IN: Mapping[str, type[Dispersion]] = {
     "uniform": Uniform,
     "normal": Normal,
     "choice": Choice,
@@ -89,10 +363,9 @@ FRIENDLY: Mapping[str, type[Dispersion]] = {
 }
 
 
-def _kind(stated: Any) -> str:
-    """The model that reads a dispersion: by its name, `scipy` where it is none of ours."""
+def _model_tag(stated: Any) -> str:
     name = stated.get("distribution") if isinstance(stated, Mapping) else getattr(stated, "distribution", None)
-    return name if isinstance(name, str) and name in FRIENDLY else "scipy"
+    return name if isinstance(name, str) and name in BUILT_IN else "scipy"
 
 
 AnyDispersion = Annotated[
@@ -105,5 +378,5 @@ AnyDispersion = Annotated[
     | Annotated[Derived, Tag("derived")]
     | Annotated[Grid, Tag("grid")]
     | Annotated[Scipy, Tag("scipy")],
-    Discriminator(_kind),
+    Discriminator(_model_tag),
 ]

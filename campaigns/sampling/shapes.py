@@ -1,4 +1,4 @@
-"""Distribution functions and their inverses: the normal's own, and those of `scipy.stats` by their names."""
+"""Distribution functions and their inverses: the standard normal distribution, and those of `scipy.stats` by name."""
 
 from __future__ import annotations
 
@@ -13,13 +13,10 @@ from scipy.special import ndtr, ndtri
 
 
 class Shape(Hashable, Protocol):
-    """A distribution: its function, the survival function, the inverses of both, and where it lies."""
+    """A distribution: distribution function, survival function, inverses of both, and support."""
 
     @property
-    def whole(self) -> bool:
-        """Whether its values are whole numbers."""
-        ...
-
+    def is_discrete(self) -> bool: ...  # noqa: D102
     def cdf(self, x: float, /) -> float: ...  # noqa: D102
     def sf(self, x: float, /) -> float: ...  # noqa: D102
     def ppf(self, q: float, /) -> float: ...  # noqa: D102
@@ -28,9 +25,9 @@ class Shape(Hashable, Protocol):
 
 
 class _StandardNormal:
-    """The normal distribution without the second that importing `scipy.stats` takes."""
+    """Standard normal distribution without importing `scipy.stats`, which takes a second."""
 
-    whole = False
+    is_discrete = False
 
     def cdf(self, x: float) -> float:
         return float(ndtr(x))
@@ -53,9 +50,9 @@ STANDARD_NORMAL = _StandardNormal()
 
 @lru_cache(maxsize=1)
 def scipy_distributions() -> Mapping[str, bool]:
-    """The distributions of one variable in `scipy.stats` by their names: whether each is discrete.
+    """Univariate distributions of `scipy.stats` by name: whether each is discrete.
 
-    `uniform` is left out, as it is written with other parameters here.
+    `uniform` is excluded, since campaign files write it with other parameters.
     """
     from scipy import stats
 
@@ -64,8 +61,8 @@ def scipy_distributions() -> Mapping[str, bool]:
     return {name: isinstance(kind, stats.rv_discrete) for name, kind in kinds if isinstance(kind, known)}
 
 
-def parameters_of(distribution: str) -> tuple[list[str], list[str]]:
-    """The parameters that a distribution of `scipy.stats` requires, and all that it takes."""
+def scipy_parameters(distribution: str) -> tuple[list[str], list[str]]:
+    """Parameters that a distribution of `scipy.stats` requires, and all that it accepts."""
     from scipy import stats
 
     shapes = getattr(stats, distribution).shapes
@@ -73,31 +70,20 @@ def parameters_of(distribution: str) -> tuple[list[str], list[str]]:
     return required, [*required, "loc"] if scipy_distributions()[distribution] else [*required, "loc", "scale"]
 
 
-class Frozen:
-    """A distribution of `scipy.stats` with its parameters.
+class ScipyShape:
+    """A distribution of `scipy.stats` with given parameters. Raises ValueError where it is not defined for them."""
 
-    Parameters
-    ----------
-    distribution
-        Its name there.
-    stated
-        Its parameters.
-
-    Raises
-    ------
-    ValueError
-        Where it is not defined for them.
-    """
-
-    def __init__(self, distribution: str, stated: Mapping[str, float]) -> None:
+    def __init__(self, distribution: str, parameters: Mapping[str, float]) -> None:
         from scipy import stats
 
-        self.whole = scipy_distributions()[distribution]
-        self._where = f"{distribution} is not defined for {', '.join(f'{key} = {one}' for key, one in stated.items())}"
+        self.is_discrete = scipy_distributions()[distribution]
+        self._where = (
+            f"{distribution} is not defined for {', '.join(f'{key} = {one}' for key, one in parameters.items())}"
+        )
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                self._shape: Any = getattr(stats, distribution)(**stated)
+                self._shape: Any = getattr(stats, distribution)(**parameters)
                 low, high = (float(one) for one in self._shape.support())
         except (ArithmeticError, TypeError, ValueError) as error:
             raise ValueError(f"{self._where}: {error}") from error
@@ -106,74 +92,68 @@ class Frozen:
         self._support = low, high
 
     def cdf(self, x: float) -> float:
-        """Probability of at most `x`."""
-        return self._of("cdf", x)
+        """Probability of a value of at most `x`."""
+        return self._evaluate("cdf", x)
 
     def sf(self, x: float) -> float:
-        """Probability of more than `x`."""
-        return self._of("sf", x)
+        """Probability of a value above `x`."""
+        return self._evaluate("sf", x)
 
     def ppf(self, q: float) -> float:
         """Inverse of `cdf`."""
-        return self._of("ppf", q)
+        return self._evaluate("ppf", q)
 
     def isf(self, q: float) -> float:
         """Inverse of `sf`."""
-        return self._of("isf", q)
+        return self._evaluate("isf", q)
 
     def support(self) -> tuple[float, float]:
-        """Least and greatest value."""
+        """Minimum and maximum."""
         return self._support
 
-    def _of(self, function: str, x: float) -> float:
-        """One of SciPy's functions, without its warnings: what is wrong shows in the number."""
+    def _evaluate(self, function: str, x: float) -> float:
+        """Call a function of SciPy without its warnings: an invalid result shows as NaN."""
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                found = float(getattr(self._shape, function)(x))
+                result = float(getattr(self._shape, function)(x))
         except (ArithmeticError, TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"{self._where}: {error}") from error
-        if math.isnan(found):
+        if math.isnan(result):
             raise ValueError(f"{self._where}: its {function} of {x} is not a number")
-        return found
+        return result
 
 
 def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probability: float) -> float | int:
-    """The value at a probability of a distribution cut to `limits`, computed on the side where digits are kept.
+    """Quantile of a distribution truncated to `limits`, evaluated in the tail that keeps its digits.
 
-    Of F cut to [a, b] the inverse is F^-1(F(a) + p (F(b) - F(a))); where a lies beyond the median the same is said by
-    the survival function, whose small values have digits that 1 - F has lost. Limits of whole numbers are included.
+    The inverse of F truncated to [a, b] is F^-1(F(a) + p (F(b) - F(a))). Where a lies above the median, the survival
+    function replaces F, since its small values keep digits that 1 - F loses. Limits of discrete distributions are
+    included.
 
-    Raises
-    ------
-    ValueError
-        Where the limits are in the wrong order, or leave nothing to draw.
+    Raises ValueError where the limits are in the wrong order or have no probability between them.
     """
     low, high = shape.support() if limits is None else limits
     if limits is None:
         value = shape.ppf(probability)
     else:
-        inverse, at_low, at_high = _cut(shape, low, high)
+        inverse, at_low, at_high = _truncated_inverse(shape, low, high)
         value = inverse(at_low + probability * (at_high - at_low))
     value = min(max(value, low), high)
-    return _whole(value) if shape.whole else value
+    if shape.is_discrete and not math.isfinite(value):
+        raise ValueError(f"the distribution reaches {value}")
+    return round(value) if shape.is_discrete else value
 
 
 @lru_cache(maxsize=1024)
-def _cut(shape: Shape, low: float, high: float) -> tuple[Callable[[float], float], float, float]:
-    """The inverse that keeps digits between two limits, and its arguments there."""
-    if not (low <= high if shape.whole else low < high):
+def _truncated_inverse(shape: Shape, low: float, high: float) -> tuple[Callable[[float], float], float, float]:
+    """Inverse function that keeps its digits between two limits, and its arguments at them."""
+    if not (low <= high if shape.is_discrete else low < high):
         raise ValueError(f"truncate = [{low}, {high}]: the first limit must be below the second")
-    below = math.ceil(low) - 1.0 if shape.whole else low
+    below = math.ceil(low) - 1.0 if shape.is_discrete else low
     upper = shape.cdf(below) > 0.5
     function, inverse = (shape.sf, shape.isf) if upper else (shape.cdf, shape.ppf)
     at_low, at_high = function(below), function(high)
     if not abs(at_high - at_low) > 0.0:
         raise ValueError(f"truncate = [{low}, {high}]: the distribution has no probability between the limits")
     return inverse, at_low, at_high
-
-
-def _whole(value: float) -> int:
-    if not math.isfinite(value):
-        raise ValueError(f"the distribution reaches {value}")
-    return round(value)

@@ -1,4 +1,4 @@
-"""A case's products on disk: arrays in one `products.npz`, everything around them in `products.json`."""
+"""Products of a case on disk: arrays in `products.npz`, everything else in `products.json`."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ import numpy as np
 
 from marsyard.campaigns.errors import StoreError, writing
 
-#: Stands for an array in `products.json`, with the name that it has in `products.npz`.
+#: Key in `products.json` that replaces an array by its name in `products.npz`.
 _ARRAY = "__array__"
 _OUTLINE = "products.json"
 
 
 @dataclass(frozen=True)
 class PackedProducts:
-    """A case's products as the bytes of their two files."""
+    """Products of a case as the bytes of their two files."""
 
     outline: bytes
     arrays: bytes
 
     @staticmethod
     def nothing() -> PackedProducts:
-        """No products at all."""
+        """Empty products."""
         return pack_products({})
 
     @property
@@ -41,12 +41,10 @@ class PackedProducts:
 
 
 def pack_products(products: Mapping[str, Any]) -> PackedProducts:
-    """Products as they lie on disk, so that a worker does the work and another process writes them.
+    """Pack products into bytes, so that a worker compresses them and another process writes them.
 
-    Raises
-    ------
-    TypeError
-        Where a product is neither an array, a text, a number, a truth value, None, nor a table or list of those.
+    Raises TypeError where a product is neither an array, a text, a number, a boolean, None, nor a table or list of
+    these.
     """
     arrays: dict[str, np.ndarray] = {}
     outline = _outline(products, "products", arrays)
@@ -57,19 +55,16 @@ def pack_products(products: Mapping[str, Any]) -> PackedProducts:
 
 
 def save_packed(directory: Path, packed: PackedProducts, row: Mapping[str, Any]) -> None:
-    """Writes packed products and their case's row into a folder, in the place of those that it may hold.
+    """Write packed products and their case's row into a folder, in place of existing ones.
 
-    Raises
-    ------
-    StoreError
-        Where the folder cannot be written; the files that it holds stay as they are.
+    Raises StoreError where the folder cannot be written; its files then stay as they are.
     """
     with replaced_files(directory) as folder:
         write_packed(folder, packed, row)
 
 
 def write_packed(folder: Path, packed: PackedProducts, row: Mapping[str, Any]) -> None:
-    """Writes packed products and their case's row into a folder that is there. Raises OSError where that fails."""
+    """Write packed products and their case's row into an existing folder. Raises OSError where that fails."""
     (folder / "row.json").write_text(json.dumps(dict(row), indent=2) + "\n", encoding="utf-8")
     (folder / "products.npz").write_bytes(packed.arrays)
     (folder / _OUTLINE).write_bytes(packed.outline)
@@ -77,21 +72,16 @@ def write_packed(folder: Path, packed: PackedProducts, row: Mapping[str, Any]) -
 
 @contextmanager
 def replaced_files(directory: Path) -> Iterator[Path]:
-    """A temporary folder whose files are moved into `directory` at the end, in the place of files of their names.
+    """Temporary folder whose files replace those in `directory` at the end; after an exception nothing is replaced.
 
-    Left by an exception, the files of `directory` stay as they are. The folder is made where it is missing.
-
-    Raises
-    ------
-    StoreError
-        Where the folder cannot be written.
+    Raises StoreError where the folder cannot be written.
     """
     with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=directory, prefix=".partial-") as name:
             folder = Path(name)
             yield folder
-            # the outline last, as a folder that has it counts as one of a kept case
+            # the outline last: it marks a folder as complete
             for path in sorted(folder.rglob("*"), key=lambda path: (path == folder / _OUTLINE, path)):
                 target = directory / path.relative_to(folder)
                 if path.is_dir():
@@ -101,14 +91,14 @@ def replaced_files(directory: Path) -> Iterator[Path]:
 
 
 def unpack_products(packed: PackedProducts) -> dict[str, Any]:
-    """The products that were packed; tuples come back as lists."""
+    """Products that were packed; tuples become lists."""
     with np.load(io.BytesIO(packed.arrays), allow_pickle=False) as arrays:
         filled: dict[str, Any] = _filled(json.loads(packed.outline), arrays)
     return filled
 
 
 def _outline(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
-    """A product with its arrays taken out into `arrays`."""
+    """Product with its arrays moved to `arrays`."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, np.ndarray):
@@ -131,13 +121,7 @@ def _outline(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def load_products(directory: Path) -> dict[str, Any]:
-    """The products that were saved into a folder; tuples come back as lists.
-
-    Raises
-    ------
-    StoreError
-        Where the folder holds none.
-    """
+    """Products that were saved into a folder; tuples become lists. Raises StoreError where it holds none."""
     try:
         files = [(directory / name).read_bytes() for name in (_OUTLINE, "products.npz")]
         return unpack_products(PackedProducts(*files))
@@ -146,7 +130,7 @@ def load_products(directory: Path) -> dict[str, Any]:
 
 
 def _filled(outline: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """An outline with its arrays put back."""
+    """Outline with its arrays inserted."""
     if isinstance(outline, dict):
         if set(outline) == {_ARRAY}:
             return arrays[outline[_ARRAY]]

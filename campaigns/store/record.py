@@ -1,7 +1,8 @@
-"""`campaign.json`: what was run, by which program, on which machine, and how far it came."""
+"""Campaign folder: its record `campaign.json` (statements, program, machine, progress) and its lock."""
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -9,7 +10,8 @@ import platform
 import re
 import shutil
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,8 +26,8 @@ SCHEMA = 1
 
 RECORD_FILE = "campaign.json"
 
-#: What a campaign writes into its folder; a folder with any of it is never written to again.
-OWN_FILES = (RECORD_FILE, "cases.parquet", ROWS_FILE, "report.html", "report.json", "cases")
+#: Files of a campaign; a folder with any of them is never used for another one.
+_CAMPAIGN_FILES = (RECORD_FILE, "cases.parquet", ROWS_FILE, "report.html", "report.json", "cases")
 
 
 #: JSON types of the keys of a record that commands read.
@@ -45,23 +47,18 @@ _TYPES: Mapping[str, tuple[type, str]] = {
 
 
 def utc_now() -> str:
-    """The time, to the second, as ISO 8601 writes it."""
+    """Current time in ISO 8601, to the second."""
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def claim(directory: Path) -> None:
-    """Makes a folder for a campaign.
+    """Create a folder for a campaign; a folder of a run that was killed before it wrote its record counts as free.
 
-    A folder in which a run was killed before it wrote its record counts as free: nothing was stored in it.
-
-    Raises
-    ------
-    StoreError
-        Where it holds a campaign, or cannot be written.
+    Raises StoreError where it holds a campaign, or cannot be written.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        held = [name for name in OWN_FILES if (directory / name).exists()]
+        held = [name for name in _CAMPAIGN_FILES if (directory / name).exists()]
         if held == [ROWS_FILE] and is_empty_store(directory / ROWS_FILE):
             held = []
     except FileExistsError as error:
@@ -76,23 +73,16 @@ def begin(
     directory: Path,
     configuration: CampaignConfiguration,
     identity: Identity,
-    crew: str,
+    executor: str,
     *,
     command: Sequence[str] = (),
     algorithms: Sequence[Mapping[str, Any]] = (),
 ) -> None:
-    """Writes the record of a campaign that begins.
+    """Write the record of a campaign that begins.
 
-    Parameters
-    ----------
-    directory, configuration, identity
-        The campaign's folder, what it states, and what its rows depend on.
-    crew
-        Who runs it.
-    command
-        The words of the command that runs it again, from the current folder.
-    algorithms
-        The algorithms under test, as `marsyard.campaigns.definition.algorithms.describe_algorithms` has them.
+    executor: description of its workers.
+    command: words of the command that runs it again, from the current folder.
+    algorithms: from `marsyard.campaigns.definition.algorithms.describe_algorithms`.
     """
     stated = configuration.model_dump(mode="json")
     write(
@@ -113,7 +103,7 @@ def begin(
             "identity": identity.plain(),
             "command": {"words": list(command), "folder": str(Path.cwd())} if command else None,
             "algorithms": list(algorithms),
-            "sessions": [session("run", crew, 0)],
+            "sessions": [session("run", executor, 0)],
             "changes": [],
             "showcase": None,
             "versions": dict(identity.versions),
@@ -123,29 +113,26 @@ def begin(
     )
 
 
-def session(command: str, crew: str, cases_before: int) -> dict[str, Any]:
-    """One stretch of work on a campaign, as it stands in the record."""
+def session(command: str, executor: str, cases_before: int) -> dict[str, Any]:
+    """Record entry of one session of work on a campaign."""
     return {
         "command": command,
         "started_utc": utc_now(),
-        "workers": crew,
+        "workers": executor,
         "cases_before": cases_before,
         "environment": machine(),
     }
 
 
 def update(directory: Path, changes: Mapping[str, Any]) -> None:
-    """Writes changes into a campaign's record, whole or not at all."""
+    """Change keys of a campaign's record, all or none."""
     write(directory, {**read(directory), **changes})
 
 
 def write(directory: Path, record: Mapping[str, Any]) -> None:
-    """Writes a campaign's record, whole or not at all.
+    """Write a campaign's record, whole or not at all.
 
-    Raises
-    ------
-    StoreError
-        Where that fails; the record that was there stays.
+    Raises StoreError where that fails; the previous record stays.
     """
     path = directory / RECORD_FILE
     partial = path.with_suffix(".partial")
@@ -158,12 +145,9 @@ def write(directory: Path, record: Mapping[str, Any]) -> None:
 
 
 def read(directory: Path) -> dict[str, Any]:
-    """A campaign's record.
+    """Read a campaign's record.
 
-    Raises
-    ------
-    StoreError
-        Where the folder holds none, or one of another version.
+    Raises StoreError where the folder holds none, or one of another version.
     """
     path = directory / RECORD_FILE
     if not directory.is_dir():
@@ -187,8 +171,8 @@ def read(directory: Path) -> dict[str, Any]:
 
 
 def _check_types(path: Path, record: Mapping[str, Any]) -> None:
-    """Raises StoreError where a key that commands read is missing or of another JSON type."""
-    # records of versions that kept no identity lack the other keys as well, and can still be judged
+    """Raise StoreError where a required key is missing or of another JSON type."""
+    # records of versions without an identity lack the other keys as well, and can still be reported
     required = _TYPES if "identity" in record else ("name", "state", "cases", "configuration")
     missing = [key for key in required if key not in record]
     if missing:
@@ -206,7 +190,7 @@ def _check_types(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def stored_configuration(directory: Path) -> CampaignConfiguration:
-    """The configuration with which a stored campaign was run."""
+    """Configuration of a stored campaign."""
     try:
         return CampaignConfiguration.model_validate(read(directory)["configuration"])
     except (ValueError, KeyError) as error:
@@ -214,7 +198,7 @@ def stored_configuration(directory: Path) -> CampaignConfiguration:
 
 
 def git_commit() -> str | None:
-    """The commit that is checked out where the program runs from, with ``+changes`` if it was edited; or None."""
+    """Commit of the checked-out program, with ``+changes`` if files were edited; None where unknown."""
     git = shutil.which("git")
     if git is None:
         return None
@@ -236,7 +220,7 @@ def git_commit() -> str | None:
 
 
 def machine() -> dict[str, Any]:
-    """Python, the platform, and the processor with its features: rows are equal bit for bit where these are."""
+    """Python, platform and processor with its features: rows are equal bit for bit where these are equal."""
     model, features = _processor()
     return {
         "python": platform.python_version(),
@@ -250,7 +234,7 @@ def machine() -> dict[str, Any]:
 
 
 def _processor() -> tuple[str, str | None]:
-    """The processor's model and a hash of its list of features, where Linux tells."""
+    """Processor's model and a hash of its features, where Linux states them."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -260,3 +244,40 @@ def _processor() -> tuple[str, str | None]:
     listed = " ".join(sorted(features[1].split())) if features else None
     digest = hashlib.sha256(listed.encode()).hexdigest()[:16] if listed else None
     return (model[1] if model else platform.processor()), digest
+
+
+#: Locked by the process that works in the folder; the kernel releases the lock when the process ends.
+_LOCK_FILE = "campaign.lock"
+
+
+@contextmanager
+def folder_lock(directory: Path) -> Iterator[None]:
+    """Lock a campaign's folder. Raises StoreError where another process holds it, or the folder cannot be written."""
+    path = directory / _LOCK_FILE
+    with writing(directory):
+        file = path.open("a+", encoding="utf-8")
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.seek(0)
+            holder = file.read().strip() or "another process"
+            raise StoreError(f"{directory} is in use: {holder} works in it; wait for it, or end it") from error
+        # only for messages of other processes, so a full disk is ignored here
+        with suppress(OSError):
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {platform.node()}\n")
+            file.flush()
+        yield
+
+
+def is_locked(directory: Path) -> bool:
+    """Whether a process works in a folder."""
+    try:
+        with (directory / _LOCK_FILE).open("r", encoding="utf-8") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False

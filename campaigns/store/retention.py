@@ -1,4 +1,4 @@
-"""Which cases keep their products, and how much of the disk these may take."""
+"""Retention of products: cases that keep them, and their disk space."""
 
 from __future__ import annotations
 
@@ -11,25 +11,21 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, R
 from marsyard.campaigns.outcomes import UNFINISHED
 from marsyard.campaigns.store.products import PackedProducts, save_packed
 
-#: Products of one case each lie in a folder of its number in here.
+#: Folder of the kept products, with a folder for each case.
 CASES_FOLDER = "cases"
 
 
 def case_directory(directory: Path, case: int) -> Path:
-    """Where a campaign keeps the products of a case."""
+    """Folder of a case's products."""
     return directory / CASES_FOLDER / str(case)
 
 
 @dataclass(frozen=True)
 class Keep:
-    """Which rows' products a worker sends back.
+    """Selection of rows whose products a worker returns.
 
-    Attributes
-    ----------
-    every
-        The step between numbers of cases that are kept; 0 for none by their number.
-    failed
-        Requirements of which a case that fails any is kept.
+    every: step between numbers of kept cases; 0 for none by their number.
+    failed: requirements; a case that fails any of them is kept.
     """
 
     every: int = 0
@@ -47,7 +43,7 @@ KEEP_ALL = Keep(every=1)
 
 
 def keep_while_running(configuration: CampaignConfiguration) -> Keep:
-    """What a campaign keeps as its cases end; the worst are known, and run again, when all have."""
+    """Selection while a campaign runs; the worst cases are run again at its end."""
     retain = configuration.retain
     if retain.products == "all":
         return KEEP_ALL
@@ -57,7 +53,7 @@ def keep_while_running(configuration: CampaignConfiguration) -> Keep:
 
 
 def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
-    """Whether a row counts against a requirement; an unfinished case does so in every population that it may be in."""
+    """Whether a row fails a requirement; an unfinished case does in every population that may contain it."""
     belongs = _belongs(row, requirement.population)
     if belongs is not True or row["outcome"] in UNFINISHED:
         return belongs is not False
@@ -70,7 +66,7 @@ def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
 
 
 def _belongs(row: Mapping[str, Any], population: str) -> bool | None:
-    """Whether a row is a member of a population, as in `Requirement.population`; None where the row does not say."""
+    """Whether a row is in a population, as in `Requirement.population`; None where the row does not state it."""
     known = {"all": True, "completed": row["outcome"] not in UNFINISHED, "valid": row["answered"]}
     parts = [known[part] if part in known else row.get(part) for part in population.split(" and ")]
     if any(part is False for part in parts):
@@ -79,7 +75,7 @@ def _belongs(row: Mapping[str, Any], population: str) -> bool | None:
 
 
 class ProductStore:
-    """The products that a campaign keeps, within its budget of the disk."""
+    """Kept products of a campaign, within its disk budget."""
 
     def __init__(self, directory: Path, budget_gb: float) -> None:
         self._directory = directory
@@ -87,12 +83,9 @@ class ProductStore:
         self.full = False
 
     def save(self, case: int, packed: PackedProducts, row: Mapping[str, Any]) -> bool:
-        """Keeps a case's products, unless they go beyond the budget; from then on none are kept.
+        """Save a case's products, unless they exceed the budget; from then on none are saved.
 
-        Raises
-        ------
-        StoreError
-            Where they cannot be written.
+        Raises StoreError where they cannot be written.
         """
         self.full = self.full or packed.size > self._left
         if self.full:
@@ -103,5 +96,4 @@ class ProductStore:
 
 
 def _size(folder: Path) -> int:
-    """Bytes of the files in a folder; 0 where there is none."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder.is_dir() else 0

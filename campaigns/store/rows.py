@@ -1,11 +1,11 @@
-"""Rows as they are stored while a campaign runs and for good: one SQLite file, written by one process.
+"""Rows of a campaign, stored while it runs: one SQLite file, written by one process.
 
-The file is the campaign's memory: the Parquet table is made from it and can be made again. A row is a list of values in
-JSON; which columns they are is stored once a layout.
+The Parquet table can always be rebuilt from this file. A row is a JSON list of values; its column names are stored once
+per layout.
 
-Durability: the journal is a write-ahead log with `synchronous = FULL`, so that a transaction that was committed
-outlives a killed program, and a machine that loses its power as far as the disk keeps what it was told to. That costs
-one `fsync` a batch, some milliseconds for a second of work.
+Durability: the journal is a write-ahead log with `synchronous = FULL`. A committed transaction survives a killed
+program, and a power failure as far as the disk honours `fsync`. That costs one `fsync` per batch, some milliseconds for
+a second of work.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from typing import Any, Self
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.outcomes import UNFINISHED
-from marsyard.campaigns.store.columns import Row
+from marsyard.scenarios.interface import Scalar
 
 ROWS_FILE = "cases.sqlite"
 
-#: Version of the tables below, kept as `PRAGMA user_version`.
+#: Version of the tables below, stored as `PRAGMA user_version`.
 STORE_VERSION = 2
 
-#: Marks the file as ours (`PRAGMA application_id`): "Mars".
+#: Identifies the file type (`PRAGMA application_id`): "Mars".
 _APPLICATION = int.from_bytes(b"Mars", "big")
 
 _TABLES = f"""
@@ -50,15 +50,7 @@ COMMIT;
 
 
 def create_store(path: Path, about: Mapping[str, str]) -> None:
-    """Makes an empty store, whole or not at all.
-
-    Parameters
-    ----------
-    path
-        Where nothing may be yet.
-    about
-        What the rows belong to; see `RowStore.about`.
-    """
+    """Create an empty store, whole or not at all; `about` identifies the campaign of its rows."""
     partial = path.with_name(f"{path.name}.partial")
     try:
         partial.unlink(missing_ok=True)
@@ -74,19 +66,11 @@ def create_store(path: Path, about: Mapping[str, str]) -> None:
 
 
 class RowStore:
-    """The rows of a campaign, as a context.
+    """Rows of a campaign, as a context.
 
-    Parameters
-    ----------
-    path
-        A file made by `create_store`.
-    thorough
-        Whether every page is held against its neighbours first, as is due before more is written.
-
-    Raises
-    ------
-    StoreError
-        Where there is no such file, it is damaged, or of another version. Nothing is written to it then.
+    path: a file made by `create_store`.
+    thorough: check every page first, as required before more is written.
+    Raises StoreError where the file is missing, damaged, or of another version; nothing is written to it then.
     """
 
     def __init__(self, path: Path, *, thorough: bool = False) -> None:
@@ -101,16 +85,16 @@ class RowStore:
             self._check(thorough)
             self._connection.execute("PRAGMA journal_mode = WAL")
             self._connection.execute("PRAGMA synchronous = FULL")
-            self._layouts = dict(map(self._layout, self._connection.execute("SELECT names, layout FROM layouts")))
+            self._layouts = dict(map(self._read_layout, self._connection.execute("SELECT names, layout FROM layouts")))
             self._kinds = set(self._connection.execute("SELECT name, kind FROM kinds"))
         except BaseException as error:
             self._connection.close()
             if isinstance(error, sqlite3.Error):
-                raise self._failed(error) from error
+                raise self._store_error(error) from error
             raise
 
     def _check(self, thorough: bool) -> None:
-        """Refuses what is not ours, not of this version, or not whole."""
+        """Refuse a file of another type or version, or a damaged one."""
         (application,) = self._connection.execute("PRAGMA application_id").fetchone()
         (version,) = self._connection.execute("PRAGMA user_version").fetchone()
         if application != _APPLICATION:
@@ -122,7 +106,7 @@ class RowStore:
             if found != ["ok"]:
                 raise StoreError(f"{self._path} is damaged: {' '.join(found)}; nothing was written to it")
 
-    def _layout(self, entry: tuple[str, int]) -> tuple[tuple[str, ...], int]:
+    def _read_layout(self, entry: tuple[str, int]) -> tuple[tuple[str, ...], int]:
         """Column names and number of a layout."""
         text, layout = entry
         try:
@@ -133,11 +117,13 @@ class RowStore:
             raise StoreError(f"{self._path} is damaged: layout {layout} is not a list of column names")
         return tuple(names), layout
 
-    def _failed(self, error: sqlite3.Error) -> StoreError:
-        """What went wrong, in one sentence that says what to do."""
+    def _store_error(self, error: sqlite3.Error) -> StoreError:
+        """Error in one sentence, with advice."""
         text = str(error)
         if "full" in text:
-            return StoreError(f"{self._path}: the disk is full; the rows before that are safe: make room and resume")
+            return StoreError(
+                f"{self._path}: the disk is full; the rows before that are safe: free disk space and resume"
+            )
         if "malformed" in text or "not a database" in text:
             return StoreError(f"{self._path} is damaged: {text}; nothing was written to it")
         return StoreError(f"{self._path}: {text}")
@@ -148,22 +134,19 @@ class RowStore:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # Closing clears the log up, which may fail where writing did; the log then stays and is read the next time.
+        # closing may fail where writing did; the log then stays and is read the next time
         with suppress(sqlite3.Error):
             self._connection.close()
 
     @property
     def about(self) -> dict[str, str]:
-        """What was said of the rows when the store was made."""
+        """Identification of the rows, as given when the store was made."""
         return dict(self._ask("SELECT key, value FROM about"))
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Stores rows in one transaction; a case that has a row gets the new one.
+        """Store rows in one transaction; an existing row of a case is replaced.
 
-        Raises
-        ------
-        StoreError
-            Where that fails; then none of them is stored.
+        Raises StoreError where that fails; then none of them is stored.
         """
         try:
             self._connection.execute("BEGIN IMMEDIATE")
@@ -177,7 +160,7 @@ class RowStore:
                     self._connection.execute("ROLLBACK")
                 raise
         except sqlite3.Error as error:
-            raise self._failed(error) from error
+            raise self._store_error(error) from error
 
     def _entry(self, row: Row) -> tuple[Any, ...]:
         names = tuple(row)
@@ -194,44 +177,44 @@ class RowStore:
         return row["case"], row["outcome"], layout, json.dumps(list(row.values()))
 
     def count(self) -> int:
-        """Cases that have a row."""
+        """Number of cases that have a row."""
         (number,) = self._ask("SELECT count(*) FROM cases").fetchone()
         return int(number)
 
     def outcomes(self) -> dict[str, int]:
-        """How many cases came to each outcome."""
+        """Number of cases of each outcome."""
         return dict(self._ask("SELECT outcome, count(*) FROM cases GROUP BY outcome"))
 
     def unfinished(self) -> int:
-        """Cases that did not come to their end."""
+        """Number of unfinished cases."""
         return sum(number for outcome, number in self.outcomes().items() if outcome in UNFINISHED)
 
     def missing(self, total: int) -> list[range]:
-        """The cases below `total` that have no row."""
+        """Cases below `total` that have no row."""
         ends = [-1, *(number for (number,) in self._ask("SELECT case_number FROM cases ORDER BY 1")), total]
         return [range(before + 1, after) for before, after in pairwise(ends) if after > before + 1]
 
     def with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
-        """The cases that came to any of some outcomes."""
+        """Cases with any of some outcomes."""
         asked = sorted(outcomes)
         marks = ", ".join("?" * len(asked))
         query = f"SELECT case_number FROM cases WHERE outcome IN ({marks}) ORDER BY 1"  # noqa: S608 (marks only)
         return [number for (number,) in self._ask(query, asked)]
 
     def first_completed(self) -> int | None:
-        """The first case that came to its end; None where none did."""
+        """First finished case; None where there is none."""
         marks = ", ".join("?" * len(UNFINISHED))
         query = f"SELECT min(case_number) FROM cases WHERE outcome NOT IN ({marks})"  # noqa: S608 (marks only)
         (found,) = self._ask(query, sorted(UNFINISHED)).fetchone()
         return None if found is None else int(found)
 
     def row(self, case: int) -> Row | None:
-        """The row of a case; None where it has none."""
+        """Row of a case; None where it has none."""
         found = self._ask("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
         return None if found is None else self._decoded(self.names()[found[0]], found[1])
 
     def rows(self) -> Iterator[Row]:
-        """The rows in the order of their cases."""
+        """Rows in the order of their cases."""
         names = self.names()
         for layout, text in self._ask("SELECT layout, row FROM cases ORDER BY case_number"):
             yield self._decoded(names[layout], text)
@@ -243,26 +226,26 @@ class RowStore:
             raise StoreError(f"{self._path} is damaged: a row cannot be read: {error}") from error
 
     def names(self) -> dict[int, tuple[str, ...]]:
-        """The columns of each layout, in the order in which the layouts come with the cases."""
+        """Columns of each layout, layouts in the order of their first cases."""
         order = self._ask("SELECT layout FROM cases GROUP BY layout ORDER BY min(case_number)")
-        known = {layout: names for names, layout in self._layouts.items()}
+        names = {layout: columns for columns, layout in self._layouts.items()}
         try:
-            return {layout: known[layout] for (layout,) in order}
+            return {layout: names[layout] for (layout,) in order}
         except KeyError as error:
             raise StoreError(f"{self._path} is damaged: rows have the unknown layout {error}") from error
 
     def kinds(self) -> dict[str, set[str]]:
-        """What each column holds: any of `bool`, `int`, `big` (beyond 64 bits), `float`, `str`."""
+        """Types of each column's values: any of `bool`, `int`, `big` (beyond 64 bits), `float`, `str`."""
         found: dict[str, set[str]] = {}
         for name, kind in self._kinds:
             found.setdefault(name, set()).add(kind)
         return found
 
     def chunks(self, size: int) -> Iterator[list[tuple[int, list[Any]]]]:
-        """Layouts and values of all rows in the order of their cases, so many at a time."""
+        """Layouts and values of all rows in the order of their cases, `size` at a time."""
         cursor = self._ask("SELECT layout, row FROM cases ORDER BY case_number")
         while found := cursor.fetchmany(size):
-            # one text for all: half the time of reading them one by one
+            # parsing one text takes half the time of parsing each row
             try:
                 values = json.loads(f"[{','.join(text for _, text in found)}]")
             except (ValueError, TypeError) as error:
@@ -273,11 +256,11 @@ class RowStore:
         try:
             return self._connection.execute(query, values)
         except sqlite3.Error as error:
-            raise self._failed(error) from error
+            raise self._store_error(error) from error
 
 
 def is_empty_store(path: Path) -> bool:
-    """Whether a file is a store without rows; False where it is damaged, or none."""
+    """Whether a file is a store without rows; False where it is damaged, or no store."""
     try:
         with readable_store(path) as store:
             return store.count() == 0
@@ -287,10 +270,10 @@ def is_empty_store(path: Path) -> bool:
 
 @contextmanager
 def readable_store(path: Path) -> Iterator[RowStore]:
-    """The rows of a campaign, to be read only: of a folder that cannot be written to, a temporary copy.
+    """Rows of a campaign for reading; of a folder that cannot be written to, a temporary copy.
 
-    SQLite needs files of its own next to the log even where it only reads. Raises StoreError as `RowStore` does, and
-    where the copy cannot be made.
+    SQLite needs files of its own next to the log even for reading. Raises StoreError as `RowStore` does, and where the
+    copy cannot be made.
     """
     if all(os.access(one, os.W_OK, effective_ids=True) for one in (path, path.parent)):
         with RowStore(path) as store:
@@ -308,8 +291,16 @@ def readable_store(path: Path) -> Iterator[RowStore]:
 
 
 def kind_of(value: Any) -> str:
-    """What a value is, in the words of `RowStore.kinds`."""
+    """Type of a value, in the words of `RowStore.kinds`."""
     kind = type(value)
     if kind is int and not -(2**63) <= value < 2**63:
         return "big"
     return kind.__name__
+
+
+#: One case as stored.
+Row = Mapping[str, Scalar]
+
+#: Columns that the engine writes, before and behind those of the scenario.
+LEADING_COLUMNS = ("case", "outcome", "answered")
+TRAILING_COLUMNS = ("wall_time_s", "cpu_time_s", "error", "traceback")

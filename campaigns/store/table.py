@@ -1,4 +1,4 @@
-"""The Parquet table of a campaign: made from its store row group by row group, so that memory stays small."""
+"""Parquet table of a campaign, written from its store in row groups to limit memory; and its worst cases."""
 
 from __future__ import annotations
 
@@ -10,22 +10,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store.columns import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.campaigns.store.record import stored_configuration
-from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, readable_store
+from marsyard.campaigns.store.rows import LEADING_COLUMNS, ROWS_FILE, TRAILING_COLUMNS, Row, RowStore, readable_store
 
 TABLE_FILE = "cases.parquet"
 
-#: Rows of a row group.
+#: Number of rows in a row group.
 _GROUP = 50_000
 
 
-def columns_of(layouts: Iterable[Sequence[str]], measures: Sequence[str] = ()) -> list[str]:
-    """Every column in any layout: the engine's first and last, the scenario's between them as they first appear.
-
-    `measures` are columns that there must be in any event.
-    """
+def _all_columns(layouts: Iterable[Sequence[str]], measures: Sequence[str] = ()) -> list[str]:
+    """Columns of all layouts and of `measures`: the engine's first and last, the scenario's between them in order."""
     found = dict.fromkeys(name for names in layouts for name in names)
     found.update(dict.fromkeys(measures))
     own = [name for name in found if name not in LEADING_COLUMNS and name not in TRAILING_COLUMNS]
@@ -33,32 +32,23 @@ def columns_of(layouts: Iterable[Sequence[str]], measures: Sequence[str] = ()) -
 
 
 def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> None:
-    """Writes the rows of a store as a Parquet table in the order of the cases, whole or not at all.
+    """Write the rows of a store as a Parquet table in the order of the cases, whole or not at all.
 
-    A number that a row lacks is NaN, anything else that it lacks is null.
-
-    Parameters
-    ----------
-    path
-        Where to.
-    store
-        The rows.
-    measures
-        Columns of numbers that the table must have even where no row does.
+    A missing number is NaN, any other missing value null. `measures` are columns of numbers that the table always has.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     layouts = store.names()
-    columns = columns_of(layouts.values(), measures)
+    columns = _all_columns(layouts.values(), measures)
     kinds = store.kinds()
     forms = {name: _form(kinds.get(name, set())) for name in columns}
     schema = pa.schema([(name, form[0]) for name, form in forms.items()])
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
-        with pq.ParquetWriter(partial, schema) as writer, _no_search_for_garbage():
+        with pq.ParquetWriter(partial, schema) as writer, _garbage_collection_paused():
             for chunk in store.chunks(_GROUP):
-                pairs = zip(_columns(chunk, layouts, columns), forms.values(), strict=True)
+                pairs = zip(_chunk_columns(chunk, layouts, columns), forms.values(), strict=True)
                 arrays = [_array(values, *form) for values, form in pairs]
                 writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=_GROUP)
         with partial.open("rb") as file:
@@ -71,7 +61,7 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
         raise StoreError(f"{path} cannot be made, as {ROWS_FILE} is damaged: a row cannot be read: {error}") from error
 
 
-def _columns(
+def _chunk_columns(
     chunk: Sequence[tuple[int, list[Any]]], layouts: Mapping[int, Sequence[str]], columns: Sequence[str]
 ) -> Iterator[Sequence[Any]]:
     """The values of each column in a chunk of rows; None where a row lacks it."""
@@ -95,8 +85,8 @@ def _columns(
 
 
 @contextmanager
-def _no_search_for_garbage() -> Iterator[None]:
-    """Rows do not refer to themselves, and looking through millions for some that do takes as long as reading them."""
+def _garbage_collection_paused() -> Iterator[None]:
+    """Pause garbage collection, which takes as long as reading millions of rows, none with cyclic references."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -107,7 +97,6 @@ def _no_search_for_garbage() -> Iterator[None]:
 
 
 def _array(values: Sequence[Any], type_: Any, convert: Callable[[Any], Any] | None) -> Any:
-    """A column; numbers that are missing are NaN."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -116,7 +105,7 @@ def _array(values: Sequence[Any], type_: Any, convert: Callable[[Any], Any] | No
 
 
 def _form(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
-    """The narrowest type that holds all of a column's values, and what brings them to it."""
+    """Narrowest Arrow type that holds all values of a column, and the conversion to it."""
     import pyarrow as pa
 
     if kinds == {"bool"}:
@@ -139,12 +128,9 @@ def _text(value: Any) -> str | None:
 
 
 def read_rows(path: Path, case: int | None = None) -> list[dict[str, Any]]:
-    """The rows of a Parquet table, without what they lack; of all cases, or of one.
+    """Rows of a Parquet table without missing values; of all cases, or of one.
 
-    Raises
-    ------
-    StoreError
-        Where there is no such table.
+    Raises StoreError where there is no such table.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -158,12 +144,9 @@ def read_rows(path: Path, case: int | None = None) -> list[dict[str, Any]]:
 
 
 def refresh_table(directory: Path) -> None:
-    """Makes the table of a campaign that is not finished from the rows that it has so far.
+    """Write the table of an unfinished campaign from its rows so far.
 
-    Raises
-    ------
-    StoreError
-        Where it has no store that can be read, or the table cannot be written.
+    Raises StoreError where its store cannot be read, or the table cannot be written.
     """
     if not (directory / ROWS_FILE).exists() and (directory / TABLE_FILE).exists():
         return  # of an earlier version, which wrote the table when it was interrupted
@@ -173,9 +156,38 @@ def refresh_table(directory: Path) -> None:
 
 
 def stored_row(directory: Path, case: int) -> Row | None:
-    """The row of a case of a stored campaign; None where it has none."""
+    """Row of a case of a stored campaign; None where it has none."""
     if (directory / ROWS_FILE).is_file():
         with readable_store(directory / ROWS_FILE) as store:
             return store.row(case)
     table = directory / TABLE_FILE
     return next(iter(read_rows(table, case)), None) if table.exists() else None
+
+
+def showcase_case(configuration: CampaignConfiguration, table: Path, store: RowStore) -> int | None:
+    """Case whose products are kept for the report; None where none is requested or finished."""
+    if configuration.retain.showcase == "none":
+        return None
+    worst = _ranked(configuration, table, 1) if configuration.retain.showcase == "worst" else []
+    return worst[0] if worst else store.first_completed()
+
+
+def worst_cases(configuration: CampaignConfiguration, table: Path) -> list[int]:
+    """Answered cases with the largest metrics, the worst first, as many as `retain.worst`."""
+    return _ranked(configuration, table, configuration.retain.worst)
+
+
+def _ranked(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:
+    """First `number` answered cases by the magnitude of the first requirement's metric that is a single column."""
+    # a sum of columns is a sum of times, which does not rank cases
+    single = (one for one in configuration.requirements if one.bound is not None and len(one.metric_columns) == 1)
+    metric = next((asked.metric for asked in single), None)
+    if metric is None:
+        return []
+    import pyarrow.parquet as pq
+
+    rows = pq.read_table(table, columns=["case", "answered", metric])
+    sizes = np.abs(np.asarray(rows[metric].to_numpy(), dtype=np.float64))
+    sizes = np.where(np.asarray(rows["answered"].to_numpy(), dtype=np.bool_), sizes, np.nan)
+    order = np.argsort(-sizes, kind="stable")[:number]
+    return [int(rows["case"][int(index)].as_py()) for index in order if not np.isnan(sizes[index])]

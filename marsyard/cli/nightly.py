@@ -38,8 +38,7 @@ def nightly(
     Exit status: as of the campaigns, the worst; 1 also for a regression, or a campaign that could not be run.
     """
     from marsyard.campaigns.errors import writing
-    from marsyard.campaigns.store.lock import folder_lock
-    from marsyard.campaigns.store.record import git_commit
+    from marsyard.campaigns.store.record import folder_lock, git_commit
     from marsyard.cli.nightly_plan import PLAN_FILE, read_plan
     from marsyard.cli.progress import campaign_progress
     from marsyard.reports.history import FINISHED, INTERRUPTED, History

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from marsyard.campaigns.errors import StoreError, writing
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.lock import is_locked
+from marsyard.campaigns.store.record import is_locked
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table
 from marsyard.cli.campaign import Exit
 

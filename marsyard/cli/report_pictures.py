@@ -16,9 +16,8 @@ def keep_notable_cases(directory: Path, say: Callable[[str], None]) -> None:
     CampaignError
         Where the campaign's scenario or an algorithm cannot be imported.
     """
-    from marsyard.campaigns.execution.workers import LocalWorkers
-    from marsyard.campaigns.running.replay import replay_with
-    from marsyard.campaigns.running.stored import loaded_campaign
+    from marsyard.campaigns.execution.workers import LocalExecutor
+    from marsyard.campaigns.running.replay import loaded_campaign, replay_with
     from marsyard.campaigns.store.products import save_packed
     from marsyard.campaigns.store.record import stored_configuration
     from marsyard.campaigns.store.retention import case_directory
@@ -32,7 +31,7 @@ def keep_notable_cases(directory: Path, say: Callable[[str], None]) -> None:
         return
     configuration = stored_configuration(directory)
     loaded_campaign(directory, configuration)
-    with LocalWorkers(1) as workers:
+    with LocalExecutor(1) as workers:
         for case in lacking:
             replayed = replay_with(workers, configuration, case, stored_row(directory, case))
             if replayed.products is None or replayed.failed:

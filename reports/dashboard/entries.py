@@ -1,4 +1,4 @@
-"""Stored campaigns as the dashboard lists them: read from their records and the twins of their reports."""
+"""Contents of the dashboard: stored campaigns, from their records and report data, and a table row per requirement."""
 
 from __future__ import annotations
 
@@ -11,19 +11,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from marsyard.campaigns.definition.requirements import StatedRequirement
 from marsyard.campaigns.errors import CampaignError
 from marsyard.reports.campaign import SCHEMA, TWIN_FILE, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.traceability import Algorithm, algorithms_of, judged_text
+from marsyard.reports.verdicts import ESTIMATE
+from marsyard.reports.wording import NOTHING, percent
 from marsyard.scenarios.systems import system_of
 
-#: How deep below a folder campaigns are looked for.
+#: Maximum depth of campaigns below a folder.
 _DEPTH = 3
 
 
 @dataclass(frozen=True)
-class Shown:
-    """One requirement as a campaign shows it."""
+class ShownRequirement:
+    """Verdict of a campaign on one requirement."""
 
     requirement: str
     statement: str
@@ -41,22 +44,11 @@ class Shown:
 
 @dataclass(frozen=True)
 class Entry:
-    """A stored campaign.
+    """A stored campaign, from its record and its report; empty fields where these state nothing.
 
-    Attributes
-    ----------
-    slug
-        Its folder's name in the site: letters, digits, dots and hyphens, told apart by a hash of where it was.
-    directory
-        Where it is stored.
-    name, system, sites, algorithms, commit, started, state, cases, crashed, verdict, sentence
-        As its record and its report have it; empty where they do not say.
-    tested
-        The algorithms under test with their versions, options and sources, the judged one first.
-    shown
-        What it shows of each requirement.
-    kept, worst
-        Cases whose products are kept, and those with the largest errors.
+    slug: its folder's name in the site: letters, digits, dots and hyphens, with a hash of its path.
+    tested: algorithms under test with versions, options and sources, the judged one first.
+    kept, worst: cases with kept products, and those with the largest errors.
     """
 
     slug: str
@@ -73,24 +65,24 @@ class Entry:
     crashed: int
     verdict: str
     sentence: str
-    shown: tuple[Shown, ...]
+    shown: tuple[ShownRequirement, ...]
     kept: tuple[int, ...]
     worst: tuple[str, ...]
     outcomes: Mapping[str, int]
 
     @property
     def judged(self) -> str:
-        """Names and versions of the algorithms that are judged; as the rows name them where the record does not."""
+        """Names and versions of the judged algorithms; names from the rows where the record states none."""
         return judged_text(self.tested) or ", ".join(self.algorithms)
 
     @property
     def finished(self) -> bool:
-        """Whether it came to its end: what is interrupted shows but a part."""
+        """Whether all cases have run."""
         return self.state == "finished"
 
 
 def find_campaigns(directories: Sequence[Path]) -> list[Path]:
-    """The campaigns in folders: those that are one, and those below them, each once, in order of their paths."""
+    """Campaigns in or below folders, each once, ordered by path."""
     found: dict[Path, Path] = {}
     for directory in directories:
         for one in _below(directory, _DEPTH):
@@ -108,9 +100,9 @@ def _below(directory: Path, depth: int) -> Iterator[Path]:
 
 
 def read_entries(paths: Iterable[Path]) -> tuple[list[Entry], list[str]]:
-    """The campaigns, the latest first, and what is wrong with those that cannot be shown.
+    """Campaigns, the latest first, and the problems of those that cannot be shown.
 
-    A report that is missing, older than the rows, or of another layout is written anew.
+    A report that is missing, older than the rows, or of another schema is written again.
     """
     entries, problems = [], []
     for path in paths:
@@ -160,8 +152,8 @@ def _entry(path: Path, twin: Mapping[str, Any]) -> Entry:
     )
 
 
-def _shown(verdict: Mapping[str, Any]) -> Shown:
-    return Shown(
+def _shown(verdict: Mapping[str, Any]) -> ShownRequirement:
+    return ShownRequirement(
         requirement=str(verdict.get("requirement_id") or "?"),
         statement=str(verdict.get("statement") or ""),
         status=str(verdict.get("status") or ""),
@@ -178,20 +170,20 @@ def _shown(verdict: Mapping[str, Any]) -> Shown:
 
 
 def slug_of(path: Path, name: str) -> str:
-    """A folder's name that no other campaign has and that cannot lead out of the site."""
+    """Folder name that is unique and cannot lead out of the site."""
     plain = re.sub(r"[^A-Za-z0-9-]+", "-", name)[:60].strip("-") or "campaign"
     return f"{plain}-{hashlib.sha256(str(path.resolve()).encode('utf-8', 'replace')).hexdigest()[:10]}"
 
 
 def _named(twin: Mapping[str, Any], key: str, parameters: Mapping[str, Any], stated: str) -> tuple[str, ...]:
-    """What the rows name, or the parameters where the rows name none."""
+    """Names in the rows, or that of the parameters where the rows have none."""
     found = tuple(str(one) for one in twin.get(key) or () if str(one))
     one = _first(parameters, stated)
     return found or ((one,) if one else ())
 
 
 def _first(parameters: Mapping[str, Any], key: str) -> str:
-    """The first text found under a key at any depth of nested tables; empty where there is none."""
+    """First text under a key at any depth of nested tables; empty where there is none."""
     for name, value in parameters.items():
         if name == key and isinstance(value, str):
             return value
@@ -203,3 +195,122 @@ def _first(parameters: Mapping[str, Any], key: str) -> str:
 
 def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+
+
+#: Maximum number of further campaigns next to a requirement's verdict.
+MAX_FURTHER_VERDICTS = 7
+#: Maximum number of campaigns in a sparkline, and its size in pixels.
+_TREND, _WIDTH, _HEIGHT = 24, 120.0, 26.0
+
+
+@dataclass(frozen=True)
+class Sparkline:
+    """Observed rates over time, oldest first: points of the line, the last of them, and the height of the required
+    rate.
+    """
+
+    points: str
+    last: tuple[float, float]
+    asked: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Verdict of a campaign on a requirement."""
+
+    entry: Entry
+    shown: ShownRequirement
+
+
+@dataclass(frozen=True)
+class RequirementRow:
+    """A requirement, the latest verdict of each campaign, and the trend of the campaign that was judged last.
+
+    `all_cells` are the verdicts of all campaigns, the latest first, unfinished campaigns last; `cells` the latest
+    verdict of each campaign name.
+    """
+
+    requirement: str
+    statement: str
+    kind: str
+    source: str
+    cells: Sequence[Cell]
+    all_cells: Sequence[Cell]
+    trend: Sparkline | None
+
+    @property
+    def latest(self) -> Cell | None:
+        """Verdict of the latest campaign, a finished one where there is any."""
+        return self.cells[0] if self.cells else None
+
+
+def requirement_rows(entries: Sequence[Entry], stated: Mapping[str, StatedRequirement]) -> list[RequirementRow]:
+    """A row for every requirement that is stated or that a campaign verifies; the stated ones first."""
+    cells: dict[str, list[Cell]] = {name: [] for name in stated}
+    for entry in entries:
+        for shown in entry.shown:
+            cells.setdefault(shown.requirement, []).append(Cell(entry, shown))
+    return [_row(name, found, stated.get(name)) for name, found in cells.items()]
+
+
+def _row(name: str, listed: Sequence[Cell], stated: StatedRequirement | None) -> RequirementRow:
+    found = sorted(listed, key=lambda cell: not cell.entry.finished)
+    latest: dict[str, Cell] = {}
+    for cell in found:
+        latest.setdefault(cell.entry.name, cell)
+    cells = list(latest.values())
+    same = [cell for cell in found if cell.entry.name == cells[0].entry.name and cell.entry.finished]
+    return RequirementRow(
+        requirement=name,
+        statement=stated.statement if stated else (cells[0].shown.statement if cells else ""),
+        kind=(stated.kind or "") if stated else "",
+        source=stated.source if stated else "",
+        cells=cells,
+        all_cells=found,
+        trend=sparkline([cell.shown for cell in reversed(same)]),
+    )
+
+
+def sparkline(shown: Sequence[ShownRequirement]) -> Sparkline | None:
+    """Observed rates over time against the required rate; None for fewer than two campaigns."""
+    known = [one for one in shown if math.isfinite(one.estimate) and math.isfinite(one.probability)][-_TREND:]
+    if len(known) < 2:
+        return None
+    rates = [one.estimate for one in known]
+    low = min(*rates, *(one.probability for one in known))
+    low -= 0.15 * (1.0 - low) + 1e-9
+    step = (_WIDTH - 8.0) / (len(known) - 1)
+
+    def height(rate: float) -> float:
+        return round(3.0 + (_HEIGHT - 6.0) * (1.0 - rate) / (1.0 - low), 2)
+
+    places = [(round(4.0 + step * k, 2), height(rate)) for k, rate in enumerate(rates)]
+    text = f"{len(known)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
+    return Sparkline(" ".join(f"{x},{y}" for x, y in places), places[-1], height(known[-1].probability), text)
+
+
+def coverage(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
+    """Number of requirements of each latest verdict, those without a campaign last."""
+    words = [row.latest.shown.status for row in rows if row.latest is not None]
+    known = [word for word in dict.fromkeys(("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS", *words)) if word in words]
+    found = [(word, words.count(word)) for word in known]
+    missing = sum(row.latest is None for row in rows)
+    return [*found, ("NO CAMPAIGN", missing)] if missing else found
+
+
+def evidence_text(shown: ShownRequirement) -> str:
+    """Cases behind a verdict."""
+    return f"{shown.failures:,} of {shown.n:,} failed" if shown.n else "no case yet"
+
+
+def basis_text(shown: ShownRequirement) -> str:
+    """Basis of a verdict without a confidence; empty otherwise."""
+    return "decided by rate" if shown.decide_by == ESTIMATE else ""
+
+
+def margin_text(shown: ShownRequirement) -> str:
+    """Margin of the deciding value above or below the required rate, in percentage points."""
+    if math.isnan(shown.margin):
+        return NOTHING
+    return f"{100.0 * shown.margin:+.2f} pp".replace("-", "−")

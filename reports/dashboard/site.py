@@ -1,8 +1,7 @@
-"""Writes the dashboard: an index of requirements and campaigns, a page for each campaign and for each kept case.
+"""Static site of the dashboard: an index of requirements and campaigns, and a page for each campaign and kept case.
 
-Every page stands in the site's folder and needs nothing outside of it; a campaign's report is linked or copied in.
-Pages of campaigns and cases that have not changed are left as they are, so that renewing the site over a thousand
-campaigns takes no longer than what is new.
+All pages lie in the site's folder and need nothing outside of it; reports of campaigns are linked or copied into it.
+Pages of unchanged campaigns are not rewritten, so the cost of an update depends on the new campaigns only.
 """
 
 from __future__ import annotations
@@ -18,14 +17,16 @@ from typing import Any
 from marsyard.campaigns.definition.requirements import StatedRequirement, shipped_requirements
 from marsyard.reports.campaign import PAGE_FILE, VERIFICATION_FILE, page_environment, write_whole
 from marsyard.reports.cases import shown_case
-from marsyard.reports.dashboard.entries import Entry, find_campaigns, read_entries
-from marsyard.reports.dashboard.rows import (
-    MOST_BESIDE,
+from marsyard.reports.dashboard.entries import (
+    MAX_FURTHER_VERDICTS,
+    Entry,
     RequirementRow,
     basis_text,
     coverage,
     evidence_text,
+    find_campaigns,
     margin_text,
+    read_entries,
     requirement_rows,
 )
 from marsyard.reports.sections import embedded, replay_command, script_hash
@@ -33,14 +34,14 @@ from marsyard.reports.stored import read_run
 from marsyard.reports.wording import percent
 
 INDEX = "index.html"
-#: Kept cases of a campaign that get a page.
-_MOST_CASES = 24
+#: Maximum number of kept cases of a campaign with a page.
+_MAX_CASES = 24
 _TEMPLATES = Path(__file__).parents[1] / "templates"
 
 
 @dataclass(frozen=True)
 class Site:
-    """What was written: the index, how many campaigns it lists, and what is wrong with those that it does not."""
+    """Result of writing: the index, the number of campaigns, and the problems of those left out."""
 
     index: Path
     campaigns: int
@@ -48,16 +49,9 @@ class Site:
 
 
 def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, StatedRequirement] | None = None) -> Site:
-    """Writes the dashboard over all campaigns found in some folders.
+    """Write the dashboard of all campaigns in or below the folders `sources`.
 
-    Parameters
-    ----------
-    directory
-        The site's folder.
-    sources
-        Folders of campaigns, or folders that hold such.
-    stated
-        Requirements that are to be shown, by id; those that ship by default.
+    `stated` are the requirements to be shown, by id; the shipped ones by default.
     """
     entries, problems = read_entries(find_campaigns(sources))
     rows = requirement_rows(entries, shipped_requirements() if stated is None else stated)
@@ -74,7 +68,7 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
         margin=margin_text,
         basis=basis_text,
         evidence=evidence_text,
-        most=MOST_BESIDE,
+        most=MAX_FURTHER_VERDICTS,
         coverage=coverage(rows),
         percent=percent,
         data=embedded(_data(rows)),
@@ -87,14 +81,14 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
 
 
 def _write_campaign(folder: Path, entry: Entry) -> None:
-    """A campaign's page, its report beside it, and pages of its kept cases."""
+    """Write a campaign's page, its report, and pages of its kept cases."""
     page, report = folder / INDEX, entry.directory / PAGE_FILE
     source = entry.directory / "report.json"
     if page.is_file() and page.stat().st_mtime > source.stat().st_mtime:
         return
     folder.mkdir(parents=True, exist_ok=True)
     if report.is_file():
-        _place(report, folder / PAGE_FILE)
+        _link_or_copy(report, folder / PAGE_FILE)
     cases = _write_cases(folder, entry)
     shown = {"margin": margin_text, "basis": basis_text, "evidence": evidence_text, "percent": percent}
     text = _rendered("dashboard_campaign.html.j2", entry=entry, cases=cases, **shown)
@@ -102,13 +96,13 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
 
 
 def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
-    """Pages of the kept cases that can be drawn; what the campaign's page says of each."""
+    """Write pages of the kept cases; return their entries for the campaign's page."""
     if not entry.kept:
         return []
-    run, told = read_run(entry.directory), []
-    # the worst first: two clicks from a requirement lead to its pictures
-    kept = sorted(entry.kept, key=lambda case: _place_among_worst(entry, case))
-    for case in kept[:_MOST_CASES]:
+    run, listed = read_run(entry.directory), []
+    # the worst first
+    kept = sorted(entry.kept, key=lambda case: _rank_among_worst(entry, case))
+    for case in kept[:_MAX_CASES]:
         shown = shown_case(run, case)
         if shown is None:
             continue
@@ -117,19 +111,19 @@ def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
         command = replay_command(run, str(case))
         text = _rendered("dashboard_case.html.j2", entry=entry, shown=shown, values=values, command=command)
         write_whole(folder / f"case-{case}.html", text)
-        place = _place_among_worst(entry, case)
+        place = _rank_among_worst(entry, case)
         rank = "" if place == len(entry.worst) else ("the largest error" if place == 0 else "among the largest errors")
-        told.append({"case": str(case), "outcome": shown.outcome, "file": f"case-{case}.html", "rank": rank})
-    return told
+        listed.append({"case": str(case), "outcome": shown.outcome, "file": f"case-{case}.html", "rank": rank})
+    return listed
 
 
-def _place_among_worst(entry: Entry, case: int) -> int:
-    """Where a case stands among those of the largest errors; behind all of them where it is none."""
+def _rank_among_worst(entry: Entry, case: int) -> int:
+    """Index of a case among those of the largest errors; their number where it is none of them."""
     return entry.worst.index(str(case)) if str(case) in entry.worst else len(entry.worst)
 
 
-def _place(source: Path, target: Path) -> None:
-    """Has a file in the site: the same one where the disk allows that, or a copy."""
+def _link_or_copy(source: Path, target: Path) -> None:
+    """Hard-link a file into the site, or copy it where the disk does not allow links."""
     partial = target.with_name(f"{target.name}.partial")
     partial.unlink(missing_ok=True)
     try:
@@ -140,7 +134,7 @@ def _place(source: Path, target: Path) -> None:
 
 
 def _filters(entries: Sequence[Entry]) -> list[tuple[str, str, list[str]]]:
-    """What can be filtered by: attribute, name, and the values there are."""
+    """Attribute, name and values of each filter."""
     found: dict[str, set[str]] = {
         "System": {entry.system for entry in entries},
         "Site": {site for entry in entries for site in entry.sites},
@@ -151,7 +145,7 @@ def _filters(entries: Sequence[Entry]) -> list[tuple[str, str, list[str]]]:
 
 
 def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
-    """What the page's script needs to find the latest verdict among the campaigns that a filter leaves."""
+    """Data with which the page's script finds the latest verdict among the filtered campaigns."""
     return {
         row.requirement: [
             {
@@ -175,7 +169,7 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
 
 
 def _matrix(rows: Sequence[RequirementRow]) -> str:
-    """The traceability matrix of all: the latest of each campaign, and a row for what none shows."""
+    """Traceability matrix as CSV: the latest verdict of each campaign, also requirements without a campaign."""
     from marsyard.reports.traceability import algorithm_cells, verification_csv
 
     found: list[dict[str, Any]] = []

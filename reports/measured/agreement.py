@@ -1,4 +1,4 @@
-"""Real cases: how their pictures agree with the measured poses, and answers with what else was measured."""
+"""Real cases: agreement of their pictures with the measured poses, and of the answers with other measurements."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from marsyard.reports.svg import MARKERS, SERIES, in_page_style, new_axes
 from marsyard.reports.wording import NOTHING, number
 
 MEDIAN, MOST = "residual_median_px", "residual_90_percent_px"
-#: Rows of the table; further cases are counted.
-_MOST_ROWS = 60
-#: Cases from which on a figure tells more than the table.
-_LEAST_DRAWN = 3
+#: Maximum number of rows of the table; further cases are counted.
+_MAX_ROWS = 60
+#: Minimum number of cases for a figure.
+_MIN_DRAWN = 3
 #: Further columns of the table where the rows have them.
 _QUANTITIES = (
     "matches", "matches_wrong_share", MEDIAN, MOST, "residual_worst_pair_px", "turned_most_deg", "moved_most_m",
@@ -32,26 +32,27 @@ _TEXT = (
     "are what matching alone leaves, more is the poses' or the camera's."
 )
 _INERTIAL = (
-    "Velocities beside the inertial one hold its own constant error; the discrepancy of pairs, the change of velocity "
-    "from the first pair of pictures to the second against the inertial one, does not. Without measured positions the "
+    "Velocities compared with the inertial one contain its constant error; the discrepancy of pairs, the change of "
+    "velocity from the first pair of pictures to the second against the inertial one, does not. Without measured "
+    "positions the "
     "residual is that of the answer: its velocity stands for the inertial one's constant part. "
 )
 _NO_DRAWS = "Cases that were measured are no random draws: nothing here is a probability."
 
 
 def agreement_section(subject: Subject) -> Section | None:
-    """The section; None where the cases are not real ones."""
+    """Section on the agreement; None where cases are not real ones."""
     frame = subject.frame
     if "measured_case" not in frame or MEDIAN not in frame:
         return None
     names = [name for name in _columns(frame) if np.isfinite(numbers(frame, name)).any()]
     head = ["Case", "Name", "Outcome", *(label(name) for name in names)]
-    rows = [_row(frame, place, names) for place in range(min(len(frame), _MOST_ROWS))]
+    rows = [_row(frame, place, names) for place in range(min(len(frame), _MAX_ROWS))]
     plates = []
-    if np.count_nonzero(np.isfinite(numbers(frame, MEDIAN))) >= _LEAST_DRAWN:
+    if np.count_nonzero(np.isfinite(numbers(frame, MEDIAN))) >= _MIN_DRAWN:
         plates.append(plate(residual_figure(frame), "agreement", "Residuals of the cases, the smallest median first."))
     note = (_INERTIAL if "beside_inertial_m_s" in names else "") + _NO_DRAWS
-    grid = Grid(head, rows, max(0, len(frame) - _MOST_ROWS))
+    grid = Grid(head, rows, max(0, len(frame) - _MAX_ROWS))
     medians = numbers(frame, MEDIAN)
     data = {
         "cases": len(frame),
@@ -65,7 +66,7 @@ def agreement_section(subject: Subject) -> Section | None:
 
 @in_page_style
 def residual_figure(frame: pd.DataFrame) -> Figure:
-    """Median and 90 % residual of each case, in the order of the medians."""
+    """Median and 90 % residual of each case, ordered by the median."""
     medians, most = numbers(frame, MEDIAN), numbers(frame, MOST)
     known = np.flatnonzero(np.isfinite(medians))
     order = known[np.argsort(medians[known], kind="stable")]
@@ -81,7 +82,7 @@ def residual_figure(frame: pd.DataFrame) -> Figure:
 
 
 def _columns(frame: pd.DataFrame) -> Sequence[str]:
-    """Quantities in their order, and how far further algorithms are from the first."""
+    """Quantities in their order, then the distances of further algorithms from the first."""
     return [*(name for name in _QUANTITIES if name in frame), *(str(name) for name in frame if _is_apart(str(name)))]
 
 
@@ -91,6 +92,6 @@ def _is_apart(name: str) -> bool:
 
 def _row(frame: pd.DataFrame, place: int, names: Sequence[str]) -> list[str]:
     values = [float(numbers(frame.iloc[[place]], name)[0]) for name in names]
-    told = [NOTHING if not np.isfinite(one) else f"{one:.0f}" if one.is_integer() else number(one) for one in values]
+    texts = [NOTHING if not np.isfinite(one) else f"{one:.0f}" if one.is_integer() else number(one) for one in values]
     case = str(frame["case"].iloc[place]) if "case" in frame else str(place)
-    return [case, str(frame["measured_case"].iloc[place]), str(frame["outcome"].iloc[place]), *told]
+    return [case, str(frame["measured_case"].iloc[place]), str(frame["outcome"].iloc[place]), *texts]

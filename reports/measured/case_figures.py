@@ -1,4 +1,4 @@
-"""Pictures of a real case with the features matched between them, and where the measured poses put those."""
+"""Pictures of a real case with matched features, and their offsets from the measured poses."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from marsyard.reports.presentation import numbers, plane, save_figures
 from marsyard.reports.svg import MUTED, in_page_style, show_picture
 from marsyard.reports.wording import number
 
-#: Residuals are coloured from none to so many pixels.
-_REDDEST_PX = 3.0
+#: Upper end of the colour scale of residuals.
+_MAX_COLOUR_PX = 3.0
 _COLOURS = "plasma"
 _WRONG = "#c9d1d9"
-#: Pictures of a case, at most.
+#: Numbers of a case's pictures.
 _PICTURES = range(1, 100)
 
 
@@ -28,18 +28,11 @@ _PICTURES = range(1, 100)
 class MatchedPair:
     """Two pictures and the features matched between them.
 
-    Attributes
-    ----------
-    number
-        Of the earlier picture, from 1.
-    pictures
-        The two, counts.
-    pixels
-        (u, v) of each match in both, shape (n, 2, 2).
-    offsets
-        From where the poses put it to where it is in the later picture, pixels.
-    right
-        Whether some rigid motion explains it.
+    number: of the earlier picture, from 1.
+    pictures: both pictures, counts.
+    pixels: (u, v) of each match in both.
+    offsets: position in the later picture minus the position by the poses, pixels.
+    right: whether a rigid motion explains the match.
     """
 
     number: int
@@ -55,15 +48,15 @@ class MatchedPair:
         return np.asarray(np.where(np.isfinite(lengths), lengths, np.inf))
 
     @property
-    def told(self) -> str:
-        """The pair in words."""
+    def caption(self) -> str:
+        """Caption of the pair."""
         residuals = self.residuals_px
-        said = f", median residual {number(float(np.median(residuals)))} px" if residuals.size else ""
-        return f"Pictures {self.number} and {self.number + 1}: {residuals.size:,} matches{said}"
+        median = f", median residual {number(float(np.median(residuals)))} px" if residuals.size else ""
+        return f"Pictures {self.number} and {self.number + 1}: {residuals.size:,} matches{median}"
 
 
 def matched_pairs(products: Mapping[str, Any]) -> list[MatchedPair]:
-    """The pairs of a case, those that the products hold in a form that can be read."""
+    """Readable pairs of a case's products."""
     found = (_pair(products, place) for place in _PICTURES if f"matches_{place}" in products)
     return [pair for pair in found if pair is not None]
 
@@ -83,7 +76,7 @@ def is_measured_case(products: Mapping[str, Any]) -> bool:
 
 @in_page_style
 def draw_pair(pair: MatchedPair) -> Figure:
-    """Both pictures with the matches, coloured by their residuals, and the offsets."""
+    """Draw both pictures with the matches, coloured by their residuals, and the offsets."""
     figure = Figure(figsize=(12.0, 5.2), layout="constrained")
     left, right, scatter = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 0.8))
     lengths = np.hypot(*pair.offsets[pair.right].T)
@@ -92,7 +85,7 @@ def draw_pair(pair: MatchedPair) -> Figure:
         wrong, good = pair.pixels[~pair.right, side], pair.pixels[pair.right, side]
         axes.plot(*wrong.T, "x", markersize=4.0, color=_WRONG, markeredgewidth=0.8)
         drawn = axes.scatter(
-            good[:, 0], good[:, 1], c=lengths, s=12.0, cmap=_COLOURS, vmin=0.0, vmax=_REDDEST_PX, linewidths=0.0
+            good[:, 0], good[:, 1], c=lengths, s=12.0, cmap=_COLOURS, vmin=0.0, vmax=_MAX_COLOUR_PX, linewidths=0.0
         )
         axes.set_title(f"Picture {pair.number + side}", fontsize=9)
     figure.colorbar(
@@ -103,12 +96,12 @@ def draw_pair(pair: MatchedPair) -> Figure:
 
 
 def _draw_offsets(axes: Axes, pair: MatchedPair, lengths: Float[np.ndarray, " k"]) -> None:
-    """Offsets as seen in the later picture; those beyond the axes are counted."""
+    """Draw offsets in the later picture; those beyond the axes are counted."""
     finite = lengths[np.isfinite(lengths)]
-    reach = max(_REDDEST_PX, 1.5 * float(np.quantile(finite, 0.9))) if finite.size else _REDDEST_PX
+    reach = max(_MAX_COLOUR_PX, 1.5 * float(np.quantile(finite, 0.9))) if finite.size else _MAX_COLOUR_PX
     offsets = pair.offsets[pair.right]
     axes.scatter(
-        offsets[:, 0], offsets[:, 1], c=lengths, s=12.0, cmap=_COLOURS, vmin=0.0, vmax=_REDDEST_PX, linewidths=0.0
+        offsets[:, 0], offsets[:, 1], c=lengths, s=12.0, cmap=_COLOURS, vmin=0.0, vmax=_MAX_COLOUR_PX, linewidths=0.0
     )
     for line in (axes.axhline, axes.axvline):
         line(0.0, color=MUTED, linewidth=0.8)
@@ -119,5 +112,5 @@ def _draw_offsets(axes: Axes, pair: MatchedPair, lengths: Float[np.ndarray, " k"
 
 
 def write_measured_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Writes a figure of each pair into a folder; returns their paths. Raises OSError where that fails."""
+    """Write a figure of each pair into a folder; return their paths. Raises OSError where that fails."""
     return save_figures(directory, {f"matches-{pair.number}": draw_pair(pair) for pair in matched_pairs(products)})

@@ -1,4 +1,4 @@
-"""How real cases are presented: their agreement, pictures with matches, and what their task's system shows."""
+"""Presentation of real cases: agreement, pictures with matches, and the figures of their task's system."""
 
 from __future__ import annotations
 
@@ -22,47 +22,40 @@ from marsyard.reports.presentation import CaseKind, CaseView, Presentation, Tabl
 from marsyard.reports.section import plate
 from marsyard.reports.wording import number
 
-#: Pairs whose pictures go into the page.
-_MOST_PAIRS = 4
+#: Maximum number of pairs in the page.
+_MAX_PAIRS = 4
 #: Figures of a landing that need no truth.
 _WITHOUT_TRUTH = ("fig1-tracks", "fig3-epipolar", "fig4-elevation")
 _LEGEND = (
     "Features matched between one picture and the next, coloured by how far they lie from where the measured poses "
     "allow them; grey crosses: matches that no rigid motion explains, which are left out. Offsets are those of the "
-    "later picture: spread tells of the matching and of the lens, a common offset of an attitude that is off. "
+    "later picture: their spread shows errors of matching and lens, a common offset an attitude error. "
 )
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """A real case."""
+    """View of a real case."""
     pairs = matched_pairs(products)
-    plates = [plate(draw_pair(pair), f"{key}matches{pair.number}", f"{pair.told}.", wide=True) for pair in pairs]
-    left_out = len(plates) - _MOST_PAIRS
+    plates = [plate(draw_pair(pair), f"{key}matches{pair.number}", f"{pair.caption}.", wide=True) for pair in pairs]
+    left_out = len(plates) - _MAX_PAIRS
     facts = [("Pairs not shown", str(left_out))] if left_out > 0 else []
-    plates = plates[:_MOST_PAIRS]
+    plates = plates[:_MAX_PAIRS]
     if DIMES_CASE.is_case(products) and "tracks" in products:
         theirs = DIMES_CASE.view(products, key)
         return CaseView([*facts, *theirs.facts], [*plates, *theirs.plates], theirs.head, theirs.rows)
     plates += [plate(FIGURES[name](products), f"{key}{name[:4]}", f"{name}.", wide=True) for name in _landing(products)]
-    head = [
-        "Pictures",
-        "Matches",
-        "Wrong",
-        "Median residual (px)",
-        "90 % (px)",
-        "Offset right (px)",
-        "Offset down (px)",
-    ]
+    head = ["Pictures", "Matches", "Wrong", "Median residual (px)", "90 % (px)"]
+    head += ["Offset right (px)", "Offset down (px)"]
     return CaseView(facts, plates, head, [_row(pair) for pair in pairs])
 
 
 def _row(pair: MatchedPair) -> TableRow:
     residuals, offsets = pair.residuals_px, pair.offsets[pair.right]
-    told = [f"{pair.number} and {pair.number + 1}", f"{residuals.size:,}", f"{int((~pair.right).sum()):,}"]
+    cells = [f"{pair.number} and {pair.number + 1}", f"{residuals.size:,}", f"{int((~pair.right).sum()):,}"]
     if not residuals.size:
-        return TableRow([*told, *4 * ["–"]], succeeded=False)
+        return TableRow([*cells, *4 * ["–"]], succeeded=False)
     values = [np.median(residuals), np.quantile(residuals, 0.9, method="higher"), *np.nanmedian(offsets, axis=0)]
-    return TableRow([*told, *(number(float(value)) for value in values)], succeeded=True)
+    return TableRow([*cells, *(number(float(value)) for value in values)], succeeded=True)
 
 
 def _landing(products: Mapping[str, Any]) -> list[str]:

@@ -1,17 +1,17 @@
-"""Whether two sets of cases differ, free of how they were drawn on terrains: rates by an exact test, errors by ranks.
+"""Comparison of two sets of cases that share terrains: rates by an exact test, errors by rank tests.
 
-Cases on one terrain are alike. Where both sets have cases on the same terrains they are compared terrain by terrain,
-given which the draws are independent: failures by the exact distribution of Mantel and Haenszel's sum of
-hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int. Statist.
-37, 1960). Where they have few terrains in common, whole terrains are compared, each by the mean of as many cases.
+Cases on one terrain are correlated. Where both sets have cases on the same terrains, they are compared within each
+terrain, where draws are independent: failures by the exact distribution of Mantel and Haenszel's sum of hypergeometrics
+(J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int. Statist. 37, 1960). Where
+they have few terrains in common, whole terrains are compared, each by the mean of equally many cases.
 
-Small probabilities of ranks are those of permutations: where many values are tied, as shares of a few cases on a
-terrain are, the sum of ranks is skewed, and its normal approximation is too small by a factor of two to three at 0.001.
+Small p-values of ranks are computed by permutation. With many ties, for example rates of a few cases per terrain, the
+rank sum is skewed, and its normal approximation is too small by a factor of two to three at 0.001.
 
 Pairs of cases (two algorithms, or two campaigns of the same draws): McNemar's test with the exact binomial distribution
-(Psychometrika 12, 1947) on the cases in which just one succeeds; Wilcoxon's signed ranks on the differences of errors.
-Where cases share terrains, the terrain is the pair: the sums of its differences are symmetric about zero if the two are
-alike, however much its cases go together.
+(Psychometrika 12, 1947) on the cases in which exactly one succeeds; Wilcoxon's signed ranks on differences of errors.
+Where cases share terrains, the sums of the differences on each terrain are ranked: under the null hypothesis they are
+symmetric about zero for any correlation within terrains.
 """
 
 from __future__ import annotations
@@ -27,42 +27,42 @@ from scipy import stats
 from marsyard.reports.statistics.clusters import terrain_index
 from marsyard.reports.statistics.samples import Groups, is_shared, mean_interval
 
-#: Share of the cases of either set that must lie on terrains of both for a comparison terrain by terrain.
+#: Minimum fraction of the cases of either set on common terrains for a comparison within terrains.
 _COMMON = 0.5
-#: Fewest values of either set for a rank test, whose normal approximation is poor below.
-_FEWEST = 8
-#: Most entries of an exact distribution; above it the normal distribution is as good.
-_LARGEST_EXACT = 20_000
-#: Share of the terrains of either set that have as many cases as whole terrains are compared by.
+#: Minimum number of values of either set for a rank test; below it the normal approximation is poor.
+_MIN_RANKED = 8
+#: Maximum number of entries of an exact distribution; above it the normal one is as good.
+_MAX_EXACT = 20_000
+#: Fraction of the terrains of either set that have the number of cases used in a comparison of whole terrains.
 _FULL = 0.8
-#: Probabilities by the normal distribution below which permutations are counted.
-_COUNTED = 0.05
-#: Permutations that are drawn together; as many beyond what was seen are enough; values that are permuted at most.
-_BATCH, _ENOUGH, _MOST_PERMUTED = 500, 50, 2_000_000_000
-#: Permutations are drawn from a fixed seed: the same rows give the same probability.
+#: p-value of the normal approximation below which permutations are used.
+_PERMUTED_BELOW = 0.05
+#: Permutations per batch; sufficient number of exceedances; maximum number of permuted values.
+_BATCH, _ENOUGH, _MAX_PERMUTED = 500, 50, 2_000_000_000
+#: Fixed seed: the same rows give the same p-value.
 _SEED = 19370101
-#: Permutations by which a probability is told where no more are asked for.
+#: Default number of permutations.
 PERMUTATIONS = 10_000
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One metric of a set of cases: its values, NaN where a case has none, and the terrain of each case."""
+    """One metric of a set of cases: values (NaN where missing), and the terrain of each case."""
 
     values: Float[np.ndarray, " n"]
     terrains: Int[np.ndarray, " n"]
 
     def known(self) -> Sample:
-        """The cases that have a value."""
+        """Cases that have a value."""
         finite = np.isfinite(self.values)
         return Sample(self.values[finite], self.terrains[finite])
 
     def cases_on_terrains(self) -> Int[np.ndarray, " terrains"]:
-        """How many cases each terrain has."""
+        """Number of cases on each terrain."""
         return np.asarray(np.unique(self.terrains, return_counts=True)[1])
 
     def terrain_means(self, cases: int) -> Float[np.ndarray, " full"]:
-        """The mean of the first so many cases on each terrain that has as many."""
+        """Mean of the first `cases` cases on each terrain that has as many."""
         order = np.argsort(self.terrains, kind="stable")
         counts = self.cases_on_terrains()
         first = np.cumsum(counts) - counts
@@ -71,9 +71,9 @@ class Sample:
 
 
 def difference_p(now: Sample, before: Sample, permutations: int = PERMUTATIONS) -> float:
-    """Two-sided probability of sets so different if both come from the same; NaN where there is too little to say.
+    """Two-sided p-value of the difference of two sets; NaN where there is too little data.
 
-    Values of 0 and 1 alone are taken as rates. No probability of ranks is told below one over the permutations.
+    Values of only 0 and 1 are compared as rates. No p-value of ranks is below one over the permutations.
     """
     now, before = now.known(), before.known()
     if min(now.values.size, before.values.size) == 0:
@@ -88,7 +88,7 @@ def difference_p(now: Sample, before: Sample, permutations: int = PERMUTATIONS) 
 
 
 def _whole_terrains(now: Sample, before: Sample) -> tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]:
-    """The means of both sets' terrains, each of as many cases: means of few and of many differ by themselves."""
+    """Terrain means of both sets over equally many cases, since the variance of a mean depends on their number."""
     enough = [np.quantile(one.cases_on_terrains(), 1.0 - _FULL, method="lower") for one in (now, before)]
     cases = int(min(enough))
     return now.terrain_means(cases), before.terrain_means(cases)
@@ -99,13 +99,13 @@ Pairs = Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]
 
 
 def _rates_p(pairs: Pairs) -> float:
-    """Exact two-sided p of the number of ones in the first sets, given the ones in each pair: twice the lesser tail."""
+    """Exact two-sided p-value of the ones in the first sets, given the ones in each pair: twice the smaller tail."""
     tables = [(int(a.sum()), a.size, int(a.sum() + b.sum()), a.size + b.size) for a, b in pairs]
     tables = [one for one in tables if 0 < one[2] < one[3]]
     if not tables:
         return 1.0
     seen = sum(one[0] for one in tables)
-    if sum(min(n, ones) for _, n, ones, _ in tables) > _LARGEST_EXACT:
+    if sum(min(n, ones) for _, n, ones, _ in tables) > _MAX_EXACT:
         return _normal_p(seen, tables)
     law, least = np.ones(1), 0
     for _, n, ones, total in tables:
@@ -117,7 +117,6 @@ def _rates_p(pairs: Pairs) -> float:
 
 
 def _normal_p(seen: int, tables: Sequence[tuple[int, int, int, int]]) -> float:
-    """Mantel and Haenszel's large-sample test, corrected for continuity."""
     _, n, ones, total = np.array(tables, dtype=np.float64).T
     variance = float((n * ones * (total - ones) * (total - n) / (total**2 * (total - 1.0))).sum())
     excess = max(0.0, abs(seen - float((n * ones / total).sum())) - 0.5)
@@ -126,7 +125,7 @@ def _normal_p(seen: int, tables: Sequence[tuple[int, int, int, int]]) -> float:
 
 def _ranks_p(pairs: Pairs, permutations: int) -> float:
     """Van Elteren's test with ties; NaN for fewer than eight values of either set."""
-    if min(sum(a.size for a, _ in pairs), sum(b.size for _, b in pairs)) < _FEWEST:
+    if min(sum(a.size for a, _ in pairs), sum(b.size for _, b in pairs)) < _MIN_RANKED:
         return math.nan
     strata = [_scores(first, second) for first, second in pairs if first.size and second.size]
     excess = sum(float(scores[:n].sum()) for scores, n in strata)
@@ -136,19 +135,19 @@ def _ranks_p(pairs: Pairs, permutations: int) -> float:
     if variance == 0.0:
         return 1.0
     p = float(2.0 * stats.norm.sf(abs(excess) / math.sqrt(variance)))
-    if p >= _COUNTED or permutations * sum(scores.size for scores, _ in strata) > _MOST_PERMUTED:
+    if p >= _PERMUTED_BELOW or permutations * sum(scores.size for scores, _ in strata) > _MAX_PERMUTED:
         return p
     return _permuted_p(strata, abs(excess), permutations)
 
 
 def _scores(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " both"], int]:
-    """Van Elteren's scores of the values of both sets, of mean zero, and how many of them are the first's."""
+    """Van Elteren's scores of the values of both sets, of mean zero, and the size of the first set."""
     ranks = stats.rankdata(np.concatenate([first, second]))
     return (ranks - ranks.mean()) / (ranks.size + 1.0), first.size
 
 
 def _permuted_p(strata: Sequence[tuple[Float[np.ndarray, " _"], int]], excess: float, permutations: int) -> float:
-    """Share of the permutations within strata that differ by as much; fewer are drawn where it is plainly large.
+    """Fraction of the permutations within strata with at least this excess; fewer are drawn where it is clearly large.
 
     Besag & Clifford, "Sequential Monte Carlo p-values" (Biometrika 78, 1991).
     """
@@ -166,7 +165,7 @@ def _permuted_p(strata: Sequence[tuple[Float[np.ndarray, " _"], int]], excess: f
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """p-values corrected for their number, NaN left out (Holm 1979): the family-wise error rate is held by them."""
+    """p-values corrected for multiple tests, NaN left out (Holm 1979): controls the family-wise error rate."""
     known = [(p, place) for place, p in enumerate(p_values) if not math.isnan(p)]
     corrected, largest = [math.nan] * len(p_values), 0.0
     for rank, (p, place) in enumerate(sorted(known)):
@@ -178,7 +177,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def compared_successes(
     first: Bool[np.ndarray, " n"], other: Bool[np.ndarray, " n"], groups: Groups = None
 ) -> tuple[int, int, float]:
-    """Cases in which just the first and just the other succeeds, and the two-sided probability of so uneven a split."""
+    """Numbers of cases in which only the first and only the other succeeds, and the two-sided p-value."""
     only_first, only_other = int((first & ~other).sum()), int((other & ~first).sum())
     if groups is not None and is_shared(groups):
         return only_first, only_other, _signed_ranks_p(_sums(other.astype(np.float64) - first, groups))
@@ -190,7 +189,7 @@ def compared_successes(
 def compared_errors(
     differences: Float[np.ndarray, " n"], groups: Groups, confidence: float
 ) -> tuple[float, float, float, float]:
-    """Mean of paired differences, its interval, and the two-sided probability that they are symmetric about zero.
+    """Mean of paired differences, its interval, and the two-sided p-value of symmetry about zero.
 
     NaN for no pairs; the interval is NaN for one.
     """
@@ -206,6 +205,5 @@ def _sums(differences: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -
 
 
 def _signed_ranks_p(differences: Float[np.ndarray, " n"]) -> float:
-    """Wilcoxon's two-sided p; 1 where nothing differs."""
     moved = differences[differences != 0.0]
     return 1.0 if moved.size == 0 else float(stats.wilcoxon(moved).pvalue)

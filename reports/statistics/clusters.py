@@ -1,14 +1,14 @@
-"""Success rates from cases that share a terrain: such cases are not independent, and n overstates the evidence.
+"""Success rates from cases that share terrains: such cases are correlated, and n overstates the evidence.
 
 Korn & Graubard ("Confidence intervals for proportions with small expected number of positive counts estimated from
-survey data", Survey Methodology 24, 1998) put an effective sample size into the Clopper-Pearson interval: n divided by
-the design effect, which the terrains' own failure rates show. With few failures the design effect cannot be estimated
-and the method passes falsely; then whole terrains are counted, each as one case, or the rate of the cases is taken for
-that of as many independent ones as there are terrains, whichever is the safer.
+survey data", Survey Methodology 24, 1998) use an effective sample size in the Clopper-Pearson interval: n divided by
+the design effect, which is estimated from the terrains' failure rates. With few failures that estimate is unreliable
+and the method passes falsely. Then whole terrains are counted, each as one case, or the rate of the cases is attributed
+to as many independent ones as there are terrains, whichever is safer.
 
-Bounds are for the rate of a case of the population. Where bad terrains answer less often than others both hold
-(`tests/reports/statistics/test_clusters.py`). Where rare terrains fail and have several times as many cases as others
-the lower bound does not hold: at a nominal 10 % it missed in 16 to 33 % of simulated campaigns, mostly those that drew
+The bounds hold for the rate of a case of the population, also where bad terrains answer less often than others
+(`tests/reports/statistics/test_clusters.py`). The lower bound does not hold where rare failing terrains have several
+times as many cases as others: at a nominal 10 % it missed in 16 to 33 % of simulated campaigns, mostly those that drew
 none of these terrains.
 """
 
@@ -23,14 +23,14 @@ from scipy import stats
 
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 
-#: Fewest terrains, and fewest terrains with a failure (and with a success), for which the design effect is estimated.
-#: Chosen by simulation (`tests/reports/statistics/test_clusters.py`): with these the bounds keep their confidence.
+#: Minimum number of terrains, and of terrains with a failure (and with a success), to estimate the design effect.
+#: Chosen by simulation (`tests/reports/statistics/test_clusters.py`) so that the bounds keep their confidence.
 FEWEST_TERRAINS = 50
 FEWEST_MIXED_TERRAINS = 10
 
 
 class ClusterMethod(StrEnum):
-    """How the bounds of clustered cases were found."""
+    """Method of the bounds of clustered cases."""
 
     KORN_GRAUBARD = "Korn-Graubard effective sample size"
     TERRAIN_COUNT = "whole terrains counted"
@@ -38,24 +38,13 @@ class ClusterMethod(StrEnum):
 
 @dataclass(frozen=True)
 class ClusteredEvidence:
-    """What cases that share terrains show of a success rate.
+    """Evidence for a success rate from cases that share terrains.
 
-    Attributes
-    ----------
-    terrains
-        Distinct terrains behind the cases.
-    failed_terrains
-        Terrains on which at least one case failed.
-    method
-        How the bounds were found.
-    design_effect
-        Variance of the success rate over that of as many independent cases; NaN where it cannot be estimated.
-    effective_n
-        The number of independent cases that the evidence is worth: terrains where whole terrains are counted.
-    effective_successes
-        Of these, those that succeeded: the lower bound is that of so many.
-    lower, upper
-        One-sided bounds of the success rate of a case, each at the requirement's confidence.
+    terrains, failed_terrains: distinct terrains, and those on which at least one case failed.
+    method: method of the bounds.
+    design_effect: variance of the success rate over that of as many independent cases; NaN where it cannot be
+    estimated. effective_n, effective_successes: equivalent independent cases, and successes that give the lower bound.
+    lower, upper: one-sided bounds of the success rate of a case, each at the requirement's confidence.
     """
 
     terrains: int
@@ -71,17 +60,7 @@ class ClusteredEvidence:
 def clustered_evidence(
     success: Bool[np.ndarray, " n"], terrain: Int[np.ndarray, " n"], confidence: float
 ) -> ClusteredEvidence:
-    """Bounds of a success rate for cases that share terrains.
-
-    Parameters
-    ----------
-    success
-        Whether each case succeeded, shape (n,), n at least 1.
-    terrain
-        The terrain's number of each case, shape (n,).
-    confidence
-        Confidence of each one-sided bound.
-    """
+    """Bounds of a success rate, each at `confidence`, for at least one case; `terrain` numbers the terrain of each."""
     index = terrain_index(terrain)
     sizes = np.bincount(index).astype(np.float64)
     successes = np.bincount(index, weights=success.astype(np.float64))
@@ -108,7 +87,7 @@ def clustered_evidence(
 
 
 def terrain_index(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """The terrains counted from 0 without gaps, in the order of their numbers."""
+    """Consecutive terrain numbers from 0, in the order of the given ones."""
     first, last = int(terrain.min()), int(terrain.max())
     if last - first > 4 * terrain.size:
         return np.unique(terrain, return_inverse=True)[1]
@@ -118,7 +97,7 @@ def terrain_index(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
 
 
 def _design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
-    """Variance of the rate over terrains (Taylor linearisation) by the binomial one; NaN where either is 0."""
+    """Variance of the rate over terrains (Taylor linearisation) over the binomial one; NaN where either is 0."""
     terrains, n = sizes.size, sizes.sum()
     rate = successes.sum() / n
     if terrains < 2 or not 0.0 < rate < 1.0:

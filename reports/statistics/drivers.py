@@ -1,8 +1,8 @@
-"""How much of a response a condition explains: rank correlation and share of variance, each with an interval.
+"""Dependence of a response on a condition: rank correlation and fraction of variance, each with an interval.
 
-Where cases share terrains and both condition and response go with the terrain, the cases tell less than their number:
-it is divided by 1 + (m - 1) r_x r_y, with m cases a terrain and the intraclass correlations of both (Scott & Holt,
-"The effect of two-stage sampling on ordinary least squares methods", J. Amer. Statist. Assoc. 77, 1982).
+Where cases share terrains and both condition and response depend on the terrain, the number of cases is divided by
+1 + (m - 1) r_x r_y, with m cases a terrain and the intraclass correlations of both (Scott & Holt, "The effect of
+two-stage sampling on ordinary least squares methods", J. Amer. Statist. Assoc. 77, 1982).
 """
 
 from __future__ import annotations
@@ -22,19 +22,14 @@ _CASES_PER_BIN, _MOST_BINS = 15, 20
 
 @dataclass(frozen=True)
 class Driver:
-    """What a condition explains of a response.
+    """Effect of a condition on a response.
 
-    Attributes
-    ----------
-    n, effective_n
-        Cases with both, and how many independent ones they are worth.
-    correlation, lower, upper
-        Spearman's rank correlation and its interval.
-    share, share_lower, share_upper
-        Share of the variance of the response's ranks that the condition alone explains, whatever the curve's form: the
-        first-order index of a variance-based analysis, from the cases as they are; 0 to 1.
-    p_value
-        Probability that it would explain so much if it explained nothing.
+    n, effective_n: cases with both, and the equivalent number of independent ones.
+    correlation, lower, upper: Spearman's rank correlation and its interval.
+    share, share_lower, share_upper: fraction of the variance of the response's ranks that the condition alone explains,
+    for
+    any form of the curve: the first-order index of a variance-based analysis, estimated from the given cases; 0 to 1.
+    p_value: p-value of the null hypothesis that it explains nothing.
     """
 
     n: int
@@ -54,23 +49,16 @@ def driver(
     groups: Int[np.ndarray, " n"] | None,
     confidence: float,
 ) -> Driver | None:
-    """What a condition explains of a response over the cases with both; None for fewer than twenty or a constant.
+    """Effect of a condition on a response over the cases with both; None for fewer than twenty or a constant.
 
-    Parameters
-    ----------
-    condition, response
-        Numbers, NaN where there is none.
-    groups
-        Which cases share a terrain; None where none does.
-    confidence
-        Of the two-sided intervals.
+    condition, response: NaN where missing.
+    groups: terrain of each case; None where no terrain is shared.
+    confidence: of the two-sided intervals.
 
-    Notes
-    -----
-    Correlation: Fisher's z with Bonett & Wright's variance (Psychometrika 65, 2000). Share of variance: the ranks of
-    the response in bins of the condition of as many cases each (the "given data" estimate of the first-order index:
-    Plischke, Borgonovo & Smith, Eur. J. Oper. Res. 226, 2013), freed of bias as Kelley's epsilon squared is (Proc.
-    Nat. Acad. Sci. 21, 1935), with the interval that the noncentral F distribution gives.
+    Correlation: Fisher's z with Bonett & Wright's variance (Psychometrika 65, 2000). Fraction of variance: ranks of the
+    response in bins of equally many cases (the "given data" estimate of the first-order index: Plischke, Borgonovo &
+    Smith, Eur. J. Oper. Res. 226, 2013), corrected for bias as Kelley's epsilon squared (Proc. Nat. Acad. Sci. 21,
+    1935), with the interval of the noncentral F distribution.
     """
     known = np.isfinite(condition) & np.isfinite(response)
     n = int(known.sum())
@@ -129,7 +117,6 @@ def _noncentrality(ratio: float, first: float, second: float, level: float) -> f
 
 
 def _design_effect(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> float:
-    """1 + (m - 1) r_x r_y, at least 1."""
     _, index = np.unique(groups, return_inverse=True)
     sizes = np.bincount(index).astype(np.float64)
     size = float((sizes**2).sum() / sizes.sum())

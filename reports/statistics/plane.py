@@ -1,4 +1,4 @@
-"""Errors in two dimensions: the ellipse that holds a stated share of them, and circular errors."""
+"""Errors in two dimensions: prediction ellipses and circular errors."""
 
 from __future__ import annotations
 
@@ -11,26 +11,19 @@ from scipy import stats
 
 from marsyard.reports.statistics.samples import Groups, Quantile, quantile_bounds
 
-#: Fewest points of an ellipse: its factor needs two degrees of freedom beyond the plane's.
+#: Minimum number of points: the factor needs two degrees of freedom beyond the plane's.
 FEWEST_OF_ELLIPSE = 5
 
 
 @dataclass(frozen=True)
 class ErrorEllipse:
-    """The ellipse in which the next error lies with a stated probability, for normal errors.
+    """Ellipse that contains the next error with a stated probability, for normal errors.
 
-    Attributes
-    ----------
-    centre
-        Mean error, the two parts.
-    semi_major, semi_minor
-        Half axes, in the errors' unit.
-    angle_deg
-        Of the major axis from the first part's towards the second's, from -90 (excluded) to 90 degrees.
-    probability
-        Probability that the next error lies inside.
-    inside
-        Share of these errors that lie inside; far from the probability where errors are not normal.
+    centre: mean error.
+    semi_major, semi_minor: half axes, in the errors' unit.
+    angle_deg: of the major axis from the first component towards the second, from -90 (excluded) to 90 degrees.
+    probability: probability that the next error lies inside.
+    inside: fraction of these errors that lie inside; differs from the probability where errors are not normal.
     """
 
     centre: tuple[float, float]
@@ -42,7 +35,7 @@ class ErrorEllipse:
 
     @property
     def reach(self) -> float:
-        """Half the side of the least square about no error that holds the ellipse, sides along the parts."""
+        """Half the side of the smallest square about zero error that contains the ellipse."""
         turn = math.radians(self.angle_deg)
         across = math.hypot(self.semi_major * math.cos(turn), self.semi_minor * math.sin(turn))
         up = math.hypot(self.semi_major * math.sin(turn), self.semi_minor * math.cos(turn))
@@ -52,8 +45,6 @@ class ErrorEllipse:
 def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> ErrorEllipse | None:
     """The prediction ellipse of two-dimensional errors; None for fewer than five or where all lie on a point.
 
-    Notes
-    -----
     For a new error e of the same normal distribution, (e - m)' S^-1 (e - m) with the sample's mean and covariance is
     distributed as 2 (n - 1) (n + 1) / (n (n - 2)) times F with 2 and n - 2 degrees of freedom (Hotelling; Chew,
     "Confidence, prediction and tolerance regions for the multivariate normal distribution", J. Amer. Statist. Assoc.

@@ -1,20 +1,19 @@
-"""What a sample of numbers says: quantiles, mean, spread, each with bounds.
+"""Statistics of samples: quantiles, mean and spread, each with bounds.
 
-Quantiles are bounded by order statistics, free of any assumption about the distribution (Wilks, "Determination of
-sample sizes for setting tolerance limits", Ann. Math. Statist. 12, 1941; as Hanson & Beard use them for a stated
-consumer risk, NASA/TP-2010-216447). Means and spreads are bounded by the BCa bootstrap (Efron, "Better bootstrap
-confidence intervals", J. Amer. Statist. Assoc. 82, 1987) as SciPy has it, at the level of Student's t instead of the
-normal distribution (Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69, 2015): in small
-samples BCa alone covers too little. A spread's interval reaches at least as far as Bonett's ("Approximate confidence
-interval for standard deviation of nonnormal distributions", Comput. Statist. Data Anal. 50, 2006).
+Quantiles are bounded by order statistics, for any distribution (Wilks, "Determination of sample sizes for setting
+tolerance limits", Ann. Math. Statist. 12, 1941; as Hanson & Beard use them for a stated consumer risk,
+NASA/TP-2010-216447). Means and spreads are bounded by SciPy's BCa bootstrap (Efron, "Better bootstrap confidence
+intervals", J. Amer. Statist. Assoc. 82, 1987), at the level of Student's t instead of the normal distribution
+(Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69, 2015), since BCa alone covers too
+little in small samples. A spread's interval contains Bonett's ("Approximate confidence interval for standard deviation
+of nonnormal distributions", Comput. Statist. Data Anal. 50, 2006).
 
-Where values share terrains (`groups`) they are alike, so that the terrain is what was drawn. Mean and standard
-deviation: BCa bootstrap of whole terrains (Davison & Hinkley, "Bootstrap methods and their application", 1997, section
-3.8), widened for few of them as that of single values is, and reaching at least as far as Student's interval with the
-variance over terrains (Taylor linearisation; Cochran, "Sampling techniques", 1977, section 6). Quantiles: order
-statistics, counted as success rates of shared terrains are (`marsyard.reports.statistics.clusters`): by the effective
-number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952, with Korn & Graubard's number), or by whole terrains
-where too few of them lie on either side.
+Values that share terrains (`groups`) are correlated; the terrain is the sampling unit. Mean and standard deviation: BCa
+bootstrap of whole terrains (Davison & Hinkley, "Bootstrap methods and their application", 1997, section 3.8), widened
+for few of them as for single values; it contains Student's interval with the variance over terrains (Taylor
+linearisation; Cochran, "Sampling techniques", 1977, section 6). Quantiles: order statistics, with the counts of
+`marsyard.reports.statistics.clusters`: the effective number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952,
+with Korn & Graubard's number), or whole terrains where too few of them lie on either side.
 
 `python -m benchmarks.validation --only intervals --only shared` measures the coverage of all of these.
 """
@@ -34,17 +33,17 @@ from scipy import stats
 from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
 from marsyard.reports.statistics.proportions import Interval, check_confidence, proportion_lower
 
-#: Above this many values (or terrains) the bootstrap's interval equals the large-sample one in what is printed.
-LARGEST_SAMPLE = 2000
+#: Number of values (or terrains) above which the bootstrap's interval equals the large-sample one as printed.
+_MAX_BOOTSTRAP = 2000
 _RESAMPLES = 2000
-#: A report draws from a fixed seed: the same rows give the same page.
+#: Fixed seed: the same rows give the same page.
 _SEED = 19340401
 
 
 def bca(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], confidence: float) -> Interval:
-    """Two-sided interval of a statistic of one or more columns, drawn together; NaN where there is none."""
+    """Two-sided interval of a statistic of one or more columns, resampled together; NaN where there is none."""
     with warnings.catch_warnings():
-        # A degenerate bootstrap distribution (two values, say) is answered by NaN bounds, which the caller prints.
+        # a degenerate bootstrap distribution (of two values, for example) gives NaN bounds
         warnings.simplefilter("ignore")
         result = stats.bootstrap(
             tuple(data),
@@ -61,13 +60,13 @@ def bca(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], 
 
 
 def _widened(confidence: float, n: int) -> float:
-    """The level at which the normal quantile is Student's, times sqrt(n / (n - 1)): Hesterberg 2015, section 5."""
+    """Level at which the normal quantile equals Student's times sqrt(n / (n - 1)): Hesterberg 2015, section 5."""
     quantile = float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1)) * math.sqrt(n / (n - 1.0))
-    # below 1, which the bootstrap does not take
+    # below 1, which the bootstrap does not accept
     return min(2.0 * float(stats.norm.cdf(quantile)) - 1.0, 1.0 - 1e-6)
 
 
-#: Fewest terrains that say anything of the spread between them.
+#: Minimum number of terrains to estimate the spread between them.
 FEWEST_TERRAINS = 5
 
 
@@ -77,15 +76,7 @@ def is_shared(groups: Int[np.ndarray, " n"] | None) -> bool:
 
 
 def shared_mean(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
-    """Two-sided interval of the mean of values on shared terrains; NaN for fewer than five terrains.
-
-    Parameters
-    ----------
-    values, groups
-        Finite values, and the number of the terrain of each.
-    confidence
-        Of the interval.
-    """
+    """Two-sided interval of the mean of finite values on shared terrains; NaN for fewer than five terrains."""
     index = terrain_index(groups)
     sizes, sums = np.bincount(index).astype(np.float64), np.bincount(index, weights=values)
     terrains = sizes.size
@@ -94,7 +85,7 @@ def shared_mean(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], 
     mean = float(values.mean())
     half = _student(confidence, terrains) * _deviation_of_mean(sums - mean * sizes, values.size)
     plain = mean - half, mean + half
-    if terrains > LARGEST_SAMPLE:
+    if terrains > _MAX_BOOTSTRAP:
         return plain
     return _union(plain, bca((sums, sizes), _ratio, confidence))
 
@@ -109,14 +100,13 @@ def shared_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]
     centred = values - values.mean()
     sums, squares = (np.bincount(index, weights=centred**power) for power in (1, 2))
     variance = float((centred**2).mean())
-    # of the logarithm, whose distribution is less skewed, corrected for few terrains as Bonett's interval (see
-    # `samples.spread_interval`) is for few values
+    # of the logarithm, which is less skewed, corrected for few terrains as Bonett's interval is for few values
     quantile = _student(confidence, terrains)
     correction = terrains / max(terrains - quantile, 1.0)
     half = quantile * correction * _deviation_of_mean(squares - variance * sizes, values.size) / variance
     middle = math.log(correction * variance)
     plain = math.exp(0.5 * (middle - half)), math.exp(0.5 * (middle + half))
-    if terrains > LARGEST_SAMPLE:
+    if terrains > _MAX_BOOTSTRAP:
         return plain
     return _union(plain, bca((squares, sums, sizes), _spread, confidence))
 
@@ -124,9 +114,7 @@ def shared_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]
 def shared_quantile(
     values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], quantile: float, confidence: float
 ) -> Interval:
-    """One-sided bounds of a quantile of values on shared terrains, each at the confidence; infinite where the sample
-    is too small to give one.
-    """
+    """One-sided bounds of a quantile of values on shared terrains; infinite where the sample is too small."""
     lower = -_upper_bound(-values, groups, 1.0 - quantile, confidence)
     return lower, _upper_bound(values, groups, quantile, confidence)
 
@@ -134,13 +122,15 @@ def shared_quantile(
 def _upper_bound(
     values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], quantile: float, confidence: float
 ) -> float:
-    """The least value of the sample up to which at least a share `quantile` of all lies, at the confidence."""
+    """Smallest value of the sample below which at least a fraction `quantile` of the population lies, at the
+    confidence.
+    """
     ordered = np.sort(values)
     n = ordered.size
     below = values <= ordered[min(n - 1, max(0, math.ceil(quantile * n) - 1))]
     shown = clustered_evidence(below, groups, confidence)
     if shown.method is ClusterMethod.TERRAIN_COUNT:
-        # what holds for all values of so many terrains holds for at least as many values
+        # a bound for the maximum of a terrain also holds for its values
         index = terrain_index(groups)
         ordered = np.full(int(index.max()) + 1, -math.inf)
         np.maximum.at(ordered, index, values)
@@ -151,7 +141,7 @@ def _upper_bound(
 
 
 def _least_rank(ordered: Float[np.ndarray, " n"], worth: float, quantile: float, confidence: float) -> float:
-    """The first of the ordered values whose rank shows the quantile, each value being worth so many; inf for none."""
+    """First of the ordered values whose rank shows the quantile, each counting as `worth` values; inf for none."""
     n = ordered.size
     if proportion_lower(n * worth, n * worth, confidence) < quantile:
         return math.inf
@@ -168,7 +158,6 @@ def _student(confidence: float, terrains: int) -> float:
 
 
 def _deviation_of_mean(residuals: Float[np.ndarray, " terrains"], n: int) -> float:
-    """Standard deviation of a mean over n values, from the terrains' sums of residuals."""
     terrains = residuals.size
     return math.sqrt(terrains / (terrains - 1.0) * float((residuals**2).sum())) / n
 
@@ -189,10 +178,10 @@ def _union(first: Interval, second: Interval) -> Interval:
     return float(np.fmin(first[0], second[0])), float(np.fmax(first[1], second[1]))
 
 
-#: Which values are from one terrain: its number for each; None where all are independent.
+#: Terrain number of each value; None where all are independent.
 Groups = Int[np.ndarray, " n"] | None
-#: Fewest values that say anything of their spread.
-_FEWEST_OF_SPREAD = 8
+#: Minimum number of values to estimate their spread.
+_MIN_FOR_SPREAD = 8
 
 
 def quantile_bounds(
@@ -200,16 +189,10 @@ def quantile_bounds(
 ) -> Interval:
     """One-sided lower and upper order-statistic bounds of a quantile, each at the confidence.
 
-    Returns
-    -------
-    lower, upper
-        The bounds; -inf or inf where the sample is too small to give one (for the upper bound of the 99 % quantile at
-        95 % confidence: fewer than 299 values).
-
-    Notes
-    -----
-    Wilks 1941. The r-th smallest of n values lies at or above the quantile q with probability
-    P(Bin(n, q) <= r - 1): the upper bound is the smallest such value with that probability at the confidence.
+    -inf or inf where the sample is too small (upper bound of the 99 % quantile at 95 % confidence: fewer than 299
+    values).
+    Wilks 1941: the r-th smallest of n values lies at or above the quantile q with probability P(Bin(n, q) <= r - 1);
+    the upper bound is the smallest such value with that probability at the confidence.
     """
     check_confidence(confidence)
     if groups is not None and is_shared(groups):
@@ -223,7 +206,7 @@ def quantile_bounds(
 
 
 def _upper_order_bound(ordered: Float[np.ndarray, " n"], quantile: float, confidence: float) -> float:
-    """The smallest of the ordered values that bounds the quantile from above at the confidence."""
+    """Smallest of the ordered values that bounds the quantile from above at the confidence."""
     n = ordered.size
     # `ppf` gives the smallest k with P(Bin <= k) >= confidence; the value of 1-based rank k + 1 is the bound.
     rank = int(stats.binom.ppf(confidence, n, quantile))
@@ -231,7 +214,7 @@ def _upper_order_bound(ordered: Float[np.ndarray, " n"], quantile: float, confid
 
 
 def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
-    """Two-sided interval of the mean: BCa bootstrap, or the central limit theorem's in large samples.
+    """Two-sided interval of the mean: BCa bootstrap, or the central limit theorem in large samples.
 
     NaN for fewer than two values, or five terrains; the value itself where all are equal.
     """
@@ -244,27 +227,28 @@ def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Gr
         return mean, mean
     if groups is not None and is_shared(groups):
         return shared_mean(values, groups, confidence)
-    if values.size > LARGEST_SAMPLE:
+    if values.size > _MAX_BOOTSTRAP:
         half = float(stats.norm.ppf(0.5 * (1.0 + confidence))) * spread / math.sqrt(values.size)
         return mean - half, mean + half
     return bca((values,), np.mean, confidence)
 
 
 def spread_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
-    """Two-sided interval of the standard deviation: BCa bootstrap and Bonett's, whichever reaches further.
+    """Two-sided interval of the standard deviation: union of BCa bootstrap and Bonett's; in large samples Bonett's
+    alone.
 
-    NaN for fewer than eight values, or five terrains; 0 where all are equal. In large samples Bonett's alone.
+    NaN for fewer than eight values, or five terrains; 0 where all are equal.
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
-    if values.size < _FEWEST_OF_SPREAD:
+    if values.size < _MIN_FOR_SPREAD:
         return math.nan, math.nan
     if np.ptp(values) == 0.0:
         return 0.0, 0.0
     if groups is not None and is_shared(groups):
         return shared_spread(values, groups, confidence)
     lower, upper = _bonett(values, confidence)
-    if values.size > LARGEST_SAMPLE:
+    if values.size > _MAX_BOOTSTRAP:
         return lower, upper
     resampled = bca((values,), _deviation, confidence)
     return float(np.fmin(lower, resampled[0])), float(np.fmax(upper, resampled[1]))
@@ -289,7 +273,7 @@ def _bonett(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
 
 @dataclass(frozen=True)
 class Quantile:
-    """One quantile of a sample: probability, estimate and one-sided bounds (infinite where n does not allow one)."""
+    """Quantile of a sample: probability, estimate and one-sided bounds (infinite where n is too small)."""
 
     probability: float
     estimate: float
@@ -299,26 +283,15 @@ class Quantile:
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """What a sample of errors says; NaN where it has too few values to say it.
+    """Summary of a sample of errors; NaN where it has too few values.
 
-    Attributes
-    ----------
-    n, missing
-        Finite values, and those that were not finite (no answer was reported).
-    mean, mean_lower, mean_upper
-        Mean and its two-sided interval at `confidence`.
-    sd, sd_lower, sd_upper
-        Standard deviation (n - 1) and its two-sided interval at `confidence`.
-    rms, median
-        Root mean square about zero, median.
-    robust_sd
-        Median absolute deviation about the median times 1.4826: the standard deviation of a normal core.
-    largest
-        The largest magnitude.
-    quantiles
-        Quantiles with order-statistic bounds at `confidence`.
-    confidence
-        Confidence of the bounds.
+    n, missing: finite values, and others (no answer was reported).
+    mean, mean_lower, mean_upper: mean and its two-sided interval at `confidence`.
+    sd, sd_lower, sd_upper: standard deviation (n - 1) and its two-sided interval at `confidence`.
+    rms, median: root mean square about zero, median.
+    robust_sd: median absolute deviation about the median times 1.4826, the standard deviation of a normal core.
+    largest: largest magnitude.
+    quantiles: with order-statistic bounds at `confidence`.
     """
 
     n: int
@@ -343,7 +316,7 @@ def summarize(
     confidence: float = 0.95,
     groups: Groups = None,
 ) -> ErrorSummary:
-    """Summarises a sample of errors; values that are not finite are counted as missing and left out.
+    """Summarize a sample of errors; values that are not finite are counted as missing and left out.
 
     For radial errors the quantiles 0.5 and 0.95 are the circular error probable and the 95 % radius about the truth.
     """
@@ -373,6 +346,6 @@ def summarize(
 
 def _quantile(finite: Float[np.ndarray, " n"], probability: float, confidence: float, groups: Groups) -> Quantile:
     # A quantile beyond all but the last value is an extrapolation, not an estimate.
-    told = finite.size * min(probability, 1.0 - probability) >= 1.0 - 1e-9
-    estimate = float(np.quantile(finite, probability)) if told else math.nan
+    is_estimate = finite.size * min(probability, 1.0 - probability) >= 1.0 - 1e-9
+    estimate = float(np.quantile(finite, probability)) if is_estimate else math.nan
     return Quantile(probability, estimate, *quantile_bounds(finite, probability, confidence, groups))

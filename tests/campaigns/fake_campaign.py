@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store.table import read_rows
 
@@ -73,9 +72,9 @@ class Silence:
 
 
 def run(path: Path, directory: Path, watch: Silence, *overrides: str, jobs: int = 2) -> Path:
-    run_campaign(load_campaign(str(path), overrides), directory, Crew(jobs), watch)
+    run_campaign(load_campaign(str(path), overrides), directory, ExecutorConfig(jobs), watch)
     return directory
 
 
-def rows_of(directory: Path) -> list[Mapping[str, Any]]:
+def rows_of(directory: Path) -> list[dict[str, Any]]:
     return read_rows(directory / "cases.parquet")

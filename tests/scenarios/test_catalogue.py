@@ -9,7 +9,7 @@ import pytest
 from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
-from marsyard.campaigns.store.columns import Row
+from marsyard.campaigns.store.rows import Row
 from marsyard.scenarios.rover.scenario import SharedDriveScenario
 from marsyard.scenarios.rover.shared import SharedDriveParameters
 from marsyard.scenarios.systems import systems

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from marsyard.campaigns.definition import requirements
 from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.identity import foreign_sources
+from marsyard.campaigns.definition.identity import custom_sources
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
@@ -104,10 +104,10 @@ def test_a_system_of_another_package_is_found_everywhere(install: Install) -> No
 def test_the_code_of_a_foreign_scenario_is_part_of_the_identity(install: Install, tmp_path: Path) -> None:
     install("mine", _system("mine").replace("x:Y", "mine:Case"))
     assert scenario_source("mine-case") == "mine:Case"
-    assert list(foreign_sources(scenario_source("mine-case"))) == [("mine.py", tmp_path / "mine.py")]
+    assert list(custom_sources(scenario_source("mine-case"))) == [("mine.py", tmp_path / "mine.py")]
     # that of ours is hashed as a whole for every scenario
     assert scenario_source("descent") == "descent"
-    assert list(foreign_sources("descent")) == []
+    assert list(custom_sources("descent")) == []
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.cluster import ClusterWorkers
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.cluster import ClusterExecutor
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
@@ -36,7 +36,7 @@ def test_a_cluster_gives_the_rows_of_one_machine(
         "raising_cases = [3]\naborting_cases = [5]\nlooping_cases = [8]", more="[limits]\ncase_time_s=3"
     )
     rows = {}
-    for name, crew in (("cluster", Crew(cluster="local:2")), ("machine", Crew(1))):
+    for name, crew in (("cluster", ExecutorConfig(cluster="local:2")), ("machine", ExecutorConfig(1))):
         run_campaign(load_campaign(str(path)), tmp_path / name, crew, watch)
         rows[name] = read_rows(tmp_path / name / "cases.parquet")
     assert [differing_columns(*pair) for pair in zip(*rows.values(), strict=True)] == [()] * 12
@@ -51,7 +51,7 @@ def test_numbers_of_workers_that_are_none(
     campaign_file: Callable[..., Path], tmp_path: Path, watch: Silence, address: str
 ) -> None:
     with pytest.raises(CampaignError, match="expected local:N, with N at least 1"):
-        run_campaign(load_campaign(str(campaign_file())), tmp_path / "run", Crew(cluster=address), watch)
+        run_campaign(load_campaign(str(campaign_file())), tmp_path / "run", ExecutorConfig(cluster=address), watch)
     assert record.read(tmp_path / "run")["state"] == "interrupted"
 
 
@@ -59,14 +59,14 @@ def test_numbers_of_workers_that_are_none(
 def test_addresses_where_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
     monkeypatch.setattr("marsyard.campaigns.execution.cluster._REACH_S", 1)
     with pytest.raises(CampaignError, match=f"--cluster {address}: no scheduler answers"):
-        ClusterWorkers(address)
+        ClusterExecutor(address)
 
 
 def test_an_address_that_is_none_does_not_hold_up_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that is left is closed where garbage is collected: at worst where the next client's loop starts."""
     monkeypatch.setattr("marsyard.campaigns.execution.cluster._REACH_S", 1)
     with pytest.raises(CampaignError, match="missing port number"):
-        ClusterWorkers("nowhere")
+        ClusterExecutor("nowhere")
     made = distributed.utils.get_loop_factory
 
     def collecting() -> Any:
@@ -75,4 +75,4 @@ def test_an_address_that_is_none_does_not_hold_up_the_next(monkeypatch: pytest.M
 
     monkeypatch.setattr("distributed.utils.get_loop_factory", collecting)
     with pytest.raises(CampaignError, match="no scheduler answers"):
-        ClusterWorkers("tcp://127.0.0.1:1")
+        ClusterExecutor("tcp://127.0.0.1:1")

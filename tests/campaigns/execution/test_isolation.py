@@ -25,9 +25,9 @@ import pytest
 
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.cases import unfinished_row
-from marsyard.campaigns.execution.work import UNLIMITED, Work, WorkLimits
-from marsyard.campaigns.execution.worker_process import Done, request_fresh_worker
-from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.execution.work import Work, WorkLimits
+from marsyard.campaigns.execution.worker_process import TaskResult, request_fresh_worker
+from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.outcomes import CRASHED, TIMED_OUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
@@ -38,10 +38,12 @@ GUARD_S = 60.0
 _kept: list[object] = []
 
 
-def run(task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits = UNLIMITED) -> dict[int, Done[Any]]:
+def run(
+    task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits | None = None
+) -> dict[int, TaskResult[Any]]:
     """What became of items in one worker, which has ended by the time of the return."""
-    with LocalWorkers(1) as workers:
-        return {done.item: done for done in chain.from_iterable(workers.run(Work(task, items, limits)))}
+    with LocalExecutor(1) as workers:
+        return {done.item: done for done in chain.from_iterable(workers.run(Work(task, items, limits or WorkLimits())))}
 
 
 def is_gone(process: int) -> bool:
@@ -152,8 +154,8 @@ def test_a_case_that_kills_or_stops_its_parent_ends_alone(kind: int, tmp_path: P
 
 def scribble(item: int) -> int:
     """Writes a one into every field of what the worker shows its watcher, a process id where there is one."""
-    assert worker_process._place is not None
-    board = worker_process._place.board._bytes
+    assert worker_process._context is not None
+    board = worker_process._context.board._bytes
     board[:] = struct.pack("=q", 1) * (len(board) // 8)
     time.sleep(3600)
     return item
@@ -170,7 +172,7 @@ def test_only_processes_of_the_executor_are_signalled(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr("os.kill", note)
     monkeypatch.setattr("os.killpg", lambda group, number: note(group, number))
-    with LocalWorkers(1) as workers:
+    with LocalExecutor(1) as workers:
         (batch,) = workers.run(Work(scribble, [1], WorkLimits(time_s=3.0)))
         known = workers._workers[0]
         assert isinstance(batch[0].error, CaseEndedError)
@@ -220,7 +222,8 @@ def alter(seconds: float, item: int) -> object:
     """What the process is like; then changes one part of it, in every second item."""
     seen = state()
     if item % 2:
-        list(STATE.values())[item // 2]()
+        changes: list[Any] = list(STATE.values())
+        changes[item // 2]()
     time.sleep(seconds)
     # the environment differs by the worker's folder
     return item, [part for part in seen if not isinstance(part, dict)], sorted(set(seen[1]))  # type: ignore[call-overload]
@@ -231,13 +234,15 @@ def test_state_of_the_process_does_not_reach_the_next_case(seconds: float) -> No
     """Also where cases are so short that several are checked at once."""
     number = 2 * len(STATE)
     done = run(partial(alter, seconds), range(number))
+    results: list[Any] = [done[item].result for item in range(number)]
     # the last two are random numbers, which a case draws alike wherever it runs, and not as another case does
-    assert len({str((done[item].result[1][:-2], done[item].result[2])) for item in range(number)}) == 1
-    assert len({str(done[item].result[1][-2:]) for item in range(number)}) == number
+    assert len({str((one[1][:-2], one[2])) for one in results}) == 1
+    assert len({str(one[1][-2:]) for one in results}) == number
     for place, name in enumerate(STATE):
         assert done[2 * place].changed == ()
         assert done[2 * place + 1].changed == (name,)
-    assert done[5].result[1][-2:] == run(partial(alter, 0.01), [5])[5].result[1][-2:]
+    alone: Any = run(partial(alter, 0.01), [5])[5].result
+    assert results[5][1][-2:] == alone[1][-2:]
 
 
 def import_and_alter(folder: Path, item: int) -> tuple[str | None, ...]:

@@ -1,4 +1,4 @@
-"""Workers: what is lost with one is its task alone."""
+"""Executor: what is lost with one is its task alone."""
 
 from __future__ import annotations
 
@@ -20,19 +20,18 @@ import pytest
 
 from marsyard.algorithms.processes import used_memory
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.batches import MAX_CASES, Batches
-from marsyard.campaigns.execution.work import UNLIMITED, Work, WorkLimits
-from marsyard.campaigns.execution.worker_process import Board, Done, Standing
-from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.execution.work import MAX_BATCH, Batches, Work, WorkLimits
+from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, WorkerStatus
+from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
 def run(
-    workers: LocalWorkers, task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits = UNLIMITED
-) -> Iterator[Done[Any]]:
-    return chain.from_iterable(workers.run(Work(task, items, limits)))
+    workers: LocalExecutor, task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits | None = None
+) -> Iterator[TaskResult[Any]]:
+    return chain.from_iterable(workers.run(Work(task, items, limits or WorkLimits())))
 
 
 def process_number(_: int) -> int:
@@ -60,21 +59,21 @@ def nap(seconds: float, item: int) -> int:
 
 
 def test_tasks_run_in_as_many_processes_as_asked_for() -> None:
-    with LocalWorkers(1) as workers:
+    with LocalExecutor(1) as workers:
         assert {done.result for done in run(workers, process_number, range(5))} != {os.getpid()}
-    with LocalWorkers(2) as workers:
+    with LocalExecutor(2) as workers:
         assert len({done.result for done in run(workers, process_number, range(20))}) == 2
 
 
 def test_a_task_that_lost_its_worker_by_no_fault_of_its_own_is_run_again(tmp_path: Path) -> None:
-    with LocalWorkers(2) as workers:
+    with LocalExecutor(2) as workers:
         done = list(run(workers, partial(abort_once, str(tmp_path / "marker")), range(6)))
     assert sorted(ended.item for ended in done if ended.result == ended.item) == list(range(6))
     assert all(ended.error is None for ended in done)
 
 
 def test_errors_belong_to_their_tasks() -> None:
-    with LocalWorkers(2) as workers:
+    with LocalExecutor(2) as workers:
         ended = {done.item: done for done in run(workers, misbehave, range(3))}
         assert isinstance(ended[0].error, LookupError)
         assert isinstance(ended[1].error, CaseEndedError)
@@ -85,7 +84,7 @@ def test_errors_belong_to_their_tasks() -> None:
 
 
 def interrupted() -> None:
-    with LocalWorkers(1) as workers:
+    with LocalExecutor(1) as workers:
         for _ in run(workers, lambda item: nap(60.0 * item, item), range(2)):
             raise KeyboardInterrupt
 
@@ -106,7 +105,7 @@ def test_memory_of_what_is_to_do_is_flat() -> None:
             taken += 1
             yield item
 
-    with LocalWorkers(2) as workers:
+    with LocalExecutor(2) as workers:
         for number, _ in enumerate(run(workers, partial(nap, 0.0), items())):  # type: ignore[arg-type]
             if number == 10:
                 break
@@ -134,7 +133,7 @@ def hurt(folder: str, item: int) -> int:
 def test_what_is_over_a_limit_is_ended_and_nothing_else(tmp_path: Path) -> None:
     limits = WorkLimits(time_s=3.0, memory_bytes=0.2e9, output_bytes=1e5)
     # With one worker the items run in their order; the first batches are small, the later ones hold several.
-    with LocalWorkers(1) as workers:
+    with LocalExecutor(1) as workers:
         ended = {
             done.item: done
             for done in run(workers, partial(hurt, str(tmp_path)), [0, 5, 6, 7, 1, 2, 3, 4, 8, 9], limits)
@@ -155,7 +154,8 @@ def test_what_is_over_a_limit_is_ended_and_nothing_else(tmp_path: Path) -> None:
     ]
     # Each says where it stood, down to the line.
     for error in errors.values():
-        assert " in hurt" in error.trace  # type: ignore[union-attr]
+        assert isinstance(error, CaseEndedError)
+        assert " in hurt" in error.trace
     assert {item: done.result for item, done in ended.items() if done.error is None} == {
         n: n for n in (0, 5, 6, 7, 8, 9)
     }
@@ -171,7 +171,7 @@ def fill(item: int, kept: list[object] = []) -> int:  # noqa: B006  (kept on pur
 
 def test_a_leak_is_not_laid_to_the_task_that_meets_the_limit() -> None:
     limits = WorkLimits(memory_bytes=0.2e9)
-    with LocalWorkers(1) as workers:
+    with LocalExecutor(1) as workers:
         ended = list(run(workers, slow_fill, range(12), limits))
     assert sorted(done.item for done in ended if done.error is None) == list(range(12))
 
@@ -190,7 +190,7 @@ def spawn(item: int) -> int:
 
 
 def test_what_a_task_started_ends_with_it() -> None:
-    with LocalWorkers(1) as workers:
+    with LocalExecutor(1) as workers:
         (done,) = run(workers, spawn, [0], WorkLimits(time_s=1.0))
         assert isinstance(done.error, CaseEndedError)
         found = subprocess.run(["ps", "-eo", "ppid,args"], capture_output=True, text=True, check=True).stdout
@@ -203,7 +203,7 @@ def leave(*_: object) -> None:
 
 
 def test_a_worker_that_cannot_begin_is_an_error_of_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
-    with LocalWorkers(1) as workers:
+    with LocalExecutor(1) as workers:
         monkeypatch.setattr("marsyard.campaigns.execution.watched.run_batch", leave)
         with pytest.raises(CampaignError, match="worker processes die before they begin a case"):
             list(workers.run(Work(process_number, range(3))))
@@ -230,7 +230,7 @@ def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
     sizes = []
     while batch := batches.next():
         sizes.append(len(batch))
-        batches.took(len(batch), 0.05 * len(batch))
+        batches.record_time(len(batch), 0.05 * len(batch))
     assert sum(sizes) == 400
     assert sizes[:5] == [1, 2, 4, 8, 16]
     assert max(sizes) == 20
@@ -239,18 +239,18 @@ def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
     empty = Batches(range(10_000), None, 2)
     sizes = [len(empty.next())]
     while batch := empty.next():
-        empty.took(sizes[-1], 0.0)
+        empty.record_time(sizes[-1], 0.0)
         sizes.append(len(batch))
-    assert max(sizes) == MAX_CASES
+    assert max(sizes) == MAX_BATCH
     slow = Batches(range(5), 5, 1)
-    slow.took(1, 30.0)
+    slow.record_time(1, 30.0)
     assert [len(slow.next()) for _ in range(5)] == [1] * 5
     assert slow.next() == []
 
 
 def test_the_board_shows_where_a_worker_stands(tmp_path: Path) -> None:
-    board = Board.create(tmp_path / "board")
+    board = StatusBoard.create(tmp_path / "board")
     assert board.read().item is None
-    Board(tmp_path / "board").write(Standing(2**40, 1.5))
-    assert board.read() == Standing(2**40, 1.5)
+    StatusBoard(tmp_path / "board").write(WorkerStatus(2**40, 1.5))
+    assert board.read() == WorkerStatus(2**40, 1.5)
     board.close()

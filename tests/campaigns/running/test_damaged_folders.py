@@ -15,8 +15,7 @@ import typer
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError, ConfigurationError, StoreError
-from marsyard.campaigns.execution.crew import Crew
-from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
 from marsyard.campaigns.running.engine import resume_campaign
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
@@ -35,7 +34,7 @@ def test_a_run_killed_before_its_record_was_written_can_be_started_again(
     directory.mkdir()
     create_store(directory / ROWS_FILE, {"identity": "of the run that was killed"})
     with pytest.raises(StoreError, match="a run was stopped before it began: start it again with --out"):
-        resume_campaign(directory, Crew(1), watch)
+        resume_campaign(directory, ExecutorConfig(1), watch)
     run(campaign_file(), directory, watch, "cases=2", jobs=1)
     assert len(rows_of(directory)) == 2
     # a store with rows is never written over, whatever became of the record
@@ -78,7 +77,7 @@ def test_a_record_that_lacks_a_key_is_refused(troubled: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("command", [lambda folder: replay(folder, 0), lambda folder: resume_campaign(
-    folder, Crew(1), Silence()
+    folder, ExecutorConfig(1), Silence()
 )])  # fmt: skip
 def test_stored_parameters_of_wrong_types_are_refused(
     troubled: Path, tmp_path: Path, command: Callable[[Path], Any]
@@ -125,9 +124,9 @@ def test_a_full_folder_for_temporary_files_is_one_message(monkeypatch: pytest.Mo
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("marsyard.campaigns.execution.temporary.tempfile.mkdtemp", full)
+    monkeypatch.setattr("marsyard.campaigns.execution.workers.tempfile.mkdtemp", full)
     with pytest.raises(CampaignError, match=r"TMPDIR says where they go.*No space left"):
-        LocalWorkers(1)
+        LocalExecutor(1)
 
 
 def test_a_full_disk_ends_any_command_with_one_message(capsys: pytest.CaptureFixture[str]) -> None:

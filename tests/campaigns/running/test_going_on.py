@@ -11,11 +11,11 @@ import pytest
 
 from marsyard.campaigns.definition.identity import package_versions
 from marsyard.campaigns.errors import CampaignError, StoreError
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.lock import folder_lock
+from marsyard.campaigns.store.record import folder_lock
 from tests.campaigns.fake_campaign import Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]
@@ -31,8 +31,8 @@ def test_cases_are_added_behind_those_there_are(
     done: Path, campaign_file: CampaignFile, tmp_path: Path, watch: Silence
 ) -> None:
     before = [str(row) for row in rows_of(done)]
-    append_cases(done, 3, Crew(1), watch)
-    append_cases(done, 1, Crew(2), watch)
+    append_cases(done, 3, ExecutorConfig(1), watch)
+    append_cases(done, 1, ExecutorConfig(2), watch)
     rows = rows_of(done)
     assert [str(row) for row in rows[:4]] == before
     stored = record.read(done)
@@ -42,7 +42,7 @@ def test_cases_are_added_behind_those_there_are(
     assert [differing_columns(*pair) for pair in zip(rows, whole, strict=True)] == [()] * 8
     assert replay(done, 7).differing == ()
     with pytest.raises(CampaignError, match="0 cases cannot be added"):
-        append_cases(done, 0, Crew(1), watch)
+        append_cases(done, 0, ExecutorConfig(1), watch)
 
 
 def test_resume_of_a_finished_campaign_does_no_work(
@@ -55,8 +55,8 @@ def test_resume_of_a_finished_campaign_does_no_work(
     def forbidden(*_: object) -> None:
         raise AssertionError("a worker is started")
 
-    monkeypatch.setattr("marsyard.campaigns.running.engine.hire", forbidden)
-    resume_campaign(done, Crew(1), watch)
+    monkeypatch.setattr("marsyard.campaigns.running.engine.create_executor", forbidden)
+    resume_campaign(done, ExecutorConfig(1), watch)
     assert watch.notes[-1] == "the campaign is finished: all 4 cases have rows; nothing is run"
     assert watch.steps == {}
     assert {name: (done / name).stat().st_mtime_ns for name in before} == before
@@ -65,9 +65,9 @@ def test_resume_of_a_finished_campaign_does_no_work(
 
 def test_crashed_cases_are_run_again_on_request(done: Path, watch: Silence) -> None:
     times = {row["case"]: row["wall_time_s"] for row in rows_of(done)}
-    resume_campaign(done, Crew(1), watch)
+    resume_campaign(done, ExecutorConfig(1), watch)
     assert {row["case"]: row["wall_time_s"] for row in rows_of(done)} == times
-    resume_campaign(done, Crew(1), watch, retry=["crashed"])
+    resume_campaign(done, ExecutorConfig(1), watch, retry=["crashed"])
     again = {row["case"]: row["wall_time_s"] for row in rows_of(done)}
     assert [case for case in times if again[case] != times[case]] == [2]
 
@@ -76,15 +76,19 @@ def test_other_programs_do_not_go_on_unasked(done: Path, watch: Silence, monkeyp
     real = package_versions()
     monkeypatch.setattr("marsyard.campaigns.definition.identity.package_versions", lambda: {**real, "numpy": "0.9"})
     before = {path: path.read_bytes() for path in done.glob("c*.*")}
-    said = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo go on nevertheless.*--allow-changed"
-    for act in (lambda: resume_campaign(done, Crew(1), watch), lambda: append_cases(done, 2, Crew(1), watch)):
+    said = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo continue nevertheless.*--allow-changed"
+    acts: tuple[Callable[[], None], ...] = (
+        lambda: resume_campaign(done, ExecutorConfig(1), watch),
+        lambda: append_cases(done, 2, ExecutorConfig(1), watch),
+    )
+    for act in acts:
         with pytest.raises(CampaignError, match=said):
             act()
     assert {path: path.read_bytes() for path in before} == {
         **before,
         done / "campaign.lock": before[done / "campaign.lock"],
     }
-    append_cases(done, 2, Crew(1), watch, allow_changed=True)
+    append_cases(done, 2, ExecutorConfig(1), watch, allow_changed=True)
     (change,) = record.read(done)["changes"]
     assert (change["cases_before"], change["in"]) == (4, [f"numpy ({np.__version__}, now 0.9)"])
     assert record.read(done)["identity"]["versions"]["numpy"] == "0.9"
@@ -94,7 +98,7 @@ def test_a_changed_configuration_is_no_longer_the_campaigns(done: Path, watch: S
     text = (done / "campaign.json").read_text()
     (done / "campaign.json").write_text(text.replace('"altitude_m": 2000.0', '"altitude_m": 2001.0'))
     with pytest.raises(CampaignError, match="configuration \\("):
-        resume_campaign(done, Crew(1), watch)
+        resume_campaign(done, ExecutorConfig(1), watch)
 
 
 def test_a_store_of_another_campaign_is_refused(
@@ -103,11 +107,15 @@ def test_a_store_of_another_campaign_is_refused(
     other = run(campaign_file(""), tmp_path / "other", watch, "cases=1", "seed=77", jobs=1)
     shutil.copy(other / "cases.sqlite", done / "cases.sqlite")
     with pytest.raises(StoreError, match="belong to different campaigns"):
-        resume_campaign(done, Crew(1), watch)
+        resume_campaign(done, ExecutorConfig(1), watch)
 
 
 def test_two_runners_do_not_share_a_folder(done: Path, watch: Silence) -> None:
     with folder_lock(done):
-        for act in (lambda: resume_campaign(done, Crew(1), watch), lambda: append_cases(done, 2, Crew(1), watch)):
+        acts: tuple[Callable[[], None], ...] = (
+            lambda: resume_campaign(done, ExecutorConfig(1), watch),
+            lambda: append_cases(done, 2, ExecutorConfig(1), watch),
+        )
+        for act in acts:
             with pytest.raises(StoreError, match="is in use"):
                 act()

@@ -12,7 +12,7 @@ import pytest
 from marsyard.campaigns.definition.identity import identity_of
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
@@ -53,16 +53,20 @@ def done(campaign_file: CampaignFile, tmp_path: Path, watch: Silence, table: Pat
 
 def test_a_changed_file_is_noticed_by_resume_and_append(done: Path, table: Path, watch: Silence) -> None:
     assert list(record.read(done)["identity"]["inputs"]) == [str(table)]
-    resume_campaign(done, Crew(1), watch)
+    resume_campaign(done, ExecutorConfig(1), watch)
     table.write_text("1,2,4\n")
-    for act in (lambda: resume_campaign(done, Crew(1), watch), lambda: append_cases(done, 1, Crew(1), watch)):
-        with pytest.raises(CampaignError, match=r"Changed:\n  .*table.csv \(\w{12}, now \w{12}\)\nTo go on"):
+    acts: tuple[Callable[[], None], ...] = (
+        lambda: resume_campaign(done, ExecutorConfig(1), watch),
+        lambda: append_cases(done, 1, ExecutorConfig(1), watch),
+    )
+    for act in acts:
+        with pytest.raises(CampaignError, match=r"Changed:\n  .*table.csv \(\w{12}, now \w{12}\)\nTo continue"):
             act()
     assert replay(done, 0).changed[0].startswith(str(table))
-    append_cases(done, 1, Crew(1), watch, allow_changed=True)
+    append_cases(done, 1, ExecutorConfig(1), watch, allow_changed=True)
     (change,) = record.read(done)["changes"]
     assert "table.csv" in change["in"][0]
-    append_cases(done, 1, Crew(1), watch)
+    append_cases(done, 1, ExecutorConfig(1), watch)
 
 
 def test_campaigns_of_earlier_versions_go_on_and_keep_hashes_from_then_on(
@@ -71,12 +75,12 @@ def test_campaigns_of_earlier_versions_go_on_and_keep_hashes_from_then_on(
     stored = json.loads((done / "campaign.json").read_text())
     del stored["identity"]["inputs"]
     (done / "campaign.json").write_text(json.dumps(stored))
-    append_cases(done, 1, Crew(1), watch)
+    append_cases(done, 1, ExecutorConfig(1), watch)
     assert any("table.csv" in note and "not known" in note for note in watch.notes)
     assert record.read(done)["identity"]["inputs"]
     table.write_text("other\n")
     with pytest.raises(CampaignError, match=r"table\.csv"):
-        resume_campaign(done, Crew(1), watch)
+        resume_campaign(done, ExecutorConfig(1), watch)
 
 
 def test_files_that_are_dispersed_over_belong_to_it(campaign_file: CampaignFile, tmp_path: Path, table: Path) -> None:

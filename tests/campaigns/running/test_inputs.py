@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases
 from marsyard.campaigns.running.estimate import estimate
 from marsyard.campaigns.running.inputs import plan_inputs, used_inputs
@@ -40,7 +41,7 @@ def test_only_inputs_that_cases_draw_are_built(selecting: Path, tmp_path: Path, 
     assert _built(tmp_path / "inputs") == drawn
     assert watch.steps["preparing"] == len(drawn) <= 3
     # cases that are added build those of their own
-    append_cases(directory, 3, Crew(1), watch)
+    append_cases(directory, 3, ExecutorConfig(1), watch)
     assert _built(tmp_path / "inputs") == {f"shared-{row['terrain']}" for row in rows_of(directory)}
 
 
@@ -96,7 +97,8 @@ def test_a_scenario_that_states_nothing_has_all_of_its_inputs_built(
 def test_eight_descents_over_gusev_need_eight_terrains() -> None:
     campaign = load_campaign("dimes-gusev", [], 8)
     assert len(used_inputs(campaign, range(8))) == 8
-    assert {campaign.parameters(case).place.terrain for case in range(8)} == set(used_inputs(campaign, range(8)))
+    parameters: list[Any] = [campaign.parameters(case) for case in range(8)]
+    assert {one.place.terrain for one in parameters} == set(used_inputs(campaign, range(8)))
 
 
 @pytest.mark.parametrize("name", ["hda-hazardous", "vtt-montecarlo", "vtt-accuracy", "dimes-fieldtest", "dimes-smoke"])

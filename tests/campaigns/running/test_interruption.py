@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.campaigns.execution.crew import Crew
-from marsyard.campaigns.execution.workers import LocalWorkers
+from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
 from marsyard.campaigns.running.engine import resume_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
@@ -127,7 +126,7 @@ def test_whatever_ends_the_runner_nothing_of_its_cases_is_left(
     assert _marked(str(tmp_path)) == []
     if kind == signal.SIGKILL:
         monkeypatch.setattr("tempfile.tempdir", str(temporary))
-        with LocalWorkers(1):
+        with LocalExecutor(1):
             assert len(list(temporary.iterdir())) == 1
     assert list(temporary.iterdir()) == []
 
@@ -198,7 +197,7 @@ def test_hostile_cases_come_to_the_right_outcomes_and_touch_no_other(
     assert all(rows[case]["error"] and "fake_scenario.py" in rows[case]["traceback"] for case in expected if case != 4)
     # With more time the slow ones are run again, and the others stay as they are.
     before = rows_of(tmp_path / "hostile")
-    resume_campaign(tmp_path / "hostile", Crew(1), watch, retry=["timed-out"], case_time_s=1.0)
+    resume_campaign(tmp_path / "hostile", ExecutorConfig(1), watch, retry=["timed-out"], case_time_s=1.0)
     assert rows_of(tmp_path / "hostile")[7]["error"] == "took longer than its limit of 1 s"
     for row, other in zip(before, rows_of(tmp_path / "hostile"), strict=True):
         assert row["case"] == 7 or str(row) == str(other)

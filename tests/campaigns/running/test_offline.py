@@ -12,7 +12,7 @@ from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError, StoreError
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.offline import (
     Exported,
@@ -45,7 +45,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     folder = tmp_path_factory.mktemp("offline")
     (folder / "fake.toml").write_text(FILE)
     made = Exported(folder / "out", truth_folder(folder / "out"))
-    export_campaign(campaign(made), made, Crew(1), Silence())
+    export_campaign(campaign(made), made, ExecutorConfig(1), Silence())
     return made
 
 
@@ -78,9 +78,9 @@ def written(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
 def test_answers_made_elsewhere_score_as_a_run(exported: Exported, tmp_path: Path) -> None:
     watch = Silence()
     scored = scored_campaign(exported, written(tmp_path / "theirs.csv", answered(exported)))
-    run_campaign(scored, tmp_path / "scored", Crew(1), watch)
+    run_campaign(scored, tmp_path / "scored", ExecutorConfig(1), watch)
     own = load_campaign(str(exported.directory.parent / "fake.toml"))
-    run_campaign(own, tmp_path / "own", Crew(1), watch)
+    run_campaign(own, tmp_path / "own", ExecutorConfig(1), watch)
     for row, other in zip(rows_of(tmp_path / "scored"), rows_of(tmp_path / "own"), strict=True):
         assert differing_columns(row, other) == ("algorithm",)
         assert row["algorithm"] == "theirs"
@@ -97,19 +97,19 @@ def test_truth_stays_in_its_own_folder(exported: Exported) -> None:
     assert not any("12.0" in path.read_text() for path in exported.directory.glob("*.*"))
     with pytest.raises(CampaignError, match="lies within"):
         export_campaign(
-            campaign(exported), Exported(exported.directory, exported.directory / "truth"), Crew(1), Silence()
+            campaign(exported), Exported(exported.directory, exported.directory / "truth"), ExecutorConfig(1), Silence()
         )
 
 
 def test_an_export_goes_on_and_is_not_mixed_with_another(exported: Exported) -> None:
     times = {path: path.stat().st_mtime_ns for path in (exported.directory / "cases").rglob("*")}
-    export_campaign(campaign(exported), exported, Crew(1), Silence())
+    export_campaign(campaign(exported), exported, ExecutorConfig(1), Silence())
     assert {path: path.stat().st_mtime_ns for path in times} == times
     with pytest.raises(StoreError, match="holds the truth of another export"):
-        export_campaign(campaign(exported, "seed=4"), exported, Crew(1), Silence())
+        export_campaign(campaign(exported, "seed=4"), exported, ExecutorConfig(1), Silence())
     elsewhere = Exported(exported.directory, exported.truth.with_name("new-truth"))
     with pytest.raises(StoreError, match="is there already, and is not empty"):
-        export_campaign(campaign(exported), elsewhere, Crew(1), Silence())
+        export_campaign(campaign(exported), elsewhere, ExecutorConfig(1), Silence())
 
 
 def test_tables_that_do_not_answer_each_case_once(exported: Exported, tmp_path: Path) -> None:

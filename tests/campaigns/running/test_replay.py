@@ -19,7 +19,9 @@ CampaignFile = Callable[..., Path]
 def test_replay_says_what_differs(troubled: Path, tmp_path: Path) -> None:
     troubled = shutil.copytree(troubled, tmp_path / "copy")
     frame = pd.read_parquet(troubled / "cases.parquet")
-    frame.loc[4, "altitude_m"] = np.nextafter(frame.loc[4, "altitude_m"], np.inf)
+    altitudes = frame["altitude_m"].to_numpy(copy=True)
+    altitudes[4] = np.nextafter(altitudes[4], np.inf)
+    frame["altitude_m"] = altitudes
     frame.to_parquet(troubled / "cases.parquet")
     (troubled / "cases.sqlite").unlink()
     assert replay(troubled, 4).differing == ("altitude_m",)

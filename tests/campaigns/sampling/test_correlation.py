@@ -65,7 +65,7 @@ def test_ranks_correlate_as_stated_whatever_the_distributions(
 ) -> None:
     group = campaign(campaign_file, SKEWED, design, cases)
     drawn = table(group, cases)
-    found = stats.spearmanr(drawn).statistic
+    found = np.atleast_2d(stats.spearmanr(drawn).statistic)
     stated = group.configuration.correlations[0].rank
     assert stated is not None
     for row in range(3):
@@ -113,7 +113,7 @@ def test_normal_groups_have_their_covariance(campaign_file: CampaignFile, east: 
 def test_the_conversion_of_ranks_is_exact() -> None:
     """2 sin(pi/6 rho_s) against Spearman's coefficient of a bivariate normal, by integration: 6/pi asin(rho / 2)."""
     group = Correlation(parameters=("a", "b"), rank=((1.0, 0.4), (0.4, 1.0)))
-    rho = group.of_normals[0, 1]
+    rho = group.normal_correlation[0, 1]
     nodes, weights = np.polynomial.hermite_e.hermegauss(80)
     x, y = np.meshgrid(nodes, nodes)
     weight = np.outer(weights, weights) / (2 * np.pi)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from scipy.stats import qmc
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
-from marsyard.campaigns.sampling.design import stratified
+from marsyard.campaigns.sampling.design import build_stratified_design
 
 CampaignFile = Callable[..., Path]
 HEAD = (
@@ -105,11 +106,11 @@ def test_a_sobol_design_is_evener_than_random_draws(campaign_file: CampaignFile)
 @pytest.mark.parametrize("nominal", [False, True])
 def test_any_case_is_drawn_alone(campaign_file: CampaignFile, kind: str, nominal: bool) -> None:
     cases = 6 * 16 + nominal
-    of = {"dispersions": DISPERSIONS + GRID + GROUP, "nominal": nominal}
+    of: dict[str, Any] = {"dispersions": DISPERSIONS + GRID + GROUP, "nominal": nominal}
     forward = load(campaign_file, kind, cases, **of)
     drawn = [forward.draws(case) for case in range(cases)]
     for case in (cases - 1, 17, 3, 0):
-        stratified.cache_clear()
+        build_stratified_design.cache_clear()
         assert load(campaign_file, kind, cases, **of).draws(case) == drawn[case]
     assert len({str(one) for one in drawn}) == cases
 

@@ -17,7 +17,7 @@ from scipy import stats
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.sampling.dispersion import TAIL, Dispersion
 from marsyard.campaigns.sampling.dispersions import AnyDispersion
-from marsyard.campaigns.sampling.shapes import parameters_of, scipy_distributions
+from marsyard.campaigns.sampling.shapes import scipy_distributions, scipy_parameters
 from marsyard.sim.streams import Streams
 
 CampaignFile = Callable[..., Path]
@@ -100,11 +100,11 @@ def test_any_distribution_of_scipy_is_followed_within_any_limits(data: st.DataOb
         ({"distribution": "geom", "p": 0.25, "truncate": [6, 15]}, stats.geom(0.25)),
     ],
 )
-def test_whole_numbers_of_scipy_follow_their_weights(stated: dict[str, object], shape: Any) -> None:
+def test_whole_numbers_of_scipy_follow_their_weights(stated: dict[str, Any], shape: Any) -> None:
     one = dispersion(**stated)
     drawn = [one.quantile(value) for value in np.random.default_rng(3).random(CASES)]
     assert {type(one) for one in drawn} == {int}
-    first, last = stated.get("truncate", (0, 60))  # type: ignore[misc]
+    first, last = stated.get("truncate", (0, 60))
     allowed = np.arange(np.ceil(first), last + 1)
     chance = shape.pmf(allowed) / shape.pmf(allowed).sum()
     assert set(drawn) <= set(allowed.astype(int).tolist())
@@ -118,7 +118,7 @@ def test_whole_numbers_of_scipy_follow_their_weights(stated: dict[str, object], 
 @pytest.mark.parametrize("name", sorted(scipy_distributions()))
 def test_every_distribution_of_scipy_is_drawn_or_refused(name: str) -> None:
     """Whatever its parameters are: a ValidationError, or a finite value between its bounds."""
-    required, allowed = parameters_of(name)
+    required, allowed = scipy_parameters(name)
     for value in (0.5, 1.0, 3.0, -2.0):
         stated = dict.fromkeys(required, value) | ({"scale": 2.0} if "scale" in allowed else {})
         try:

@@ -18,8 +18,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.retention import fails
 from marsyard.campaigns.store.rows import RowStore, create_store
-from marsyard.campaigns.store.table import write_table
-from marsyard.campaigns.store.worst import showcase_case, worst_cases
+from marsyard.campaigns.store.table import showcase_case, worst_cases, write_table
 from tests.campaigns.fake_campaign import Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.lock import folder_lock, is_locked
 from marsyard.campaigns.store.products import load_products, pack_products, save_packed
+from marsyard.campaigns.store.record import folder_lock, is_locked
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import read_rows, write_table
 

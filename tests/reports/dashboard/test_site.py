@@ -11,8 +11,15 @@ import pandas as pd
 import pytest
 
 from marsyard.campaigns.definition.requirements import shipped_requirements
-from marsyard.reports.dashboard.entries import Shown, find_campaigns, read_entries, slug_of
-from marsyard.reports.dashboard.rows import margin_text, requirement_rows, sparkline
+from marsyard.reports.dashboard.entries import (
+    ShownRequirement,
+    find_campaigns,
+    margin_text,
+    read_entries,
+    requirement_rows,
+    slug_of,
+    sparkline,
+)
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.sections import script_hash
 
@@ -146,8 +153,10 @@ def test_pages_of_unchanged_campaigns_are_left(make_rows: Rows, make_run: MakeRu
     assert "as it was" not in page.read_text(encoding="utf-8")
 
 
-def _shown(estimate: float, margin: float = -0.05) -> Shown:
-    return Shown("R", "", "PASS", estimate, 0.9, 0.95, margin, n=10, failures=1, confidence=0.9, decide_by="", note="")
+def _shown(estimate: float, margin: float = -0.05) -> ShownRequirement:
+    return ShownRequirement(
+        "R", "", "PASS", estimate, 0.9, 0.95, margin, n=10, failures=1, confidence=0.9, decide_by="", note=""
+    )
 
 
 def test_sparkline_draws_better_higher() -> None:

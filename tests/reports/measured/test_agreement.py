@@ -68,7 +68,7 @@ def test_pairs_are_read_with_care() -> None:
     whole = products(40)
     (pair,) = matched_pairs(whole)
     assert np.count_nonzero(pair.right) == 30
-    assert pair.told.startswith("Pictures 1 and 2: 30 matches, median residual ")
+    assert pair.caption.startswith("Pictures 1 and 2: 30 matches, median residual ")
     assert matched_pairs({**whole, "matches_1": np.zeros((4, 3))}) == []
     assert matched_pairs({**whole, "image_2": None}) == []
     # a real case is known before the systems whose pictures it may hold too

@@ -20,7 +20,7 @@ def _one(values: np.ndarray) -> Sample:
 
 def test_rates_on_one_terrain_are_compared_as_by_fisher() -> None:
     now, before = np.repeat([1, 0], [7, 33]), np.repeat([1, 0], [2, 58])
-    greater = stats.fisher_exact([[7, 33], [2, 58]], "greater").pvalue
+    greater = stats.fisher_exact(np.array([[7, 33], [2, 58]]), "greater").pvalue
     assert difference_p(_one(now), _one(before)) == pytest.approx(2 * greater)
 
 
@@ -61,7 +61,7 @@ def test_terrains_with_more_cases_are_no_change() -> None:
 
 def test_large_counts_agree_with_the_exact_test() -> None:
     now, before = np.repeat([1, 0], [21_000, 30_000]), np.repeat([1, 0], [41_500, 60_500])
-    exact = stats.fisher_exact([[21_000, 30_000], [41_500, 60_500]]).pvalue
+    exact = stats.fisher_exact(np.array([[21_000, 30_000], [41_500, 60_500]])).pvalue
     assert difference_p(_one(now), _one(before)) == pytest.approx(exact, rel=0.05)
 
 

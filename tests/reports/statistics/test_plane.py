@@ -12,7 +12,7 @@ from marsyard.reports.statistics.plane import ErrorEllipse, circular_error, erro
 def _turned(rng: np.random.Generator, n: int) -> np.ndarray:
     """Normal errors of deviations 3 and 1 about (2, -1), the long axis 30 degrees from the first part's."""
     turn = np.array([[math.cos(0.5236), -math.sin(0.5236)], [math.sin(0.5236), math.cos(0.5236)]])
-    return np.array([2.0, -1.0]) + (rng.normal(size=(n, 2)) * [3.0, 1.0]) @ turn.T
+    return np.asarray(np.array([2.0, -1.0]) + (rng.normal(size=(n, 2)) * [3.0, 1.0]) @ turn.T)
 
 
 def test_ellipse_of_many_normal_errors() -> None:

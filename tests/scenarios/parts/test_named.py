@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, problems_of
-from marsyard.campaigns.definition.identity import chosen_parts, foreign_sources
+from marsyard.campaigns.definition.identity import custom_sources, selected_parts
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.parts import named
 from marsyard.scenarios.parts.motions import OwnMotion
@@ -169,10 +169,10 @@ def test_the_identity_covers_the_modules_of_parts() -> None:
             },
         }
     )
-    assert chosen_parts(configuration) == (
+    assert selected_parts(configuration) == (
         "own_parts:Glider",
         "mine.scores:energy",
         "other:Falling",
         "own_parts:PulsedLidar",
     )
-    assert list(foreign_sources("own_parts:Glider")) == [("own_parts.py", EXAMPLES / "own_parts.py")]
+    assert list(custom_sources("own_parts:Glider")) == [("own_parts.py", EXAMPLES / "own_parts.py")]
