@@ -16,10 +16,10 @@ from marsyard.campaigns.definition.identity import selected_algorithms
 from marsyard.campaigns.errors import not_allowed
 from marsyard.campaigns.sampling.dispersion import Dispersion
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
-from marsyard.scenarios.columns import StatedColumns, stated_columns
 from marsyard.scenarios.estimators import labels
 from marsyard.scenarios.interface import TakesParts
 from marsyard.scenarios.parts.named import SCORE
+from marsyard.scenarios.systems import StatedColumns, stated_columns
 
 #: Cases whose draws are validated before a campaign starts; the range of each dispersion is checked in full.
 _CHECKED_CASES = 32
