@@ -20,10 +20,8 @@ from marsyard.reports.wording import count
 def run_until_decided(campaign: Campaign, directory: Path, crew: Crew, watch: Watch) -> None:
     """Runs a campaign of at most its number of cases; see `marsyard.reports.statistics.sequential`.
 
-    Raises
-    ------
-    CampaignError
-        Where its cases are no independent draws, or no requirement waits to be decided; and as `run_campaign` does.
+    Raises CampaignError where its cases are no independent draws, or no requirement waits to be decided; and as
+    `run_campaign` does.
     """
     configuration = campaign.configuration
     how = sampled(configuration.model_dump(mode="json"))

@@ -54,10 +54,7 @@ class Plan(Parameters):
 def read_plan(path: Path) -> Plan:
     """The plan in a file.
 
-    Raises
-    ------
-    ConfigurationError
-        Where it cannot be read, or states something else.
+    Raises ConfigurationError where it cannot be read, or states something else.
     """
     return read_table(path, Plan)
 

@@ -28,10 +28,7 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
     Of a campaign that is not finished the rows are judged that it has so far, with a status that is never 0, and the
     record is left alone. `requirements` stand in for the campaign's own; the record then keeps its status as well.
 
-    Raises
-    ------
-    StoreError
-        Where the folder holds no campaign with rows, or the report cannot be written.
+    Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
     from marsyard.reports.tables import verdict_table
     from marsyard.reports.wording import count
@@ -59,10 +56,7 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
 
     The record keeps the exit status of a campaign that is finished and is judged by its own requirements.
 
-    Raises
-    ------
-    StoreError
-        Where the folder holds no campaign with rows, or the report cannot be written.
+    Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
     from marsyard.reports.campaign import write_judged
     from marsyard.reports.evaluation import judged
@@ -105,10 +99,7 @@ def _how_it_stands(directory: Path, state: str) -> str:
 def read_frame(directory: Path) -> pd.DataFrame:
     """The stored rows of a campaign.
 
-    Raises
-    ------
-    StoreError
-        Where there are none.
+    Raises StoreError where there are none.
     """
     import pandas as pd
 

@@ -114,31 +114,16 @@ class Shot:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of one camera, or of one of a pair.
+    """A picture of one camera, or of one of a pair."""
 
-    Attributes
-    ----------
-    suffix
-        What tells the pictures of a pair apart: ``-left``, ``-right``; empty for a single camera.
-    camera, mounted
-        The camera model in the world frame; and in the body frame, as it is written.
-    frame, scene
-        Radiance and truth, and what was drawn.
-    exposed
-        The detector at the exposure time that was found; None without detector.
-    counts
-        What the detector delivered; None without detector.
-    filled
-        Whether a pixel sees ground of a terrain model's hole, which is filled; None where the ground is a preset's.
-    """
-
-    suffix: str
-    camera: CameraModel
-    mounted: CameraModel
-    frame: Frame
-    scene: Scene
-    exposed: AutoExposure | None
-    counts: UInt16[np.ndarray, "rows columns"] | None
+    suffix: str  #: What tells the pictures of a pair apart: ``-left``, ``-right``; empty for a single camera
+    camera: CameraModel  #: The camera model in the world frame; and in the body frame, as it is written
+    mounted: CameraModel  #: The camera model in the world frame; and in the body frame, as it is written
+    frame: Frame  #: Radiance and truth, and what was drawn
+    scene: Scene  #: Radiance and truth, and what was drawn
+    exposed: AutoExposure | None  #: The detector at the exposure time that was found; None without detector
+    counts: UInt16[np.ndarray, "rows columns"] | None  #: What the detector delivered; None without detector
+    #: Whether a pixel sees ground of a terrain model's hole, which is filled; None where the ground is a preset's
     filled: Bool[np.ndarray, "rows columns"] | None
 
     def sixteen_bit(self) -> UInt16[np.ndarray, "rows columns"]:

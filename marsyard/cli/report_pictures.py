@@ -11,10 +11,7 @@ def keep_notable_cases(directory: Path, say: Callable[[str], None]) -> None:
 
     A case whose row does not come out as it is stored is kept all the same, and said.
 
-    Raises
-    ------
-    CampaignError
-        Where the campaign's scenario or an algorithm cannot be imported.
+    Raises CampaignError where the campaign's scenario or an algorithm cannot be imported.
     """
     from marsyard.campaigns.execution.workers import LocalWorkers
     from marsyard.campaigns.running.replay import replay_with

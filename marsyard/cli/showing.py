@@ -67,10 +67,7 @@ def described(campaign: Campaign, cases: int | None) -> dict[str, Any]:
 def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
     """Draws what the first cases draw into an SVG or PNG file.
 
-    Raises
-    ------
-    CampaignError
-        Where the file has another ending or cannot be written, or there is nothing to draw.
+    Raises CampaignError where the file has another ending or cannot be written, or there is nothing to draw.
     """
     from marsyard.reports.draws import Drawn, draws_figure, save_figure
 
@@ -96,10 +93,7 @@ def _quantiles(dispersion: Dispersion) -> list[Any] | None:
 def drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
     """What each dispersion draws in the first cases, by its parameter.
 
-    Raises
-    ------
-    CampaignError
-        Where the campaign has fewer cases, or a case cannot be drawn.
+    Raises CampaignError where the campaign has fewer cases, or a case cannot be drawn.
     """
     there = campaign.configuration.total_cases
     if not 1 <= cases <= there:

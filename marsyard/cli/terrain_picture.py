@@ -18,10 +18,7 @@ HOLE_COLOUR, OUTLINE_COLOUR = (40, 40, 220), (0, 200, 255)
 def write_terrain_picture(path: Path, surface: Surface, real: Embedded | None) -> None:
     """Write a shaded picture of a terrain, grid north up, as PNG; of an imported one the real part and its holes.
 
-    Raises
-    ------
-    ValueError
-        Where the file exists, or cannot be written.
+    Raises ValueError where the file exists, or cannot be written.
     """
     import cv2
     import numpy as np

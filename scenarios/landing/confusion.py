@@ -31,24 +31,14 @@ GROSS = 2.0
 
 @dataclass(frozen=True)
 class MapAtPlaces:
-    """The algorithm's map at places of the truth.
+    """The algorithm's map at places of the truth."""
 
-    Attributes
-    ----------
-    known
-        Whether the map has slope and roughness there, and both pictures show the footprint.
-    safe
-        Whether the map calls the place safe.
-    flagged
-        Whether a cell that is itself a hazard, before growth, lies under the lander.
-    slope_rad
-        The map's slope.
-    """
-
+    #: Whether the map has slope and roughness there, and both pictures show the footprint
     known: Bool[np.ndarray, "rows columns"]
-    safe: Bool[np.ndarray, "rows columns"]
+    safe: Bool[np.ndarray, "rows columns"]  #: Whether the map calls the place safe
+    #: Whether a cell that is itself a hazard, before growth, lies under the lander
     flagged: Bool[np.ndarray, "rows columns"]
-    slope_rad: Float[np.ndarray, "rows columns"]
+    slope_rad: Float[np.ndarray, "rows columns"]  #: The map's slope
 
     @classmethod
     def of(cls, ground: Ground, flight: Flight, truth: GroundTruth, limits_rad_m: tuple[float, float]) -> MapAtPlaces:

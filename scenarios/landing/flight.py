@@ -29,24 +29,13 @@ LEAST_INTERVAL_S = 0.1
 
 @dataclass(frozen=True)
 class Flight:
-    """Truth and belief at the two pictures.
+    """Truth and belief at the two pictures."""
 
-    Attributes
-    ----------
-    states
-        True states of the body; the camera is at its origin.
-    poses
-        The on-board filter's.
-    up_body
-        Upwards at the first picture as the inclinometers have it, unit vector in body axes.
-    transit
-        The helicopter's flight that the pictures are from; None for a pair as stated.
-    """
-
-    states: tuple[State, State]
-    poses: tuple[PoseMeasurement, PoseMeasurement]
+    states: tuple[State, State]  #: True states of the body; the camera is at its origin
+    poses: tuple[PoseMeasurement, PoseMeasurement]  #: The on-board filter's
+    #: Upwards at the first picture as the inclinometers have it, unit vector in body axes
     up_body: Float64[np.ndarray, "3"]
-    transit: Transit | None = None
+    transit: Transit | None = None  #: The helicopter's flight that the pictures are from; None for a pair as stated
 
     @classmethod
     def of(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> Flight:

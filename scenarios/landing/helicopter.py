@@ -101,25 +101,13 @@ class Instruments:
 
 @dataclass(frozen=True)
 class Navigated:
-    """A part of a flight as the instruments and the filter had it.
+    """A part of a flight as the instruments and the filter had it."""
 
-    Attributes
-    ----------
-    solution
-        The filter's.
-    boundaries_s
-        True times of its boundaries.
-    solutions, readings
-        What it took in.
-    fix_times_s
-        True times of the receiver's solutions.
-    """
-
-    solution: NavigationSolution
-    boundaries_s: Float64[np.ndarray, "m"]
-    solutions: RtkSolutions
-    readings: TiltCompassReadings
-    fix_times_s: Float64[np.ndarray, "n"]
+    solution: NavigationSolution  #: The filter's
+    boundaries_s: Float64[np.ndarray, "m"]  #: True times of its boundaries
+    solutions: RtkSolutions  #: What it took in
+    readings: TiltCompassReadings  #: What it took in
+    fix_times_s: Float64[np.ndarray, "n"]  #: True times of the receiver's solutions
 
     @classmethod
     def over(
@@ -161,29 +149,15 @@ class Navigated:
 
 @dataclass(frozen=True)
 class Transit:
-    """A flight for pictures.
+    """A flight for pictures."""
 
-    Attributes
-    ----------
-    parameters, instruments, air
-        What it was flown with.
-    flight
-        The truth.
-    navigated
-        The filter's solution up to its end.
-    times_s
-        True times of the pictures (the middles of their exposures).
-    tags_s
-        Their time tags.
-    """
-
-    parameters: HelicopterParameters
-    instruments: Instruments
-    air: Air
-    flight: RotorcraftFlight
-    navigated: Navigated
-    times_s: Float64[np.ndarray, "pictures"]
-    tags_s: Float64[np.ndarray, "pictures"]
+    parameters: HelicopterParameters  #: What it was flown with
+    instruments: Instruments  #: What it was flown with
+    air: Air  #: What it was flown with
+    flight: RotorcraftFlight  #: The truth
+    navigated: Navigated  #: The filter's solution up to its end
+    times_s: Float64[np.ndarray, "pictures"]  #: True times of the pictures (the middles of their exposures)
+    tags_s: Float64[np.ndarray, "pictures"]  #: Their time tags
 
     @classmethod
     def flown(
@@ -235,39 +209,20 @@ class Transit:
 
 @dataclass(frozen=True)
 class Touchdown:
-    """A landing.
+    """A landing."""
 
-    Attributes
-    ----------
-    flight
-        The whole flight, from its start to rest on the ground.
-    navigated
-        Instruments and filter from the transit's end on.
-    time_s
-        When the skids touched.
-    state
-        Truth then.
-    believed_m
-        Where the filter had it then.
-    gps_m, gps_deviation_m
-        Means of the receiver's positions and of the standard deviations it reported, while it stood: how the paper
-        measured (Table II); not a number without solutions.
-    gps_solutions
-        How many were averaged.
-    turns, moved_m
-        Turns that were needed to agree on flight and filter, and what the last one still moved the path.
-    """
-
-    flight: RotorcraftFlight
-    navigated: Navigated
-    time_s: float
-    state: State
-    believed_m: Float64[np.ndarray, "3"]
+    flight: RotorcraftFlight  #: The whole flight, from its start to rest on the ground
+    navigated: Navigated  #: Instruments and filter from the transit's end on
+    time_s: float  #: When the skids touched
+    state: State  #: Truth then
+    believed_m: Float64[np.ndarray, "3"]  #: Where the filter had it then
+    #: Means of the receiver's positions and of the standard deviations it reported, while it stood: how the paper
+    #: measured (Table II); not a number without solutions
     gps_m: Float64[np.ndarray, "3"]
     gps_deviation_m: Float64[np.ndarray, "3"]
-    gps_solutions: int
-    turns: int
-    moved_m: float
+    gps_solutions: int  #: How many were averaged
+    turns: int  #: Turns that were needed to agree on flight and filter, and what the last one still moved the path
+    moved_m: float  #: Turns that were needed to agree on flight and filter, and what the last one still moved the path
 
     def gps_error_m(self, site_m: Float64[np.ndarray, "3"]) -> float:
         """Horizontal distance of the averaged solutions from the desired site: the paper's "position error"."""

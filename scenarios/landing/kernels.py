@@ -101,20 +101,11 @@ def footprints(
 ) -> tuple[Array, Array, Array]:
     """Slope, greatest distance from the plane (upwards or downwards), and area farther than `limit`, of footprints.
 
-    Parameters
-    ----------
-    heights, spacing
-        The grid, metres.
-    middles
-        The grid's point (row, column) in the middle of each footprint; a footprint lies within the grid.
-    disc
-        The footprint.
-    limit
-        Distance above which area is counted.
-
-    Returns
-    -------
-    Angles (radians), distances (metres) and areas (square metres).
+    `heights`, `spacing`: The grid, metres.
+    `middles`: The grid's point (row, column) in the middle of each footprint; a footprint lies within the grid.
+    `disc`: The footprint.
+    `limit`: Distance above which area is counted.
+    Returns angles (radians), distances (metres) and areas (square metres).
     """
     offsets, fitted = disc.offsets, disc.fitted
     slopes, roughness, exceeding = np.empty(len(middles)), np.empty(len(middles)), np.empty(len(middles))

@@ -54,10 +54,7 @@ def choose_pair(
 
     Pairs with too little overlap are taken only if there are no others.
 
-    Raises
-    ------
-    ValueError
-        If there are fewer than two pictures.
+    Raises ValueError if there are fewer than two pictures.
     """
     if len(poses) < 2:
         raise ValueError(f"a pair is to be chosen from {len(poses)} pictures; at least 2 are needed")

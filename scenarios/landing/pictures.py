@@ -23,18 +23,10 @@ from marsyard.sim.streams import Streams
 
 @dataclass(frozen=True)
 class Pair:
-    """Two pictures.
+    """Two pictures."""
 
-    Attributes
-    ----------
-    images
-        As delivered, with the true camera.
-    frames
-        What was to be seen, without detector.
-    """
-
-    images: tuple[DetectorImage, DetectorImage]
-    frames: tuple[Frame, Frame]
+    images: tuple[DetectorImage, DetectorImage]  #: As delivered, with the true camera
+    frames: tuple[Frame, Frame]  #: What was to be seen, without detector
 
     @property
     def counts(self) -> tuple[UInt16[np.ndarray, "rows columns"], UInt16[np.ndarray, "rows columns"]]:

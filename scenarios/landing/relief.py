@@ -29,57 +29,32 @@ FITTED_EVERY = 4
 
 @dataclass(frozen=True)
 class Limits:
-    """What a lander can stand on.
+    """What a lander can stand on."""
 
-    Attributes
-    ----------
-    diameter_m
-        Diameter of its footprint, a disc.
-    max_slope_rad, max_roughness_m
-        Steepest plane and farthest distance from it.
-    """
-
-    diameter_m: float
-    max_slope_rad: float
-    max_roughness_m: float
+    diameter_m: float  #: Diameter of its footprint, a disc
+    max_slope_rad: float  #: Steepest plane and farthest distance from it
+    max_roughness_m: float  #: Steepest plane and farthest distance from it
 
 
 @dataclass(frozen=True)
 class Footprints:
-    """The true ground under landers at some places.
+    """The true ground under landers at some places."""
 
-    Attributes
-    ----------
-    slope_rad, roughness_m
-        As defined above.
-    exceeding_m2
-        Area of the footprint that is farther from the plane than the limit.
-    safe
-        Whether slope and roughness are within the limits.
-    """
-
-    slope_rad: Float[np.ndarray, "*places"]
-    roughness_m: Float[np.ndarray, "*places"]
-    exceeding_m2: Float[np.ndarray, "*places"]
-    safe: Bool[np.ndarray, "*places"]
+    slope_rad: Float[np.ndarray, "*places"]  #: As defined above
+    roughness_m: Float[np.ndarray, "*places"]  #: As defined above
+    exceeding_m2: Float[np.ndarray, "*places"]  #: Area of the footprint that is farther from the plane than the limit
+    safe: Bool[np.ndarray, "*places"]  #: Whether slope and roughness are within the limits
 
 
 @dataclass(frozen=True)
 class Relief:
-    """Exact heights on a grid along the world's axes.
+    """Exact heights on a grid along the world's axes."""
 
-    Attributes
-    ----------
-    heights_m
-        Of ground and rocks; row i lies at y = south + i spacing, column j at x = west + j spacing.
-    west_m, south_m, spacing_m
-        Where the grid lies.
-    """
-
+    #: Of ground and rocks; row i lies at y = south + i spacing, column j at x = west + j spacing
     heights_m: Float[np.ndarray, "rows columns"]
-    west_m: float
-    south_m: float
-    spacing_m: float
+    west_m: float  #: Where the grid lies
+    south_m: float  #: Where the grid lies
+    spacing_m: float  #: Where the grid lies
 
     @classmethod
     def of(
@@ -126,10 +101,7 @@ class Relief:
     def footprints(self, places: Float[np.ndarray, "*places 2"], limits: Limits) -> Footprints:
         """The ground under landers at places (x, y).
 
-        Raises
-        ------
-        ValueError
-            If a footprint does not lie within the grid.
+        Raises ValueError if a footprint does not lie within the grid.
         """
         disc = _disc(round(0.5 * limits.diameter_m / self.spacing_m))
         middles = np.rint(self.cells(places)).astype(np.int64).reshape(-1, 2)

@@ -33,29 +33,14 @@ class GroundTruth:
     """The true ground of a flight.
 
     Places are a lattice about the first picture, along its horizontal axes.
-
-    Attributes
-    ----------
-    relief
-        Exact heights.
-    limits
-        What the lander can stand on.
-    places
-        World x, y of the lattice.
-    footprints
-        The ground under a lander at each place.
-    covered
-        Whether both pictures show all of the ground under it.
-    step_m
-        Distance of the places.
     """
 
-    relief: Relief
-    limits: Limits
-    places: Float[np.ndarray, "rows columns 2"]
-    footprints: Footprints
-    covered: Bool[np.ndarray, "rows columns"]
-    step_m: float
+    relief: Relief  #: Exact heights
+    limits: Limits  #: What the lander can stand on
+    places: Float[np.ndarray, "rows columns 2"]  #: World x, y of the lattice
+    footprints: Footprints  #: The ground under a lander at each place
+    covered: Bool[np.ndarray, "rows columns"]  #: Whether both pictures show all of the ground under it
+    step_m: float  #: Distance of the places
 
     @classmethod
     def of(cls, world: World, flight: Flight, pair: Pair, limits: Limits) -> GroundTruth:

@@ -23,24 +23,12 @@ KEPT_GROUNDS = 64
 
 @dataclass(frozen=True)
 class World:
-    """Where a landing happens.
+    """Where a landing happens."""
 
-    Attributes
-    ----------
-    ground
-        The terrain with its rocks.
-    sun
-        The sun.
-    meshes
-        Own bodies on the ground.
-    brightness
-        Sunlight at the ground over that for which the detector's responsivity is stated.
-    """
-
-    ground: SiteGround
-    sun: Sun
-    meshes: tuple[MeshParameters, ...]
-    brightness: float
+    ground: SiteGround  #: The terrain with its rocks
+    sun: Sun  #: The sun
+    meshes: tuple[MeshParameters, ...]  #: Own bodies on the ground
+    brightness: float  #: Sunlight at the ground over that for which the detector's responsivity is stated
 
     @classmethod
     def of(cls, p: LandingScenarioParameters, load_ground: LoadGround = SiteGround.from_bank) -> World:

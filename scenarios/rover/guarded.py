@@ -17,12 +17,8 @@ from marsyard.sim.measurements import MastCalibration, RoverMeasurements, Target
 class GuardedTracker:
     """A tracker under test.
 
-    Parameters
-    ----------
-    tracker
-        The user's or one of ours.
-    mast
-        As calibrated; the tracker gets one copy of it for all of the run.
+    `tracker`: The user's or one of ours.
+    `mast`: As calibrated; the tracker gets one copy of it for all of the run.
     """
 
     def __init__(self, tracker: TargetTracker, mast: MastCalibration) -> None:
@@ -45,14 +41,9 @@ class GuardedTracker:
     ) -> tuple[TargetUpdate, float]:
         """The answer to a stop's pictures, and the time that it took, s; raises as `aim`.
 
-        Parameters
-        ----------
-        pictures
-            Of the left and the right camera.
-        angles_rad
-            Azimuth and elevation as the mast's encoders read them.
-        world_from_rover
-            The rover's pose as estimated on board.
+        `pictures`: Of the left and the right camera.
+        `angles_rad`: Azimuth and elevation as the mast's encoders read them.
+        `world_from_rover`: The rover's pose as estimated on board.
         """
         handover = Handover((pictures.left, pictures.right))
         left, right = handover.given

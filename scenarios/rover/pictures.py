@@ -71,24 +71,12 @@ class StereoPictures:
 
 @dataclass(frozen=True)
 class Photographer:
-    """Takes stereo subframes.
+    """Takes stereo subframes."""
 
-    Attributes
-    ----------
-    backend
-        Of the renderer.
-    detectors
-        Of the pair.
-    exposure
-        How it is set.
-    noise
-        Stream of the detectors' noise.
-    """
-
-    backend: Backend
-    detectors: Detectors
-    exposure: ExposureParameters
-    noise: np.random.Generator
+    backend: Backend  #: Of the renderer
+    detectors: Detectors  #: Of the pair
+    exposure: ExposureParameters  #: How it is set
+    noise: np.random.Generator  #: Stream of the detectors' noise
 
     def take(
         self,
@@ -102,22 +90,13 @@ class Photographer:
     ) -> StereoPictures:
         """Subframes of the true cameras on a head.
 
-        Parameters
-        ----------
-        scene
-            What is there, without the rover.
-        rover
-            The rover, where its shadow may fall on what is shown.
-        world_from_head
-            True pose of the mast's head.
-        cameras
-            The true cameras in the head's frame.
-        boxes
-            Parts of the full frames to deliver.
-        brightness
-            Sunlight over that at 1 AU.
-        time_s
-            When.
+        `scene`: What is there, without the rover.
+        `rover`: The rover, where its shadow may fall on what is shown.
+        `world_from_head`: True pose of the mast's head.
+        `cameras`: The true cameras in the head's frame.
+        `boxes`: Parts of the full frames to deliver.
+        `brightness`: Sunlight over that at 1 AU.
+        `time_s`: When.
         """
         shown = [
             PixelRays.of(camera.cropped(*box.corner, box.size)) for camera, box in zip(cameras, boxes, strict=True)

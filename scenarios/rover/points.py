@@ -87,10 +87,7 @@ def facing(
 ) -> Float64[np.ndarray, "3"]:
     """Unit normal, towards a place, of the surface that is seen from it about a point: mean of a square of rays.
 
-    Parameters
-    ----------
-    reach_rad
-        Half of the square's side, as an angle. Rays that pass the rock do not count.
+    `reach_rad`: Half of the square's side, as an angle. Rays that pass the rock do not count.
     """
     axes = sight_axes(point - eye)
     steps = np.tan(reach_rad) * np.linspace(-1.0, 1.0, _ACROSS_PATCH)
@@ -110,23 +107,12 @@ def facing(
 
 @dataclass(frozen=True)
 class Sight:
-    """A rock seen from a place: directions as tangents across (to the right) and up about the line to its middle.
+    """A rock seen from a place: directions as tangents across (to the right) and up about the line to its middle."""
 
-    Attributes
-    ----------
-    triangles
-        The rock, world axes, metres.
-    eye
-        World place that it is seen from.
-    axes
-        Rows: forward, right and up of the view, world axes.
-    seen
-        Rows of lines of sight, from the rock's foot up, with the tangents across at its left and right outline.
-    """
-
-    triangles: Float64[np.ndarray, "triangles 3 3"]
-    eye: Float64[np.ndarray, "3"]
-    axes: Float64[np.ndarray, "3 3"]
+    triangles: Float64[np.ndarray, "triangles 3 3"]  #: The rock, world axes, metres
+    eye: Float64[np.ndarray, "3"]  #: World place that it is seen from
+    axes: Float64[np.ndarray, "3 3"]  #: Rows: forward, right and up of the view, world axes
+    #: Rows of lines of sight, from the rock's foot up, with the tangents across at its left and right outline
     seen: Float64[np.ndarray, "rows 3"]
 
     @classmethod
@@ -150,17 +136,9 @@ class Sight:
     def point(self, across: float, up: float) -> Float64[np.ndarray, "3"]:
         """The surface point seen at a place of the rock's face, world axes, metres.
 
-        Parameters
-        ----------
-        across
-            From the left (-1) to the right (1) outline.
-        up
-            From the foot (0) to the top (1).
-
-        Raises
-        ------
-        ValueError
-            Where the line of sight meets no triangle: at the outline itself.
+        `across`: From the left (-1) to the right (1) outline.
+        `up`: From the foot (0) to the top (1).
+        Raises ValueError where the line of sight meets no triangle: at the outline itself.
         """
         heights, left, right = self.seen.T
         tangent_up = heights[0] + up * (heights[-1] - heights[0])

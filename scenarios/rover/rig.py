@@ -19,24 +19,12 @@ from marsyard.sim.streams import Streams
 
 @dataclass
 class Rig:
-    """A mast and its pair.
+    """A mast and its pair."""
 
-    Attributes
-    ----------
-    head
-        The pair as it is and as calibrated.
-    mast
-        The mast with its errors.
-    state
-        Where it points now.
-    motors
-        Stream of where its motors stop.
-    """
-
-    head: StereoHead
-    mast: Mast
-    state: MastState
-    motors: np.random.Generator
+    head: StereoHead  #: The pair as it is and as calibrated
+    mast: Mast  #: The mast with its errors
+    state: MastState  #: Where it points now
+    motors: np.random.Generator  #: Stream of where its motors stop
 
     @classmethod
     def of(cls, p: RoverScenarioParameters, streams: Streams) -> Rig:

@@ -19,18 +19,10 @@ WIDEST_ARC_RAD = np.radians(15.0)
 
 @dataclass(frozen=True)
 class Belief:
-    """What the rover's computer knows when it plans a step.
+    """What the rover's computer knows when it plans a step."""
 
-    Attributes
-    ----------
-    target_rover
-        The target's latest estimate in the rover frame, metres, shape (3,).
-    range_m
-        From the camera to it.
-    """
-
-    target_rover: Float64[np.ndarray, "3"]
-    range_m: float
+    target_rover: Float64[np.ndarray, "3"]  #: The target's latest estimate in the rover frame, metres, shape (3,)
+    range_m: float  #: From the camera to it
 
     @property
     def distance_m(self) -> float:

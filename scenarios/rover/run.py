@@ -61,37 +61,17 @@ class Setup:
 
 @dataclass
 class Run(Setup):
-    """A run in progress, or finished.
+    """A run in progress, or finished."""
 
-    Attributes
-    ----------
-    target
-        The designated point.
-    stops
-        Those at which the target was tracked, in order.
-    outcome
-        How it ended.
-    handed_over
-        Whether the arm would have been given the target at the end.
-    visual_odometry_updates, autonav_updates
-        How many there were.
-    mapper
-        The navigator's map.
-    time_s
-        Since the start.
-    pending
-        What was driven since the last stop.
-    """
-
-    target: ChosenTarget
-    stops: list[Stop] = field(default_factory=list)
-    outcome: RunOutcome = RunOutcome.STUCK
-    handed_over: bool = False
-    visual_odometry_updates: int = 0
-    autonav_updates: int = 0
-    mapper: Mapper = field(default_factory=Mapper)
-    time_s: float = 0.0
-    pending: list[Drive] = field(default_factory=list)
+    target: ChosenTarget  #: The designated point
+    stops: list[Stop] = field(default_factory=list)  #: Those at which the target was tracked, in order
+    outcome: RunOutcome = RunOutcome.STUCK  #: How it ended
+    handed_over: bool = False  #: Whether the arm would have been given the target at the end
+    visual_odometry_updates: int = 0  #: How many there were
+    autonav_updates: int = 0  #: How many there were
+    mapper: Mapper = field(default_factory=Mapper)  #: The navigator's map
+    time_s: float = 0.0  #: Since the start
+    pending: list[Drive] = field(default_factory=list)  #: What was driven since the last stop
 
     @classmethod
     def at(cls, setup: Setup, target: ChosenTarget) -> Run:

@@ -31,61 +31,28 @@ class RunOutcome(Enum):
 
 @dataclass(frozen=True)
 class View:
-    """The pictures of a stop, and where they were taken.
+    """The pictures of a stop, and where they were taken."""
 
-    Attributes
-    ----------
-    leg
-        Number of the leg that led here; -1 for the start.
-    time_s
-        Since the start of the run.
-    stance
-        The rover as it stands.
-    estimated
-        World pose of the rover as estimated on board.
-    angles_rad
-        Azimuth and elevation that the mast's encoders read.
-    world_from_head
-        True pose of the mast's head.
-    pictures
-        As delivered.
-    drives
-        The commands driven since the stop before.
-    """
-
-    leg: int
-    time_s: float
-    stance: Stance
-    estimated: RigidTransform
-    angles_rad: tuple[float, float]
-    world_from_head: RigidTransform
-    pictures: StereoPictures
-    drives: tuple[Drive, ...]
+    leg: int  #: Number of the leg that led here; -1 for the start
+    time_s: float  #: Since the start of the run
+    stance: Stance  #: The rover as it stands
+    estimated: RigidTransform  #: World pose of the rover as estimated on board
+    angles_rad: tuple[float, float]  #: Azimuth and elevation that the mast's encoders read
+    world_from_head: RigidTransform  #: True pose of the mast's head
+    pictures: StereoPictures  #: As delivered
+    drives: tuple[Drive, ...]  #: The commands driven since the stop before
 
 
 @dataclass(frozen=True)
 class Stop(View):
-    """A stop at which the target was tracked.
+    """A stop at which the target was tracked."""
 
-    Attributes
-    ----------
-    update
-        The tracker's answer.
-    track_time_s
-        Processor time of the update.
-    point_px
-        Where the left camera truly shows the designated point, full-frame (u, v); NaN where it does not.
-    point_rover
-        The designated point in the rover's true frame, metres.
-    range_m
-        From the left camera's true centre to it.
-    """
-
-    update: TargetUpdate
-    track_time_s: float
+    update: TargetUpdate  #: The tracker's answer
+    track_time_s: float  #: Processor time of the update
+    #: Where the left camera truly shows the designated point, full-frame (u, v); NaN where it does not
     point_px: Float64[np.ndarray, "2"]
-    point_rover: Float64[np.ndarray, "3"]
-    range_m: float
+    point_rover: Float64[np.ndarray, "3"]  #: The designated point in the rover's true frame, metres
+    range_m: float  #: From the left camera's true centre to it
 
     @classmethod
     def of(

@@ -32,24 +32,13 @@ BEHIND_SHARE = 0.1
 
 @dataclass(frozen=True)
 class ChosenTarget:
-    """The point that is driven to.
+    """The point that is driven to."""
 
-    Attributes
-    ----------
-    point_world
-        The designated point of the rock's surface, world, metres.
-    designation
-        How it is designated to the rover.
-    on_edge
-        Whether the template about it, as either camera sees it from the start, shows what lies well behind the rock.
-    lit
-        Whether the sun shines on it at the start: no part of the rock is before the sun.
-    """
-
-    point_world: Float64[np.ndarray, "3"]
-    designation: TargetDesignation
+    point_world: Float64[np.ndarray, "3"]  #: The designated point of the rock's surface, world, metres
+    designation: TargetDesignation  #: How it is designated to the rover
+    #: Whether the template about it, as either camera sees it from the start, shows what lies well behind the rock
     on_edge: bool
-    lit: bool
+    lit: bool  #: Whether the sun shines on it at the start: no part of the rock is before the sun
 
 
 @dataclass(frozen=True)
@@ -58,17 +47,11 @@ class Sightings:
 
     A patch narrows with the cosine of its obliquity: a turn of 10 deg takes a sixth of its width about 45 deg, and a
     third about 65 deg, which a template that is only scaled and rolled does not follow.
-
-    Attributes
-    ----------
-    in_view
-        Whether both cameras see it at every stop, its template never on an occluding edge.
-    obliquity_start_deg, obliquity_max_deg
-        Between the left camera's line of sight and the normal of the surface that the first template shows, at the
-        first stop and at most; 0 is face-on.
     """
 
-    in_view: bool
+    in_view: bool  #: Whether both cameras see it at every stop, its template never on an occluding edge
+    #: Between the left camera's line of sight and the normal of the surface that the first template shows, at the first
+    #: stop and at most; 0 is face-on
     obliquity_start_deg: float
     obliquity_max_deg: float
 

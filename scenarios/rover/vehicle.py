@@ -21,28 +21,16 @@ FELT_M = 1.5
 
 @dataclass
 class Vehicle:
-    """A rover under way.
+    """A rover under way."""
 
-    Attributes
-    ----------
-    rover, ground, soil
-        What drives on what.
-    stance
-        Truth.
-    odometer, estimate
-        What it believes.
-    slips, errors
-        Streams of its slip and of its odometry.
-    """
-
-    rover: RoverParameters
-    ground: Ground
-    soil: Soil
-    stance: Stance
-    odometer: Odometer
-    estimate: PoseEstimate
-    slips: np.random.Generator
-    errors: np.random.Generator
+    rover: RoverParameters  #: What drives on what
+    ground: Ground  #: What drives on what
+    soil: Soil  #: What drives on what
+    stance: Stance  #: Truth
+    odometer: Odometer  #: What it believes
+    estimate: PoseEstimate  #: What it believes
+    slips: np.random.Generator  #: Streams of its slip and of its odometry
+    errors: np.random.Generator  #: Streams of its slip and of its odometry
 
     @classmethod
     def placed(cls, p: RoverScenarioParameters, world: RunWorld, rig: Rig, streams: Streams) -> Vehicle:

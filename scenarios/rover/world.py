@@ -92,23 +92,13 @@ class SunPath:
 
 @dataclass
 class RunWorld:
-    """Where a run happens.
+    """Where a run happens."""
 
-    Attributes
-    ----------
-    ground
-        The ground with all its rocks; the target's is called `TARGET`, obstacles `obstacle-1`, `obstacle-2`, ...
-    base
-        The scene at the start, without the rover.
-    sun
-        The sun over the run.
-    target_triangles
-        Triangles of the target's rock as it is drawn: what pictures show is what truth is.
-    """
-
+    #: The ground with all its rocks; the target's is called `TARGET`, obstacles `obstacle-1`, `obstacle-2`,
     ground: SiteGround
-    base: Scene
-    sun: SunPath
+    base: Scene  #: The scene at the start, without the rover
+    sun: SunPath  #: The sun over the run
+    #: Triangles of the target's rock as it is drawn: what pictures show is what truth is
     target_triangles: Float64[np.ndarray, "triangles 3 3"]
     _latest: tuple[int, Scene] | None = field(default=None, repr=False)
 
