@@ -10,7 +10,6 @@ loop); what the last turn still moved is told.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
@@ -56,15 +55,14 @@ class HelicopterParameters(Parameters):
     rtk: RtkParameters = RtkParameters()
     compass: TiltCompassParameters = TiltCompassParameters()
     navigation: FilterParameters = FilterParameters()
-    picture_clock: Annotated[ClockParameters, Field(description="errors of the pictures' time tags (assumed)")] = (
-        ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005)
+    picture_clock: ClockParameters = Field(
+        ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005),
+        description="errors of the time tags (assumed)",
     )
-    averaging_after_s: Annotated[
-        float, Field(ge=2.0, le=3600.0, description="from the touchdown to the first averaged solution, s (assumed)")
-    ] = 2.0
-    averaging_s: Annotated[
-        float, Field(gt=0.0, le=600.0, description="for which solutions are averaged, s: the paper has dozens")
-    ] = 5.0
+    averaging_after_s: float = Field(
+        2.0, ge=2.0, le=3600.0, description="touchdown to the first averaged solution (assumed)"
+    )
+    averaging_s: float = Field(5.0, gt=0.0, le=600.0, description="averaging time: the paper has dozens of solutions")
 
     @property
     def span_s(self) -> tuple[float, float]:

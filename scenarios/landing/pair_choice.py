@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
@@ -25,12 +24,10 @@ class PairParameters(Parameters):
     A pair is worth its overlap times its baseline, which counts up to `wanted_share` of the range.
     """
 
-    wanted_share: Annotated[
-        float, Field(gt=0.0, le=2.0, description="baseline over range beyond which more is worth nothing")
-    ] = 0.2
-    least_overlap: Annotated[
-        float, Field(ge=0.0, le=1.0, description="share of the first picture's ground that the second must show")
-    ] = 0.5
+    wanted_share: float = Field(0.2, gt=0.0, le=2.0, description="baseline over range beyond which more does not count")
+    least_overlap: float = Field(
+        0.5, ge=0.0, le=1.0, description="fraction of the first picture's ground in the second"
+    )
 
 
 @dataclass(frozen=True)

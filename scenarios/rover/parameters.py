@@ -39,10 +39,9 @@ class InclineParameters(Parameters):
 
     name: Annotated[str, Field(min_length=1, description="what the report calls such ground")] = "flat ground"
     slope_deg: Annotated[float, Field(ge=0.0, le=40.0, description="0 for none")] = 0.0
-    oblique_deg: Annotated[
-        float,
-        Field(ge=-180.0, le=180.0, description="turn of the start about the target, added to its bearing"),
-    ] = 0.0
+    oblique_deg: float = Field(
+        0.0, ge=-180.0, le=180.0, description="rotation of the start about the target, added to its bearing"
+    )
 
 
 class WorldParameters(Parameters):
@@ -54,23 +53,19 @@ class WorldParameters(Parameters):
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, 2.5 cm apart")] = 2048
     incline: InclineParameters = InclineParameters()
-    rms_slope_deg: Annotated[
-        float | None, Field(ge=0.0, le=30.0, description="RMS slope of the rough ground; by default the site's")
-    ] = None
-    rock_abundance: Annotated[
-        float | None, Field(ge=0.0, le=0.4, description="share of the ground under rocks; by default the site's")
-    ] = None
-    largest_near_m: Annotated[
-        NonNegative, Field(description="largest rock left between the start and the target, m: operators choose a way")
-    ] = 0.08
+    rms_slope_deg: float | None = Field(None, ge=0.0, le=30.0, description="of the rough ground; by default the site's")
+    rock_abundance: float | None = Field(
+        None, ge=0.0, le=0.4, description="fraction of the ground under rocks; default: the site's"
+    )
+    largest_near_m: NonNegative = Field(
+        0.08, description="largest rock left between start and target: operators choose a clear route"
+    )
     east_m: Annotated[float, Field(description="where the target's rock lies, on the periodic terrain")] = 8.0
     north_m: Annotated[float, Field(description="where the target's rock lies, on the periodic terrain")] = 8.0
-    rocks_underfoot: Annotated[
-        bool, Field(description="whether wheels feel the rocks they meet, or the ground alone")
-    ] = False
-    background_half_deg: Annotated[
-        float, Field(gt=0.0, le=180.0, description="half the angle behind the target over which rocks are drawn")
-    ] = 50.0
+    rocks_underfoot: bool = Field(False, description="whether wheels feel the rocks they meet, or the ground alone")
+    background_half_deg: float = Field(
+        50.0, gt=0.0, le=180.0, description="half the angle behind the target with rocks drawn"
+    )
 
     @field_validator("site")
     @classmethod
@@ -113,23 +108,19 @@ class TargetParameters(Parameters):
     yaw_deg: Annotated[float | None, Field(description="its turn; drawn by default")] = None
     across: Annotated[float, Field(ge=-1.0, le=1.0, description="place of the point across the rock")] = 0.0
     up: Annotated[float, Field(ge=0.0, le=1.0, description="place of the point up the rock")] = 0.5
-    designation: Annotated[
-        Literal["pixel", "rover", "site"], Field(description="how the ground names the target (section 3)")
-    ] = "pixel"
+    designation: Literal["pixel", "rover", "site"] = Field("pixel", description="how operators designate the target")
 
 
 class StartParameters(Parameters):
     """Where the rover stands at first, seen from the target."""
 
-    distance_m: Annotated[
-        float, Field(gt=1.0, le=40.0, description="horizontally from the mast to the designated point, m")
-    ] = 10.0
-    bearing_deg: Annotated[
-        float, Field(ge=-360.0, le=720.0, description="direction from the target to the rover, clockwise from north")
-    ] = 270.0
-    target_azimuth_deg: Annotated[
-        float, Field(ge=-180.0, le=180.0, description="where the target is seen, to the right of straight ahead")
-    ] = 0.0
+    distance_m: float = Field(10.0, gt=1.0, le=40.0, description="horizontally from the mast to the designated point")
+    bearing_deg: float = Field(
+        270.0, ge=-360.0, le=720.0, description="from the target to the rover, clockwise from north"
+    )
+    target_azimuth_deg: float = Field(
+        0.0, ge=-180.0, le=180.0, description="of the target, to the right of straight ahead"
+    )
 
 
 class LegParameters(Parameters):
@@ -147,36 +138,26 @@ class LegParameters(Parameters):
 
     motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
     steps: Annotated[int, Field(ge=1, le=200, description="steps; at most so many of an approach or back-off")] = 60
-    step_share: Annotated[
-        float, Field(gt=0.0, le=0.9, description="length of a step over the distance from camera to target")
-    ] = 0.1
+    step_share: float = Field(0.1, gt=0.0, le=0.9, description="step length over the distance from camera to target")
     step_m: Annotated[float | None, Field(description="length of a step instead; needed for straight")] = None
     step_deg: Annotated[float, Field(ge=-180.0, le=180.0, description="of a turn or circle")] = 5.0
-    goal_m: Annotated[
-        Positive, Field(description="horizontal distance of the rover's origin from the target in the end, m")
-    ] = 2.0
-    ends_with_steps: Annotated[
-        bool, Field(description="whether it has come to its end when its steps are done, short of goal_m or not")
-    ] = False
-    offset_right_m: Annotated[
-        float, Field(description="how far to the right of the target's direction the goal lies, m")
-    ] = 0.0
-    shuffle_m: Annotated[
-        NonNegative, Field(description="forth, and back after the next step: saves a steering motor that is stuck, m")
-    ] = 0.0
-    visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
-    visual_odometry_step_m: Annotated[
-        Positive, Field(description="longest drive between two of its pictures, m (60 % overlap)")
-    ] = 0.75
-    autonav: Annotated[bool, Field(description="whether the navigator steers around what wedges of pictures show")] = (
-        False
+    goal_m: Positive = Field(2.0, description="horizontal distance of the rover's origin from the target in the end, m")
+    ends_with_steps: bool = Field(
+        False, description="whether the leg ends when its steps are done, even short of goal_m"
     )
+    offset_right_m: float = Field(0.0, description="how far to the right of the target's direction the goal lies, m")
+    shuffle_m: NonNegative = Field(
+        0.0, description="forth, and back after the next step: spares a stuck steering motor"
+    )
+    visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
+    visual_odometry_step_m: Positive = Field(
+        0.75, description="longest drive between two of its pictures (60 % overlap)"
+    )
+    autonav: bool = Field(False, description="whether the navigator steers around what wedges of pictures show")
     maps_first: Annotated[bool, Field(description="whether the navigator's map is begun or added to before it")] = False
     map_by: Annotated[Literal["body", "mast"], Field(description="cameras that map for the navigator")] = "mast"
     wedges: Annotated[int, Field(ge=1, le=4, description="wedges of the mast's pictures at each step")] = 2
-    target_is_no_obstacle: Annotated[
-        bool, Field(description="whether the navigator may come near the target's rock (section 6)")
-    ] = True
+    target_is_no_obstacle: bool = Field(True, description="whether the navigator may come near the target's rock")
 
     @model_validator(mode="after")
     def _has_a_step(self) -> LegParameters:
@@ -192,9 +173,9 @@ class SunParameters(Parameters):
 
     azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="above the horizon")] = 45.0
-    hour_angle_deg_min: Annotated[
-        float, Field(ge=-1.0, le=1.0, description="its motion about the pole: 16 deg in 66 min (Table IV)")
-    ] = 16.0 / 66.0
+    hour_angle_deg_min: float = Field(
+        16.0 / 66.0, ge=-1.0, le=1.0, description="rotation about the pole: 16 deg in 66 min (Table IV)"
+    )
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0
     held_s: Annotated[Positive, Field(description="time for which it is held in the pictures' light, s")] = 120.0
 
@@ -211,10 +192,9 @@ class TimingParameters(Parameters):
 class ExposureParameters(Parameters):
     """How the pictures are exposed (section 4.5)."""
 
-    of: Annotated[
-        Literal["subframe", "full-frame", "fixed"],
-        Field(description="auto-exposure over the subframe, over the full frame with what sky it shows, or none"),
-    ] = "subframe"
+    of: Literal["subframe", "full-frame", "fixed"] = Field(
+        "subframe", description="region of auto-exposure; fixed: none"
+    )
     auto: AutoExposureParameters = AutoExposureParameters()
 
 
@@ -242,13 +222,12 @@ class OwnPair(Parameters):
 class CameraParameters(Parameters):
     """The stereo pair on the mast."""
 
-    preset: Annotated[
-        str, Field(description="a pair of `marsyard.sim.sensor.mast.MASTS`, with the mast and the rover that carry it")
-    ] = "mer-navcam"
+    preset: str = Field(
+        "mer-navcam",
+        description="stereo pair of `marsyard.sim.sensor.mast.MASTS`, with its mast and rover",
+    )
     own: Annotated[OwnPair | None, Field(description="an own pair, on that mast in place of the preset's")] = None
-    detector: Annotated[
-        DetectorChoice | None, Field(description="of both cameras; by default the preset's, whatever the pair")
-    ] = None
+    detector: DetectorChoice | None = Field(None, description="of both cameras; by default the preset's")
     detector_noise: Annotated[bool, Field(description="whether pictures have a detector's noise and response")] = True
 
     @field_validator("preset")
@@ -286,12 +265,12 @@ class CameraParameters(Parameters):
 class ScoreParameters(Parameters):
     """What counts as tracked, and what of each update is stored."""
 
-    tracked_px: Annotated[
-        Positive, Field(description="most distance of a tracked target from the true projection of the point, px")
-    ] = 10.0
-    stored_updates: Annotated[
-        int, Field(ge=0, le=100, description="first updates whose figures are stored in the row, one column each")
-    ] = 0
+    tracked_px: Positive = Field(
+        10.0, description="maximum distance of a tracked target from the point's true projection"
+    )
+    stored_updates: int = Field(
+        0, ge=0, le=100, description="number of first updates whose figures are stored as columns"
+    )
 
 
 class RoverScenarioParameters(ChosenAlgorithms, OwnScores):
@@ -317,16 +296,12 @@ class RoverScenarioParameters(ChosenAlgorithms, OwnScores):
     clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the run")] = None
     rover_shadow: Annotated[bool, Field(description="whether the rover and its mast cast shadows")] = True
     timing: TimingParameters = TimingParameters()
-    algorithm: Annotated[
-        str, Field(description="tracker under test: vtt, pure-ncc, lucas-kanade, or your own 'module:Class'")
-    ] = "vtt"
-    vtt: Annotated[VttOptions, Field(description="options of the tracker; pure-ncc takes no scale and roll")] = (
-        VttOptions()
+    algorithm: str = Field(
+        "vtt", description="tracker under test: vtt, pure-ncc, lucas-kanade, or a custom 'module:Class'"
     )
+    vtt: VttOptions = Field(VttOptions(), description="options of the tracker; pure-ncc takes no scale and roll")
     score: ScoreParameters = ScoreParameters()
-    backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
-        default_factory=default_backend
-    )
+    backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
 
     @property
     def bearing_rad(self) -> float:

@@ -73,9 +73,9 @@ class SharedDriveParameters(Parameters):
     skip: Annotated[int, Field(ge=0, le=100, description="stops left out between two updates")] = 0
     margin_px: Annotated[float, Field(gt=0.0, description="what of the frame is taken around the rock")] = 110.0
     bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps that are told apart")] = ()
-    face_deg: Annotated[
-        float | None, Field(gt=0.0, le=90.0, description="most oblique sight at any stop of a target `on_face`")
-    ] = None
+    face_deg: float | None = Field(
+        None, gt=0.0, le=90.0, description="maximum obliquity at any stop of a target `on_face`"
+    )
 
     @model_validator(mode="after")
     def _are_there(self) -> SharedDriveParameters:
