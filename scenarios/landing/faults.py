@@ -22,21 +22,27 @@ class Faults(SizedFaults):
     """
 
     black_picture: Annotated[int, Field(ge=0, le=2, description="picture that is delivered black, 1 or 2; 0: none")] = 0
-    repeated_picture: int = Field(0, ge=0, le=1, description="1: the first picture is delivered as the second too")
-    lost_rows: NonNegative = Field(0.0, le=1.0, description="fraction of the second picture's rows lost, from below")
+    repeated_picture: int = Field(
+        default=0, ge=0, le=1, description="1: the first picture is delivered as the second too"
+    )
+    lost_rows: NonNegative = Field(
+        default=0.0, le=1.0, description="fraction of the second picture's rows lost, from below"
+    )
     lost_pictures: float = Field(
-        0.0, ge=0.0, le=1.0, description="fraction of a flight's pictures lost; two always arrive"
+        default=0.0, ge=0.0, le=1.0, description="fraction of a flight's pictures lost; two always arrive"
     )
     laser_silent: Annotated[int, Field(ge=0, le=1, description="1: the altimeter gives no range, to the ground")] = 0
     laser_stuck: NonNegative = Field(
-        0.0, le=5.0, description="excess of a stuck altimeter's range over the flight's height, as a fraction"
+        default=0.0, le=5.0, description="excess of a stuck altimeter's range over the flight's height, as a fraction"
     )
     gps_outage_s: NonNegative = Field(
-        0.0, le=300.0, description="silence of the receiver before the first picture; it lasts to the end"
+        default=0.0, le=300.0, description="silence of the receiver before the first picture; it lasts to the end"
     )
-    listed_bad_pixels: NonNegative = Field(0.0, le=0.5, description="bad pixels that the camera lists and fills")
+    listed_bad_pixels: NonNegative = Field(
+        default=0.0, le=0.5, description="bad pixels that the camera lists and fills"
+    )
     own_shadow_m: NonNegative = Field(
-        0.0, le=100.0, description="diameter of the disc that casts the own shadow; raises the sun"
+        default=0.0, le=100.0, description="diameter of the disc that casts the own shadow; raises the sun"
     )
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:

@@ -56,13 +56,15 @@ class HelicopterParameters(Parameters):
     compass: TiltCompassParameters = TiltCompassParameters()
     navigation: FilterParameters = FilterParameters()
     picture_clock: ClockParameters = Field(
-        ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005),
+        default=ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005),
         description="errors of the time tags (assumed)",
     )
     averaging_after_s: float = Field(
-        2.0, ge=2.0, le=3600.0, description="touchdown to the first averaged solution (assumed)"
+        default=2.0, ge=2.0, le=3600.0, description="touchdown to the first averaged solution (assumed)"
     )
-    averaging_s: float = Field(5.0, gt=0.0, le=600.0, description="averaging time: the paper has dozens of solutions")
+    averaging_s: float = Field(
+        default=5.0, gt=0.0, le=600.0, description="averaging time: the paper has dozens of solutions"
+    )
 
     @property
     def span_s(self) -> tuple[float, float]:

@@ -24,9 +24,11 @@ class PairParameters(Parameters):
     A pair is worth its overlap times its baseline, which counts up to `wanted_share` of the range.
     """
 
-    wanted_share: float = Field(0.2, gt=0.0, le=2.0, description="baseline over range beyond which more does not count")
+    wanted_share: float = Field(
+        default=0.2, gt=0.0, le=2.0, description="baseline over range beyond which more does not count"
+    )
     least_overlap: float = Field(
-        0.5, ge=0.0, le=1.0, description="fraction of the first picture's ground in the second"
+        default=0.5, ge=0.0, le=1.0, description="fraction of the first picture's ground in the second"
     )
 
 

@@ -43,14 +43,18 @@ class PassParameters(Parameters):
     about the first picture's optical axis, its columns and its rows.
     """
 
-    height_m: float = Field(15.0, gt=0.0, le=2000.0, description="above the ground below the first picture, m")
-    baseline_share: float = Field(0.2, ge=0.0, le=2.0, description="horizontal distance of the pictures over height")
+    height_m: float = Field(default=15.0, gt=0.0, le=2000.0, description="above the ground below the first picture, m")
+    baseline_share: float = Field(
+        default=0.2, ge=0.0, le=2.0, description="horizontal distance of the pictures over height"
+    )
     speed_m_s: Annotated[float, Field(ge=0.0, le=200.0, description="along the course, m/s")] = 3.0
     heading_deg: Annotated[Angle, Field(description="azimuth of the picture's upper edge")] = 0.0
     course_deg: Annotated[Angle, Field(description="from there to the course, clockwise: 90 is along the rows")] = 90.0
     tilt_deg: Annotated[float, Field(ge=0.0, le=60.0, description="of the first picture's axis from nadir")] = 0.0
     tilt_towards_deg: Annotated[Angle, Field(description="azimuth towards which it is tilted")] = 0.0
-    climb_share: float = Field(0.0, gt=-0.9, le=5.0, description="change of height between the pictures over height")
+    climb_share: float = Field(
+        default=0.0, gt=-0.9, le=5.0, description="change of height between the pictures over height"
+    )
     roll_deg: Annotated[Angle, Field(description="turn about the optical axis between the pictures")] = 0.0
     pitch_deg: Annotated[Angle, Field(description="turn about the picture's columns' direction, its right")] = 0.0
     yaw_deg: Annotated[Angle, Field(description="turn about the picture's rows' direction, its upper edge's")] = 0.0
@@ -60,24 +64,28 @@ class PassParameters(Parameters):
 class NavigationParameters(Parameters):
     """Errors of the on-board poses and of the inclinometers, drawn for a case; one standard deviation per axis."""
 
-    position_m: NonNegative = Field(0.02, le=100.0, description="of the position, the same at both pictures, m")
+    position_m: NonNegative = Field(default=0.02, le=100.0, description="of the position, the same at both pictures, m")
     motion_m: Annotated[NonNegative, Field(le=10.0, description="of the motion between the pictures, m")] = 0.01
-    tilt_deg: NonNegative = Field(0.3, le=30.0, description="of the attitude's roll and pitch, common to both, deg")
-    azimuth_deg: NonNegative = Field(1.0, le=30.0, description="of the attitude's azimuth, common to both, deg")
+    tilt_deg: NonNegative = Field(
+        default=0.3, le=30.0, description="of the attitude's roll and pitch, common to both, deg"
+    )
+    azimuth_deg: NonNegative = Field(default=1.0, le=30.0, description="of the attitude's azimuth, common to both, deg")
     turn_deg: Annotated[NonNegative, Field(le=10.0, description="of the turn between the pictures, deg")] = 0.1
-    inclinometer_deg: NonNegative = Field(0.2, le=30.0, description="of the inclinometers' roll and pitch, deg")
+    inclinometer_deg: NonNegative = Field(default=0.2, le=30.0, description="of the inclinometers' roll and pitch, deg")
 
 
 class LanderParameters(Parameters):
     """The lander: what it can stand on, and the shadow that it casts."""
 
     diameter_m: float = Field(
-        2.0, gt=0.0, le=100.0, description="of its footprint, a disc; the helicopter: 2 m (paper, IV)"
+        default=2.0, gt=0.0, le=100.0, description="of its footprint, a disc; the helicopter: 2 m (paper, IV)"
     )
     max_slope_deg: Annotated[float, Field(gt=0.0, lt=90.0, description="steepest plane that it can stand on")] = 15.0
-    max_roughness_m: float = Field(0.2, gt=0.0, le=100.0, description="farthest that ground may be off that plane, m")
+    max_roughness_m: float = Field(
+        default=0.2, gt=0.0, le=100.0, description="farthest that ground may be off that plane, m"
+    )
     caster_diameter_m: NonNegative = Field(
-        0.0, le=100.0, description="diameter of the disc that casts its shadow; 0: none"
+        default=0.0, le=100.0, description="diameter of the disc that casts its shadow; 0: none"
     )
 
     @property
@@ -97,28 +105,38 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
 
     site: Annotated[str, Field(description="preset of terrain, light, texture and rocks")] = "heli-hazardous"
     scale: Annotated[Literal["ground", "descent"], Field(description="which of the site's terrains")] = "ground"
-    terrain_of: str | None = Field(None, description="whose terrain is below; filled in, and not to be set otherwise")
+    terrain_of: str | None = Field(
+        default=None, description="whose terrain is below; filled in, and not to be set otherwise"
+    )
     terrain: TerrainParameters = TerrainParameters()
     place: Place = Place()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
-    texture: NonNegative = Field(1.0, le=10.0, description="contrast of the fine texture, over the site's own")
+    texture: NonNegative = Field(default=1.0, le=10.0, description="contrast of the fine texture, over the site's own")
     sun: SunParameters = SunParameters()
-    camera: NamedOrOwnCamera = Field("xc-55", description="nadir camera preset; or a custom camera: a table with file")
-    calibration: CalibrationParameters = Field(CalibrationParameters(), description="errors of the calibrated camera")
+    camera: NamedOrOwnCamera = Field(
+        default="xc-55", description="nadir camera preset; or a custom camera: a table with file"
+    )
+    calibration: CalibrationParameters = Field(
+        default=CalibrationParameters(), description="errors of the calibrated camera"
+    )
     detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
     exposure: Annotated[AutoExposureParameters, Field(description="how the exposure is set")] = AutoExposureParameters()
     flown: PassParameters = Field(
-        PassParameters(), description="poses at the two pictures; a helicopter's flight uses the azimuths only"
+        default=PassParameters(), description="poses at the two pictures; a helicopter's flight uses the azimuths only"
     )
-    navigation: NavigationParameters = Field(NavigationParameters(), description="pose errors without a helicopter")
+    navigation: NavigationParameters = Field(
+        default=NavigationParameters(), description="pose errors without a helicopter"
+    )
     helicopter: HelicopterParameters | None = Field(
-        None, description="flown for the pictures and to the site; none: a pair as stated"
+        default=None, description="flown for the pictures and to the site; none: a pair as stated"
     )
-    pair: PairParameters = Field(PairParameters(), description="which two of a helicopter's pictures are used")
+    pair: PairParameters = Field(default=PairParameters(), description="which two of a helicopter's pictures are used")
     laser: LaserParameters = LaserParameters()
     lander: LanderParameters = LanderParameters()
     faults: Faults = Faults()
-    algorithm: str = Field("hda", description="estimator under test: hda, essential-matrix, semi-global, or your own")
+    algorithm: str = Field(
+        default="hda", description="estimator under test: hda, essential-matrix, semi-global, or your own"
+    )
     hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions(
         track_seed=TrackSeed.POSE
     )
