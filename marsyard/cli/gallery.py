@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 from marsyard.cli.render import Shot, says_why_not, take
 
@@ -68,10 +69,8 @@ class Plate:
 
 
 def gallery(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the page and its pictures.")] = Path(
-        "gallery"
-    ),
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a gallery that is there.")] = False,
+    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of the page and pictures.")] = Path("gallery"),
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace an existing gallery.")] = False,
 ) -> None:
     """Render every site through the cameras that fit it: one page, and a contact sheet. Takes about a minute."""
     with says_why_not(out):

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
-from marsyard.cli.campaign import Exit, JobsOption, console, make_crew, says_what_is_wrong, stopped_by_signals
+from marsyard.cli.campaign import make_crew, stopped_by_signals
+from marsyard.cli.options import Exit, JobsOption, console, handle_user_errors
 
 if TYPE_CHECKING:
     from marsyard.campaigns.execution.crew import Crew
@@ -24,14 +26,12 @@ HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "s
 NOT_RUN = "NOT RUN"
 
 
-@says_what_is_wrong
+@handle_user_errors
 def nightly(
-    plan: Annotated[
-        Path | None, typer.Argument(metavar="[PLAN.toml]", help="The plan; by default the one that ships.")
-    ] = None,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder of the history, the runs, the page and the dashboard.")
-    ] = Path("nightly"),
+    plan: Annotated[Path | None, Argument(metavar="[PLAN.toml]", help="The plan; by default the built-in one.")] = None,
+    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of history, runs, page and dashboard.")] = Path(
+        "nightly"
+    ),
     jobs: JobsOption = None,
 ) -> None:
     """Run the plan's campaigns, compare each figure with the nights before, write nightly.md and the dashboard.

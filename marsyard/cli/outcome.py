@@ -11,7 +11,7 @@ from marsyard.campaigns.errors import StoreError, writing
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import is_locked
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table
-from marsyard.cli.campaign import Exit
+from marsyard.cli.options import Exit
 
 if TYPE_CHECKING:
     import pandas as pd

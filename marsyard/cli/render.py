@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
-from marsyard.cli.campaign import Exit, MaxHolesOption, SiteArgument
+from marsyard.cli.options import Exit, MaxHolesOption, SiteArgument
 
 if TYPE_CHECKING:
     import numpy as np
@@ -145,35 +146,31 @@ class Picture:
 
 def render(
     site: SiteArgument,
-    camera: Annotated[
-        str, typer.Option("--camera", metavar="NAME", help="Such as mer-navcam; a wrong name lists those there are.")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="PREFIX", help="Path of the files without their endings.")],
+    camera: Annotated[str, Option("--camera", metavar="NAME", help="Such as mer-navcam; a wrong name lists all.")],
+    out: Annotated[Path, Option("--out", metavar="PREFIX", help="Path of the files without extension.")],
     scale: Annotated[
-        str | None, typer.Option("--scale", metavar="SCALE", help="descent or ground; by default the camera's usual.")
+        str | None, Option("--scale", metavar="SCALE", help="descent or ground; by default the camera's.")
     ] = None,
     altitude: Annotated[
-        float | None, typer.Option("--altitude", metavar="M", help="Height above the ground; by default the usual.")
+        float | None, Option("--altitude", metavar="M", help="Height above the ground; by default the camera's.")
     ] = None,
     east: Annotated[
-        float | None, typer.Option("--east", metavar="M", help="By default 0, of a DTM its middle; repeats.")
+        float | None, Option("--east", metavar="M", help="By default 0, or the middle of a DTM; periodic.")
     ] = None,
     north: Annotated[
-        float | None, typer.Option("--north", metavar="M", help="By default 0, of a DTM its middle; repeats.")
+        float | None, Option("--north", metavar="M", help="By default 0, or the middle of a DTM; periodic.")
     ] = None,
     azimuth: Annotated[
-        float, typer.Option("--azimuth", metavar="DEG", help="Where the camera looks, clockwise from north.")
+        float, Option("--azimuth", metavar="DEG", help="Viewing direction, clockwise from north.")
     ] = 0.0,
     elevation: Annotated[
-        float | None, typer.Option("--elevation", metavar="DEG", help="Of its axis above the horizon; -90: down.")
+        float | None, Option("--elevation", metavar="DEG", help="Of the optical axis; -90: down.")
     ] = None,
-    sun_azimuth: Annotated[float, typer.Option("--sun-azimuth", metavar="DEG", help="Clockwise from north.")] = 250.0,
-    sun_elevation: Annotated[float, typer.Option("--sun-elevation", metavar="DEG", help="Above the horizon.")] = 35.0,
-    detector: Annotated[
-        bool, typer.Option("--detector/--radiance", help="Counts of the camera's detector, or radiance factor.")
-    ] = True,
-    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Of the terrain and the noise.")] = 1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+    sun_azimuth: Annotated[float, Option("--sun-azimuth", metavar="DEG", help="Clockwise from north.")] = 250.0,
+    sun_elevation: Annotated[float, Option("--sun-elevation", metavar="DEG", help="Above the horizon.")] = 35.0,
+    detector: Annotated[bool, Option("--detector/--radiance", help="Detector counts, or radiance factor.")] = True,
+    seed: Annotated[int, Option("--seed", metavar="S", min=0, help="Of the terrain and the noise.")] = 1,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace existing files.")] = False,
     max_holes: MaxHolesOption = None,
 ) -> None:
     """Render a site or DTM: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; -left, -right of a pair."""

@@ -1,6 +1,6 @@
-"""Which two of a flight's pictures are used: a function of baseline and overlap (landing paper, section V).
+"""Choice of two of a flight's pictures by baseline and overlap (landing paper, section V).
 
-As on board: from the filter's poses, the laser's ranges and the calibrated camera, over ground taken to be level.
+Uses on-board data: the filter's poses, the laser's ranges and the calibrated camera, over ground assumed level.
 """
 
 from __future__ import annotations
@@ -19,22 +19,18 @@ from marsyard.sim.parameters import Parameters
 
 
 class PairParameters(Parameters):
-    """The criterion. The paper names baseline and overlap; how they are weighed is assumed.
+    """The criterion: overlap times baseline, which counts up to `wanted_share` of the range.
 
-    A pair is worth its overlap times its baseline, which counts up to `wanted_share` of the range.
+    The paper names baseline and overlap; their weighting is assumed.
     """
 
-    wanted_share: float = Field(
-        default=0.2, gt=0.0, le=2.0, description="baseline over range beyond which more does not count"
-    )
-    least_overlap: float = Field(
-        default=0.5, ge=0.0, le=1.0, description="fraction of the first picture's ground in the second"
-    )
+    wanted_share: float = Field(default=0.2, gt=0.0, le=2.0, description="maximum of baseline over range that counts")
+    least_overlap: float = Field(default=0.5, ge=0.0, le=1.0, description="of the first picture's ground in the second")
 
 
 @dataclass(frozen=True)
 class PairChoice:
-    """A pair: numbers of its pictures, their baseline across the first optical axis, and their overlap."""
+    """Numbers of the chosen pictures, their baseline across the first optical axis, and their overlap."""
 
     first: int
     second: int
@@ -49,9 +45,9 @@ def choose_pair(
     parameters: PairParameters,
     height_m: float,
 ) -> PairChoice:
-    """The best pair; of equal ones the earliest. Where the laser gave no range, the commanded height stands for it.
+    """The pair of the highest worth, the earliest of equal ones; the commanded height replaces a missing range.
 
-    Pairs with too little overlap are taken only if there are no others.
+    Pairs with too little overlap are chosen only if there are no others.
 
     Raises ValueError if there are fewer than two pictures.
     """
@@ -78,7 +74,7 @@ def choose_pair(
 
 @dataclass(frozen=True)
 class _View:
-    """A picture's centre of projection, optical axis, and lines of sight of its corners, world axes."""
+    """A picture's centre of projection, optical axis, and rays of its corners, world axes."""
 
     centre_m: Float64[np.ndarray, "3"]
     axis: Float64[np.ndarray, "3"]
@@ -102,7 +98,7 @@ class _View:
 
 
 def _overlap(first: Float32[np.ndarray, "4 2"] | None, second: Float32[np.ndarray, "4 2"] | None) -> float:
-    """Share of the first's area that the second covers."""
+    """Fraction of the first's area that the second covers."""
     if first is None or second is None:
         return 0.0
     common, _ = cv2.intersectConvexConvex(first, second)

@@ -33,15 +33,17 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.terrain import site, sites
 
+#: Angles in degrees: relative, and azimuths.
+Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
+Azimuth = Annotated[float, Field(ge=-360.0, le=720.0)]
+
 
 class InclineParameters(Parameters):
     """An even slope about the target that climbs to the east, and the direction of the route on it."""
 
     name: Annotated[str, Field(min_length=1, description="its name in the report")] = "flat ground"
     slope_deg: Annotated[float, Field(ge=0.0, le=40.0, description="0 for none")] = 0.0
-    oblique_deg: float = Field(
-        default=0.0, ge=-180.0, le=180.0, description="rotation of the start about the target, added to its bearing"
-    )
+    oblique_deg: Turn = Field(default=0.0, description="rotation of the start about the target, added to its bearing")
 
 
 class WorldParameters(Parameters):
@@ -54,21 +56,19 @@ class WorldParameters(Parameters):
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, 2.5 cm apart")] = 2048
     incline: InclineParameters = InclineParameters()
     rms_slope_deg: float | None = Field(
-        default=None, ge=0.0, le=30.0, description="of the rough ground; by default the site's"
+        default=None, ge=0.0, le=30.0, description="of rough ground; default: the site's"
     )
     rock_abundance: float | None = Field(
-        default=None, ge=0.0, le=0.4, description="fraction of the ground under rocks; default: the site's"
+        default=None, ge=0.0, le=0.4, description="ground under rocks; default: the site's"
     )
     largest_near_m: NonNegative = Field(
-        default=0.08, description="largest rock left between start and target: operators choose a clear route"
+        default=0.08, description="largest rock left on the route that operators choose"
     )
     east_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
     north_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
-    rocks_underfoot: bool = Field(
-        default=False, description="whether wheels feel the rocks they meet, or the ground alone"
-    )
+    rocks_underfoot: bool = Field(default=False, description="whether wheels feel rocks, or the ground alone")
     background_half_deg: float = Field(
-        default=50.0, gt=0.0, le=180.0, description="half the angle behind the target with rocks drawn"
+        default=50.0, gt=0.0, le=180.0, description="half angle behind the target with rocks"
     )
 
     @field_validator("site")
@@ -112,23 +112,15 @@ class TargetParameters(Parameters):
     yaw_deg: Annotated[float | None, Field(description="by default drawn")] = None
     across: Annotated[float, Field(ge=-1.0, le=1.0, description="position of the point across the rock")] = 0.0
     up: Annotated[float, Field(ge=0.0, le=1.0, description="position of the point up the rock")] = 0.5
-    designation: Literal["pixel", "rover", "site"] = Field(
-        default="pixel", description="how operators designate the target"
-    )
+    designation: Literal["pixel", "rover", "site"] = Field(default="pixel", description="kind of designation")
 
 
 class StartParameters(Parameters):
     """The rover's start, relative to the target."""
 
-    distance_m: float = Field(
-        default=10.0, gt=1.0, le=40.0, description="horizontally from the mast to the designated point"
-    )
-    bearing_deg: float = Field(
-        default=270.0, ge=-360.0, le=720.0, description="from the target to the rover, clockwise from north"
-    )
-    target_azimuth_deg: float = Field(
-        default=0.0, ge=-180.0, le=180.0, description="of the target, to the right of straight ahead"
-    )
+    distance_m: float = Field(default=10.0, gt=1.0, le=40.0, description="horizontally, mast to designated point")
+    bearing_deg: Azimuth = Field(default=270.0, description="from the target to the rover, clockwise from north")
+    target_azimuth_deg: Turn = Field(default=0.0, description="of the target, to the right of straight ahead")
 
 
 class LegParameters(Parameters):
@@ -148,32 +140,22 @@ class LegParameters(Parameters):
     steps: Annotated[
         int, Field(ge=1, le=200, description="number of steps; the maximum of an approach or back-off")
     ] = 60
-    step_share: float = Field(
-        default=0.1, gt=0.0, le=0.9, description="step length over the distance from camera to target"
-    )
+    step_share: float = Field(default=0.1, gt=0.0, le=0.9, description="step length over the camera's distance")
     step_m: Annotated[float | None, Field(description="length of a step instead; needed for straight")] = None
-    step_deg: Annotated[float, Field(ge=-180.0, le=180.0, description="of a turn or circle")] = 5.0
-    goal_m: Positive = Field(
-        default=2.0, description="horizontal distance of the rover's origin from the target in the end, m"
-    )
-    ends_with_steps: bool = Field(
-        default=False, description="whether the leg ends when its steps are done, even short of goal_m"
-    )
+    step_deg: Annotated[Turn, Field(description="of a turn or circle")] = 5.0
+    goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
+    ends_with_steps: bool = Field(default=False, description="whether it may end short of goal_m, its steps done")
     offset_right_m: float = Field(default=0.0, description="offset of the goal to the right of the target's direction")
     shuffle_m: NonNegative = Field(
-        default=0.0, description="forth, and back after the next step: spares a stuck steering motor"
+        default=0.0, description="forth, and back after the next step: for a stuck steering motor"
     )
     visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
-    visual_odometry_step_m: Positive = Field(
-        default=0.75, description="longest drive between two of its pictures (60 % overlap)"
-    )
+    visual_odometry_step_m: Positive = Field(default=0.75, description="longest drive between pictures (60 % overlap)")
     autonav: bool = Field(default=False, description="whether the navigator avoids rocks in its map")
     maps_first: Annotated[bool, Field(description="whether the navigator maps before the first step")] = False
     map_by: Annotated[Literal["body", "mast"], Field(description="cameras that map for the navigator")] = "mast"
     wedges: Annotated[int, Field(ge=1, le=4, description="wedges of the mast's pictures at each step")] = 2
-    target_is_no_obstacle: bool = Field(
-        default=True, description="whether the navigator may come near the target's rock"
-    )
+    target_is_no_obstacle: bool = Field(default=True, description="whether the navigator ignores the target's rock")
 
     @model_validator(mode="after")
     def _check_step(self) -> LegParameters:
@@ -187,10 +169,10 @@ class LegParameters(Parameters):
 class SunParameters(Parameters):
     """Position of the sun at the start, and its motion."""
 
-    azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 225.0
+    azimuth_deg: Annotated[Azimuth, Field(description="clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="above the horizon")] = 45.0
     hour_angle_deg_min: float = Field(
-        default=16.0 / 66.0, ge=-1.0, le=1.0, description="rotation about the pole: 16 deg in 66 min (Table IV)"
+        default=16.0 / 66.0, ge=-1.0, le=1.0, description="about the pole: 16 deg in 66 min (Table IV)"
     )
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0
     held_s: Annotated[Positive, Field(description="interval over which pictures share one sun")] = 120.0
@@ -208,9 +190,7 @@ class TimingParameters(Parameters):
 class ExposureParameters(Parameters):
     """Exposure of the pictures (section 4.5)."""
 
-    of: Literal["subframe", "full-frame", "fixed"] = Field(
-        default="subframe", description="region of auto-exposure; fixed: none"
-    )
+    of: Literal["subframe", "full-frame", "fixed"] = Field(default="subframe", description="region of auto-exposure")
     auto: AutoExposureParameters = AutoExposureParameters()
 
 
@@ -240,7 +220,7 @@ class CameraParameters(Parameters):
 
     preset: str = Field(
         default="mer-navcam",
-        description="stereo pair of `marsyard.sim.sensor.mast.MASTS`, with its mast and rover",
+        description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast and rover",
     )
     own: Annotated[OwnPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="of both cameras; by default the preset's")
@@ -281,12 +261,8 @@ class CameraParameters(Parameters):
 class ScoreParameters(Parameters):
     """Criterion for a tracked target, and columns per update."""
 
-    tracked_px: Positive = Field(
-        default=10.0, description="maximum distance of a tracked target from the point's true projection"
-    )
-    stored_updates: int = Field(
-        default=0, ge=0, le=100, description="number of first updates whose figures are stored as columns"
-    )
+    tracked_px: Positive = Field(default=10.0, description="maximum distance of a tracked target from the true pixel")
+    stored_updates: int = Field(default=0, ge=0, le=100, description="first updates with figures as columns")
 
 
 class RoverScenarioParameters(ChosenAlgorithms, OwnScores):
@@ -312,12 +288,8 @@ class RoverScenarioParameters(ChosenAlgorithms, OwnScores):
     clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the run")] = None
     rover_shadow: Annotated[bool, Field(description="whether the rover and its mast cast shadows")] = True
     timing: TimingParameters = TimingParameters()
-    algorithm: str = Field(
-        default="vtt", description="tracker under test: vtt, pure-ncc, lucas-kanade, or a custom 'module:Class'"
-    )
-    vtt: VttOptions = Field(
-        default=VttOptions(), description="options of the tracker; pure-ncc takes no scale and roll"
-    )
+    algorithm: str = Field(default="vtt", description="vtt, pure-ncc, lucas-kanade, or a custom 'module:Class'")
+    vtt: VttOptions = Field(default=VttOptions(), description="the tracker's; pure-ncc takes no scale and roll")
     score: ScoreParameters = ScoreParameters()
     backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
 

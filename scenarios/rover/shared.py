@@ -69,9 +69,7 @@ class SharedDriveParameters(Parameters):
     skip: Annotated[int, Field(ge=0, le=100, description="stops left out between two updates")] = 0
     margin_px: Annotated[float, Field(gt=0.0, description="margin about the rock in the pictures")] = 110.0
     bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps")] = ()
-    face_deg: float | None = Field(
-        default=None, gt=0.0, le=90.0, description="maximum obliquity at any stop of a target `on_face`"
-    )
+    face_deg: float | None = Field(default=None, gt=0.0, le=90.0, description="maximum obliquity of a target `on_face`")
 
     @model_validator(mode="after")
     def _check_numbers(self) -> SharedDriveParameters:

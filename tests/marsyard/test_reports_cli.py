@@ -22,7 +22,7 @@ from marsyard.campaigns.execution.crew import Crew
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli import app as cli
-from marsyard.cli.deciding import run_until_decided
+from marsyard.cli.evidence import run_until_decided
 from marsyard.cli.site_server import server
 from marsyard.reports.cases import notable_cases
 from marsyard.reports.evaluation import next_look
