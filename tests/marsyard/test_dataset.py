@@ -87,7 +87,7 @@ def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: P
 
     told = json.loads(files["0000001-0.json"])
     image, rocks, hazard = (
-        cv2.imdecode(np.frombuffer(files[f"0000001-0.{name}.png"], np.uint8), cv2.IMREAD_UNCHANGED)
+        np.asarray(cv2.imdecode(np.frombuffer(files[f"0000001-0.{name}.png"], np.uint8), cv2.IMREAD_UNCHANGED))
         for name in ("image", "rocks", "hazard")
     )
     distance, normal = (np.load(io.BytesIO(files[f"0000001-0.{name}.npy"])) for name in ("range", "normal"))

@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from rich.console import Console
 
-from marsyard import doctor
+from marsyard import doctor, gl_probe
 from marsyard.doctor import Check, Probe, Verdict
 
 SOUND = Probe({"renderer": "r", "version": "v", "depth_error_m": 1e-5, "offset_px": [0.0, 0.0], "lit": True})
@@ -187,6 +187,6 @@ def test_a_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 
 def test_the_probe_stands_alone() -> None:
-    source = Path(doctor.gl_probe.__file__).read_text()
+    source = Path(str(gl_probe.__file__)).read_text()
     packages = [line.split()[1].split(".")[0] for line in source.splitlines() if line.startswith(("import ", "from "))]
     assert set(packages) <= set(sys.stdlib_module_names)

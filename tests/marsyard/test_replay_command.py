@@ -8,6 +8,7 @@ import shutil
 import sqlite3
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -125,7 +126,12 @@ def test_a_folder_that_cannot_be_written_to_is_replayed_into_another(
     connect = "marsyard.campaigns.store.rows.sqlite3.connect"
     original = sqlite3.connect
     monkeypatch.setattr("os.access", refused)
-    monkeypatch.setattr(connect, lambda name, **options: opened.append(str(name)) or original(name, **options))
+
+    def record_open(name: str, **options: Any) -> sqlite3.Connection:
+        opened.append(str(name))
+        return original(name, **options)
+
+    monkeypatch.setattr(connect, record_open)
     status, output = told("replay", copy, 1, "--out", tmp_path / "out")
     assert (status, "the row equals the stored one" in output) == (0, True), output
     assert opened

@@ -18,7 +18,7 @@ from marsyard.scenarios.rover.points import (
 def sphere() -> np.ndarray:
     """Triangles of a sphere of radius 0.5 about (5, 0, 0.5)."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
-    return np.asarray(mesh.triangles, dtype=np.float64) + np.array([5.0, 0.0, 0.5])
+    return np.asarray(np.asarray(mesh.triangles, dtype=np.float64) + np.array([5.0, 0.0, 0.5]))
 
 
 def test_distances_are_those_to_a_sphere(sphere: np.ndarray) -> None:
