@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from marsyard.cli.options import handle_user_errors
+from marsyard.cli.options import OverwriteOption, handle_user_errors
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
@@ -42,7 +42,7 @@ def new(
     ] = None,
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24,
     out: Annotated[Path | None, Option("--out", metavar="FILE", help="Instead of NAME.toml.")] = None,
-    overwrite: Annotated[bool, Option("--overwrite", help="Replace an existing file.")] = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Write a commented campaign of your own; at a terminal asks for what is not given."""
     from marsyard.campaigns.errors import CampaignError, not_allowed

@@ -1,4 +1,4 @@
-"""`marsyard nightly`: runs a plan's campaigns, holds their figures against the nights before, and tells."""
+"""`marsyard nightly`: run a plan's campaigns and compare their figures with those of earlier nights."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def nightly(
         (out / RUNS).mkdir(parents=True, exist_ok=True)
     with folder_lock(out), History(out / HISTORY_FILE) as history:
         night = history.begin(git_commit())
-        # what a night that is killed leaves behind
+        # the page of a night that is killed
         _write_page(history, night, out, ())
         try:
             with stopped_by_signals(), campaign_progress(console(stderr=True)) as watch:
@@ -59,24 +59,24 @@ def nightly(
                     _run_one(_Night(history, night, out, crew, stated), one, path.parent, watch)
         except KeyboardInterrupt:
             history.finish(night, INTERRUPTED)
-            _tell(history, night, out, ())
+            _publish(history, night, out, ())
             raise typer.Exit(Exit.INTERRUPTED) from None
         found = _changes(history, night)
         history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in found])
-        _tell(history, night, out, found)
+        _publish(history, night, out, found)
         status = _status(history.campaigns(night), found)
     raise typer.Exit(status)
 
 
 class _Night:
-    """A night under way."""
+    """A night in progress."""
 
     def __init__(self, history: History, night: int, out: Path, crew: Crew, plan: Plan) -> None:
         self.history, self.night, self.out, self.crew, self.plan = history, night, out, crew, plan
 
 
 def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) -> None:
-    """Runs a campaign, judges it, and keeps its figures; whatever goes wrong with it leaves the others alone."""
+    """Run a campaign, judge it, and store its figures; its errors do not affect the others."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import run_campaign
     from marsyard.cli.nightly_plan import definition_of
@@ -93,13 +93,15 @@ def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) 
         frame, figures = figures_of(found.run)
         kept = [NightFigure(one.name, one.larger_is_better, one.level, sample_of(frame, one)) for one in figures]
         whole = found.whole
-        told = NightCampaign(name, definition_of(campaign), directory.name, whole.word, found.exit_code, whole.sentence)
+        result = NightCampaign(
+            name, definition_of(campaign), directory.name, whole.word, found.exit_code, whole.sentence
+        )
     except Exception as error:  # a defect in one campaign must not cost the night its others
         kept = []
         if not isinstance(error, CampaignError):
             traceback.print_exc()
-        told = NightCampaign(planned.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
-    now.history.add(now.night, told, kept)
+        result = NightCampaign(planned.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
+    now.history.add(now.night, result, kept)
 
 
 def _changes(history: History, night: int) -> list[Change]:
@@ -108,8 +110,8 @@ def _changes(history: History, night: int) -> list[Change]:
     return changes(comparisons_of(history, night))
 
 
-def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
-    """Writes the page, renews the dashboard, and prints the page."""
+def _publish(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
+    """Write the page and the dashboard, and print the page."""
     from marsyard.reports.dashboard.site import write_site
 
     text = _write_page(history, night, out, found)
@@ -118,7 +120,7 @@ def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> N
 
 
 def _write_page(history: History, night: int, out: Path, found: Sequence[Change]) -> str:
-    """Writes what is known of the night so far, and returns it."""
+    """Write the page of the night so far, and return it."""
     from marsyard.reports.campaign import write_whole
     from marsyard.reports.nights import comparisons_of, night_text
 

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 
 def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[str, Any]] | None = None) -> int:
-    """Judges a campaign, writes its report, prints both, and returns the exit status.
+    """Judge a campaign, write its report, print both, and return the exit status.
 
-    Of a campaign that is not finished the rows are judged that it has so far, with a status that is never 0, and the
-    record is left alone. `requirements` stand in for the campaign's own; the record then keeps its status as well.
+    An unfinished campaign is judged by its rows so far, with a status that is never 0; its record is not changed.
+    `requirements` replace the campaign's own; the record then keeps its status too.
 
     Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
@@ -44,7 +44,7 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
     lines = [f"verdict: {found.whole.word}", found.whole.sentence, f"report: {page}"]
     if not finished:
         come = f"{len(found.run.whole)} of {count(stored['cases'], 'case')}"
-        lines.insert(0, f"INCOMPLETE: {come}; {_how_it_stands(directory, stored['state'])}")
+        lines.insert(0, f"INCOMPLETE: {come}; {_state_text(directory, stored['state'])}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     # what has been met so far is not met yet
@@ -52,9 +52,9 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
 
 
 def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> tuple[Judged, Path]:
-    """Judges a campaign's rows and writes its report; returns what was found, and the page.
+    """Judge a campaign's rows and write its report; return the verdicts and the page.
 
-    The record keeps the exit status of a campaign that is finished and is judged by its own requirements.
+    The record stores the exit status of a finished campaign that is judged by its own requirements.
 
     Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
@@ -71,7 +71,7 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
 def _comparison_tables(
     frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], verdicts: Sequence[Verdict]
 ) -> list[Table]:
-    """What algorithms on the same cases did; nothing where there is one only."""
+    """Comparison of algorithms on the same cases; empty for a single one."""
     from marsyard.cli.showing import grid_table
     from marsyard.reports.columns import primary_metric
     from marsyard.reports.comparison import comparison, comparison_grids
@@ -89,8 +89,8 @@ def _comparison_tables(
     return tables
 
 
-def _how_it_stands(directory: Path, state: str) -> str:
-    """Why a campaign is incomplete, and what to do."""
+def _state_text(directory: Path, state: str) -> str:
+    """Why a campaign is incomplete, and the next command."""
     if is_locked(directory):
         return "it is running"
     return f"it was {'killed' if state == 'running' else state}; to go on: marsyard resume {directory}"

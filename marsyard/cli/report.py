@@ -77,8 +77,8 @@ def compare(
     paired, found = contrasts(*runs)
     names = [str(run.directory) for run in runs]
     if as_json:
-        told = {"first": names[0], "second": names[1], "paired": paired, "same_terrains": same_grounds(*runs)}
-        typer.echo(json.dumps({**told, "figures": contrast_data(found)}, indent=2))
+        runs_data = {"first": names[0], "second": names[1], "paired": paired, "same_terrains": same_grounds(*runs)}
+        typer.echo(json.dumps({**runs_data, "figures": contrast_data(found)}, indent=2))
         return
     out = console()
     out.print(grid_table("Side by side", contrast_grid(["first", "second"], found)))

@@ -1,4 +1,4 @@
-"""`marsyard terrain`: the sites, and figures of their terrain beside what the field test paper says of them."""
+"""`marsyard terrain`: the sites, and figures of their terrain next to the field test paper's."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
-from marsyard.cli.options import Exit, JsonOption, MaxHolesOption, SiteArgument
+from marsyard.cli.options import JsonOption, MaxHolesOption, SiteArgument, fail
 
 if TYPE_CHECKING:
     from marsyard.sim.terrain import Surface
@@ -38,7 +38,7 @@ def list_sites(
     from marsyard.sim.terrain.sites import sites
 
     if as_json:
-        told = [
+        rows = [
             {
                 "name": one.name,
                 "planet": one.environment.planet,
@@ -47,7 +47,7 @@ def list_sites(
             }
             for one in sites().values()
         ]
-        typer.echo(json.dumps(told, indent=2))
+        typer.echo(json.dumps(rows, indent=2))
         return
 
     table = Table(box=None, pad_edge=False)
@@ -94,8 +94,7 @@ def stats(
         if picture is not None:
             write_terrain_picture(picture, surface, real)
     except ValueError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(Exit.WRONG) from None
+        fail(error)
     measured = terrain_statistics(surface, None if real is None else real.real_samples(parameters.samples))
     extent = None if real is None else real.extent
     if as_json:
