@@ -152,7 +152,7 @@ class Transit:
     instruments: Instruments
     air: Air
     flight: RotorcraftFlight  #: truth
-    navigated: Navigated
+    navigated: NavigatedPart
     times_s: Float64[np.ndarray, "pictures"]  #: true times of the middles of the exposures
     tags_s: Float64[np.ndarray, "pictures"]  #: time tags of the pictures
 
@@ -209,7 +209,7 @@ class Touchdown:
     """A landing."""
 
     flight: RotorcraftFlight  #: from its start to rest on the ground
-    navigated: Navigated  #: from the transit's end on
+    navigated: NavigatedPart  #: from the transit's end on
     time_s: float  #: first contact of the skids
     state: State  #: true state then
     believed_m: Float64[np.ndarray, "3"]  #: position by the filter then

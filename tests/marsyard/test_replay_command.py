@@ -129,7 +129,8 @@ def test_a_folder_that_cannot_be_written_to_is_replayed_into_another(
 
     def record_open(name: str, **options: Any) -> sqlite3.Connection:
         opened.append(str(name))
-        return original(name, **options)
+        connection: sqlite3.Connection = original(name, **options)
+        return connection
 
     monkeypatch.setattr(connect, record_open)
     status, output = told("replay", copy, 1, "--out", tmp_path / "out")
