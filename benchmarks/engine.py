@@ -18,7 +18,7 @@ from marsyard.algorithms.processes import resident_bytes
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import write_table
@@ -110,7 +110,7 @@ def _a_hundred_thousand(cases: int = 100_000) -> list[Figure]:
     campaign = Campaign(configuration, BusyScenario())
     with TemporaryDirectory() as folder:
         began = time.perf_counter()
-        run_campaign(campaign, Path(folder, "run"), Crew(2), Stopwatch(()))
+        run_campaign(campaign, Path(folder, "run"), ExecutorConfig(2), Stopwatch(()))
         ours = time.perf_counter() - began
     began = time.perf_counter()
     Parallel(2)(delayed(_one)(campaign, case) for case in range(cases))
@@ -137,7 +137,7 @@ def span(busy_s: float, first: int, last: int) -> Span:
     )
     watch = Stopwatch((first, last))
     with TemporaryDirectory() as folder:
-        run_campaign(Campaign(configuration, BusyScenario()), Path(folder, "run"), Crew(1), watch)
+        run_campaign(Campaign(configuration, BusyScenario()), Path(folder, "run"), ExecutorConfig(1), watch)
         own = pq.read_table(Path(folder, "run", "cases.parquet"), columns=["wall_time_s"])["wall_time_s"]
         own_s = pc.mean(own.slice(first, last - first)).as_py()
     (began, before), (ended, after) = watch.at[first], watch.at[last]
@@ -155,7 +155,7 @@ def gain(campaign: str = "dimes-smoke", cases: int = 120) -> float:
         watch = Stopwatch((first, last))
         with TemporaryDirectory() as folder:
             loaded = load_campaign(campaign, ["retain.showcase=none"], cases)
-            run_campaign(loaded, Path(folder, "run"), Crew(jobs), watch)
+            run_campaign(loaded, Path(folder, "run"), ExecutorConfig(jobs), watch)
         times.append(watch.at[last][0] - watch.at[first][0])
     return times[0] / times[1]
 

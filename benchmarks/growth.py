@@ -29,7 +29,7 @@ from benchmarks.timing import core_seconds
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.scenarios.descent.optics import camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
@@ -130,18 +130,18 @@ def _cases_over_terrains(samples: Sequence[int]) -> list[tuple[float, float]]:
 
 
 def _campaigns(cases: Sequence[int]) -> list[tuple[float, float]]:
-    return [(float(count), _campaign_s(count, 0.0, Crew(1))) for count in cases]
+    return [(float(count), _campaign_s(count, 0.0, ExecutorConfig(1))) for count in cases]
 
 
 def _crews(jobs: Sequence[int]) -> list[tuple[float, float]]:
-    return [(float(count), _campaign_s(400, LIGHT_S, Crew(count))) for count in jobs]
+    return [(float(count), _campaign_s(400, LIGHT_S, ExecutorConfig(count))) for count in jobs]
 
 
 def _clusters(workers: Sequence[int]) -> list[tuple[float, float]]:
-    return [(float(count), _campaign_s(400, LIGHT_S, Crew(cluster=f"local:{count}"))) for count in workers]
+    return [(float(count), _campaign_s(400, LIGHT_S, ExecutorConfig(cluster=f"local:{count}"))) for count in workers]
 
 
-def _campaign_s(cases: int, waiting_s: float, crew: Crew) -> float:
+def _campaign_s(cases: int, waiting_s: float, executor: ExecutorConfig) -> float:
     """Wall-clock time from the first to the last completed case."""
     scenario = "benchmarks.growth:LightScenario" if waiting_s else "benchmarks.engine:BusyScenario"
     configuration = CampaignConfiguration(
@@ -154,7 +154,7 @@ def _campaign_s(cases: int, waiting_s: float, crew: Crew) -> float:
     watch = Stopwatch((1, cases))
     with TemporaryDirectory() as folder:
         waiting = LightScenario() if waiting_s else BusyScenario()
-        run_campaign(Campaign(configuration, waiting), Path(folder, "run"), crew, watch)
+        run_campaign(Campaign(configuration, waiting), Path(folder, "run"), executor, watch)
     return watch.at[cases][0] - watch.at[1][0]
 
 

@@ -90,7 +90,7 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
     """
     from rich.console import Console
 
-    from marsyard.campaigns.execution.crew import Crew
+    from marsyard.campaigns.execution.workers import ExecutorConfig
     from marsyard.campaigns.running.engine import run_campaign as run
     from marsyard.cli.outcome import settle
     from marsyard.cli.progress import campaign_progress
@@ -98,7 +98,7 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
 
     folder = Path(directory)
     with campaign_progress(Console(stderr=True)) as progress, RunLog(folder, progress) as log:
-        run(campaign, folder, Crew(jobs), log)
+        run(campaign, folder, ExecutorConfig(jobs), log)
     settle(folder)
     return folder
 

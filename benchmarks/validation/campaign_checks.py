@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.validation.chaos import DEEDS, ChaosParameters, deed
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store.table import read_rows
@@ -63,12 +63,15 @@ def same_rows(quick: bool) -> Iterator[Measure]:
 
 def _in_every_way(campaign: str, folder: Path, settings: Sequence[str], kills: int, what: str) -> Iterator[Measure]:
     folder.mkdir()
-    expected = _rows_of(campaign, folder / "one", Crew(1), settings)
+    expected = _rows_of(campaign, folder / "one", ExecutorConfig(1), settings)
     cases = len(expected)
     replayed = range(0, cases, max(cases // 8, 1))
+    cluster = ExecutorConfig(cluster="local:2")
     ways: dict[str, Callable[[], list[dict[str, Any]]]] = {
-        "two workers": lambda: _rows_of(campaign, folder / "two", Crew(2), settings),
-        "a Dask cluster of two": lambda: _rows_of(campaign, folder / "cluster", Crew(cluster="local:2"), settings),
+        "two workers": lambda: _rows_of(campaign, folder / "two", ExecutorConfig(2), settings),
+        "a Dask cluster of two": lambda: _rows_of(
+            campaign, folder / "cluster", ExecutorConfig(cluster="local:2"), settings
+        ),
         f"a runner killed {kills} times": lambda: _killed(campaign, folder / "killed", settings, kills),
         "single replays": lambda: [dict(replay(folder / "one", case).row) for case in replayed],
     }
@@ -89,7 +92,9 @@ def survival(quick: bool) -> Iterator[Measure]:
         took, rows = {}, {}
         for part in (0.0, share):
             began = time.monotonic()
-            rows[part] = _rows_of(file, folder / f"{part}", Crew(2), [f"share={part}", f"cases={cases}", "work_s=0.4"])
+            rows[part] = _rows_of(
+                file, folder / f"{part}", ExecutorConfig(2), [f"share={part}", f"cases={cases}", "work_s=0.4"]
+            )
             took[part] = time.monotonic() - began
         campaign = load_campaign(str(file), [f"share={share}"])
         deeds = [_deed(campaign, case) for case in range(cases)]
@@ -120,8 +125,10 @@ def _written(folder: Path) -> Path:
     return path
 
 
-def _rows_of(campaign: str | Path, directory: Path, crew: Crew, settings: Sequence[str]) -> list[dict[str, Any]]:
-    run_campaign(load_campaign(str(campaign), settings), directory, crew, Silence())
+def _rows_of(
+    campaign: str | Path, directory: Path, executor: ExecutorConfig, settings: Sequence[str]
+) -> list[dict[str, Any]]:
+    run_campaign(load_campaign(str(campaign), settings), directory, executor, Silence())
     return read_rows(directory / "cases.parquet")
 
 

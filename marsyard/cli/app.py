@@ -1,43 +1,60 @@
-"""The command line. What a command needs is imported by the command, so that ``--help`` answers at once."""
+"""The command line. Commands import their dependencies when they run, so that ``--help`` is fast."""
 
 from __future__ import annotations
 
 import json
 import sys
+import tomllib
 import traceback
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer import Option
+from typer.core import TyperCommand, TyperGroup
 
-from marsyard.cli.campaign import (
-    CampaignArgument,
-    Exit,
-    JsonOption,
-    SetOption,
-    append,
-    console,
-    replay,
-    resume,
-    run,
-    says_what_is_wrong,
-)
-from marsyard.cli.clean import clean
-from marsyard.cli.compile import compile_kernels
+from marsyard.cli.campaign import append, replay, resume, run
 from marsyard.cli.conformance import conformance
 from marsyard.cli.dashboard import dashboard
-from marsyard.cli.dataset import dataset
 from marsyard.cli.gallery import gallery
+from marsyard.cli.housekeeping import clean, compile_kernels
 from marsyard.cli.ingest import ingest
 from marsyard.cli.new import new
 from marsyard.cli.nightly import nightly
-from marsyard.cli.offline import export, score
+from marsyard.cli.offline import dataset, export, score
+from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, console, handle_user_errors
 from marsyard.cli.render import render
 from marsyard.cli.report import compare, report
 from marsyard.cli.terrain import app as terrain
 
+
+class _Command(TyperCommand):
+    """A command whose help shows no value type for flags."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The parameters, flags without a type."""
+        return _hide_flag_types(super().get_params(ctx))
+
+
+class _Group(TyperGroup):
+    """A group whose help shows no value type for flags."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The parameters, flags without a type."""
+        return _hide_flag_types(super().get_params(ctx))
+
+
+def _hide_flag_types(parameters: list[Any]) -> list[Any]:
+    for one in parameters:
+        if getattr(one, "is_flag", False):
+            one.metavar = ""
+    return parameters
+
+
 app = typer.Typer(
+    cls=_Group,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="A virtual Mars Yard: runs vision software through rendered, truth-known cases and says whether its "
@@ -45,54 +62,56 @@ app = typer.Typer(
     epilog="Exit status: 0 every requirement met, or none asked; 1 a requirement failed, or a case crashed; "
     "2 the command or a file is wrong; 3 not enough cases to say, or no independent random draws.",
 )
-app.add_typer(terrain, name="terrain")
-for command in (run, resume, append, report, compare, replay, nightly, dashboard):
-    app.command()(command)
-app.command()(render)
-app.command()(gallery)
-app.command()(new)
-app.command()(ingest)
-app.command()(clean)
-app.command(name="compile")(compile_kernels)
-app.command()(dataset)
-app.command()(conformance)
-for offline in (export, score):
-    app.command()(offline)
 
 
-@app.command(name="list")
-@says_what_is_wrong
-def list_campaigns(
-    as_json: JsonOption = False,
-) -> None:
+@handle_user_errors
+def list_campaigns(as_json: JsonOption = False) -> None:
     """List the campaigns of the catalogue."""
+    from rich.table import Table
+    from rich.text import Text
+
     from marsyard.campaigns.definition.catalogue import catalogue
-    from marsyard.cli.listing import catalogue_data, catalogue_table
     from marsyard.scenarios.systems import problems
 
     for problem in problems():
         typer.echo(f"warning: {problem}", err=True)
+    keys = ("scenario", "cases", "description")
+    campaigns = {name: (path, _read_stated(path)) for name, path in catalogue().items()}
     if as_json:
-        typer.echo(json.dumps(catalogue_data(catalogue()), indent=2))
+        rows = [
+            {"name": name, "file": str(path), **{key: stated.get(key) for key in keys}}
+            for name, (path, stated) in campaigns.items()
+        ]
+        typer.echo(json.dumps(rows, indent=2))
         return
-    console().print(catalogue_table(catalogue()))
+    table = Table()
+    for heading in ("campaign", *keys):
+        table.add_column(heading, overflow="fold")
+    for name, (_, stated) in campaigns.items():
+        table.add_row(Text(name), *(Text(str(stated.get(key, ""))) for key in keys))
+    console().print(table)
 
 
-@app.command()
-@says_what_is_wrong
+def _read_stated(path: Path) -> dict[str, Any]:
+    """A campaign's file without validation; `run` reports its errors."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        return {"description": f"cannot be read: {error}"}
+
+
+@handle_user_errors
 def show(
     campaign: CampaignArgument,
     override: SetOption = None,
-    draw: Annotated[
-        int | None, typer.Option("--draw", metavar="N", help="Show what the first N cases draw; nothing is run.")
-    ] = None,
+    draw: Annotated[int | None, Option("--draw", metavar="N", help="Show the draws of the first N cases.")] = None,
     figure: Annotated[
         Path | None,
-        typer.Option("--figure", metavar="FILE", help="With --draw: marginals and pairs as a picture, .svg or .png."),
+        Option("--figure", metavar="FILE", help="With --draw: write marginals and pairs as .svg or .png."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with every value that was drawn.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print JSON, with all draws.")] = False,
 ) -> None:
-    """Show a campaign: its parameters, its dispersions with their sources, and its requirements; or what it draws."""
+    """Show a campaign: parameters, dispersions with their sources, requirements; or the draws of its cases."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError
     from marsyard.cli.showing import described, show_campaign, show_draws, write_draws_figure
@@ -112,18 +131,15 @@ def show(
         typer.echo(f"figure: {figure}", err=as_json)
 
 
-@app.command()
-def doctor(
-    as_json: JsonOption = False,
-) -> None:
-    """Examine the machine and the installation, and say how to mend what is amiss."""
+def doctor(as_json: JsonOption = False) -> None:
+    """Check the machine and the installation, with a fix for each problem."""
     from marsyard.doctor import run as examine
 
     raise typer.Exit(examine(console(), as_json=as_json))
 
 
-def _version(asked: bool) -> None:
-    """Prints the version and ends, where asked to."""
+def _print_version(asked: bool) -> None:
+    """Print the version and exit."""
     if asked:
         from importlib.metadata import version
 
@@ -134,15 +150,44 @@ def _version(asked: bool) -> None:
 @app.callback()
 def _marsyard(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+        bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
     pass
 
 
+#: Commands by the panels of the help.
+PANELS: dict[str, dict[str, Callable[..., None]]] = {
+    "Run campaigns": {
+        "list": list_campaigns,
+        "show": show,
+        "run": run,
+        "resume": resume,
+        "append": append,
+        "replay": replay,
+        "nightly": nightly,
+    },
+    "Results": {"report": report, "compare": compare, "dashboard": dashboard},
+    "Worlds and pictures": {"render": render, "gallery": gallery, "dataset": dataset},
+    "Your own campaigns and algorithms": {
+        "new": new,
+        "ingest": ingest,
+        "conformance": conformance,
+        "export": export,
+        "score": score,
+    },
+    "Housekeeping": {"doctor": doctor, "compile": compile_kernels, "clean": clean},
+}
+for panel, commands in PANELS.items():
+    for name, command in commands.items():
+        app.command(name=name, cls=_Command, rich_help_panel=panel)(command)
+    if panel == "Worlds and pictures":
+        app.add_typer(terrain, name="terrain", cls=_Group, rich_help_panel=panel)
+
+
 def main() -> None:
-    """Entry point of the program. A defect ends with a traceback, and not with the status 1 of a verdict."""
-    # Where `pgrep` is missing loky says so at length each time it clears up after a worker, and manages without.
+    """Entry point of the program. A defect ends with a traceback and status 2, not with a verdict's status 1."""
+    # without `pgrep` loky warns at each worker's end, and works all the same
     warnings.filterwarnings("ignore", message="Failed to kill subprocesses")
     try:
         app()

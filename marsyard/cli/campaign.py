@@ -2,112 +2,43 @@
 
 from __future__ import annotations
 
-import errno
-import functools
+import itertools
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ParamSpec
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
+
+from marsyard.cli.options import (
+    AlgorithmOption,
+    CampaignArgument,
+    CasesOption,
+    CaseTimeOption,
+    ChangedOption,
+    ClusterOption,
+    DirectoryArgument,
+    Exit,
+    JobsOption,
+    OutOption,
+    SeedOption,
+    SetOption,
+    console,
+    handle_user_errors,
+    size_text,
+)
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from marsyard.campaigns.definition.campaign import Campaign
-    from marsyard.campaigns.execution.crew import Crew
+    from marsyard.campaigns.execution.workers import ExecutorConfig
     from marsyard.campaigns.running.engine import Watch
     from marsyard.campaigns.running.replay import Replay
 
 
-class Exit(IntEnum):
-    """Exit status of the program; where several apply 2 goes before 1 before 3."""
-
-    MET = 0
-    FAILED = 1
-    WRONG = 2
-    INSUFFICIENT = 3
-    INTERRUPTED = 130
-
-
-CampaignArgument = Annotated[
-    str, typer.Argument(metavar="CAMPAIGN", help="A name from `marsyard list`, or the path of a TOML file.")
-]
-SiteArgument = Annotated[
-    str, typer.Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
-]
-MaxHolesOption = Annotated[
-    float | None,
-    typer.Option(
-        "--max-holes", metavar="F", min=0.0, max=0.99, help="Of a DTM: fraction of posts without height allowed."
-    ),
-]
-CasesOption = Annotated[int | None, typer.Option("-n", "--cases", metavar="N", help="Number of cases.")]
-SeedOption = Annotated[int | None, typer.Option("--seed", metavar="S", help="Root seed.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-DirectoryArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a campaign that was run.")]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Instead of the file's value, for example render.backend=egl; a parameter set so is not dispersed.",
-    ),
-]
-AlgorithmOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--algorithm",
-        metavar="NAME",
-        help="The algorithm under test: a name, module:Class, exec:PROGRAM or serve:PROGRAM. Given several times, all "
-        "run on the same cases and are compared; the first is judged.",
-    ),
-]
-JobsOption = Annotated[int | None, typer.Option("--jobs", metavar="J", help="Worker processes; by default one a core.")]
-ClusterOption = Annotated[
-    str | None,
-    typer.Option(
-        "--cluster", metavar="ADDRESS", help="Run on Dask: a scheduler as tcp://HOST:PORT, or local:N made here."
-    ),
-]
-CaseTimeOption = Annotated[
-    float | None,
-    typer.Option("--case-time", metavar="S", help="Seconds that a case may take (limits.case_time_s of the file)."),
-]
-ChangedOption = Annotated[
-    bool,
-    typer.Option("--allow-changed", help="Go on although code or versions have changed; the record then says so."),
-]
-
-Parameters = ParamSpec("Parameters")
-
-
-def says_what_is_wrong(command: Callable[Parameters, None]) -> Callable[Parameters, None]:
-    """A command that ends with one message and status 2 where the user has something to mend."""
-
-    @functools.wraps(command)
-    def guarded(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
-        # here, so that `doctor` starts, and says so, where another package stands in for ours
-        from marsyard.campaigns.errors import CampaignError
-
-        try:
-            command(*args, **kwargs)
-        except CampaignError as error:
-            typer.echo(f"error: {error}", err=True)
-            raise typer.Exit(Exit.WRONG) from None
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
-                raise
-            typer.echo(f"error: {error}", err=True)
-            raise typer.Exit(Exit.WRONG) from None
-
-    return guarded
-
-
-@says_what_is_wrong
+@handle_user_errors
 def run(
     campaign: CampaignArgument,
     cases: CasesOption = None,
@@ -115,17 +46,15 @@ def run(
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
     case_time: CaseTimeOption = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder; by default runs/<campaign>-<UTC time>.")
-    ] = None,
+    out: OutOption = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Estimate time and disk from a few trial cases, and run nothing else.")
+        bool, Option("--dry-run", help="Only estimate time and disk space from a few trial cases.")
     ] = False,
     until_decided: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--until-decided",
-            help="Take the number of cases as the most: look at the verdicts on the way, and stop when decided.",
+            help="Stop early once the verdicts are decided; the number of cases is the maximum.",
         ),
     ] = False,
     override: SetOption = None,
@@ -136,26 +65,26 @@ def run(
 
     limits = [] if case_time is None else [f"limits.case_time_s={case_time}"]
     loaded = load_campaign(campaign, [*(override or []), *limits], cases, seed, algorithm or [])
-    # only now, so that a file that is wrong is told of at once
+    # imported after loading, so that an error in the file is reported at once
     from marsyard.campaigns.running.engine import run_campaign
-    from marsyard.cli.deciding import run_until_decided
+    from marsyard.cli.evidence import run_until_decided
 
-    crew = make_crew(jobs, cluster)
+    executor = make_executor(jobs, cluster)
     if dry_run:
-        _print_estimate(loaded, crew)
+        _print_estimate(loaded, executor)
         _print_limits(loaded)
         return
     directory = out if out is not None else default_directory(loaded.configuration.name)
     start = run_until_decided if until_decided else run_campaign
-    carry_out(directory, lambda watch: start(loaded, directory, crew, watch))
+    run_and_judge(directory, lambda watch: start(loaded, directory, executor, watch))
 
 
-@says_what_is_wrong
+@handle_user_errors
 def resume(
     directory: DirectoryArgument,
     retry: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--retry",
             metavar="OUTCOME",
             help="Run these cases again as well: crashed, timed-out, out-of-memory, too-much-output, bad-answer, or "
@@ -167,28 +96,28 @@ def resume(
     case_time: CaseTimeOption = None,
     allow_changed: ChangedOption = False,
 ) -> None:
-    """Run the cases that an interrupted or killed campaign still lacks, and judge it; finished cases stay."""
+    """Run the remaining cases of an interrupted or killed campaign, and judge it."""
     from marsyard.campaigns.running.engine import resume_campaign
-    from marsyard.cli.deciding import go_on_until_decided
+    from marsyard.cli.evidence import continue_until_decided
 
-    crew, words = make_crew(jobs, cluster), _outcomes(retry or [])
+    executor, outcomes = make_executor(jobs, cluster), _retried_outcomes(retry or [])
 
-    def go_on(watch: Watch) -> None:
-        resume_campaign(directory, crew, watch, retry=words, case_time_s=case_time, allow_changed=allow_changed)
-        go_on_until_decided(directory, crew, watch)
+    def continue_campaign(watch: Watch) -> None:
+        resume_campaign(directory, executor, watch, retry=outcomes, case_time_s=case_time, allow_changed=allow_changed)
+        continue_until_decided(directory, executor, watch)
 
-    carry_out(directory, go_on)
+    run_and_judge(directory, continue_campaign)
 
 
-@says_what_is_wrong
+@handle_user_errors
 def append(
     directory: DirectoryArgument,
-    cases: Annotated[int, typer.Argument(metavar="N", help="Number of cases to add.", min=1)],
+    cases: Annotated[int, Argument(metavar="N", help="Number of cases to add.", min=1)],
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
     allow_changed: ChangedOption = False,
 ) -> None:
-    """Add a block of cases to a finished campaign, run them, and judge all; the cases that are there stay."""
+    """Add cases to a finished campaign, run them, and judge all."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, with_block
     from marsyard.campaigns.store.record import stored_configuration
@@ -196,22 +125,20 @@ def append(
     if stored_configuration(directory).most_cases is not None:
         raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
     _print_limits(with_block(directory, cases))
-    crew = make_crew(jobs, cluster)
-    carry_out(directory, lambda watch: append_cases(directory, cases, crew, watch, allow_changed=allow_changed))
+    executor = make_executor(jobs, cluster)
+    run_and_judge(directory, lambda watch: append_cases(directory, cases, executor, watch, allow_changed=allow_changed))
 
 
-@says_what_is_wrong
+@handle_user_errors
 def replay(
     directory: DirectoryArgument,
-    case: Annotated[int, typer.Argument(metavar="CASE", help="The case's number, from 0.")],
+    case: Annotated[int, Argument(metavar="CASE", help="Number of the case, from 0.")],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder for its products; by default DIR/cases/CASE.")
+        Path | None, Option("--out", metavar="DIR", help="Folder of its products; by default DIR/cases/CASE.")
     ] = None,
-    step: Annotated[
-        bool, typer.Option("--step", help="Write each stage's product as well, as pictures and files, into steps/.")
-    ] = False,
+    step: Annotated[bool, Option("--step", help="Also write each stage's product into steps/.")] = False,
 ) -> None:
-    """Run one case again, keep and draw its intermediate results, and compare its row with the stored one."""
+    """Rerun one case, write and plot its intermediate results, and compare its row with the stored one."""
     from marsyard.campaigns.running.replay import replay as run_again
     from marsyard.campaigns.store.retention import case_directory
 
@@ -230,7 +157,7 @@ def replay(
 
 
 def _write_products(target: Path, replayed: Replay, *, step: bool) -> list[str]:
-    """Writes the products, stages and figures of a replayed case, all of them or none; returns lines that name them."""
+    """Write the products, stages and figures of a replayed case, all or none; return lines that name them."""
     from marsyard.campaigns.store.products import PackedProducts, replaced_files, unpack_products, write_packed
     from marsyard.cli.steps import write_steps
     from marsyard.reports.cases import write_case_figures
@@ -246,7 +173,7 @@ def _write_products(target: Path, replayed: Replay, *, step: bool) -> list[str]:
 
 
 def _compare(replayed: Replay) -> None:
-    """Says in what a replayed row differs from the stored one; ends with status 1 where it does."""
+    """Report the differences of a replayed row from the stored one; end with status 1 if there are any."""
     if replayed.changed:
         typer.echo(f"since the campaign ran this has changed: {'; '.join(replayed.changed)}")
     if replayed.stored is None:
@@ -260,28 +187,20 @@ def _compare(replayed: Replay) -> None:
         typer.echo("the row equals the stored one")
 
 
-def console(*, stderr: bool = False) -> Console:
-    """Where a command prints."""
-    from rich.console import Console
-
-    return Console(stderr=stderr)
-
-
-def make_crew(jobs: int | None, cluster: str | None) -> Crew:
-    """Who runs a campaign, as the options say."""
+def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
+    """The workers of a campaign by the options."""
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.campaigns.execution.crew import Crew
-    from marsyard.campaigns.execution.workers import available_cores
+    from marsyard.campaigns.execution.workers import ExecutorConfig, available_cores
 
     if jobs is not None and jobs < 1:
         raise CampaignError(f"--jobs {jobs}: at least one worker process is needed")
     if jobs is not None and cluster is not None:
         raise CampaignError("--jobs and --cluster exclude one another: a cluster has its own workers")
-    return Crew(jobs or available_cores(), cluster)
+    return ExecutorConfig(jobs or available_cores(), cluster)
 
 
-def _outcomes(words: Sequence[str]) -> list[str]:
-    """What `--retry` asks for."""
+def _retried_outcomes(words: Sequence[str]) -> list[str]:
+    """The outcomes of `--retry`."""
     from marsyard.campaigns.errors import CampaignError, not_allowed
     from marsyard.campaigns.outcomes import RETRYABLE
 
@@ -291,8 +210,8 @@ def _outcomes(words: Sequence[str]) -> list[str]:
     return list(RETRYABLE) if "all" in words else list(words)
 
 
-def carry_out(directory: Path, work: Callable[[Watch], None]) -> None:
-    """Does a campaign's work and judges it; where it is interrupted says how to go on."""
+def run_and_judge(directory: Path, work: Callable[[Watch], None]) -> None:
+    """Do a campaign's work and judge it."""
     from marsyard.cli.outcome import conclude
     from marsyard.cli.run_log import RunLog
 
@@ -302,8 +221,8 @@ def carry_out(directory: Path, work: Callable[[Watch], None]) -> None:
 
 
 @contextmanager
-def shown_progress(directory: Path, to_go_on: str) -> Iterator[Watch]:
-    """Shows how far the work in a folder is; where it is interrupted says how to go on, and ends with status 130."""
+def shown_progress(directory: Path, next_command: str) -> Iterator[Watch]:
+    """Show the progress of work in a folder; an interruption ends with the next command and status 130."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store.record import read
     from marsyard.cli.progress import campaign_progress
@@ -314,16 +233,16 @@ def shown_progress(directory: Path, to_go_on: str) -> Iterator[Watch]:
     except KeyboardInterrupt:
         try:
             stored = read(directory)
-            said = f"the rows so far are in {directory} ({stored['cases_finished']} of {stored['cases']})"
+            rows = f"the rows so far are in {directory} ({stored['cases_finished']} of {stored['cases']})"
+            typer.echo(f"interrupted; {rows}. To go on: {next_command}", err=True)
         except CampaignError:
-            raise typer.Exit(Exit.INTERRUPTED) from None
-        typer.echo(f"interrupted; {said}. To go on: {to_go_on}", err=True)
+            pass
         raise typer.Exit(Exit.INTERRUPTED) from None
 
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Has the first Ctrl-C or SIGTERM stop the work in good order, and the second end the program at once."""
+    """The first Ctrl-C or SIGTERM stops the work in good order, the second ends the program at once."""
 
     def stop(number: int, _frame: object) -> None:
         for kind in (signal.SIGINT, signal.SIGTERM):
@@ -331,7 +250,7 @@ def stopped_by_signals() -> Iterator[None]:
         raise KeyboardInterrupt(signal.Signals(number).name)
 
     def end_at_once(_number: int, _frame: object) -> None:
-        # the supervisors of the workers see this process end, kill what is below them and remove the temporary files
+        # the workers' supervisors detect the end of this process, kill their children and remove temporary files
         os.write(2, b"\x1b[?25hkilled\n" if os.isatty(2) else b"killed\n")
         os._exit(Exit.INTERRUPTED)
 
@@ -343,29 +262,33 @@ def stopped_by_signals() -> Iterator[None]:
             signal.signal(kind, handler)
 
 
-def _print_estimate(campaign: Campaign, crew: Crew) -> None:
-    """Prints what a campaign would take."""
+def _print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
+    """Print the estimated time and disk space of a campaign."""
     from marsyard.campaigns.running.estimate import estimate
     from marsyard.reports.wording import count
 
-    workers = crew.jobs if crew.cluster is None else os.cpu_count() or 1
-    found = estimate(campaign, workers)
+    workers = executor.jobs if executor.cluster is None else os.cpu_count() or 1
+    estimated = estimate(campaign, workers)
     total = campaign.configuration.total_cases
-    least, most = found.case_range_s
-    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {_duration(found.time_s)}")
-    if found.inputs:
-        typer.echo(f"  {count(found.inputs, 'terrain')} (shared inputs) to build, {found.input_s:.3g} s each")
-    typer.echo(f"  {found.case_s:.3g} s a case ({least:.3g} to {most:.3g} s in {count(found.trials, 'trial case')})")
-    if found.unfinished:
-        typer.echo(f"  {found.unfinished} of the trial cases did not come to their end")
-    typer.echo(f"disk: {size_text(found.rows_bytes)} of rows, up to {size_text(found.products_bytes)} of products")
-    if found.inputs_bytes:
-        limit = size_text(found.cache_limit_bytes)
-        typer.echo(f"  {size_text(found.inputs_bytes)} of terrains in the cache, which keeps at most {limit}")
+    low, high = estimated.case_range_s
+    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {_duration(estimated.time_s)}")
+    if estimated.inputs:
+        typer.echo(f"  {count(estimated.inputs, 'terrain')} (shared inputs) to build, {estimated.input_s:.3g} s each")
+    typer.echo(
+        f"  {estimated.case_s:.3g} s a case ({low:.3g} to {high:.3g} s in {count(estimated.trials, 'trial case')})"
+    )
+    if estimated.unfinished:
+        typer.echo(f"  {estimated.unfinished} of the trial cases did not come to their end")
+    typer.echo(
+        f"disk: {size_text(estimated.rows_bytes)} of rows, up to {size_text(estimated.products_bytes)} of products"
+    )
+    if estimated.inputs_bytes:
+        limit = size_text(estimated.cache_limit_bytes)
+        typer.echo(f"  {size_text(estimated.inputs_bytes)} of terrains in the cache, which keeps at most {limit}")
 
 
 def _print_limits(campaign: Campaign) -> None:
-    """Prints why the campaign's requirements cannot read PASS, and the change that helps."""
+    """Print why the campaign's requirements cannot be PASS, and the remedy."""
     from marsyard.cli.evidence import evidence_limits
 
     for limit in evidence_limits(campaign):
@@ -373,27 +296,16 @@ def _print_limits(campaign: Campaign) -> None:
 
 
 def _duration(seconds: float) -> str:
-    """A time as people say it."""
+    """A time in s, min or h."""
     if seconds < 120.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
-def size_text(count: float) -> str:
-    """A number of bytes as people say it."""
-    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= size:
-            return f"{count / size:.3g} {unit}"
-    return f"{count:.0f} bytes"
-
-
 def default_directory(name: str) -> Path:
-    """A folder that is not there yet: ``runs/<campaign>-<UTC time>``, with a number behind it in a busy second."""
+    """A new folder ``runs/<campaign>-<UTC time>``, numbered if it exists."""
     from datetime import UTC, datetime
 
     base = Path("runs") / f"{name}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
-    directory, number = base, 1
-    while directory.exists():
-        number += 1
-        directory = base.with_name(f"{base.name}-{number}")
-    return directory
+    numbered = (base.with_name(f"{base.name}-{number}") for number in itertools.count(2))
+    return next(one for one in itertools.chain([base], numbered) if not one.exists())

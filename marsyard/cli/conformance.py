@@ -8,29 +8,29 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
-from marsyard.cli.campaign import Exit, JsonOption, console, says_what_is_wrong
+from marsyard.cli.options import Exit, JsonOption, console, handle_user_errors
 
 if TYPE_CHECKING:
     from marsyard.scenarios.conformance import Finding, Subject
 
 
-@says_what_is_wrong
+@handle_user_errors
 def conformance(
     algorithm: Annotated[
-        str, typer.Argument(metavar="ALGORITHM", help="A name, module:Class, exec:PROGRAM or serve:PROGRAM.")
+        str, Argument(metavar="ALGORITHM", help="A name, module:Class, exec:PROGRAM or serve:PROGRAM.")
     ],
     task: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--task",
             metavar="TASK",
-            help="velocity, tracking, landing; dynamics, instrument, score. By default what its members tell, and "
-            "velocity of a program.",
+            help="velocity, tracking, landing, dynamics, instrument or score; by default from its methods.",
         ),
     ] = None,
     time_limit: Annotated[
-        float, typer.Option("--time-limit", metavar="S", help="Seconds that one answer may take.", min=0.1)
+        float, Option("--time-limit", metavar="S", help="Time limit of one answer in seconds.", min=0.1)
     ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:

@@ -6,25 +6,26 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
-from marsyard.cli.campaign import says_what_is_wrong
+from marsyard.cli.options import handle_user_errors
 
 LOOPBACK = "127.0.0.1"
 
 
-@says_what_is_wrong
+@handle_user_errors
 def dashboard(
     directories: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Folders of campaigns, or folders that hold such.")
+        list[Path], Argument(metavar="DIR...", help="Folders of campaigns, or their parent folders.")
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The site's folder.")] = Path("site"),
+    out: Annotated[Path, Option("--out", metavar="DIR", help="The site's folder.")] = Path("site"),
     requirements: Annotated[
-        Path | None, typer.Option("--requirements", metavar="FILE", help="The requirements to show, instead of ours.")
+        Path | None, Option("--requirements", metavar="FILE", help="Requirements to show in place of ours.")
     ] = None,
     serve: Annotated[
-        int | None, typer.Option("--serve", metavar="PORT", help="Serve the site, on this machine alone.", min=0)
+        int | None, Option("--serve", metavar="PORT", help="Serve the site on this machine only.", min=0)
     ] = None,
-    host: Annotated[str, typer.Option("--host", metavar="ADDRESS", help="With --serve: where to listen.")] = LOOPBACK,
+    host: Annotated[str, Option("--host", metavar="ADDRESS", help="With --serve: address to listen on.")] = LOOPBACK,
 ) -> None:
     """Write a dashboard over stored campaigns: requirements, latest verdicts, trends, pages of campaigns and cases."""
     from marsyard.campaigns.definition.requirements import read_requirements

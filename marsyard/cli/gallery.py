@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
-from marsyard.cli.render import Shot, says_why_not, take
+from marsyard.cli.options import OverwriteOption
+from marsyard.cli.render import Shot, report_picture_errors, take
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,7 +52,7 @@ PLATES: Sequence[tuple[str, str, dict[str, Any]]] = (
 
 @dataclass(frozen=True)
 class Plate:
-    """A picture for the page: what it shows, its greys, and its file of full size beside the page."""
+    """A picture for the page: its shot, its grey levels, and its file of full size next to the page."""
 
     shot: Shot
     grey: Grey
@@ -68,13 +70,11 @@ class Plate:
 
 
 def gallery(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the page and its pictures.")] = Path(
-        "gallery"
-    ),
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a gallery that is there.")] = False,
+    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of the page and pictures.")] = Path("gallery"),
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Render every site through the cameras that fit it: one page, and a contact sheet. Takes about a minute."""
-    with says_why_not(out):
+    with report_picture_errors(out):
         _check_folder(out, overwrite)
         plates = []
         for number, (site, camera, settings) in enumerate(PLATES, start=1):
@@ -112,7 +112,7 @@ def displayed(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarr
 
 
 def write_gallery(plates: Sequence[Plate], folder: Path) -> Path:
-    """Writes the page, the pictures beside it and the contact sheet; the page's path."""
+    """Write the page, the pictures next to it and the contact sheet; return the page's path."""
     from importlib.metadata import version
 
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -124,7 +124,7 @@ def write_gallery(plates: Sequence[Plate], folder: Path) -> Path:
         (folder / one.file).write_bytes(_jpeg(one.grey, FULL_QUALITY))
     (folder / SHEET).write_bytes(contact_sheet(plates))
     order = dict.fromkeys(one.shot.site for one in plates)
-    groups = [(sites()[name], [_shown(one) for one in plates if one.shot.site == name]) for name in order]
+    groups = [(sites()[name], [_template_values(one) for one in plates if one.shot.site == name]) for name in order]
     environment = Environment(
         loader=PackageLoader("marsyard.reports"),
         autoescape=True,
@@ -178,8 +178,8 @@ def _cell(grey: Grey) -> Grey:
     return shrunk
 
 
-def _shown(one: Plate) -> dict[str, Any]:
-    """What the page's template takes of a picture."""
+def _template_values(one: Plate) -> dict[str, Any]:
+    """A picture's values in the page's template."""
     import base64
 
     import cv2
@@ -222,7 +222,7 @@ def _encoded(ending: str, grey: Grey, options: Sequence[int]) -> bytes:
 
 
 def _check_folder(folder: Path, overwrite: bool) -> None:
-    """Raises ValueError where the gallery cannot be written, or is there and may not be replaced."""
+    """Raise ValueError where the gallery cannot be written, or exists and may not be replaced."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {folder} is a file; a folder is needed")
     there = [name for name in (PAGE, SHEET) if (folder / name).exists()]

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
-from marsyard.cli.campaign import says_what_is_wrong
+from marsyard.cli.options import handle_user_errors
 
 if TYPE_CHECKING:
     from marsyard.scenarios.system import Ingested
@@ -18,15 +19,13 @@ if TYPE_CHECKING:
 CAMPAIGN_FILE = "campaign.toml"
 
 
-@says_what_is_wrong
+@handle_user_errors
 def ingest(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and pictures (docs/real-pictures.md).")
+        Path, Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and pictures (docs/real-pictures.md).")
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="New folder for the cases and their campaign.")],
-    system: Annotated[
-        str | None, typer.Option("--system", help="The system whose cases these are; by default real pictures.")
-    ] = None,
+    out: Annotated[Path, Option("--out", metavar="DIR", help="New folder of the cases and their campaign.")],
+    system: Annotated[str | None, Option("--system", help="System of the cases; by default real pictures.")] = None,
 ) -> None:
     """Make a campaign of real cases from pictures with measured attitude and altitude."""
     from marsyard.campaigns.definition.loading import load_campaign

@@ -10,38 +10,39 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
-from marsyard.cli.campaign import says_what_is_wrong
+from marsyard.cli.options import OverwriteOption, handle_user_errors
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
     from marsyard.scenarios.template import CampaignTemplate, Choices
 
 
-@says_what_is_wrong
+@handle_user_errors
 def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")],
+    name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")],
     system: Annotated[
         str | None,
-        typer.Option("--system", help="What is tested, such as velocity; an unknown name lists all that there are."),
+        Option("--system", help="System under test, such as velocity; a wrong name lists all."),
     ] = None,
-    site: Annotated[str | None, typer.Option("--site", help="One of `marsyard terrain list`.")] = None,
+    site: Annotated[str | None, Option("--site", help="One of `marsyard terrain list`.")] = None,
     camera: Annotated[
-        str | None, typer.Option("--camera", metavar="FILE", help="Your camera's file (docs/own-worlds.md).")
+        str | None, Option("--camera", metavar="FILE", help="Custom camera file (docs/own-worlds.md).")
     ] = None,
     detector: Annotated[
-        str | None, typer.Option("--detector", metavar="FILE", help="Your detector's datasheet in TOML.")
+        str | None, Option("--detector", metavar="FILE", help="Custom detector datasheet in TOML.")
     ] = None,
     flight: Annotated[
-        str | None, typer.Option("--flight", metavar="FILE", help="Your trajectory, in place of the dynamics.")
+        str | None, Option("--flight", metavar="FILE", help="Trajectory file in place of the dynamics.")
     ] = None,
-    axes: Annotated[str, typer.Option("--axes", help="The trajectory's world axes: enu or ned.")] = "enu",
+    axes: Annotated[str, Option("--axes", help="World axes of the trajectory: enu or ned.")] = "enu",
     bound: Annotated[
-        float | None, typer.Option("--bound", metavar="X", help="The requirement: maximum error, or minimum fraction.")
+        float | None, Option("--bound", metavar="X", help="Requirement: maximum error or minimum fraction.")
     ] = None,
-    cases: Annotated[int, typer.Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Instead of NAME.toml.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it is there.")] = False,
+    cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24,
+    out: Annotated[Path | None, Option("--out", metavar="FILE", help="Instead of NAME.toml.")] = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Write a commented campaign of your own; at a terminal asks for what is not given."""
     from marsyard.campaigns.errors import CampaignError, not_allowed

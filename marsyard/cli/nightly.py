@@ -1,4 +1,4 @@
-"""`marsyard nightly`: runs a plan's campaigns, holds their figures against the nights before, and tells."""
+"""`marsyard nightly`: run a plan's campaigns and compare their figures with those of earlier nights."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
-from marsyard.cli.campaign import Exit, JobsOption, console, make_crew, says_what_is_wrong, stopped_by_signals
+from marsyard.cli.campaign import make_executor, stopped_by_signals
+from marsyard.cli.options import Exit, JobsOption, console, handle_user_errors
 
 if TYPE_CHECKING:
-    from marsyard.campaigns.execution.crew import Crew
+    from marsyard.campaigns.execution.workers import ExecutorConfig
     from marsyard.campaigns.running.engine import Watch
     from marsyard.cli.nightly_plan import Plan, PlannedCampaign
     from marsyard.reports.history import Change, History, NightCampaign
@@ -23,14 +25,12 @@ HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "s
 NOT_RUN = "NOT RUN"
 
 
-@says_what_is_wrong
+@handle_user_errors
 def nightly(
-    plan: Annotated[
-        Path | None, typer.Argument(metavar="[PLAN.toml]", help="The plan; by default the one that ships.")
-    ] = None,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder of the history, the runs, the page and the dashboard.")
-    ] = Path("nightly"),
+    plan: Annotated[Path | None, Argument(metavar="[PLAN.toml]", help="The plan; by default the built-in one.")] = None,
+    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of history, runs, page and dashboard.")] = Path(
+        "nightly"
+    ),
     jobs: JobsOption = None,
 ) -> None:
     """Run the plan's campaigns, compare each figure with the nights before, write nightly.md and the dashboard.
@@ -44,37 +44,37 @@ def nightly(
     from marsyard.reports.history import FINISHED, INTERRUPTED, History
 
     path = plan or PLAN_FILE
-    stated, crew = read_plan(path), make_crew(jobs, None)
+    stated, executor = read_plan(path), make_executor(jobs, None)
     with writing(out):
         (out / RUNS).mkdir(parents=True, exist_ok=True)
     with folder_lock(out), History(out / HISTORY_FILE) as history:
         night = history.begin(git_commit())
-        # what a night that is killed leaves behind
+        # the page of a night that is killed
         _write_page(history, night, out, ())
         try:
             with stopped_by_signals(), campaign_progress(console(stderr=True)) as watch:
                 for one in stated.campaigns:
-                    _run_one(_Night(history, night, out, crew, stated), one, path.parent, watch)
+                    _run_one(_Night(history, night, out, executor, stated), one, path.parent, watch)
         except KeyboardInterrupt:
             history.finish(night, INTERRUPTED)
-            _tell(history, night, out, ())
+            _publish(history, night, out, ())
             raise typer.Exit(Exit.INTERRUPTED) from None
         found = _changes(history, night)
         history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in found])
-        _tell(history, night, out, found)
+        _publish(history, night, out, found)
         status = _status(history.campaigns(night), found)
     raise typer.Exit(status)
 
 
 class _Night:
-    """A night under way."""
+    """A night in progress."""
 
-    def __init__(self, history: History, night: int, out: Path, crew: Crew, plan: Plan) -> None:
-        self.history, self.night, self.out, self.crew, self.plan = history, night, out, crew, plan
+    def __init__(self, history: History, night: int, out: Path, executor: ExecutorConfig, plan: Plan) -> None:
+        self.history, self.night, self.out, self.executor, self.plan = history, night, out, executor, plan
 
 
 def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) -> None:
-    """Runs a campaign, judges it, and keeps its figures; whatever goes wrong with it leaves the others alone."""
+    """Run a campaign, judge it, and store its figures; its errors do not affect the others."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import run_campaign
     from marsyard.cli.nightly_plan import definition_of
@@ -86,18 +86,20 @@ def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) 
         campaign = planned.load(now.plan.seed, now.night, folder)
         name = campaign.configuration.name
         directory = now.out / RUNS / f"night-{now.night:05d}-{name}"
-        run_campaign(campaign, directory, now.crew, watch)
+        run_campaign(campaign, directory, now.executor, watch)
         found, _ = settle(directory)
         frame, figures = figures_of(found.run)
         kept = [NightFigure(one.name, one.larger_is_better, one.level, sample_of(frame, one)) for one in figures]
         whole = found.whole
-        told = NightCampaign(name, definition_of(campaign), directory.name, whole.word, found.exit_code, whole.sentence)
+        result = NightCampaign(
+            name, definition_of(campaign), directory.name, whole.word, found.exit_code, whole.sentence
+        )
     except Exception as error:  # a defect in one campaign must not cost the night its others
         kept = []
         if not isinstance(error, CampaignError):
             traceback.print_exc()
-        told = NightCampaign(planned.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
-    now.history.add(now.night, told, kept)
+        result = NightCampaign(planned.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
+    now.history.add(now.night, result, kept)
 
 
 def _changes(history: History, night: int) -> list[Change]:
@@ -106,8 +108,8 @@ def _changes(history: History, night: int) -> list[Change]:
     return changes(comparisons_of(history, night))
 
 
-def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
-    """Writes the page, renews the dashboard, and prints the page."""
+def _publish(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
+    """Write the page and the dashboard, and print the page."""
     from marsyard.reports.dashboard.site import write_site
 
     text = _write_page(history, night, out, found)
@@ -116,7 +118,7 @@ def _tell(history: History, night: int, out: Path, found: Sequence[Change]) -> N
 
 
 def _write_page(history: History, night: int, out: Path, found: Sequence[Change]) -> str:
-    """Writes what is known of the night so far, and returns it."""
+    """Write the page of the night so far, and return it."""
     from marsyard.reports.campaign import write_whole
     from marsyard.reports.history import comparisons_of, night_text
 

@@ -44,7 +44,7 @@ class Plan(Parameters):
     campaigns: Annotated[tuple[PlannedCampaign, ...], Field(strict=False, min_length=1)]
 
     @model_validator(mode="after")
-    def _campaigns_are_told_apart(self) -> Plan:
+    def _check_names(self) -> Plan:
         names = [one.campaign for one in self.campaigns]
         if len(set(names)) < len(names):
             raise ValueError("a campaign is named twice; give it a file and a name of its own")
@@ -54,10 +54,7 @@ class Plan(Parameters):
 def read_plan(path: Path) -> Plan:
     """The plan in a file.
 
-    Raises
-    ------
-    ConfigurationError
-        Where it cannot be read, or states something else.
+    Raises ConfigurationError where it cannot be read, or states something else.
     """
     return read_table(path, Plan)
 

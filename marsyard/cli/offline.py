@@ -1,4 +1,4 @@
-"""`marsyard export` and `score`: cases for algorithms that are run elsewhere, and their answers judged."""
+"""`marsyard export`, `score`, `dataset`: cases for external algorithms, their answers scored, and training data."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
-from marsyard.cli.campaign import (
+from marsyard.cli.campaign import default_directory, make_executor, run_and_judge, shown_progress
+from marsyard.cli.options import (
     CampaignArgument,
     CasesOption,
     ClusterOption,
     Exit,
     JobsOption,
+    OutOption,
     SeedOption,
     SetOption,
-    carry_out,
-    default_directory,
-    make_crew,
-    says_what_is_wrong,
-    shown_progress,
+    handle_user_errors,
+    size_text,
 )
 
 TruthOption = Annotated[
-    Path | None, typer.Option("--truth", metavar="TRUTH", help="Folder of the truth; by default DIR-truth beside DIR.")
+    Path | None, Option("--truth", metavar="TRUTH", help="Folder of the truth; by default DIR-truth next to DIR.")
 ]
 
 
-@says_what_is_wrong
+@handle_user_errors
 def export(
     campaign: CampaignArgument,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the cases, without their truth.")],
+    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of the cases, without truth.")],
     cases: CasesOption = None,
     seed: SeedOption = None,
     truth: TruthOption = None,
@@ -39,7 +39,7 @@ def export(
     cluster: ClusterOption = None,
     override: SetOption = None,
 ) -> None:
-    """Write a campaign's pictures, measurements and cameras for others to answer; again to go on where it stopped."""
+    """Write a campaign's pictures, measurements and cameras for external algorithms; repeat the command to continue."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.running.offline import Exported, export_campaign, truth_folder
     from marsyard.campaigns.store import record
@@ -55,7 +55,7 @@ def export(
     words += [word for value in override or [] for word in ("--set", value)]
     loaded = replace(loaded, command=tuple(words))
     with shown_progress(exported.truth, f"the same command again ({out})") as watch:
-        export_campaign(loaded, exported, make_crew(jobs, cluster), watch)
+        export_campaign(loaded, exported, make_executor(jobs, cluster), watch)
     crashed = int(record.read(exported.truth)["cases_crashed"])
     total = loaded.configuration.total_cases
     typer.echo(f"{total - crashed} of {count(total, 'case')}: {out}")
@@ -66,18 +66,16 @@ def export(
         raise typer.Exit(Exit.FAILED)
 
 
-@says_what_is_wrong
+@handle_user_errors
 def score(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="A folder that `marsyard export` wrote.")],
-    answers: Annotated[Path, typer.Argument(metavar="ANSWERS", help="The answers: a table with commas, .csv.")],
+    directory: Annotated[Path, Argument(metavar="DIR", help="Folder written by `marsyard export`.")],
+    answers: Annotated[Path, Argument(metavar="ANSWERS", help="The answers, a .csv table.")],
     truth: TruthOption = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="RUN", help="Folder; by default runs/<campaign>-<UTC time>.")
-    ] = None,
+    out: OutOption = None,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
 ) -> None:
-    """Score answers that were made elsewhere: the scoring, the verdicts and the report of a run."""
+    """Score external answers: the scores, verdicts and report of a run."""
     from marsyard.campaigns.running.engine import Watch, run_campaign
     from marsyard.campaigns.running.offline import Exported, other_pictures, scored_campaign, truth_folder
     from marsyard.reports.wording import count
@@ -88,11 +86,33 @@ def score(
     target = out if out is not None else default_directory(campaign.configuration.name)
 
     def run(watch: Watch) -> None:
-        run_campaign(campaign, target, make_crew(jobs, cluster), watch)
+        run_campaign(campaign, target, make_executor(jobs, cluster), watch)
         other = other_pictures(exported.truth, target)
         if other:
             watch.note(
                 f"other pictures here than were exported: {count(len(other), 'case')}, the first case {other[0]}"
             )
 
-    carry_out(target, run)
+    run_and_judge(target, run)
+
+
+@handle_user_errors
+def dataset(
+    campaign: CampaignArgument,
+    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of the shards.")],
+    cases: CasesOption = None,
+    seed: SeedOption = None,
+    shard: Annotated[int, Option("--shard", metavar="N", min=1, help="Cases in a shard.")] = 50,
+    jobs: Annotated[int, Option("--jobs", metavar="J", min=1, help="Worker processes.")] = 1,
+    override: SetOption = None,
+) -> None:
+    """Write pictures with range, normals, rock masks, hazard maps and poses as WebDataset shards; repeat to continue.
+
+    For campaigns of landings, two pictures a case; existing shards are kept.
+    """
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.dataset import write_dataset
+
+    shards = write_dataset(load_campaign(campaign, override or [], cases, seed), out, shard, jobs)
+    total = sum(path.stat().st_size for path in shards)
+    typer.echo(f"{len(shards)} shards, {size_text(total)}: {out}")

@@ -11,7 +11,7 @@ from marsyard.campaigns.errors import StoreError, writing
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.record import is_locked
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table
-from marsyard.cli.campaign import Exit
+from marsyard.cli.options import Exit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,15 +23,12 @@ if TYPE_CHECKING:
 
 
 def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[str, Any]] | None = None) -> int:
-    """Judges a campaign, writes its report, prints both, and returns the exit status.
+    """Judge a campaign, write its report, print both, and return the exit status.
 
-    Of a campaign that is not finished the rows are judged that it has so far, with a status that is never 0, and the
-    record is left alone. `requirements` stand in for the campaign's own; the record then keeps its status as well.
+    An unfinished campaign is judged by its rows so far, with a status that is never 0; its record is not changed.
+    `requirements` replace the campaign's own; the record then keeps its status too.
 
-    Raises
-    ------
-    StoreError
-        Where the folder holds no campaign with rows, or the report cannot be written.
+    Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
     from marsyard.reports.tables import verdict_table
     from marsyard.reports.wording import count
@@ -47,7 +44,7 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
     lines = [f"verdict: {found.whole.word}", found.whole.sentence, f"report: {page}"]
     if not finished:
         come = f"{len(found.run.whole)} of {count(stored['cases'], 'case')}"
-        lines.insert(0, f"INCOMPLETE: {come}; {_how_it_stands(directory, stored['state'])}")
+        lines.insert(0, f"INCOMPLETE: {come}; {_state_text(directory, stored['state'])}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     # what has been met so far is not met yet
@@ -55,14 +52,11 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
 
 
 def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> tuple[Judged, Path]:
-    """Judges a campaign's rows and writes its report; returns what was found, and the page.
+    """Judge a campaign's rows and write its report; return the verdicts and the page.
 
-    The record keeps the exit status of a campaign that is finished and is judged by its own requirements.
+    The record stores the exit status of a finished campaign that is judged by its own requirements.
 
-    Raises
-    ------
-    StoreError
-        Where the folder holds no campaign with rows, or the report cannot be written.
+    Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
     from marsyard.reports.campaign import write_judged
     from marsyard.reports.evaluation import judged
@@ -77,7 +71,7 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
 def _comparison_tables(
     frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], verdicts: Sequence[Verdict]
 ) -> list[Table]:
-    """What algorithms on the same cases did; nothing where there is one only."""
+    """Comparison of algorithms on the same cases; empty for a single one."""
     from marsyard.cli.showing import grid_table
     from marsyard.reports.columns import primary_metric
     from marsyard.reports.comparison import comparison, comparison_grids
@@ -95,8 +89,8 @@ def _comparison_tables(
     return tables
 
 
-def _how_it_stands(directory: Path, state: str) -> str:
-    """Why a campaign is incomplete, and what to do."""
+def _state_text(directory: Path, state: str) -> str:
+    """Why a campaign is incomplete, and the next command."""
     if is_locked(directory):
         return "it is running"
     return f"it was {'killed' if state == 'running' else state}; to go on: marsyard resume {directory}"
@@ -105,10 +99,7 @@ def _how_it_stands(directory: Path, state: str) -> str:
 def read_frame(directory: Path) -> pd.DataFrame:
     """The stored rows of a campaign.
 
-    Raises
-    ------
-    StoreError
-        Where there are none.
+    Raises StoreError where there are none.
     """
     import pandas as pd
 

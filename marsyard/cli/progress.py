@@ -1,4 +1,4 @@
-"""Tells of a running campaign: a bar with rate and time left on a terminal, plain lines elsewhere."""
+"""Progress of a running campaign: a bar with rate and time left on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -87,21 +87,21 @@ class LineProgress:
     def __init__(self, console: Console) -> None:
         self._console = console
         self._stage, self._total, self._done = "", 0, 0
-        self._began = self._told = 0.0
+        self._began = self._printed = 0.0
 
     def begin(self, stage: str, total: int) -> None:
         """See `marsyard.campaigns.running.engine.Watch`."""
         self._stage, self._total, self._done = stage, total, 0
-        self._began = self._told = time.monotonic()
+        self._began = self._printed = time.monotonic()
         self._line(f"{stage}: {total}")
 
     def step(self) -> None:
         """See `marsyard.campaigns.running.engine.Watch`."""
         self._done += 1
         now = time.monotonic()
-        if self._done < self._total and now - self._told < LINE_INTERVAL_S:
+        if self._done < self._total and now - self._printed < LINE_INTERVAL_S:
             return
-        self._told, elapsed = now, now - self._began
+        self._printed, elapsed = now, now - self._began
         text = f"{self._stage}: {self._done}/{self._total}, {rate_text(self._done, elapsed)}"
         left = left_s(self._done, self._total, elapsed)
         self._line(f"{text}, {left:.0f} s left" if self._done < self._total else f"{text}, {elapsed:.1f} s")

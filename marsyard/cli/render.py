@@ -1,4 +1,4 @@
-"""`marsyard render`: a picture of a site with its truth layers, its camera model, and all that it was made from."""
+"""`marsyard render`: a picture of a site with its truth layers, camera model and inputs."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
-from marsyard.cli.campaign import Exit, MaxHolesOption, SiteArgument
+from marsyard.cli.options import MaxHolesOption, OverwriteOption, SiteArgument, fail
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from marsyard.sim.sensor import AutoExposure
     from marsyard.sim.terrain import Site
 
-#: What a picture is written as: 16-bit picture, truth layers, camera model, and what it was made from.
+#: Files of a picture: 16-bit picture, truth layers, camera model, and record of its inputs.
 ENDINGS = (".png", ".npz", ".cahvor", ".json")
 #: Radiance factor of the largest number in a picture without detector.
 FULL_SCALE_RADIANCE_FACTOR = 1.0
@@ -34,7 +35,7 @@ HIGHEST_M = 20000.0
 
 @dataclass(frozen=True)
 class Shot:
-    """What to take a picture of, and from where; angles in degrees, lengths in metres."""
+    """Site, camera pose and sun of a picture."""
 
     site: str
     camera: str
@@ -51,15 +52,15 @@ class Shot:
 
     @classmethod
     def usual(cls, site: str, camera: str, **settings: Any) -> Shot:
-        """A picture from the camera's usual stance where not set otherwise. Raises ValueError for what cannot be."""
+        """A picture from the camera's usual pose with these settings. Raises ValueError for an invalid one."""
         from marsyard.scenarios.imported_site import MAX_HOLE_FRACTION, is_terrain_file, site_or_file
         from marsyard.scenarios.views import STANCES
         from marsyard.sim.sensor import PRESETS
         from marsyard.sim.terrain import sites
 
         if not is_terrain_file(site):
-            _known("site", site, sites())
-        _known("camera", camera, PRESETS)
+            _check_name("site", site, sites())
+        _check_name("camera", camera, PRESETS)
         stance = STANCES[camera]
         usual = {
             "scale": stance.scale,
@@ -114,35 +115,20 @@ class Shot:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of one camera, or of one of a pair.
+    """A picture of one camera, or of one of a pair."""
 
-    Attributes
-    ----------
-    suffix
-        What tells the pictures of a pair apart: ``-left``, ``-right``; empty for a single camera.
-    camera, mounted
-        The camera model in the world frame; and in the body frame, as it is written.
-    frame, scene
-        Radiance and truth, and what was drawn.
-    exposed
-        The detector at the exposure time that was found; None without detector.
-    counts
-        What the detector delivered; None without detector.
-    filled
-        Whether a pixel sees ground of a terrain model's hole, which is filled; None where the ground is a preset's.
-    """
-
-    suffix: str
-    camera: CameraModel
-    mounted: CameraModel
-    frame: Frame
+    suffix: str  #: ``-left`` or ``-right`` of a pair; empty for a single camera
+    camera: CameraModel  #: in the world frame
+    mounted: CameraModel  #: in the body frame, as written to the file
+    frame: Frame  #: radiance and truth
     scene: Scene
-    exposed: AutoExposure | None
-    counts: UInt16[np.ndarray, "rows columns"] | None
+    exposed: AutoExposure | None  #: the detector at its automatic exposure time; None without detector
+    counts: UInt16[np.ndarray, "rows columns"] | None  #: None without detector
+    #: whether a pixel sees a filled hole of a terrain model; None on a preset's ground
     filled: Bool[np.ndarray, "rows columns"] | None
 
     def sixteen_bit(self) -> UInt16[np.ndarray, "rows columns"]:
-        """Counts moved to the upper bits, or radiance factor in 65535ths of the full scale."""
+        """Counts shifted to the upper bits, or radiance factor in 65535ths of the full scale."""
         import numpy as np
 
         if self.exposed is not None and self.counts is not None:
@@ -154,45 +140,41 @@ class Picture:
 
     @property
     def multiplied_by(self) -> int:
-        """By what counts are multiplied to fill 16 bits; 1 without detector."""
+        """Factor of the counts that fills 16 bits; 1 without detector."""
         return 1 if self.exposed is None else int(2 ** (16 - self.exposed.detector.parameters.bits))
 
 
 def render(
     site: SiteArgument,
-    camera: Annotated[
-        str, typer.Option("--camera", metavar="NAME", help="Such as mer-navcam; a wrong name lists those there are.")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="PREFIX", help="Path of the files without their endings.")],
+    camera: Annotated[str, Option("--camera", metavar="NAME", help="Such as mer-navcam; a wrong name lists all.")],
+    out: Annotated[Path, Option("--out", metavar="PREFIX", help="Path of the files without extension.")],
     scale: Annotated[
-        str | None, typer.Option("--scale", metavar="SCALE", help="descent or ground; by default the camera's usual.")
+        str | None, Option("--scale", metavar="SCALE", help="descent or ground; by default the camera's.")
     ] = None,
     altitude: Annotated[
-        float | None, typer.Option("--altitude", metavar="M", help="Height above the ground; by default the usual.")
+        float | None, Option("--altitude", metavar="M", help="Height above the ground; by default the camera's.")
     ] = None,
     east: Annotated[
-        float | None, typer.Option("--east", metavar="M", help="By default 0, of a DTM its middle; repeats.")
+        float | None, Option("--east", metavar="M", help="By default 0, or the middle of a DTM; periodic.")
     ] = None,
     north: Annotated[
-        float | None, typer.Option("--north", metavar="M", help="By default 0, of a DTM its middle; repeats.")
+        float | None, Option("--north", metavar="M", help="By default 0, or the middle of a DTM; periodic.")
     ] = None,
     azimuth: Annotated[
-        float, typer.Option("--azimuth", metavar="DEG", help="Where the camera looks, clockwise from north.")
+        float, Option("--azimuth", metavar="DEG", help="Viewing direction, clockwise from north.")
     ] = 0.0,
     elevation: Annotated[
-        float | None, typer.Option("--elevation", metavar="DEG", help="Of its axis above the horizon; -90: down.")
+        float | None, Option("--elevation", metavar="DEG", help="Of the optical axis; -90: down.")
     ] = None,
-    sun_azimuth: Annotated[float, typer.Option("--sun-azimuth", metavar="DEG", help="Clockwise from north.")] = 250.0,
-    sun_elevation: Annotated[float, typer.Option("--sun-elevation", metavar="DEG", help="Above the horizon.")] = 35.0,
-    detector: Annotated[
-        bool, typer.Option("--detector/--radiance", help="Counts of the camera's detector, or radiance factor.")
-    ] = True,
-    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Of the terrain and the noise.")] = 1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+    sun_azimuth: Annotated[float, Option("--sun-azimuth", metavar="DEG", help="Clockwise from north.")] = 250.0,
+    sun_elevation: Annotated[float, Option("--sun-elevation", metavar="DEG", help="Above the horizon.")] = 35.0,
+    detector: Annotated[bool, Option("--detector/--radiance", help="Detector counts, or radiance factor.")] = True,
+    seed: Annotated[int, Option("--seed", metavar="S", min=0, help="Of the terrain and the noise.")] = 1,
+    overwrite: OverwriteOption = False,
     max_holes: MaxHolesOption = None,
 ) -> None:
     """Render a site or DTM: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; -left, -right of a pair."""
-    with says_why_not(out):
+    with report_picture_errors(out):
         shot = Shot.usual(
             site,
             camera,
@@ -216,18 +198,16 @@ def render(
 
 
 @contextmanager
-def says_why_not(out: Path) -> Iterator[None]:
-    """Ends a command with what kept it from making pictures, or from writing them there."""
+def report_picture_errors(out: Path) -> Iterator[None]:
+    """End the command with status 2 where pictures cannot be rendered or written."""
     from marsyard.sim.render.backend import RenderingError
 
     try:
         yield
     except (ValueError, RenderingError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(Exit.WRONG) from None
+        fail(error)
     except OSError as error:
-        typer.echo(f"error: cannot write to {out}: {error}", err=True)
-        raise typer.Exit(Exit.WRONG) from None
+        fail(f"cannot write to {out}: {error}")
 
 
 def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Picture]:
@@ -335,7 +315,7 @@ def layers(picture: Picture) -> dict[str, Any]:
 
 
 def write(picture: Picture, shot: Shot, prefix: Path) -> list[Path]:
-    """Writes a picture's files and returns their paths."""
+    """Write a picture's files and return their paths."""
     import json
 
     import cv2
@@ -356,7 +336,7 @@ def write(picture: Picture, shot: Shot, prefix: Path) -> list[Path]:
 
 
 def record(picture: Picture, shot: Shot) -> dict[str, Any]:
-    """All that a picture was made from, and what its numbers mean."""
+    """All inputs of a picture, and the meaning of its numbers."""
     from importlib.metadata import version
 
     from marsyard.sim.render.backend import default_backend
@@ -405,7 +385,7 @@ def _path(prefix: Path, suffix: str, ending: str) -> Path:
 
 
 def _check_files(prefix: Path, camera: str, overwrite: bool) -> None:
-    """Raises ValueError where the files cannot be written, or are there and may not be replaced."""
+    """Raise ValueError where the files cannot be written, or exist and may not be replaced."""
     from marsyard.sim.sensor import preset
 
     folder = prefix.parent
@@ -422,8 +402,8 @@ def _check_files(prefix: Path, camera: str, overwrite: bool) -> None:
         raise ValueError(f"{', '.join(there)}: there already; --overwrite replaces what is there")
 
 
-def _known(kind: str, name: str, names: Iterable[str]) -> None:
-    """Raises ValueError for an unknown name, with what may have been meant."""
+def _check_name(kind: str, name: str, names: Iterable[str]) -> None:
+    """Raise ValueError for an unknown name, with similar names."""
     allowed = list(names)
     if name in allowed:
         return

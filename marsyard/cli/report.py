@@ -1,4 +1,4 @@
-"""`marsyard report` and `compare`: what stored rows show."""
+"""`marsyard report` and `compare`: verdicts and differences from stored rows."""
 
 from __future__ import annotations
 
@@ -10,47 +10,47 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from marsyard.cli.campaign import DirectoryArgument, JsonOption, console, says_what_is_wrong
+from marsyard.cli.options import DirectoryArgument, JsonOption, console, handle_user_errors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-#: Names of a browser that prints pages, in the order in which they are looked for.
+#: Browsers that can print pages, in order of preference.
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _PRINTING_S = 600.0
 
 RequirementsOption = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         "--requirements",
         metavar="FILE",
-        help="Judge by the requirements of this file that name the campaign, instead of by the campaign's own.",
+        help="Judge by this file's requirements for the campaign, not by its own.",
     ),
 ]
 
 
-@says_what_is_wrong
+@handle_user_errors
 def report(
     directory: DirectoryArgument,
     requirements: RequirementsOption = None,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Print the page into report.pdf as well; takes Chromium.")] = False,
-    csv: Annotated[bool, typer.Option("--csv", help="Write all rows into cases.csv as well.")] = False,
+    pdf: Annotated[bool, Option("--pdf", help="Also print the page to report.pdf (needs Chromium).")] = False,
+    csv: Annotated[bool, Option("--csv", help="Also write all rows to cases.csv.")] = False,
     gallery: Annotated[
         bool,
-        typer.Option("--gallery", help="First run the worst cases, some without an answer and some at random again."),
+        Option("--gallery", help="First rerun the worst, some unanswered and some random cases for their pictures."),
     ] = False,
 ) -> None:
-    """Judge a campaign, also one that was interrupted or killed, and write its report, from the stored rows.
+    """Judge a campaign from its stored rows, complete or not, and write its report.
 
-    Nothing is run again but for --gallery.
+    Cases are rerun for --gallery only.
     """
     from marsyard.cli.outcome import conclude
-    from marsyard.cli.report_pictures import keep_notable_cases
 
     if gallery:
-        keep_notable_cases(directory, typer.echo)
-    asked = None if requirements is None else _asked(directory, requirements)
+        _rerun_notable_cases(directory)
+    asked = None if requirements is None else _file_requirements(directory, requirements)
     status = conclude(directory, console(), asked)
     if csv:
         typer.echo(f"rows: {_write_csv(directory)}")
@@ -59,15 +59,15 @@ def report(
     raise typer.Exit(status)
 
 
-@says_what_is_wrong
+@handle_user_errors
 def compare(
-    first: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a campaign that was run.")],
-    second: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of another.")],
+    first: Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign that was run.")],
+    second: Annotated[Path, Argument(metavar="DIR", help="Folder of another.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Set two stored campaigns side by side: success, answers and errors, and whether they differ.
+    """Compare two stored campaigns: success, answers and errors, with tests of their differences.
 
-    Exit status 0 in any event: a difference is no verdict.
+    Exit status 0 in any case: a difference is not a verdict.
     """
     from marsyard.cli.showing import grid_table
     from marsyard.reports.comparison import contrast_data, contrast_grid, contrasts, same_grounds
@@ -77,8 +77,8 @@ def compare(
     paired, found = contrasts(*runs)
     names = [str(run.directory) for run in runs]
     if as_json:
-        told = {"first": names[0], "second": names[1], "paired": paired, "same_terrains": same_grounds(*runs)}
-        typer.echo(json.dumps({**told, "figures": contrast_data(found)}, indent=2))
+        runs_data = {"first": names[0], "second": names[1], "paired": paired, "same_terrains": same_grounds(*runs)}
+        typer.echo(json.dumps({**runs_data, "figures": contrast_data(found)}, indent=2))
         return
     out = console()
     out.print(grid_table("Side by side", contrast_grid(["first", "second"], found)))
@@ -89,8 +89,8 @@ def compare(
     out.print(f"Cases: {how}. p: two-sided, corrected for the number of figures (Holm).", soft_wrap=True)
 
 
-def _asked(directory: Path, path: Path) -> Sequence[dict[str, Any]]:
-    """The requirements of a file that a campaign shows."""
+def _file_requirements(directory: Path, path: Path) -> Sequence[dict[str, Any]]:
+    """The requirements of a file that name the campaign."""
     from marsyard.campaigns.definition.requirements import applicable, read_requirements
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store import record
@@ -103,7 +103,7 @@ def _asked(directory: Path, path: Path) -> Sequence[dict[str, Any]]:
 
 
 def _write_csv(directory: Path) -> Path:
-    """Writes all rows as CSV, a block of the table at a time, whole or not at all."""
+    """Write all rows as CSV in batches, atomically."""
     import pyarrow.csv as pa_csv
     import pyarrow.parquet as pq
 
@@ -122,7 +122,7 @@ def _write_csv(directory: Path) -> Path:
 
 
 def _print_page(directory: Path) -> Path:
-    """Prints the page into a PDF by a browser without a window."""
+    """Print the page to PDF with a headless browser."""
     from marsyard.campaigns.errors import CampaignError
 
     browser = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
@@ -138,3 +138,34 @@ def _print_page(directory: Path) -> Path:
         except (subprocess.SubprocessError, OSError) as error:
             raise CampaignError(f"{browser} did not print {target}: {error}") from error
     return target
+
+
+def _rerun_notable_cases(directory: Path) -> None:
+    """Rerun a campaign's notable cases without stored products, and store them; a differing row is reported.
+
+    Raises CampaignError where the campaign's scenario or an algorithm cannot be imported.
+    """
+    from marsyard.campaigns.execution.workers import LocalExecutor
+    from marsyard.campaigns.running.replay import loaded_campaign, replay_with
+    from marsyard.campaigns.store.products import save_packed
+    from marsyard.campaigns.store.record import stored_configuration
+    from marsyard.campaigns.store.retention import case_directory
+    from marsyard.campaigns.store.table import stored_row
+    from marsyard.reports.cases import notable_cases
+    from marsyard.reports.stored import read_run
+
+    run = read_run(directory)
+    lacking = [case for case in notable_cases(run) if case not in run.showcases]
+    if not lacking:
+        return
+    configuration = stored_configuration(directory)
+    loaded_campaign(directory, configuration)
+    with LocalExecutor(1) as workers:
+        for case in lacking:
+            replayed = replay_with(workers, configuration, case, stored_row(directory, case))
+            if replayed.products is None or replayed.failed:
+                typer.echo(f"case {case}: ran again and left no pictures")
+                continue
+            save_packed(case_directory(directory, case), replayed.products, replayed.row)
+            differs = f", and differs from its row in: {', '.join(replayed.differing)}" if replayed.differing else ""
+            typer.echo(f"case {case}: ran again for its pictures{differs}")

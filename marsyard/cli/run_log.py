@@ -1,4 +1,4 @@
-"""The log of a campaign's folder, `run.log`: what was asked for, how the run went, and how it ended."""
+"""The log of a campaign's folder, `run.log`: command, progress and end of each session."""
 
 from __future__ import annotations
 
@@ -22,14 +22,11 @@ LINE_INTERVAL_S = 60.0
 
 
 class RunLog:
-    """A `Watch` that writes down what it is told, and tells another. A session's lines are added to those before.
+    """A `Watch` that appends to the log and forwards to another; a log that cannot be written stops no campaign."""
 
-    A log that cannot be written stops no campaign.
-    """
-
-    def __init__(self, directory: Path, told: Watch) -> None:
+    def __init__(self, directory: Path, watch: Watch) -> None:
         self._path = directory / LOG_FILE
-        self._told = told
+        self._watch = watch
         self._stage, self._total, self._done = "", 0, 0
         self._started = time.monotonic()
         self._written = 0.0
@@ -53,19 +50,19 @@ class RunLog:
         """A stage of so many steps begins."""
         self._stage, self._total, self._done = stage, total, 0
         self._line(f"{stage}: {total}")
-        self._told.begin(stage, total)
+        self._watch.begin(stage, total)
 
     def step(self) -> None:
         """A step of the stage has ended."""
         self._done += 1
         if self._done == self._total or time.monotonic() - self._written > LINE_INTERVAL_S:
             self._line(self._how_far())
-        self._told.step()
+        self._watch.step()
 
     def note(self, text: str) -> None:
         """Something that the user should know."""
         self._line(f"note: {text}")
-        self._told.note(text)
+        self._watch.note(text)
 
     def _how_far(self) -> str:
         return f"{self._stage}: {self._done}/{self._total}"

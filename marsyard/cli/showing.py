@@ -1,4 +1,4 @@
-"""A campaign on the terminal: in full, and what its dispersions draw."""
+"""A campaign on the terminal: its definition, and the draws of its dispersions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _FIGURES = (".svg", ".png")
 
 
 def show_campaign(campaign: Campaign, console: Console) -> None:
-    """Prints a campaign: what it is, its parameters, its dispersions and its requirements."""
+    """Print a campaign: description, parameters, dispersions and requirements."""
     configuration = campaign.configuration
     _print_head(configuration, console)
     console.print(_parameters(configuration))
@@ -44,33 +44,30 @@ def show_campaign(campaign: Campaign, console: Console) -> None:
 
 
 def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
-    """Prints what the first cases draw."""
+    """Print the draws of the first cases."""
     drawn = drawn_values(campaign, cases)
     _print_head(campaign.configuration, console)
     console.print(_draws(campaign, drawn, console.width))
 
 
 def described(campaign: Campaign, cases: int | None) -> dict[str, Any]:
-    """A campaign as plain data, with what its first cases draw where that is asked for; endless bounds are None."""
+    """A campaign as plain data, optionally with the draws of its first cases; infinite bounds are None."""
     configuration = campaign.configuration
-    told: dict[str, Any] = configuration.model_dump(mode="json")
-    told["design"]["text"] = _said(configuration)
-    told["dispersions"] = [_dispersion_data(campaign, path) for path in configuration.dispersions]
+    data: dict[str, Any] = configuration.model_dump(mode="json")
+    data["design"]["text"] = _sampling_text(configuration)
+    data["dispersions"] = [_dispersion_data(campaign, path) for path in configuration.dispersions]
     if cases is not None:
         drawn = drawn_values(campaign, cases)
-        told["draws"] = [
+        data["draws"] = [
             {"case": case, "values": {path: values[case] for path, values in drawn.items()}} for case in range(cases)
         ]
-    return told
+    return data
 
 
 def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
-    """Draws what the first cases draw into an SVG or PNG file.
+    """Plot the draws of the first cases to an SVG or PNG file.
 
-    Raises
-    ------
-    CampaignError
-        Where the file has another ending or cannot be written, or there is nothing to draw.
+    Raises CampaignError where the file has another ending or cannot be written, or there is nothing to draw.
     """
     from marsyard.reports.draws import Drawn, draws_figure, save_figure
 
@@ -94,12 +91,9 @@ def _quantiles(dispersion: Dispersion) -> list[Any] | None:
 
 
 def drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
-    """What each dispersion draws in the first cases, by its parameter.
+    """The draws of each dispersion in the first cases, by parameter.
 
-    Raises
-    ------
-    CampaignError
-        Where the campaign has fewer cases, or a case cannot be drawn.
+    Raises CampaignError where the campaign has fewer cases, or a case cannot be drawn.
     """
     there = campaign.configuration.total_cases
     if not 1 <= cases <= there:
@@ -119,12 +113,12 @@ def _print_head(configuration: CampaignConfiguration, console: Console) -> None:
     for line in (
         f"{configuration.name}: {configuration.description}",
         f"scenario {configuration.scenario}, {count(configuration.total_cases, 'case')}, seed {configuration.seed}",
-        f"sampling: {_said(configuration)}",
+        f"sampling: {_sampling_text(configuration)}",
     ):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def _said(configuration: CampaignConfiguration) -> str:
+def _sampling_text(configuration: CampaignConfiguration) -> str:
     design = configuration.design
     return said_of(design.kind, list(configuration.grids), nominal=design.nominal)
 
@@ -141,12 +135,12 @@ def _parameters(configuration: CampaignConfiguration) -> Table:
 def _dispersions(campaign: Campaign) -> Table:
     table = _table("Dispersions", "parameter", "distribution", "bounds", "unit", "source")
     for path, dispersion in campaign.marginals.items():
-        told = _dispersion_data(campaign, path)
+        data = _dispersion_data(campaign, path)
         name = Text(path)
-        if told["description"]:
-            name.append(f"\n{told['description']}", style="dim")
+        if data["description"]:
+            name.append(f"\n{data['description']}", style="dim")
         source = Text(dispersion.source) if dispersion.source else Text("not stated", style="yellow")
-        table.add_row(name, Text(dispersion.describe()), Text(_bounds_text(dispersion)), Text(told["unit"]), source)
+        table.add_row(name, Text(dispersion.describe()), Text(_bounds_text(dispersion)), Text(data["unit"]), source)
     return table
 
 
@@ -190,7 +184,7 @@ def _correlations(configuration: CampaignConfiguration) -> Table:
 
 
 def _draws(campaign: Campaign, drawn: Mapping[str, Sequence[Any]], width: int) -> Table:
-    """What was drawn, a row for each parameter: its extent over all cases, then as many cases as the terminal holds."""
+    """Draws, a row for each parameter: its range over all cases, then as many cases as fit the terminal."""
     cases, nominal = len(next(iter(drawn.values()), [])), int(campaign.configuration.design.nominal)
     names = {path: _with_unit(path, campaign.marginals[path]) for path in drawn}
     longest = max((len(name) for name in names.values()), default=0)
@@ -209,12 +203,12 @@ def _draws(campaign: Campaign, drawn: Mapping[str, Sequence[Any]], width: int) -
 
 
 def _with_unit(path: str, dispersion: Dispersion) -> str:
-    """A parameter's path, which tells the unit; with that behind it which the file states instead."""
+    """A parameter's path, with the unit if the file states one."""
     return f"{path} ({dispersion.unit})" if dispersion.unit else path
 
 
 def _extent(values: Sequence[Any]) -> tuple[str, str, str]:
-    """Least, mean and greatest of numbers; how many kinds there are of what is none."""
+    """Minimum, mean and maximum of numbers; the number of kinds of other values."""
     if not values:
         return "", "", ""
     if any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):

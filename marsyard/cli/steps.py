@@ -19,14 +19,8 @@ def write_steps(directory: Path, products: Mapping[str, Any]) -> int:
     A picture (whole numbers, two dimensions, or three with three bands) is a PNG with its counts as they are; any other
     array is `.npy`; all else is JSON. A table or list of products is a folder.
 
-    Returns
-    -------
-    Number of files.
-
-    Raises
-    ------
-    StoreError
-        Where they cannot be written.
+    Returns number of files.
+    Raises StoreError where they cannot be written.
     """
     with writing(directory):
         return _write(directory, products)

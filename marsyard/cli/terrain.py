@@ -1,4 +1,4 @@
-"""`marsyard terrain`: the sites, and figures of their terrain beside what the field test paper says of them."""
+"""`marsyard terrain`: the sites, and figures of their terrain next to the field test paper's."""
 
 from __future__ import annotations
 
@@ -7,14 +7,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
-from marsyard.cli.campaign import Exit, JsonOption, MaxHolesOption, SiteArgument
+from marsyard.cli.options import JsonOption, MaxHolesOption, SiteArgument, fail
 
 if TYPE_CHECKING:
-    from marsyard.sim.terrain.imported import RealExtent
+    from marsyard.sim.terrain import Surface
+    from marsyard.sim.terrain.imported import Embedded, RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
     from marsyard.sim.terrain.sites import PaperFigures
     from marsyard.sim.terrain.statistics import TerrainStatistics
+
+#: Longest side of a picture; colours are blue, green, red.
+MAX_PIXELS = 2048
+HOLE_COLOUR, OUTLINE_COLOUR = (40, 40, 220), (0, 200, 255)
 
 app = typer.Typer(no_args_is_help=True, help="Sites and the figures of their terrain.")
 
@@ -32,7 +38,7 @@ def list_sites(
     from marsyard.sim.terrain.sites import sites
 
     if as_json:
-        told = [
+        rows = [
             {
                 "name": one.name,
                 "planet": one.environment.planet,
@@ -41,7 +47,7 @@ def list_sites(
             }
             for one in sites().values()
         ]
-        typer.echo(json.dumps(told, indent=2))
+        typer.echo(json.dumps(rows, indent=2))
         return
 
     table = Table(box=None, pad_edge=False)
@@ -57,13 +63,13 @@ def list_sites(
 def stats(
     site: SiteArgument,
     scale: Annotated[
-        str | None, typer.Option("--scale", metavar="SCALE", help="descent or ground; by default the site's coarser.")
+        str | None, Option("--scale", metavar="SCALE", help="descent or ground; by default the coarser one.")
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Seed of the terrain.")] = 1,
+    seed: Annotated[int, Option("--seed", metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: JsonOption = False,
     max_holes: MaxHolesOption = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="PNG", help="Write a picture from above; filled holes are red.")
+        Path | None, Option("--picture", metavar="PNG", help="Write a nadir picture; filled holes are red.")
     ] = None,
 ) -> None:
     """Print albedo, slopes, relief and image contrast of a site's terrain beside the paper's figures."""
@@ -71,7 +77,6 @@ def stats(
 
     import numpy as np
 
-    from marsyard.cli.terrain_picture import write_terrain_picture
     from marsyard.scenarios.imported_site import MAX_HOLE_FRACTION, site_or_file
     from marsyard.scenarios.terrain_files import grid_north_deg
     from marsyard.sim.terrain.bank import synthesise
@@ -89,8 +94,7 @@ def stats(
         if picture is not None:
             write_terrain_picture(picture, surface, real)
     except ValueError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(Exit.WRONG) from None
+        fail(error)
     measured = terrain_statistics(surface, None if real is None else real.real_samples(parameters.samples))
     extent = None if real is None else real.extent
     if as_json:
@@ -197,3 +201,37 @@ def _range(values: tuple[float, float], digits: int) -> str:
 
 def _number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def write_terrain_picture(path: Path, surface: Surface, real: Embedded | None) -> None:
+    """Write a shaded picture of a terrain, grid north up, as PNG; of an imported one the real part and its holes.
+
+    Raises ValueError where the file exists, or cannot be written.
+    """
+    import cv2
+    import numpy as np
+
+    from marsyard.sim.terrain.statistics import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
+
+    if path.suffix.lower() != ".png":
+        raise ValueError(f"--picture {path}: a file that ends in .png is needed")
+    if path.exists():
+        raise ValueError(f"--picture {path}: exists; choose another name")
+    side = surface.levels[0].shape[0]
+    level = max(int(np.ceil(np.log2(side / MAX_PIXELS))), 0)
+    shaded = nadir_picture(surface, level, np.radians(315.0), np.radians(CONTRAST_SUN_ELEVATION_DEG))
+    grey = np.clip(255.0 * shaded / np.percentile(shaded, 99.8), 0.0, 255.0).astype(np.uint8)
+    picture = np.repeat(grey[..., None], 3, axis=2)
+    if real is not None:
+        step = 2**level
+        holes = real.filled_samples(side)[::step, ::step]
+        picture[holes] = (0.4 * picture[holes] + 0.6 * np.array(HOLE_COLOUR)).astype(np.uint8)
+        south_west = real.columns.start // step, real.rows.start // step
+        north_east = real.columns.stop // step, real.rows.stop // step
+        cv2.rectangle(picture, south_west, north_east, OUTLINE_COLOUR, 1)
+    try:
+        written = cv2.imwrite(str(path), picture[::-1])
+    except cv2.error as fault:
+        raise ValueError(f"--picture {path}: cannot be written ({fault})") from fault
+    if not written:
+        raise ValueError(f"--picture {path}: cannot be written")

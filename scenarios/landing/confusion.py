@@ -1,9 +1,8 @@
 """The algorithm's maps against the truth: elevation, slope, missed hazards and false alarms.
 
-Everything is counted at the places of the truth's lattice that the map covers and whose ground both pictures show, and
-at the map's cell nearest to each. Places in the map's coordinates are held against the truth at the same horizontal
-distance from the camera: the navigation's error of position, which the landing shares, is left out, those of its
-azimuth and of the vertical are in.
+Footprints are counted at the positions of the truth's lattice that the map covers and that both pictures show, at the
+nearest cell of the map. Map and truth are compared at the same horizontal offset from the camera: this excludes the
+navigation's position error, which the landing shares, and includes its errors of azimuth and vertical.
 """
 
 from __future__ import annotations
@@ -19,40 +18,26 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.truth import GroundTruth
 
-#: Bounds of the classes of hazards, in units of the limit: below, up to half above, up to twice, thrice, and beyond.
+#: Bounds of the hazard classes over the limit, and names of the classes between them.
 CLASSES = (1.0, 1.5, 2.0, 3.0)
-#: Names of the classes between these bounds.
 CLASS_NAMES = ("below_1", "1_to_1.5", "1.5_to_2", "2_to_3", "above_3")
-#: Cells that a hazard must be across for it to be asked for.
-CELLS_ACROSS = 3.0
-#: Hazards of this many limits are the ones that bar 2 of the validation asks for.
-GROSS = 2.0
+#: Gross hazards (bar 2 of the validation): minimum diameter in cells, and minimum roughness over the limit.
+GROSS_CELLS, GROSS = 3.0, 2.0
 
 
 @dataclass(frozen=True)
-class MapAtPlaces:
-    """The algorithm's map at places of the truth.
+class SampledMap:
+    """The algorithm's map at the truth's positions."""
 
-    Attributes
-    ----------
-    known
-        Whether the map has slope and roughness there, and both pictures show the footprint.
-    safe
-        Whether the map calls the place safe.
-    flagged
-        Whether a cell that is itself a hazard, before growth, lies under the lander.
-    slope_rad
-        The map's slope.
-    """
-
+    #: whether the map has slope and roughness there, and both pictures show the footprint
     known: Bool[np.ndarray, "rows columns"]
-    safe: Bool[np.ndarray, "rows columns"]
-    flagged: Bool[np.ndarray, "rows columns"]
+    safe: Bool[np.ndarray, "rows columns"]  #: whether the map calls the position safe
+    flagged: Bool[np.ndarray, "rows columns"]  #: whether a hazard cell, before growth, lies under the lander
     slope_rad: Float[np.ndarray, "rows columns"]
 
     @classmethod
-    def of(cls, ground: Ground, flight: Flight, truth: GroundTruth, limits_rad_m: tuple[float, float]) -> MapAtPlaces:
-        """The map at the truth's places; `limits_rad_m` are the algorithm's own limits of slope and roughness."""
+    def of(cls, ground: Ground, flight: Flight, truth: GroundTruth, limits_rad_m: tuple[float, float]) -> SampledMap:
+        """The map at the truth's positions; `limits_rad_m`: the algorithm's own limits of slope and roughness."""
         cells = _cells_at(ground, flight, truth)
         shape = np.array(ground.elevation.elevation_m.shape)
         inside = np.all((cells >= 0) & (cells < shape), axis=-1) & truth.covered
@@ -69,53 +54,52 @@ class MapAtPlaces:
 
 
 def _cells_at(ground: Ground, flight: Flight, truth: GroundTruth) -> Int[np.ndarray, "rows columns 2"]:
-    """The map's cells (row, column) at the truth's places."""
+    """The map's cells (row, column) at the truth's positions."""
     away = truth.places - flight.states[0].position_m[:2]
     world_from_surface = ground.world_from_surface.as_matrix()[:2, :2]
     return np.asarray(np.rint(ground.elevation.cells(np.asarray(away @ world_from_surface))).astype(np.int64))
 
 
-def hazard_counts(ground: Ground, at: MapAtPlaces, truth: GroundTruth) -> dict[str, Scalar]:
-    """Counts of footprints by what is true of them and what the map says: sums over cases make rates.
+def hazard_counts(ground: Ground, at: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
+    """Confusion counts of footprints, truth against map; sums over cases give rates.
 
     For each class of roughness and of slope over the limit: `footprints_*` in all, `footprints_*_safe` that the map
-    calls safe, `footprints_*_unflagged` under which it has no hazard before growth. `gross_*` are hazards of twice the
-    limit of roughness that are at least three cells across; `false_alarms` truly safe footprints with a hazard of the
-    map under them.
+    calls safe, `footprints_*_unflagged` without a map hazard before growth. `gross_*` are hazards of twice the limit of
+    roughness with a diameter of at least three cells; `false_alarms` are truly safe footprints with a map hazard.
     """
-    under = truth.footprints
-    across = 2.0 * np.sqrt(under.exceeding_m2 / np.pi) / ground.elevation.cell_m
-    gross = (under.roughness_m >= GROSS * truth.limits.max_roughness_m) & (across >= CELLS_ACROSS)
-    row: dict[str, Scalar] = {
-        "footprints": _count(at.known),
-        "footprints_called_safe": _count(at.safe),
-        "footprints_called_safe_unsafe": _count(at.safe & ~under.safe),
-        "footprints_truly_safe": _count(at.known & under.safe),
-        "false_alarms": _count(at.known & under.safe & at.flagged),
-        "missed": _count(at.known & ~under.safe & ~at.flagged),
-        "gross": _count(at.known & gross),
-        "gross_called_safe": _count(at.safe & gross),
-        "gross_unflagged": _count(at.known & gross & ~at.flagged),
+    under, known, safe = truth.footprints, at.known, at.safe
+    over = {
+        "roughness": under.roughness_m / truth.limits.max_roughness_m,
+        "slope": under.slope_rad / truth.limits.max_slope_rad,
     }
-    for kind, over in (
-        ("roughness", under.roughness_m / truth.limits.max_roughness_m),
-        ("slope", under.slope_rad / truth.limits.max_slope_rad),
-    ):
-        members = np.digitize(over, CLASSES)
+    diameter_cells = 2.0 * np.sqrt(under.exceeding_m2 / np.pi) / ground.elevation.cell_m
+    gross = (under.roughness_m >= GROSS * truth.limits.max_roughness_m) & (diameter_cells >= GROSS_CELLS)
+    counted = {
+        "footprints": known,
+        "footprints_called_safe": safe,
+        "footprints_called_safe_unsafe": safe & ~under.safe,
+        "footprints_truly_safe": known & under.safe,
+        "false_alarms": known & under.safe & at.flagged,
+        "missed": known & ~under.safe & ~at.flagged,
+        "gross": known & gross,
+        "gross_called_safe": safe & gross,
+        "gross_unflagged": known & gross & ~at.flagged,
+    }
+    for kind, ratio in over.items():
+        classes = np.digitize(ratio, CLASSES)
         for number, name in enumerate(CLASS_NAMES):
-            of_class = at.known & (members == number)
-            row[f"footprints_{kind}_{name}"] = _count(of_class)
-            row[f"footprints_{kind}_{name}_safe"] = _count(of_class & at.safe)
-            row[f"footprints_{kind}_{name}_unflagged"] = _count(of_class & ~at.flagged)
-    return row
+            members = known & (classes == number)
+            column = f"footprints_{kind}_{name}"
+            counted |= {column: members, f"{column}_safe": members & safe, f"{column}_unflagged": members & ~at.flagged}
+    return {column: int(np.count_nonzero(chosen)) for column, chosen in counted.items()}
 
 
-def map_errors(ground: Ground, flight: Flight, at: MapAtPlaces, truth: GroundTruth) -> dict[str, Scalar]:
+def map_errors(ground: Ground, flight: Flight, at: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
     """Errors of the map's elevation and slope.
 
-    The elevation is held against the mean of the exact heights over each cell, relative to the camera. `bias` is the
-    error's mean, `rms` its RMS about zero, `noise` what a robust standard deviation makes of it after its plane is
-    taken off: what roughness sees; `outliers` the share beyond five of these.
+    The elevation is compared with the mean of the exact heights over each cell, relative to the camera. `bias` is the
+    mean error, `rms` its RMS about zero, `noise` the robust standard deviation about the error's plane, which affects
+    roughness; `outliers` is the fraction beyond five of these.
     """
     rows, columns = np.indices(ground.elevation.elevation_m.shape)
     local = ground.elevation.places(np.stack([rows, columns], axis=-1).astype(np.float64))
@@ -132,23 +116,18 @@ def map_errors(ground: Ground, flight: Flight, at: MapAtPlaces, truth: GroundTru
     level = values - design @ np.linalg.lstsq(design[near], values[near], rcond=None)[0]
     noise = _deviation(level)
     slope_errors = (at.slope_rad - truth.footprints.slope_rad)[at.known]
+    some = slope_errors.size > 0
     return {
         "elevation_bias_m": float(values.mean()),
         "elevation_rms_m": float(np.sqrt(np.mean(values**2))),
         "elevation_median_error_m": float(np.median(np.abs(values))),
         "elevation_noise_m": noise,
         "elevation_outliers": float(np.mean(np.abs(level) > 5.0 * noise)),
-        "slope_error_bias_deg": float(np.degrees(slope_errors.mean())) if slope_errors.size else float("nan"),
-        "slope_error_rms_deg": float(np.degrees(np.sqrt(np.mean(slope_errors**2))))
-        if slope_errors.size
-        else float("nan"),
+        "slope_error_bias_deg": float(np.degrees(slope_errors.mean())) if some else float("nan"),
+        "slope_error_rms_deg": float(np.degrees(np.sqrt(np.mean(slope_errors**2)))) if some else float("nan"),
     }
 
 
 def _deviation(values: Float[np.ndarray, "n"]) -> float:
-    """A robust standard deviation; the least positive number where more than half of the values are the same."""
+    """Robust standard deviation, at least 1e-12: positive also where more than half of the values are equal."""
     return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-12)
-
-
-def _count(chosen: Bool[np.ndarray, "rows columns"]) -> int:
-    return int(np.count_nonzero(chosen))

@@ -1,4 +1,4 @@
-"""What can go wrong in a flight: each fault by its size, all of them off by default."""
+"""Faults of a landing flight: each fault by its size, all off by default."""
 
 from __future__ import annotations
 
@@ -16,39 +16,27 @@ from marsyard.sim.sensor.satellite_navigation import Outage
 
 
 class Faults(SizedFaults):
-    """Faults of a flight.
+    """Faults of a flight; lost pictures and receiver outages need a helicopter flight."""
 
-    Lost pictures and outages of the receiver are those of a helicopter that is flown.
-    """
-
-    black_picture: Annotated[int, Field(ge=0, le=2, description="picture that is delivered black, 1 or 2; 0: none")] = 0
-    repeated_picture: Annotated[
-        int, Field(ge=0, le=1, description="1: the first picture is delivered again in place of the second")
-    ] = 0
-    lost_rows: Annotated[
-        NonNegative, Field(le=1.0, description="share of the second picture's rows that is lost, from below")
-    ] = 0.0
-    lost_pictures: Annotated[
-        float, Field(ge=0.0, le=1.0, description="share of a flight's pictures that is lost; two always arrive")
-    ] = 0.0
+    black_picture: Annotated[int, Field(ge=0, le=2, description="number of the black picture, 1 or 2; 0: none")] = 0
+    repeated_picture: int = Field(default=0, ge=0, le=1, description="1: the second picture is the first again")
+    lost_rows: NonNegative = Field(
+        default=0.0, le=1.0, description="part of the second picture's rows lost, from below"
+    )
+    lost_pictures: float = Field(default=0.0, ge=0.0, le=1.0, description="part of the pictures; two always arrive")
     laser_silent: Annotated[int, Field(ge=0, le=1, description="1: the altimeter gives no range, to the ground")] = 0
-    laser_stuck: Annotated[
-        NonNegative,
-        Field(
-            le=5.0, description="share by which the range that a stuck altimeter repeats is above the flight's height"
-        ),
-    ] = 0.0
-    gps_outage_s: Annotated[
-        NonNegative,
-        Field(le=300.0, description="how long the receiver has been silent at the first picture, and stays so, s"),
-    ] = 0.0
-    listed_bad_pixels: Annotated[
-        NonNegative, Field(le=0.5, description="the same, where the camera has a list of them and fills them")
-    ] = 0.0
-    own_shadow_m: Annotated[
-        NonNegative,
-        Field(le=100.0, description="diameter of the disc that casts the own shadow, m; the sun is nearer the zenith"),
-    ] = 0.0
+    laser_stuck: NonNegative = Field(
+        default=0.0, le=5.0, description="excess of the stuck range over the height, as a fraction"
+    )
+    gps_outage_s: NonNegative = Field(
+        default=0.0, le=300.0, description="silence before the first picture; it lasts to the end"
+    )
+    listed_bad_pixels: NonNegative = Field(
+        default=0.0, le=0.5, description="`bad_pixels` that the camera lists and fills"
+    )
+    own_shadow_m: NonNegative = Field(
+        default=0.0, le=100.0, description="diameter of the shadow's disc; raises the sun"
+    )
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
         """Bad pixels are filled where the camera has a list of them."""
@@ -59,9 +47,9 @@ class Faults(SizedFaults):
 
 
 def faulty_sun_deg(faults: Faults, elevation_deg: float) -> float:
-    """The sun's elevation: where the own shadow is to be seen its distance from the zenith is a quarter.
+    """The sun's elevation; with an own shadow its zenith distance is a quarter, so that the shadow is in the picture.
 
-    A camera that looks down sees the shadow only if the sun is nearer to the zenith than half of its angle of view.
+    A nadir camera sees the shadow only if the sun's zenith distance is below half of its angle of view.
     """
     return 90.0 - 0.25 * (90.0 - elevation_deg) if faults.own_shadow_m else elevation_deg
 
@@ -69,7 +57,7 @@ def faulty_sun_deg(faults: Faults, elevation_deg: float) -> float:
 def faulty_helicopter(faults: Faults, helicopter: HelicopterParameters) -> HelicopterParameters:
     """The helicopter with its receiver's outage: from before the first picture until after the landing.
 
-    It hovers for as much longer before, so that its filter starts with the receiver as in any other flight.
+    The hover before is longer by the outage, so that the filter starts with the receiver as in other flights.
     """
     if not faults.gps_outage_s:
         return helicopter
@@ -84,7 +72,7 @@ def faulty_helicopter(faults: Faults, helicopter: HelicopterParameters) -> Helic
 
 
 def arrived_numbers(faults: Faults, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "n"]:
-    """Numbers of a flight's pictures that arrive, at least two, in order."""
+    """Sorted numbers of a flight's pictures that arrive, at least two."""
     kept = max(2, count - round(faults.lost_pictures * count))
     return np.sort(rng.permutation(count)[:kept]).astype(np.int64)
 
@@ -95,7 +83,7 @@ def delivered(faults: Faults, pictures: Pictures) -> list[np.ndarray]:
 
 
 def faulty_ranges(faults: Faults, ranges_m: Float64[np.ndarray, "n"], height_m: float) -> Float64[np.ndarray, "n"]:
-    """The altimeter's ranges from a flight's height, or what it gives instead."""
+    """The altimeter's ranges, or the stuck or missing value in their place."""
     stuck = stuck_range_m(faults, height_m)
     if stuck is None:
         return ranges_m
@@ -103,7 +91,7 @@ def faulty_ranges(faults: Faults, ranges_m: Float64[np.ndarray, "n"], height_m: 
 
 
 def stuck_range_m(faults: Faults, height_m: float) -> float | None:
-    """What the altimeter says whatever the range is, infinite if it is silent; None if it works."""
+    """The stuck range of the altimeter, infinite if it is silent; None if it works."""
     if faults.laser_silent:
         return float("inf")
     return height_m * (1.0 + faults.laser_stuck) if faults.laser_stuck else None

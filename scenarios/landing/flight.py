@@ -1,4 +1,4 @@
-"""Where the camera truly was at the two pictures, and where the on-board filter has it."""
+"""True states and on-board poses at the two pictures of a case."""
 
 from __future__ import annotations
 
@@ -22,36 +22,24 @@ from marsyard.sim.sensor.ranging import DOWN, RangingUnit, range_along
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
-#: Shortest time between pictures, for a camera that stands still, s.
-LEAST_INTERVAL_S = 0.1
+#: Minimum time between pictures, for a camera at rest.
+MIN_INTERVAL_S = 0.1
 
 
 @dataclass(frozen=True)
 class Flight:
-    """Truth and belief at the two pictures.
+    """True states and estimated poses at the two pictures."""
 
-    Attributes
-    ----------
-    states
-        True states of the body; the camera is at its origin.
-    poses
-        The on-board filter's.
-    up_body
-        Upwards at the first picture as the inclinometers have it, unit vector in body axes.
-    transit
-        The helicopter's flight that the pictures are from; None for a pair as stated.
-    """
-
-    states: tuple[State, State]
-    poses: tuple[PoseMeasurement, PoseMeasurement]
-    up_body: Float64[np.ndarray, "3"]
-    transit: Transit | None = None
+    states: tuple[State, State]  #: true states of the body; the camera is at its origin
+    poses: tuple[PoseMeasurement, PoseMeasurement]  #: by the on-board filter
+    up_body: Float64[np.ndarray, "3"]  #: up vector at the first picture by the inclinometers, in body axes
+    transit: Transit | None = None  #: the helicopter's flight; None for a pair as stated
 
     @classmethod
     def of(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> Flight:
         """The flight of a case."""
         if p.helicopter is not None:
-            return _of_helicopter(p, p.helicopter, surface, streams)
+            return _helicopter_flight(p, p.helicopter, surface, streams)
         states = true_states(p, surface, streams)
         poses = believed_poses(p, states, streams)
         upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
@@ -60,22 +48,19 @@ class Flight:
 
     @property
     def position_error_m(self) -> Float64[np.ndarray, "3"]:
-        """What the first on-board position is off the true one, metres."""
-        error: Float64[np.ndarray, "3"] = (
-            np.array(self.poses[0].world_from_body.translation) - self.states[0].position_m
-        )
-        return error
+        """Estimated minus true position at the first picture."""
+        return np.asarray(np.array(self.poses[0].world_from_body.translation) - self.states[0].position_m)
 
 
 def calibrated_camera(p: LandingScenarioParameters, streams: Streams) -> CameraModel:
-    """The camera in the body frame as the helicopter's computer has it: the true one with its calibration's errors."""
+    """The calibrated camera in the body frame: the true one with calibration errors."""
     return draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
 
 
-def _of_helicopter(
+def _helicopter_flight(
     p: LandingScenarioParameters, helicopter: HelicopterParameters, surface: Surface, streams: Streams
 ) -> Flight:
-    """The chosen pair of a helicopter's flight along its pictures' rows' direction or whatever the course is."""
+    """The chosen pair of a helicopter's flight."""
     helicopter = faulty_helicopter(p.faults, helicopter)
     ground = float(surface.height(p.place.east_m, p.place.north_m))
     over = np.array([p.place.east_m, p.place.north_m, ground + helicopter.transit.height_m])
@@ -101,7 +86,7 @@ def _of_helicopter(
 def _laser_ranges(
     p: LandingScenarioParameters, transit: Transit, surface: Surface, streams: Streams
 ) -> Float64[np.ndarray, "pictures"]:
-    """The laser's ranges at all pictures, for the choice of the pair; to the ground, rocks left out."""
+    """The laser's ranges to the ground at all pictures, without rocks."""
     states = [transit.state(number) for number in range(transit.times_s.size)]
     longest = 5.0 * transit.parameters.transit.height_m
     true = [range_along(surface, state.position_m, np.asarray(state.attitude.apply(DOWN)), longest) for state in states]
@@ -122,7 +107,7 @@ def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams
     course = np.radians(flown.heading_deg + flown.course_deg)
     along = flown.baseline_share * flown.height_m
     moved = np.array([along * np.sin(course), along * np.cos(course), flown.climb_share * flown.height_m])
-    interval = max(float(np.linalg.norm(moved)) / max(flown.speed_m_s, 1e-6), LEAST_INTERVAL_S)
+    interval = max(float(np.linalg.norm(moved)) / max(flown.speed_m_s, 1e-6), MIN_INTERVAL_S)
     velocity = flown.speed_m_s * np.array([np.sin(course), np.cos(course), 0.0])
     rates = np.radians(flown.rate_deg_s) * streams.generator("attitude rates").standard_normal((2, 3))
     start = np.array(first.translation)
@@ -135,7 +120,7 @@ def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams
 def believed_poses(
     p: LandingScenarioParameters, states: tuple[State, State], streams: Streams
 ) -> tuple[PoseMeasurement, PoseMeasurement]:
-    """The filter's poses: errors that both share, and those of the motion between them."""
+    """The filter's poses: a common error of both, and an error of the motion between them."""
     n, rng = p.navigation, streams.generator("navigation")
     position = n.position_m * rng.standard_normal(3)
     motion = n.motion_m * rng.standard_normal(3)

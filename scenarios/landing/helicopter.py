@@ -1,16 +1,14 @@
-"""The helicopter of a case: its flight for pictures with what its instruments make of it, and its flight to the site.
+"""Helicopter flights of a case with their on-board navigation: transit for the pictures, and landing at the site.
 
-The landing is flown on what the on-board filter believes, and the filter's errors depend, a little, on what is flown.
-Both are worked out in turns: the flight on the errors of the turn before, then instruments and filter over that flight,
-with the same random numbers in every turn, until nothing moves any more. As the filter at any time knows only what was
-before it, the turns end at the one flight that agrees with its own filter throughout (Picard's iteration of a causal
-loop); what the last turn still moved is told.
+The landing is flown on the filter's estimate, and the filter's errors depend slightly on the flight. Both are solved by
+Picard iteration: fly with the errors of the previous iteration, then run instruments and filter over that flight with
+the same random numbers, until the path converges. As the filter is causal, the fixed point is unique. The change of
+the path in the last iteration is reported.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
@@ -41,12 +39,12 @@ from marsyard.sim.sensor.satellite_navigation import RtkParameters, RtkReceiver,
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from marsyard.sim.streams import Streams
 
-#: Turns of the landing's iteration at most, and how little a turn may still move the path for it to be the last, m.
-MOST_TURNS, STILL_M = 8, 1e-3
+#: Maximum iterations of a landing, and the change of the path at convergence, metres.
+MAX_ITERATIONS, CONVERGED_M = 8, 1e-3
 
 
 class HelicopterParameters(Parameters):
-    """A flight of the helicopter: vehicle, air, what is commanded, and the classes of its instruments."""
+    """A flight of the helicopter: vehicle, air, guidance, and the classes of its instruments."""
 
     craft: RotorcraftParameters = RotorcraftParameters()
     air: AirParameters = AirParameters()
@@ -56,32 +54,31 @@ class HelicopterParameters(Parameters):
     rtk: RtkParameters = RtkParameters()
     compass: TiltCompassParameters = TiltCompassParameters()
     navigation: FilterParameters = FilterParameters()
-    picture_clock: Annotated[ClockParameters, Field(description="errors of the pictures' time tags (assumed)")] = (
-        ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005)
+    picture_clock: ClockParameters = Field(
+        default=ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005),
+        description="errors of the time tags (assumed)",
     )
-    averaging_after_s: Annotated[
-        float, Field(ge=2.0, le=3600.0, description="from the touchdown to the first averaged solution, s (assumed)")
-    ] = 2.0
-    averaging_s: Annotated[
-        float, Field(gt=0.0, le=600.0, description="for which solutions are averaged, s: the paper has dozens")
-    ] = 5.0
+    averaging_after_s: float = Field(
+        default=2.0, ge=2.0, le=3600.0, description="touchdown to the first solution (assumed)"
+    )
+    averaging_s: float = Field(default=5.0, gt=0.0, le=600.0, description="for dozens of solutions, as in the paper")
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """From the flight's start to the latest end that it can have."""
+        """From the flight's start to its latest possible end."""
         last = self.transit.pictures_s + self.guidance.wait_s + self.guidance.longest_s + self.guidance.rest_s
         return -self.transit.lead_s, last + 1.0
 
     @property
     def received_s(self) -> tuple[float, float]:
-        """From the flight's start to the latest solution that is averaged on the ground."""
+        """From the flight's start to the latest averaged solution on the ground."""
         start, end = self.span_s
         return start, end + self.averaging_after_s + self.averaging_s
 
 
 @dataclass(frozen=True)
 class Instruments:
-    """The units on board, their errors drawn, and the filter that knows their classes."""
+    """The on-board units with their drawn errors, and the filter with their classes."""
 
     imu: Imu
     receiver: RtkReceiver
@@ -100,26 +97,14 @@ class Instruments:
 
 
 @dataclass(frozen=True)
-class Navigated:
-    """A part of a flight as the instruments and the filter had it.
-
-    Attributes
-    ----------
-    solution
-        The filter's.
-    boundaries_s
-        True times of its boundaries.
-    solutions, readings
-        What it took in.
-    fix_times_s
-        True times of the receiver's solutions.
-    """
+class NavigatedPart:
+    """The filter's solution over a part of a flight, with the measurements that it used."""
 
     solution: NavigationSolution
-    boundaries_s: Float64[np.ndarray, "m"]
+    boundaries_s: Float64[np.ndarray, "m"]  #: true times of the solution's boundaries
     solutions: RtkSolutions
     readings: TiltCompassReadings
-    fix_times_s: Float64[np.ndarray, "n"]
+    fix_times_s: Float64[np.ndarray, "n"]  #: true times of the receiver's solutions
 
     @classmethod
     def over(
@@ -131,8 +116,8 @@ class Navigated:
         streams: Streams,
         part: str,
         before: FilterState | None = None,
-    ) -> Navigated:
-        """The part from a start to an end, its noise from streams of its own; the filter goes on from a state."""
+    ) -> NavigatedPart:
+        """The part from a start to an end, its noise from its own streams; the filter continues from a state."""
         fixes = instruments.receiver.sampling.within(start_s, end_s)
         increments = instruments.imu.increments(
             trajectory, start_s, end_s, streams.generator(f"inertial unit's noise, {part}")
@@ -161,29 +146,15 @@ class Navigated:
 
 @dataclass(frozen=True)
 class Transit:
-    """A flight for pictures.
-
-    Attributes
-    ----------
-    parameters, instruments, air
-        What it was flown with.
-    flight
-        The truth.
-    navigated
-        The filter's solution up to its end.
-    times_s
-        True times of the pictures (the middles of their exposures).
-    tags_s
-        Their time tags.
-    """
+    """The flight over which pictures are taken."""
 
     parameters: HelicopterParameters
     instruments: Instruments
     air: Air
-    flight: RotorcraftFlight
-    navigated: Navigated
-    times_s: Float64[np.ndarray, "pictures"]
-    tags_s: Float64[np.ndarray, "pictures"]
+    flight: RotorcraftFlight  #: truth
+    navigated: NavigatedPart
+    times_s: Float64[np.ndarray, "pictures"]  #: true times of the middles of the exposures
+    tags_s: Float64[np.ndarray, "pictures"]  #: time tags of the pictures
 
     @classmethod
     def flown(
@@ -195,9 +166,9 @@ class Transit:
         gravity_m_s2: float,
         streams: Streams,
     ) -> Transit:
-        """The flight whose first picture is commanded at a point; course and heading counterclockwise from east.
+        """The flight with its first picture commanded at a point; course and heading counterclockwise from east.
 
-        The point's height is that above the datum: the ground's there plus `transit.height_m`.
+        The point's height is above the datum: the ground's there plus `transit.height_m`.
         """
         p = parameters
         start, end = p.span_s
@@ -206,7 +177,7 @@ class Transit:
             p.craft, p.transit, over_m, course_rad, heading_rad, gravity_m_s2, air, streams.generator("vibration")
         )
         instruments = Instruments.drawn(p, gravity_m_s2, streams)
-        navigated = Navigated.over(flight.path, *flight.path.span_s, instruments, streams, "transit")
+        navigated = NavigatedPart.over(flight.path, *flight.path.span_s, instruments, streams, "transit")
         times = np.linspace(0.0, p.transit.pictures_s, p.transit.pictures)
         clock_stream = streams.generator("picture clock")
         tags = Clock.drawn(p.picture_clock, clock_stream).tags(times, clock_stream)
@@ -226,7 +197,7 @@ class Transit:
         return [self.pose(number) for number in range(self.times_s.size)]
 
     def up_body(self, number: int) -> Float64[np.ndarray, "3"]:
-        """Upwards as the inclinometers last had it before a picture, unit vector in body axes."""
+        """Up vector in body axes by the inclinometers' last reading before a picture."""
         readings = self.navigated.readings
         last = int(np.searchsorted(readings.times_s, self.tags_s[number], side="right")) - 1
         up: Float64[np.ndarray, "3"] = readings.up_body[max(last, 0)]
@@ -235,55 +206,24 @@ class Transit:
 
 @dataclass(frozen=True)
 class Touchdown:
-    """A landing.
+    """A landing."""
 
-    Attributes
-    ----------
-    flight
-        The whole flight, from its start to rest on the ground.
-    navigated
-        Instruments and filter from the transit's end on.
-    time_s
-        When the skids touched.
-    state
-        Truth then.
-    believed_m
-        Where the filter had it then.
-    gps_m, gps_deviation_m
-        Means of the receiver's positions and of the standard deviations it reported, while it stood: how the paper
-        measured (Table II); not a number without solutions.
-    gps_solutions
-        How many were averaged.
-    turns, moved_m
-        Turns that were needed to agree on flight and filter, and what the last one still moved the path.
-    """
-
-    flight: RotorcraftFlight
-    navigated: Navigated
-    time_s: float
-    state: State
-    believed_m: Float64[np.ndarray, "3"]
+    flight: RotorcraftFlight  #: from its start to rest on the ground
+    navigated: NavigatedPart  #: from the transit's end on
+    time_s: float  #: first contact of the skids
+    state: State  #: true state then
+    believed_m: Float64[np.ndarray, "3"]  #: position by the filter then
+    #: means of the receiver's positions and reported standard deviations at rest, as in Table II; NaN without solutions
     gps_m: Float64[np.ndarray, "3"]
     gps_deviation_m: Float64[np.ndarray, "3"]
-    gps_solutions: int
-    turns: int
-    moved_m: float
+    gps_solutions: int  #: number averaged
+    turns: int  #: iterations until flight and filter agreed
+    moved_m: float  #: change of the path in the last iteration
 
-    def gps_error_m(self, site_m: Float64[np.ndarray, "3"]) -> float:
-        """Horizontal distance of the averaged solutions from the desired site: the paper's "position error"."""
-        return float(np.hypot(*(self.gps_m - site_m)[:2]))
 
-    def believed_error_m(self, site_m: Float64[np.ndarray, "3"]) -> float:
-        """Horizontal distance of where the filter had the touchdown from the desired site."""
-        return float(np.hypot(*(self.believed_m - site_m)[:2]))
-
-    def true_error_m(self, place_m: Float64[np.ndarray, "3"]) -> float:
-        """Horizontal distance of the true touchdown from a place in true coordinates.
-
-        The site that an algorithm reports is in believed coordinates: the ground that it meant lies where its offset
-        from the believed pose of the first picture is put onto the true one.
-        """
-        return float(np.hypot(*(self.state.position_m - place_m)[:2]))
+def horizontal_distance_m(first_m: Float64[np.ndarray, "3"], second_m: Float64[np.ndarray, "3"]) -> float:
+    """Horizontal distance of two positions: the paper's "position error" of a touchdown."""
+    return float(np.hypot(*(first_m - second_m)[:2]))
 
 
 def land(
@@ -294,9 +234,9 @@ def land(
     streams: Streams,
     laser_stuck_m: float | None = None,
 ) -> Touchdown | None:
-    """Flies on from a transit to a site in believed coordinates and down; None if it does not touch the ground in time.
+    """Continue a transit to a site in believed coordinates and land; None without contact with the ground in time.
 
-    `ground` holds the true heights, rocks included, about where it may come down.
+    `ground` holds the true heights about the site, rocks included.
     """
     p, before = transit.parameters, transit.flight.path
     altimeter = _landing_laser(p, laser, len(transit.air.gusts_m_s), laser_stuck_m, streams)
@@ -304,11 +244,11 @@ def land(
     errors = _at_knots(before, transit.navigated.boundaries_s, transit.navigated.errors(before))
     held, flown, end = errors, None, None
     turns, moved = 0, np.inf
-    while turns < MOST_TURNS and moved > STILL_M:
+    while turns < MAX_ITERATIONS and moved > CONVERGED_M:
         flight = landing_flight(transit.flight, p.guidance, site_m[:2], held, transit.air, ground, altimeter, end)
         path = flight.path
         end = path.span_s[1] if end is None else end
-        navigated = Navigated.over(
+        navigated = NavigatedPart.over(
             path, start, end, transit.instruments, streams, "landing", transit.navigated.solution.end
         )
         later = _at_knots(path, navigated.boundaries_s, navigated.errors(path))
@@ -331,23 +271,23 @@ def _landing_laser(
 def _at_knots(
     path: FlownPath, times_s: Float64[np.ndarray, "m"], values: Float64[np.ndarray, "m 9"]
 ) -> Float64[np.ndarray, "knots 9"]:
-    """Values at a path's knots, on straight lines, held before the first and after the last."""
+    """Values at a path's knots by linear interpolation, held before the first and after the last."""
     return np.stack([np.interp(path.knots_s, times_s, column) for column in values.T], axis=1)
 
 
 def _touchdown(
     transit: Transit,
     flight: RotorcraftFlight,
-    navigated: Navigated,
+    navigated: NavigatedPart,
     time: float,
     turns: int,
     moved: float,
     streams: Streams,
 ) -> Touchdown:
-    solutions = _standing(transit, flight, time, streams)
-    known = np.isfinite(solutions.positions_m[:, 0])
-    count = int(np.count_nonzero(known))
-    unknown = np.full(3, np.nan)
+    solutions = _solutions_at_rest(transit, flight, time, streams)
+    valid = np.isfinite(solutions.positions_m[:, 0])
+    count = int(np.count_nonzero(valid))
+    nothing = np.full(3, np.nan)
     last = int(np.searchsorted(navigated.boundaries_s, time, side="right")) - 1
     return Touchdown(
         flight=flight,
@@ -355,16 +295,16 @@ def _touchdown(
         time_s=time,
         state=flight.path.state(time),
         believed_m=navigated.solution.positions_m[last],
-        gps_m=solutions.positions_m[known].mean(axis=0) if count else unknown,
-        gps_deviation_m=solutions.reported_m[known].mean(axis=0) if count else unknown,
+        gps_m=solutions.positions_m[valid].mean(axis=0) if count else nothing,
+        gps_deviation_m=solutions.reported_m[valid].mean(axis=0) if count else nothing,
         gps_solutions=count,
         turns=turns,
         moved_m=moved,
     )
 
 
-def _standing(transit: Transit, flight: RotorcraftFlight, time: float, streams: Streams) -> RtkSolutions:
-    """The receiver's solutions that are averaged, while the helicopter stands where it came to rest."""
+def _solutions_at_rest(transit: Transit, flight: RotorcraftFlight, time: float, streams: Streams) -> RtkSolutions:
+    """The receiver's averaged solutions, with the helicopter at rest."""
     p, receiver, path = transit.parameters, transit.instruments.receiver, flight.path
     end = path.state(path.span_s[1])
     standing = Resting(end.position_m, end.attitude, path.gravity_m_s2)

@@ -1,4 +1,4 @@
-"""Heights of ground with rocks on a grid, and planes, slopes and roughness of footprints on it."""
+"""Kernels: heights of rocks on a grid, robust planes, slope and roughness of footprints."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-#: Deviations below this count by their square: the plane of least absolute deviations is then one, and found.
+#: Smaller deviations count by their square, which makes the plane of least absolute deviations unique.
 SMOOTHED_M = 1e-4
-#: A plane that moves by less has settled, and rounds after which it is taken as it is.
-SETTLED_M, MOST_ROUNDS = 1e-5, 60
+#: Change of the plane at convergence, and maximum number of iterations.
+CONVERGED_M, MAX_ITERATIONS = 1e-5, 60
 
 
 @njit(cache=True)
 def raise_by_triangles(heights: Array, west: float, south: float, spacing: float, vertices: Array, faces: Ints) -> None:
-    """Raises the heights of a grid, in place, to the triangles that lie above its points.
+    """Raise the heights of a grid, in place, to the triangles above its points.
 
     Row i of `heights` lies at y = south + i spacing, column j at x = west + j spacing.
     """
@@ -48,7 +48,7 @@ def raise_by_triangles(heights: Array, west: float, south: float, spacing: float
 
 @njit(cache=True)
 def _weighted_plane(x: Array, y: Array, z: Array, weights: Array, plane: Array) -> None:
-    """Fills a plane (value at 0, slopes) with the weighted least-squares one."""
+    """Weighted least-squares plane, written to `plane`: value at 0 and slopes."""
     total, mx, my, mz = 0.0, 0.0, 0.0, 0.0
     for i in range(x.size):
         total += weights[i]
@@ -72,24 +72,24 @@ def _weighted_plane(x: Array, y: Array, z: Array, weights: Array, plane: Array) 
 
 @njit(cache=True)
 def _least_absolute_plane(x: Array, y: Array, z: Array, weights: Array) -> Array:
-    """The plane of least absolute deviations: value at (0, 0) and slopes, by least squares weighted anew."""
+    """Plane of least absolute deviations by iteratively reweighted least squares: value at (0, 0) and slopes."""
     plane, before = np.empty(3), np.empty(3)
     weights[:] = 1.0
     _weighted_plane(x, y, z, weights, plane)
     reach = max(np.abs(x).max(), np.abs(y).max())
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         before[:] = plane
         for i in range(x.size):
             weights[i] = 1.0 / max(abs(z[i] - plane[0] - plane[1] * x[i] - plane[2] * y[i]), SMOOTHED_M)
         _weighted_plane(x, y, z, weights, plane)
         moved = abs(plane[0] - before[0]) + reach * (abs(plane[1] - before[1]) + abs(plane[2] - before[2]))
-        if moved < SETTLED_M:
+        if moved < CONVERGED_M:
             break
     return plane
 
 
 class Disc(NamedTuple):
-    """Points of a footprint from its middle (rows, columns): all, and those through which planes are laid."""
+    """Points of a footprint about its middle (rows, columns): all, and those that fit planes."""
 
     offsets: NDArray[np.int64]
     fitted: NDArray[np.int64]
@@ -99,22 +99,9 @@ class Disc(NamedTuple):
 def footprints(
     heights: Array, spacing: float, middles: NDArray[np.int64], disc: Disc, limit: float
 ) -> tuple[Array, Array, Array]:
-    """Slope, greatest distance from the plane (upwards or downwards), and area farther than `limit`, of footprints.
+    """Slope (rad), maximum absolute distance from the plane (m), and area farther than `limit` (m2), of footprints.
 
-    Parameters
-    ----------
-    heights, spacing
-        The grid, metres.
-    middles
-        The grid's point (row, column) in the middle of each footprint; a footprint lies within the grid.
-    disc
-        The footprint.
-    limit
-        Distance above which area is counted.
-
-    Returns
-    -------
-    Angles (radians), distances (metres) and areas (square metres).
+    `middles` are grid points (row, column); footprints must lie within the grid.
     """
     offsets, fitted = disc.offsets, disc.fitted
     slopes, roughness, exceeding = np.empty(len(middles)), np.empty(len(middles)), np.empty(len(middles))

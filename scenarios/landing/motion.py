@@ -1,4 +1,4 @@
-"""The motion that a landing algorithm solved for, in columns: against another motion, and what it rests on."""
+"""Columns of the motion that a landing algorithm solved for: errors and support."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from marsyard.algorithms.hda import Fate, HdaDetails
 from marsyard.scenarios.interface import Scalar
 
 NAN = float("nan")
-#: Why matches are dropped.
+#: Reasons for dropped matches.
 DROPPED = (Fate.UNLIKE, Fate.OUT_OF_BOUNDS, Fate.NOT_RETURNED)
 
 
@@ -20,14 +20,14 @@ def motion_errors(found: RigidTransform, true: RigidTransform) -> dict[str, Scal
     off = float(np.linalg.norm(found.translation - true.translation))
     return {
         "rotation_error_deg": float(np.degrees(turned)),
-        "direction_error_deg": float(np.degrees(2.0 * np.arcsin(min(_apart(found, true) / 2.0, 1.0)))),
+        "direction_error_deg": float(np.degrees(2.0 * np.arcsin(min(_direction_distance(found, true) / 2.0, 1.0)))),
         "length_error_m": length - true_length,
         "baseline_error_share": off / true_length if true_length > 0.0 else NAN,
     }
 
 
 def solved_row(details: HdaDetails) -> dict[str, Scalar]:
-    """What motion, structure and map rest on; nothing of what was not reached."""
+    """Inliers, matches and map size; without columns of stages that were not reached."""
     row: dict[str, Scalar] = {}
     if details.motion is not None:
         row |= {
@@ -45,8 +45,8 @@ def solved_row(details: HdaDetails) -> dict[str, Scalar]:
     return row
 
 
-def _apart(one: RigidTransform, other: RigidTransform) -> float:
-    """Distance of the directions of two translations."""
+def _direction_distance(one: RigidTransform, other: RigidTransform) -> float:
+    """Distance of the unit vectors of two translations."""
     a, b = (np.array(each.translation) for each in (one, other))
     if not (np.any(a) and np.any(b)):
         return NAN

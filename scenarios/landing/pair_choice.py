@@ -1,13 +1,12 @@
-"""Which two of a flight's pictures are used: a function of baseline and overlap (landing paper, section V).
+"""Choice of two of a flight's pictures by baseline and overlap (landing paper, section V).
 
-As on board: from the filter's poses, the laser's ranges and the calibrated camera, over ground taken to be level.
+Uses on-board data: the filter's poses, the laser's ranges and the calibrated camera, over ground assumed level.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
@@ -20,22 +19,18 @@ from marsyard.sim.parameters import Parameters
 
 
 class PairParameters(Parameters):
-    """The criterion. The paper names baseline and overlap; how they are weighed is assumed.
+    """The criterion: overlap times baseline, which counts up to `wanted_share` of the range.
 
-    A pair is worth its overlap times its baseline, which counts up to `wanted_share` of the range.
+    The paper names baseline and overlap; their weighting is assumed.
     """
 
-    wanted_share: Annotated[
-        float, Field(gt=0.0, le=2.0, description="baseline over range beyond which more is worth nothing")
-    ] = 0.2
-    least_overlap: Annotated[
-        float, Field(ge=0.0, le=1.0, description="share of the first picture's ground that the second must show")
-    ] = 0.5
+    wanted_share: float = Field(default=0.2, gt=0.0, le=2.0, description="maximum of baseline over range that counts")
+    least_overlap: float = Field(default=0.5, ge=0.0, le=1.0, description="of the first picture's ground in the second")
 
 
 @dataclass(frozen=True)
 class PairChoice:
-    """A pair: numbers of its pictures, their baseline across the first optical axis, and their overlap."""
+    """Numbers of the chosen pictures, their baseline across the first optical axis, and their overlap."""
 
     first: int
     second: int
@@ -50,14 +45,11 @@ def choose_pair(
     parameters: PairParameters,
     height_m: float,
 ) -> PairChoice:
-    """The best pair; of equal ones the earliest. Where the laser gave no range, the commanded height stands for it.
+    """The pair of the highest worth, the earliest of equal ones; the commanded height replaces a missing range.
 
-    Pairs with too little overlap are taken only if there are no others.
+    Pairs with too little overlap are chosen only if there are no others.
 
-    Raises
-    ------
-    ValueError
-        If there are fewer than two pictures.
+    Raises ValueError if there are fewer than two pictures.
     """
     if len(poses) < 2:
         raise ValueError(f"a pair is to be chosen from {len(poses)} pictures; at least 2 are needed")
@@ -82,7 +74,7 @@ def choose_pair(
 
 @dataclass(frozen=True)
 class _View:
-    """A picture's centre of projection, optical axis, and lines of sight of its corners, world axes."""
+    """A picture's centre of projection, optical axis, and rays of its corners, world axes."""
 
     centre_m: Float64[np.ndarray, "3"]
     axis: Float64[np.ndarray, "3"]
@@ -106,7 +98,7 @@ class _View:
 
 
 def _overlap(first: Float32[np.ndarray, "4 2"] | None, second: Float32[np.ndarray, "4 2"] | None) -> float:
-    """Share of the first's area that the second covers."""
+    """Fraction of the first's area that the second covers."""
     if first is None or second is None:
         return 0.0
     common, _ = cv2.intersectConvexConvex(first, second)

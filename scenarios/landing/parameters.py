@@ -1,4 +1,4 @@
-"""Everything that a campaign of landings may set or disperse."""
+"""Parameters of the landing scenario, all of which a campaign may set or disperse."""
 
 from __future__ import annotations
 
@@ -37,120 +37,83 @@ Angle = Annotated[float, Field(ge=-720.0, le=720.0)]
 
 
 class PassParameters(Parameters):
-    """Where the camera is at the two pictures: at one height over a straight line, as far as nothing else is asked for.
+    """Camera poses at the two pictures; by default level flight on a straight line.
 
-    The change between the pictures that tracking must bear is stated by its parts: along the course, up, and turned
-    about the first picture's optical axis, its columns and its rows.
+    The change between the pictures is given by its components: along the course, up, and rotations about the first
+    picture's optical axis, its columns and its rows.
     """
 
-    height_m: Annotated[float, Field(gt=0.0, le=2000.0, description="above the ground below the first picture, m")] = (
-        15.0
-    )
-    baseline_share: Annotated[
-        float, Field(ge=0.0, le=2.0, description="horizontal distance of the pictures over the height")
-    ] = 0.2
+    height_m: float = Field(default=15.0, gt=0.0, le=2000.0, description="above the ground below the first picture, m")
+    baseline_share: float = Field(default=0.2, ge=0.0, le=2.0, description="horizontal distance over height")
     speed_m_s: Annotated[float, Field(ge=0.0, le=200.0, description="along the course, m/s")] = 3.0
     heading_deg: Annotated[Angle, Field(description="azimuth of the picture's upper edge")] = 0.0
-    course_deg: Annotated[Angle, Field(description="from there to the course, clockwise: 90 is along the rows")] = 90.0
+    course_deg: Annotated[Angle, Field(description="of the course from there, clockwise: 90 is along the rows")] = 90.0
     tilt_deg: Annotated[float, Field(ge=0.0, le=60.0, description="of the first picture's axis from nadir")] = 0.0
     tilt_towards_deg: Annotated[Angle, Field(description="azimuth towards which it is tilted")] = 0.0
-    climb_share: Annotated[
-        float, Field(gt=-0.9, le=5.0, description="change of height between the pictures over the height")
-    ] = 0.0
-    roll_deg: Annotated[Angle, Field(description="turn about the optical axis between the pictures")] = 0.0
-    pitch_deg: Annotated[Angle, Field(description="turn about the picture's columns' direction, its right")] = 0.0
-    yaw_deg: Annotated[Angle, Field(description="turn about the picture's rows' direction, its upper edge's")] = 0.0
+    climb_share: float = Field(default=0.0, gt=-0.9, le=5.0, description="change of height over height")
+    roll_deg: Annotated[Angle, Field(description="rotation about the optical axis between the pictures")] = 0.0
+    pitch_deg: Annotated[Angle, Field(description="rotation about the picture's right")] = 0.0
+    yaw_deg: Annotated[Angle, Field(description="rotation about the picture's up direction")] = 0.0
     rate_deg_s: Annotated[NonNegative, Field(le=100.0, description="RMS attitude rate per axis at a picture")] = 0.0
 
 
 class NavigationParameters(Parameters):
-    """Errors of the on-board poses and of the inclinometers, drawn for a case; one standard deviation per axis."""
+    """Standard deviations per axis of the on-board poses and of the inclinometers, drawn for a case."""
 
-    position_m: Annotated[NonNegative, Field(le=100.0, description="of the position, the same at both pictures, m")] = (
-        0.02
-    )
+    position_m: NonNegative = Field(default=0.02, le=100.0, description="of the position, common to both pictures")
     motion_m: Annotated[NonNegative, Field(le=10.0, description="of the motion between the pictures, m")] = 0.01
-    tilt_deg: Annotated[
-        NonNegative, Field(le=30.0, description="of the attitude's roll and pitch, common to both, deg")
-    ] = 0.3
-    azimuth_deg: Annotated[
-        NonNegative, Field(le=30.0, description="of the attitude's azimuth, common to both, deg")
-    ] = 1.0
-    turn_deg: Annotated[NonNegative, Field(le=10.0, description="of the turn between the pictures, deg")] = 0.1
-    inclinometer_deg: Annotated[
-        NonNegative, Field(le=30.0, description="of the inclinometers' roll and pitch, deg")
-    ] = 0.2
+    tilt_deg: NonNegative = Field(default=0.3, le=30.0, description="of roll and pitch, common to both pictures")
+    azimuth_deg: NonNegative = Field(default=1.0, le=30.0, description="of the azimuth, common to both pictures")
+    turn_deg: Annotated[NonNegative, Field(le=10.0, description="of the rotation between the pictures")] = 0.1
+    inclinometer_deg: NonNegative = Field(default=0.2, le=30.0, description="of the inclinometers' roll and pitch, deg")
 
 
 class LanderParameters(Parameters):
-    """The lander: what it can stand on, and the shadow that it casts."""
+    """Limits of the lander, and its shadow."""
 
-    diameter_m: Annotated[
-        float, Field(gt=0.0, le=100.0, description="of its footprint, a disc; the helicopter is 2 m long (paper, IV)")
-    ] = 2.0
-    max_slope_deg: Annotated[float, Field(gt=0.0, lt=90.0, description="steepest plane that it can stand on")] = 15.0
-    max_roughness_m: Annotated[
-        float, Field(gt=0.0, le=100.0, description="farthest that ground may be off that plane, m")
-    ] = 0.2
-    caster_diameter_m: Annotated[
-        NonNegative, Field(le=100.0, description="diameter of the disc that casts its shadow into the picture; 0: none")
-    ] = 0.0
+    diameter_m: float = Field(default=2.0, gt=0.0, le=100.0, description="of its footprint, a disc (paper, IV)")
+    max_slope_deg: Annotated[float, Field(gt=0.0, lt=90.0, description="of the plane under it")] = 15.0
+    max_roughness_m: float = Field(default=0.2, gt=0.0, le=100.0, description="distance of the ground from the plane")
+    caster_diameter_m: NonNegative = Field(
+        default=0.0, le=100.0, description="of the disc that casts its shadow; 0: none"
+    )
 
     @property
     def limits(self) -> Limits:
-        """What it can stand on."""
+        """The limits in SI units."""
         return Limits(self.diameter_m, float(np.radians(self.max_slope_deg)), self.max_roughness_m)
 
 
 class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
-    """Everything that a campaign of landings may set or disperse.
-
-    The keys that the table `terrain` sets are changes of the site's own terrain at the stated scale.
-    """
+    """All parameters of the landing scenario; `terrain` holds changes of the site's terrain at the stated scale."""
 
     task = LANDING
     scored = ScoredLanding
 
     site: Annotated[str, Field(description="preset of terrain, light, texture and rocks")] = "heli-hazardous"
     scale: Annotated[Literal["ground", "descent"], Field(description="which of the site's terrains")] = "ground"
-    terrain_of: Annotated[
-        str | None, Field(description="whose terrain is below; filled in, and not to be set otherwise")
-    ] = None
+    terrain_of: str | None = Field(default=None, description="site of the terrain; filled in, not to be set")
     terrain: TerrainParameters = TerrainParameters()
     place: Place = Place()
-    meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
-    texture: Annotated[
-        NonNegative, Field(le=10.0, description="contrast of ground finer than the terrain, over the site's own")
-    ] = 1.0
+    meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom meshes on the ground")] = ()
+    texture: NonNegative = Field(default=1.0, le=10.0, description="contrast of the fine texture, over the site's own")
     sun: SunParameters = SunParameters()
-    camera: Annotated[
-        NamedOrOwnCamera, Field(description="camera preset that looks down; or an own camera: a table with file")
-    ] = "xc-55"
-    calibration: Annotated[
-        CalibrationParameters, Field(description="errors of the calibrated camera, drawn for a case")
-    ] = CalibrationParameters()
+    camera: NamedOrOwnCamera = Field(default="xc-55", description="nadir camera preset, or a table with file")
+    calibration: CalibrationParameters = Field(default=CalibrationParameters(), description="camera calibration errors")
     detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
     exposure: Annotated[AutoExposureParameters, Field(description="how the exposure is set")] = AutoExposureParameters()
-    flown: Annotated[
-        PassParameters,
-        Field(description="the two pictures' places; of a helicopter's flight only the azimuths are used"),
-    ] = PassParameters()
-    navigation: Annotated[
-        NavigationParameters, Field(description="errors of the poses where no helicopter is flown")
-    ] = NavigationParameters()
-    helicopter: Annotated[
-        HelicopterParameters | None,
-        Field(description="the helicopter that is flown for the pictures and to the site; none: a pair as stated"),
-    ] = None
-    pair: Annotated[PairParameters, Field(description="which two of a helicopter's pictures are used")] = (
-        PairParameters()
+    flown: PassParameters = Field(
+        default=PassParameters(), description="poses at the pictures; a helicopter's flight uses the azimuths"
     )
+    navigation: NavigationParameters = Field(
+        default=NavigationParameters(), description="pose errors without helicopter"
+    )
+    helicopter: HelicopterParameters | None = Field(default=None, description="flown for pictures and landing")
+    pair: PairParameters = Field(default=PairParameters(), description="which two of a helicopter's pictures are used")
     laser: LaserParameters = LaserParameters()
     lander: LanderParameters = LanderParameters()
     faults: Faults = Faults()
-    algorithm: Annotated[
-        str, Field(description="estimator under test: hda, essential-matrix, semi-global, or your own")
-    ] = "hda"
+    algorithm: str = Field(default="hda", description="hda, essential-matrix, semi-global, or a custom 'module:Class'")
     hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions(
         track_seed=TrackSeed.POSE
     )
@@ -158,14 +121,14 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
 
     @field_validator("site")
     @classmethod
-    def _site_is_there(cls, name: str) -> str:
+    def _check_site(cls, name: str) -> str:
         if name not in sites():
             raise ValueError(f"no site is called '{name}'; allowed: {', '.join(sites())}")
         return name
 
     @field_validator("camera")
     @classmethod
-    def _camera_looks_down(cls, name: str | OwnCamera) -> str | OwnCamera:
+    def _check_camera(cls, name: str | OwnCamera) -> str | OwnCamera:
         if isinstance(name, OwnCamera):
             return name
         down = [known for known in PRESETS if preset(known).design.down]
@@ -175,14 +138,14 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
 
     @field_validator("terrain")
     @classmethod
-    def _terrain_files_can_be_used(cls, terrain: TerrainParameters) -> TerrainParameters:
+    def _check_terrain_files(cls, terrain: TerrainParameters) -> TerrainParameters:
         check_terrain(terrain)
         return terrain
 
     @model_validator(mode="before")
     @classmethod
-    def _terrain_of_the_site(cls, stated: Any) -> Any:
-        """Completes the table `terrain` with the site's own."""
+    def _complete_terrain(cls, stated: Any) -> Any:
+        """Complete the table `terrain` with the site's own."""
         if not isinstance(stated, Mapping):
             return stated
         name, scale = stated.get("site", "heli-hazardous"), stated.get("scale", "ground")
@@ -199,8 +162,8 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
         return {**stated, "terrain_of": name, "terrain": site(name).terrain(scale).changed(changes).model_dump()}
 
     @model_validator(mode="after")
-    def _terrain_is_the_sites(self) -> LandingScenarioParameters:
-        """A terrain that was completed for one site must not be lit as another's."""
+    def _check_terrain(self) -> LandingScenarioParameters:
+        """A terrain that was completed for one site must not have another's light."""
         if getattr(self.preset, self.scale) is None:
             raise ValueError(f"site {self.site} has no terrain at the scale '{self.scale}'")
         rows = self.optics.size[1]
@@ -218,7 +181,7 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
         return self.camera.camera() if isinstance(self.camera, OwnCamera) else preset(self.camera).cameras()[0]
 
     @model_validator(mode="after")
-    def _faults_of_a_flight_are_flown(self) -> LandingScenarioParameters:
+    def _check_faults(self) -> LandingScenarioParameters:
         for name in ("lost_pictures", "gps_outage_s"):
             if getattr(self.faults, name) and self.helicopter is None:
                 raise ValueError(f"faults.{name} is that of a helicopter's flight; state the table helicopter")
@@ -226,7 +189,7 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
 
     @property
     def height_m(self) -> float:
-        """The height above the ground at which pictures are commanded to be taken."""
+        """Commanded height of the pictures above the ground."""
         return self.flown.height_m if self.helicopter is None else self.helicopter.transit.height_m
 
     @property

@@ -1,10 +1,9 @@
-"""The exact ground of a landing, rocks and all, and what it is like under a lander: the truth about hazards.
+"""Exact heights of ground and rocks, and true slope and roughness of lander footprints.
 
-Slope is the angle of the plane of least absolute deviations over the lander's footprint, roughness the greatest
-distance from it, upwards or downwards. As the paper's plane of least median of squares (section III), by which the
-algorithm maps, it stays with the ground where a rock stands on it; but there is only one, it needs no random trials,
-and it moves continuously with the ground, as a truth must (docs/adr/0028). Heights are the terrain's own and those of
-its rocks' triangles, over the very footprint in question: nothing is interpolated between footprints.
+Slope is the angle of the plane of least absolute deviations over the footprint, roughness the maximum distance from it,
+upwards or downwards. Like the algorithm's plane of least median of squares (paper, section III), it is robust against
+rocks on the ground; but it is unique, needs no random trials, and is continuous in the heights (docs/adr/0028). Heights
+are those of the terrain and of the rocks' triangles within each footprint, without interpolation between footprints.
 """
 
 from __future__ import annotations
@@ -23,21 +22,13 @@ from marsyard.scenarios.views import SiteGround
 
 #: Spacing of the exact heights, in footprints' diameters: 80 points across a footprint, 2.5 cm for one of 2 m.
 SPACING_DIAMETERS = 1.0 / 80.0
-#: Every so many of these are used to lay planes: 20 points across, some 310 in all.
+#: Every fourth point fits the planes: 20 points across, some 310 in all.
 FITTED_EVERY = 4
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a lander can stand on.
-
-    Attributes
-    ----------
-    diameter_m
-        Diameter of its footprint, a disc.
-    max_slope_rad, max_roughness_m
-        Steepest plane and farthest distance from it.
-    """
+    """Limits of a lander: diameter of its footprint, a disc, maximum slope of the plane and distance from it."""
 
     diameter_m: float
     max_slope_rad: float
@@ -46,35 +37,17 @@ class Limits:
 
 @dataclass(frozen=True)
 class Footprints:
-    """The true ground under landers at some places.
-
-    Attributes
-    ----------
-    slope_rad, roughness_m
-        As defined above.
-    exceeding_m2
-        Area of the footprint that is farther from the plane than the limit.
-    safe
-        Whether slope and roughness are within the limits.
-    """
+    """The true ground under landers."""
 
     slope_rad: Float[np.ndarray, "*places"]
     roughness_m: Float[np.ndarray, "*places"]
-    exceeding_m2: Float[np.ndarray, "*places"]
-    safe: Bool[np.ndarray, "*places"]
+    exceeding_m2: Float[np.ndarray, "*places"]  #: area of the footprint that is farther from the plane than the limit
+    safe: Bool[np.ndarray, "*places"]  #: whether slope and roughness are within the limits
 
 
 @dataclass(frozen=True)
 class Relief:
-    """Exact heights on a grid along the world's axes.
-
-    Attributes
-    ----------
-    heights_m
-        Of ground and rocks; row i lies at y = south + i spacing, column j at x = west + j spacing.
-    west_m, south_m, spacing_m
-        Where the grid lies.
-    """
+    """Exact heights of ground and rocks on a grid: row i at y = south + i spacing, column j at x = west + j spacing."""
 
     heights_m: Float[np.ndarray, "rows columns"]
     west_m: float
@@ -90,7 +63,7 @@ class Relief:
         spacing_m: float,
         meshes: Sequence[MeshParameters] = (),
     ) -> Relief:
-        """The ground between two corners (x, y), own meshes on it; rocks are drawn so finely that no grid can tell."""
+        """The ground between two corners (x, y) with custom meshes; rocks have more detail than the grid resolves."""
         columns, rows = (int(n) for n in np.ceil((high_m - low_m) / spacing_m) + 1)
         west, south = float(low_m[0]), float(low_m[1])
         x, y = np.meshgrid(west + spacing_m * np.arange(columns), south + spacing_m * np.arange(rows))
@@ -98,7 +71,7 @@ class Relief:
         middle = 0.5 * (low_m + high_m)
         if ground.rocks is not None:
             reach = 0.5 * float(np.hypot(*(high_m - low_m))) + float(ground.rocks.diameter_m.max(initial=0.0))
-            # as if seen from far above by pixels of the grid's spacing
+            # detail as from far above with pixels of the grid's spacing
             mesh = ground.rocks.near(
                 float(middle[0]), float(middle[1]), reach, above_m=1e3 * reach, pixel_rad=spacing_m / (1e3 * reach)
             )
@@ -111,11 +84,11 @@ class Relief:
         return cls(heights, west, south, spacing_m)
 
     def cells(self, places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Row and column of places (x, y), not whole."""
+        """Fractional row and column of positions (x, y)."""
         return np.asarray((places - np.array([self.west_m, self.south_m]))[..., ::-1] / self.spacing_m)
 
     def averaged(self, places: Float[np.ndarray, "rows columns 2"], side_m: float) -> Float[np.ndarray, "rows columns"]:
-        """Mean height over squares of this side about places (x, y); NaN outside the grid."""
+        """Mean height over squares of this side about positions (x, y); NaN outside the grid."""
         width = max(round(side_m / self.spacing_m), 1)
         means = cv2.blur(self.heights_m, (width, width)) if width > 1 else self.heights_m
         rows, columns = np.moveaxis(self.cells(places).astype(np.float32), -1, 0)
@@ -126,10 +99,7 @@ class Relief:
     def footprints(self, places: Float[np.ndarray, "*places 2"], limits: Limits) -> Footprints:
         """The ground under landers at places (x, y).
 
-        Raises
-        ------
-        ValueError
-            If a footprint does not lie within the grid.
+        Raises ValueError if a footprint does not lie within the grid.
         """
         disc = _disc(round(0.5 * limits.diameter_m / self.spacing_m))
         middles = np.rint(self.cells(places)).astype(np.int64).reshape(-1, 2)
@@ -146,7 +116,7 @@ class Relief:
 
 @lru_cache(maxsize=4)
 def _disc(radius: int) -> kernels.Disc:
-    """Points of a disc from its middle (row, column): all of them, and those through which planes are laid."""
+    """Points of a disc about its middle (row, column): all, and those that fit planes."""
     across = np.arange(-radius, radius + 1)
     points = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1).reshape(-1, 2)
     points = points[np.hypot(*points.T) <= radius]

@@ -1,4 +1,4 @@
-"""One flight, step by step: world, motion, pictures, measurements, estimate, truth, score."""
+"""Landing scenario: one flight from its world and pictures to the estimate, the landing and the score."""
 
 from __future__ import annotations
 
@@ -14,12 +14,19 @@ from marsyard.scenarios.conditions import rendered
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import Sample, pixel_sample, summed_rows
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.landing.descent import landing_row
-from marsyard.scenarios.landing.measurement import measure
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.score import conditions, map_row, motion_row, outcome_row, products, site_row, times_row
+from marsyard.scenarios.landing.pictures import KEPT_GROUNDS, measure
+from marsyard.scenarios.landing.score import (
+    conditions,
+    landing_row,
+    map_row,
+    motion_row,
+    outcome_row,
+    products,
+    site_row,
+    times_row,
+)
 from marsyard.scenarios.landing.truth import RenderedFlight
-from marsyard.scenarios.landing.world import KEPT_GROUNDS
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredLanding, scored
 from marsyard.scenarios.trial import Judged, attempted_with, case_result
@@ -42,10 +49,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         super().__init__(KEPT_GROUNDS)
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Numbers of the bank's terrains; none of a bank so large that hardly two flights have the same one.
-
-        Those are built by the flights that need them, in a tenth of a core-second each.
-        """
+        """Numbers of the bank's terrains; none of a large bank, whose terrains few flights share (0.1 s each)."""
         bank = self.checked(parameters).place.bank
         return tuple(range(bank)) if bank <= KEPT_GROUNDS else ()
 
@@ -58,7 +62,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         return TerrainBank(p.terrain, p.place.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """The two pictures of a case as they are delivered, with the truth of their pixels."""
+        """The two delivered pictures of a case, with the truth of their pixels."""
         case = RenderedFlight.of(self.checked(parameters), streams, self.load_ground)
         p, pair = case.p, case.pair
         for frame, image, state in zip(pair.frames, pair.images, case.flight.states, strict=True):
@@ -89,16 +93,15 @@ def _judge(
     algorithm: str,
     known: Mapping[str, Scalar],
 ) -> Judged:
-    """Ask one algorithm, and score its answer and the landing that it leads to."""
+    """Run one algorithm, and score its answer and the resulting landing."""
     p, flight, truth = case.p, case.flight, case.truth
     attempt = attempted_with(
         lambda given: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(given),
         checked_site,
         measurements,
     )
-    # what is left to land on where an algorithm fails to answer
-    nothing = SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
-    estimate = nothing if attempt.answer is None else attempt.answer
+    # without an answer the a-priori site is landed on
+    estimate = attempt.answer or SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
     row = {
         **({} if attempt.answer is None else outcome_row(attempt.answer)),
         **site_row(estimate, flight, truth),

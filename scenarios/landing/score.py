@@ -1,4 +1,4 @@
-"""What is stored of a flight: motion, maps and site against the truth, conditions, what figures are drawn from."""
+"""Columns and products of a flight: motion, maps, site and landing against the truth; conditions; figure arrays."""
 
 from __future__ import annotations
 
@@ -12,29 +12,47 @@ from marsyard.algorithms.hda.view import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.conditions import sun_columns
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.landing.confusion import MapAtPlaces, hazard_counts, map_errors
+from marsyard.scenarios.landing.confusion import SampledMap, hazard_counts, map_errors
+from marsyard.scenarios.landing.faults import stuck_range_m
 from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.helicopter import Touchdown, horizontal_distance_m, land
 from marsyard.scenarios.landing.motion import motion_errors, solved_row
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.pictures import Pair
 from marsyard.scenarios.landing.truth import GroundTruth, RenderedFlight
+from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground
+from marsyard.sim.sensor.ranging import RangingUnit
+from marsyard.sim.streams import Streams
 
 NAN = float("nan")
-#: Pixels that a track may be off the true place and still count as right.
-RIGHT_PX = 1.0
-#: Share of the features that both pictures show for tracking to be good.
-WELL = 0.9
-#: Changes between pictures that tracking bears (section II.A): about the optical axis, about the others, of height.
-MOST_ROLL_DEG, MOST_TILT_DEG, MOST_CLIMB = 10.0, 20.0, 0.2
+#: Maximum distance of a correct track from the true pixel.
+CORRECT_PX = 1.0
+#: Distance from the border within which features are not expected to be tracked.
+BORDER_PX = 12.0
+#: Minimum fraction of the features in both pictures to be tracked correctly.
+WELL_TRACKED = 0.9
+#: Changes between pictures that tracking tolerates (section II.A): about the optical axis, about the others, of height.
+MAX_ROLL_DEG, MAX_TILT_DEG, MAX_CLIMB = 10.0, 20.0, 0.2
+#: Columns of tracks, motion, structure and map.
+MOTION_COLUMNS = (
+    "features", "tracks", "features_in_view", "tracks_right", "tracked_share", "tracks_wrong_share", "inliers",
+    "parallax_px", "rotation_error_deg", "direction_error_deg", "length_error_m", "baseline_error_share",
+    "motion_residual_px", "points", "matched_share", "map_rows", "map_columns", "cell_m",
+    "matches_unlike", "matches_out_of_bounds", "matches_not_returned",
+)  # fmt: skip
+#: Columns of the ground under a lander, after the name of the position.
+PLACE_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m")
+TOUCHDOWN_COLUMNS = (
+    "touchdown_error_gps_m", "touchdown_error_believed_m", "touchdown_error_m", "gps_deviation_north_m",
+    "gps_deviation_east_m", "gps_solutions", "landing_turns", "landing_moved_m", "landing_after_s",
+    "touchdown_sink_m_s", "touchdown_drift_m_s",
+)  # fmt: skip
 
 
 def outcome_row(estimate: SiteEstimate) -> dict[str, Scalar]:
-    """What was answered, as populations of requirements; not to be stored of an algorithm that crashed.
-
-    Its case belongs to each of them then, and fails.
-    """
+    """The outcome as populations of requirements; omitted for a crashed algorithm, whose case fails in each."""
     return {
         "converged": estimate.outcome.converged,
         "site_reported": estimate.outcome is SiteOutcome.SAFE_SITE,
@@ -43,48 +61,85 @@ def outcome_row(estimate: SiteEstimate) -> dict[str, Scalar]:
 
 
 def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
-    """What there is to find: every flight is in one of `none_exists`, `narrow_exists` and `roomy_exists`.
+    """Populations by the true ground: no safe site, safe sites without margin only, or sites with a margin.
 
-    No place is safe; places are safe, none of them with a lander's radius of safe places about it; one has that room.
+    A site with margin (`roomy_exists`) has safe positions all around up to a lander's radius. Every flight is in one of
+    `none_exists`, `narrow_exists` and `roomy_exists`.
     """
     safe, roomy = bool(np.any(truth.safe)), bool(np.any(truth.roomy))
     return {"safe_exists": safe, "none_exists": not safe, "narrow_exists": safe and not roomy, "roomy_exists": roomy}
 
 
 def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict[str, Scalar]:
-    """The answer against the truth.
+    """The reported site against the truth.
 
-    The site is where the coordinates that were handed over lead a helicopter whose navigation is off as it was at the
-    first picture. Nothing but SAFE_SITE reports a safe site: where the algorithm did not converge the a-priori site is
-    scored.
+    The true site is the reported one minus the navigation error at the first picture. Only SAFE_SITE reports a safe
+    site: where the algorithm did not converge the a-priori site is scored.
     """
-    row = place_row("site", _reported_place(estimate, flight), truth)
+    row = _place_row("site", _true_site(estimate, flight), truth)
     safe_reported = estimate.outcome is SiteOutcome.SAFE_SITE and bool(row["site_safe"])
     return {**row, "safe_or_no_site_reported": safe_reported or estimate.outcome is SiteOutcome.NO_SAFE_SITE}
 
 
-def _reported_place(estimate: SiteEstimate, flight: Flight) -> np.ndarray | None:
-    """The true x, y to which the reported coordinates lead; None where there are none."""
+def _true_site(estimate: SiteEstimate, flight: Flight) -> np.ndarray | None:
+    """True x, y of the reported coordinates; None without a site."""
     return None if estimate.site_world is None else (estimate.site_world - flight.position_error_m)[:2]
 
 
-def place_row(name: str, place: np.ndarray | None, truth: GroundTruth) -> dict[str, Scalar]:
-    """The true ground under a lander at a place (x, y)."""
-    under = None if place is None else truth.under(place)
-    if place is None or under is None:
-        return {f"{name}_safe": False, **dict.fromkeys(_place_columns(name), NAN)}
-    values = (
-        float(place[0]),
-        float(place[1]),
-        float(np.degrees(under.slope_rad[0])),
-        float(under.roughness_m[0]),
-        truth.distance_to_hazard_m(place),
+def _place_row(name: str, position: np.ndarray | None, truth: GroundTruth) -> dict[str, Scalar]:
+    """The true ground under a lander at a position (x, y)."""
+    columns = [f"{name}_{column}" for column in PLACE_COLUMNS]
+    under = None if position is None else truth.under(position)
+    if position is None or under is None:
+        return {f"{name}_safe": False, **dict.fromkeys(columns, NAN)}
+    slope_deg, roughness_m = float(np.degrees(under.slope_rad[0])), float(under.roughness_m[0])
+    values = (*map(float, position), slope_deg, roughness_m, truth.distance_to_hazard_m(position))
+    return {f"{name}_safe": bool(under.safe[0]), **dict(zip(columns, values, strict=True))}
+
+
+def landing_row(
+    p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth, streams: Streams
+) -> dict[str, Scalar]:
+    """The helicopter's touchdown, and the ground there.
+
+    `touchdown_error_gps_m` is the distance of the receiver's averaged solutions from the site's coordinates, as the
+    paper measured it; `touchdown_error_m` that of the true touchdown from the true site, with the navigation error at
+    the first picture taken off; `touchdown_safe` whether it stands safely; `touchdown_sink_m_s` and
+    `touchdown_drift_m_s` are its vertical and horizontal speed. Without a site or a helicopter there is no landing:
+    numbers are NaN, and `touchdown_safe` is absent.
+    """
+    landed = _land(p, estimate, flight, truth, streams)
+    if landed is None or estimate.site_world is None:
+        nowhere = _place_row("touchdown", None, truth)
+        del nowhere["touchdown_safe"]
+        return {"landed": False, **nowhere, **dict.fromkeys(TOUCHDOWN_COLUMNS, NAN)}
+    site, position, velocity = estimate.site_world, landed.state.position_m, landed.state.velocity_m_s
+    numbers = (
+        horizontal_distance_m(landed.gps_m, site),
+        horizontal_distance_m(landed.believed_m, site),
+        horizontal_distance_m(position, site - flight.position_error_m),
+        float(landed.gps_deviation_m[1]),
+        float(landed.gps_deviation_m[0]),
+        landed.gps_solutions,
+        landed.turns,
+        landed.moved_m,
+        landed.time_s - flight.states[1].time_s,
+        -float(velocity[2]),
+        float(np.hypot(*velocity[:2])),
     )
-    return {f"{name}_safe": bool(under.safe[0]), **dict(zip(_place_columns(name), values, strict=True))}
+    ground = _place_row("touchdown", position[:2], truth)
+    return {"landed": True, **ground, **dict(zip(TOUCHDOWN_COLUMNS, numbers, strict=True))}
 
 
-def _place_columns(name: str) -> list[str]:
-    return [f"{name}_{part}" for part in ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m")]
+def _land(
+    p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth, streams: Streams
+) -> Touchdown | None:
+    if flight.transit is None or estimate.site_world is None:
+        return None
+    relief = truth.relief
+    ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
+    unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
+    return land(flight.transit, estimate.site_world, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
 
 
 def true_motion(flight: Flight, pair: Pair) -> RigidTransform:
@@ -97,14 +152,8 @@ def true_motion(flight: Flight, pair: Pair) -> RigidTransform:
 
 
 def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]:
-    """Tracks, and the motion against the true one; NaN for what was not reached."""
-    names = (
-        "features", "tracks", "features_in_view", "tracks_right", "tracked_share", "tracks_wrong_share", "inliers",
-        "parallax_px", "rotation_error_deg", "direction_error_deg", "length_error_m", "baseline_error_share",
-        "motion_residual_px", "points", "matched_share", "map_rows", "map_columns", "cell_m",
-        "matches_unlike", "matches_out_of_bounds", "matches_not_returned",
-    )  # fmt: skip
-    row: dict[str, Scalar] = dict.fromkeys(names, NAN)
+    """Tracks, and the motion against the true one; NaN for stages that were not reached."""
+    row: dict[str, Scalar] = dict.fromkeys(MOTION_COLUMNS, NAN)
     row["tracked_well"] = False
     if not isinstance(details, HdaDetails):
         return row
@@ -116,16 +165,16 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
 
 
 def _within_limits(true: RigidTransform, flight: Flight, range_m: float) -> bool:
-    """Whether the pictures changed by less than the paper says tracking bears (section II.A)."""
+    """Whether the change between the pictures is within the paper's limits of tracking (section II.A)."""
     pitch, yaw, roll = np.degrees(np.abs(true.rotation.as_rotvec()))
     climb = abs(float(flight.states[1].position_m[2] - flight.states[0].position_m[2]))
     return bool(
-        roll < MOST_ROLL_DEG + 0.5 and max(pitch, yaw) < MOST_TILT_DEG + 0.5 and climb < (MOST_CLIMB + 0.01) * range_m
+        roll < MAX_ROLL_DEG + 0.5 and max(pitch, yaw) < MAX_TILT_DEG + 0.5 and climb < (MAX_CLIMB + 0.01) * range_m
     )
 
 
 def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Scalar]:
-    """How many of the features that the second picture shows were found again, and rightly."""
+    """Counts of features in the second picture, and of correct and wrong tracks."""
     tracks = details.tracks
     if tracks is None or len(tracks.first) == 0:
         return {"features": 0}
@@ -133,11 +182,10 @@ def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Sc
     points = pair.frames[0].points_world()[row * pair.images[0].calibration.rows_summed, column]
     camera = pair.images[1].camera.moved(flight.states[1].world_from_body)
     pixels, ahead = camera.project(points)
-    room = 12.0
     with np.errstate(invalid="ignore"):
-        inside = np.all((pixels >= room) & (pixels <= np.array(camera.size) - 1.0 - room), axis=1) & ahead
+        inside = np.all((pixels >= BORDER_PX) & (pixels <= np.array(camera.size) - 1.0 - BORDER_PX), axis=1) & ahead
         off = np.hypot(*(tracks.second - pixels).T)
-        right = tracks.accepted & inside & (off <= RIGHT_PX)
+        right = tracks.accepted & inside & (off <= CORRECT_PX)
     accepted = int(tracks.accepted.sum())
     return {
         "features": len(tracks.first),
@@ -145,13 +193,13 @@ def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Sc
         "features_in_view": int(inside.sum()),
         "tracks_right": int(right.sum()),
         "tracked_share": float(right.sum() / inside.sum()) if np.any(inside) else NAN,
-        "tracked_well": bool(np.any(inside) and right.sum() >= WELL * inside.sum()),
+        "tracked_well": bool(np.any(inside) and right.sum() >= WELL_TRACKED * inside.sum()),
         "tracks_wrong_share": float(np.mean(~right[tracks.accepted])) if accepted else NAN,
     }
 
 
 def times_row(details: object) -> dict[str, Scalar]:
-    """Processor time of the stages of Table I; NaN for those that were not reached."""
+    """Processor time of the stages of Table I; NaN for stages that were not reached."""
     taken = details.times_s if isinstance(details, HdaDetails) else {}
     return {f"{stage}_time_s": taken.get(stage, NAN) for stage in STAGES}
 
@@ -159,18 +207,19 @@ def times_row(details: object) -> dict[str, Scalar]:
 def map_row(
     p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth
 ) -> dict[str, Scalar]:
-    """The maps against the truth; nothing where there is no map."""
+    """The maps against the truth; empty without a map."""
     if not isinstance(estimate.details, HdaDetails) or estimate.details.ground is None:
         return {}
     ground = estimate.details.ground
-    at = MapAtPlaces.of(ground, flight, truth, (p.hda.max_slope_rad, p.hda.max_roughness_m))
+    at = SampledMap.of(ground, flight, truth, (p.hda.max_slope_rad, p.hda.max_roughness_m))
     return {**map_errors(ground, flight, at, truth), **hazard_counts(ground, at, truth)}
 
 
 def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[str, Scalar]:
-    """What the case was like, read from the simulated objects."""
+    """Conditions of the case, read from the simulated objects."""
     p, pair, truth = case.p, case.pair, case.truth
     covered = truth.covered
+    slopes = truth.footprints.slope_rad[covered]
     return {
         "site": p.site,
         "terrain": p.place.terrain,
@@ -188,7 +237,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         **site_populations(truth),
         "truly_safe_share": float(truth.safe.sum() / max(int(covered.sum()), 1)),
         "within_limits": _within_limits(true_motion(case.flight, pair), case.flight, pair.axis_range_m),
-        "true_slope_median_deg": _median_deg(truth, covered),
+        "true_slope_median_deg": float(np.degrees(np.median(slopes))) if slopes.size else NAN,
         "texture": p.texture,
         "grid_px": p.hda.grid_px,
         "max_slope_deg": float(np.degrees(p.hda.max_slope_rad)),
@@ -198,7 +247,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
 
 
 def _true_motion_columns(case: RenderedFlight) -> dict[str, Scalar]:
-    """Where the camera was at the first picture, and how it moved and turned to the second."""
+    """Height and attitude at the first picture, motion and rotation to the second."""
     states = case.flight.states
     heights = height_above_ground(case.world.ground.surface, np.stack([state.position_m for state in states]))
     moved = states[1].position_m - states[0].position_m
@@ -237,12 +286,8 @@ def _navigation_errors(flight: Flight, measurements: LandingMeasurements) -> dic
     }
 
 
-def _median_deg(truth: GroundTruth, covered: np.ndarray) -> float:
-    return float(np.degrees(np.median(truth.footprints.slope_rad[covered]))) if np.any(covered) else NAN
-
-
 def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
-    """Arrays from which the case's figures are drawn.
+    """Arrays for the case's figures.
 
     Those of `marsyard.algorithms.hda.hda_products` (Figs. 1-5 and 7), and
 
@@ -252,7 +297,7 @@ def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
     - `true_heights`, `true_corner`, `true_spacing`: exact heights, world axes (row i at y = corner[1] + i spacing);
     - `camera_true`, `camera_believed`: poses of the body at the first picture (4 x 4), true and on board;
     - `limits`: the algorithm's limits of slope (radians) and roughness (metres), and the lander's diameter;
-    - `site_true`: world x, y to which the handed-over coordinates lead (see `site_row`).
+    - `site_true`: true x, y of the reported site (see `site_row`).
     """
     p, flight, pair, truth = case.p, case.flight, case.pair, case.truth
     kept: dict[str, Any] = {"image_1": pair.counts[0], "image_2": pair.counts[1]}
@@ -274,7 +319,5 @@ def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
         "camera_believed": flight.poses[0].world_from_body.as_matrix(),
         "limits": np.array([p.hda.max_slope_rad, p.hda.max_roughness_m, truth.limits.diameter_m]),
     }
-    reported = _reported_place(estimate, flight)
-    if reported is not None:
-        kept["site_true"] = reported
-    return kept
+    site = _true_site(estimate, flight)
+    return kept if site is None else {**kept, "site_true": site}

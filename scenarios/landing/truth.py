@@ -1,4 +1,4 @@
-"""What is true of a flight's ground: where a lander would stand safely, and whether there is such a place."""
+"""Landing site truth of a flight: footprint hazards on a lattice over the ground in both pictures."""
 
 from __future__ import annotations
 
@@ -13,53 +13,34 @@ from scipy.spatial.transform import Rotation
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import Pair, seen_by_both, take_pictures
+from marsyard.scenarios.landing.pictures import Pair, World, take_pictures, visible_in_both
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
-from marsyard.scenarios.landing.world import World
 from marsyard.scenarios.optics import camera_optics
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.streams import Streams
 
-#: Distance of the places at which the truth is asked for, in diameters of the footprint: 20 cm for 2 m.
+#: Spacing of the lattice, in diameters of the footprint: 20 cm for 2 m.
 STEP_DIAMETERS = 0.1
-#: Room beyond the ground in sight, in diameters: footprints and landings beside it are still told.
+#: Margin of the relief beyond the ground in sight, in diameters: for footprints and landings next to it.
 MARGIN_DIAMETERS = 1.5
-#: Values of a hazard map: a lander's footprint about the pixel's point is safe, is not, or is not all in sight.
+#: Values of a hazard map: the footprint about the pixel's point is safe, unsafe, or partly out of sight.
 SAFE, UNSAFE, UNKNOWN = 0, 1, 255
 
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """The true ground of a flight.
-
-    Places are a lattice about the first picture, along its horizontal axes.
-
-    Attributes
-    ----------
-    relief
-        Exact heights.
-    limits
-        What the lander can stand on.
-    places
-        World x, y of the lattice.
-    footprints
-        The ground under a lander at each place.
-    covered
-        Whether both pictures show all of the ground under it.
-    step_m
-        Distance of the places.
-    """
+    """The true ground of a flight on a lattice about the first picture, along its horizontal axes."""
 
     relief: Relief
     limits: Limits
-    places: Float[np.ndarray, "rows columns 2"]
-    footprints: Footprints
-    covered: Bool[np.ndarray, "rows columns"]
+    places: Float[np.ndarray, "rows columns 2"]  #: world x, y of the lattice
+    footprints: Footprints  #: the ground under a lander at each position
+    covered: Bool[np.ndarray, "rows columns"]  #: whether both pictures show the whole footprint
     step_m: float
 
     @classmethod
     def of(cls, world: World, flight: Flight, pair: Pair, limits: Limits) -> GroundTruth:
-        """The truth about the ground that both pictures show."""
+        """The truth over the ground of the first picture."""
         centre = flight.states[0].position_m
         axes = _horizontal_axes(flight.states[0].attitude)
         points = _border_points(pair)
@@ -71,41 +52,36 @@ class GroundTruth:
         places = np.asarray(centre[:2] + local @ axes)
         margin = MARGIN_DIAMETERS * limits.diameter_m
         corners = places.reshape(-1, 2)
-        relief = Relief.of(
-            world.ground,
-            corners.min(axis=0) - margin,
-            corners.max(axis=0) + margin,
-            SPACING_DIAMETERS * limits.diameter_m,
-            world.meshes,
-        )
+        west_south, east_north = corners.min(axis=0) - margin, corners.max(axis=0) + margin
+        relief = Relief.of(world.ground, west_south, east_north, SPACING_DIAMETERS * limits.diameter_m, world.meshes)
         heights = relief.averaged(places, relief.spacing_m)
-        seen = seen_by_both(pair, flight, np.concatenate([corners, heights.reshape(-1, 1)], axis=1), 0.0)
+        seen = visible_in_both(pair, flight, np.concatenate([corners, heights.reshape(-1, 1)], axis=1), 0.0)
         around = distance_transform_edt(np.pad(seen.reshape(heights.shape), 1))[1:-1, 1:-1] * step
         covered = around >= 0.5 * limits.diameter_m
         return cls(relief, limits, places, relief.footprints(places, limits), covered, step)
 
     @property
     def safe(self) -> Bool[np.ndarray, "rows columns"]:
-        """Where a lander would stand safely on ground that both pictures show."""
+        """Safe positions whose footprint both pictures show."""
         return np.asarray(self.covered & self.footprints.safe)
 
     @property
     def roomy(self) -> Bool[np.ndarray, "rows columns"]:
-        """Safe places with safe places all around up to a radius of the footprint: room for errors."""
+        """Safe positions with safe positions all around up to the footprint's radius, as margin for errors."""
         return np.asarray(distance_transform_edt(np.pad(self.safe, 1))[1:-1, 1:-1] * self.step_m > self.margin_m)
 
     @property
     def margin_m(self) -> float:
-        """Room that a roomy place has about it, metres."""
+        """Radius of safe positions about a position with margin."""
         return 0.5 * self.limits.diameter_m
 
     def distance_to_hazard_m(self, place: Float[np.ndarray, "2"]) -> float:
-        """From a place (x, y) to the nearest one where a lander would not stand safely; to the lattice's step."""
+        """Distance of a position (x, y) from the nearest unsafe position of the lattice."""
         unsafe = self.places[~self.footprints.safe]
         return float(np.hypot(*(unsafe - place).T).min()) if len(unsafe) else float("inf")
 
     def hazard_map(self, points: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns"]:
-        """What a lander would stand on about each pixel's point, at the nearest of the truth's places."""
+        """Hazard class of the footprint about each pixel's point, at the nearest position of the lattice."""
         origin = self.places[0, 0]
         axes = np.stack([self.places[0, 1] - origin, self.places[1, 0] - origin], axis=1)
         cells = np.linalg.solve(axes, (points[..., :2] - origin).reshape(-1, 2).T).T
@@ -120,7 +96,7 @@ class GroundTruth:
         return hazard.reshape(points.shape[:2])
 
     def under(self, place: Float[np.ndarray, "2"]) -> Footprints | None:
-        """The ground under a lander at any place (x, y); None where it is not known."""
+        """The ground under a lander at any position (x, y); None outside the relief."""
         try:
             return self.relief.footprints(place[None], self.limits)
         except ValueError:
@@ -129,7 +105,7 @@ class GroundTruth:
 
 @dataclass(frozen=True)
 class RenderedFlight:
-    """A flight with its world, its pictures, and the truth about the ground that they show."""
+    """A flight with its world, pictures and ground truth."""
 
     p: LandingScenarioParameters
     world: World
@@ -156,7 +132,7 @@ def _horizontal_axes(attitude: Rotation) -> Float[np.ndarray, "2 2"]:
 
 
 def _border_points(pair: Pair) -> Float[np.ndarray, "n 2"]:
-    """World x, y of what the first picture shows, thinned."""
+    """World x, y of the convex hull of the first picture's ground."""
     points = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
     points = points[np.all(np.isfinite(points), axis=1)]
     hull = cv2.convexHull(points.astype(np.float32))

@@ -1,6 +1,5 @@
-"""A rover drives to what it sees: the scenario of visual target tracking.
+"""Rover scenario: visual target tracking in a closed loop of driving and imaging.
 
-Read it in the order of a run: `parameters`, `world`, `rig`, `vehicle`, `target`, then the loop in `run` with `route`,
-`mapping` and `pictures`, and `score`; `scenario` runs a case. `shared` tracks many targets over
-the pictures of one drive.
+Reading order: `parameters`, `world`, `vehicle`, `target`, the loop in `run` with `route` and `pictures`, then `score`;
+`scenario` runs a case. `shared` tracks many targets over the pictures of one drive.
 """

@@ -1,4 +1,4 @@
-"""Everything that a campaign of the rover scenario may set or disperse."""
+"""Parameters of the rover scenario, all of which a campaign may set or disperse."""
 
 from __future__ import annotations
 
@@ -33,20 +33,21 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.terrain import site, sites
 
+#: Angles in degrees: relative, and azimuths.
+Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
+Azimuth = Annotated[float, Field(ge=-360.0, le=720.0)]
+
 
 class InclineParameters(Parameters):
-    """An even slope about the target that climbs to the east, and how the way to the target lies on it."""
+    """An even slope about the target that climbs to the east, and the direction of the route on it."""
 
-    name: Annotated[str, Field(min_length=1, description="what the report calls such ground")] = "flat ground"
+    name: Annotated[str, Field(min_length=1, description="its name in the report")] = "flat ground"
     slope_deg: Annotated[float, Field(ge=0.0, le=40.0, description="0 for none")] = 0.0
-    oblique_deg: Annotated[
-        float,
-        Field(ge=-180.0, le=180.0, description="turn of the start about the target, added to its bearing"),
-    ] = 0.0
+    oblique_deg: Turn = Field(default=0.0, description="rotation of the start about the target, added to its bearing")
 
 
 class WorldParameters(Parameters):
-    """The ground: one terrain of a site's bank, rocks that would stand in the way taken out."""
+    """One terrain of a site's bank, cleared of rocks on the route."""
 
     site: Annotated[str, Field(description="preset of terrain, rocks, texture and light")] = "mars-yard"
     bank: Annotated[int, Field(ge=1, le=100000, description="terrains in the bank")] = 8
@@ -54,34 +55,32 @@ class WorldParameters(Parameters):
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, 2.5 cm apart")] = 2048
     incline: InclineParameters = InclineParameters()
-    rms_slope_deg: Annotated[
-        float | None, Field(ge=0.0, le=30.0, description="RMS slope of the rough ground; by default the site's")
-    ] = None
-    rock_abundance: Annotated[
-        float | None, Field(ge=0.0, le=0.4, description="share of the ground under rocks; by default the site's")
-    ] = None
-    largest_near_m: Annotated[
-        NonNegative, Field(description="largest rock left between the start and the target, m: operators choose a way")
-    ] = 0.08
-    east_m: Annotated[float, Field(description="where the target's rock lies, on the periodic terrain")] = 8.0
-    north_m: Annotated[float, Field(description="where the target's rock lies, on the periodic terrain")] = 8.0
-    rocks_underfoot: Annotated[
-        bool, Field(description="whether wheels feel the rocks they meet, or the ground alone")
-    ] = False
-    background_half_deg: Annotated[
-        float, Field(gt=0.0, le=180.0, description="half the angle behind the target over which rocks are drawn")
-    ] = 50.0
+    rms_slope_deg: float | None = Field(
+        default=None, ge=0.0, le=30.0, description="of rough ground; default: the site's"
+    )
+    rock_abundance: float | None = Field(
+        default=None, ge=0.0, le=0.4, description="ground under rocks; default: the site's"
+    )
+    largest_near_m: NonNegative = Field(
+        default=0.08, description="largest rock left on the route that operators choose"
+    )
+    east_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
+    north_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
+    rocks_underfoot: bool = Field(default=False, description="whether wheels feel rocks, or the ground alone")
+    background_half_deg: float = Field(
+        default=50.0, gt=0.0, le=180.0, description="half angle behind the target with rocks"
+    )
 
     @field_validator("site")
     @classmethod
-    def _site_has_ground(cls, name: str) -> str:
-        known = [one.name for one in sites().values() if one.ground is not None]
-        if name not in known:
-            raise ValueError(f"no site for a rover is called '{name}'; allowed: {', '.join(known)}")
+    def _check_site(cls, name: str) -> str:
+        allowed = [one.name for one in sites().values() if one.ground is not None]
+        if name not in allowed:
+            raise ValueError(f"no site for a rover is called '{name}'; allowed: {', '.join(allowed)}")
         return name
 
     @model_validator(mode="after")
-    def _terrain_is_there(self) -> WorldParameters:
+    def _check_terrain(self) -> WorldParameters:
         if self.terrain >= self.bank:
             raise ValueError(f"terrain {self.terrain} is not in the bank; allowed: 0 to {self.bank - 1}")
         if self.samples & (self.samples - 1):
@@ -92,7 +91,7 @@ class WorldParameters(Parameters):
 
 
 class ObstacleParameters(Parameters):
-    """A rock in or beside the way, placed from the target."""
+    """A rock on or next to the route, positioned relative to the target."""
 
     towards_start_m: Annotated[float, Field(description="distance from the target towards the start, m")] = 4.0
     right_m: Annotated[float, Field(description="to the right of that line, seen from the start, m")] = 0.0
@@ -101,42 +100,34 @@ class ObstacleParameters(Parameters):
 
 
 class TargetParameters(Parameters):
-    """The rock that is driven to, the point on it, and how that is told to the rover.
+    """The target's rock, the designated point on it, and the kind of designation (section 3).
 
-    The point is picked where the rock is seen from the start: `across` from its left (-1) to its right (1) outline at
-    `up`, from its foot (0) to its top (1).
+    The point is picked as seen from the start: `across` from the rock's left (-1) to its right (1) outline at `up`,
+    from its foot (0) to its top (1).
     """
 
     diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="of the rock")] = 0.8
     height_m: Annotated[Positive | None, Field(description="of the rock; by default half the diameter")] = None
-    shape: Annotated[int | None, Field(ge=0, le=31, description="its shape, see PlacedRock; drawn by default")] = None
-    yaw_deg: Annotated[float | None, Field(description="its turn; drawn by default")] = None
-    across: Annotated[float, Field(ge=-1.0, le=1.0, description="place of the point across the rock")] = 0.0
-    up: Annotated[float, Field(ge=0.0, le=1.0, description="place of the point up the rock")] = 0.5
-    designation: Annotated[
-        Literal["pixel", "rover", "site"], Field(description="how the ground names the target (section 3)")
-    ] = "pixel"
+    shape: Annotated[int | None, Field(ge=0, le=31, description="see PlacedRock; by default drawn")] = None
+    yaw_deg: Annotated[float | None, Field(description="by default drawn")] = None
+    across: Annotated[float, Field(ge=-1.0, le=1.0, description="position of the point across the rock")] = 0.0
+    up: Annotated[float, Field(ge=0.0, le=1.0, description="position of the point up the rock")] = 0.5
+    designation: Literal["pixel", "rover", "site"] = Field(default="pixel", description="kind of designation")
 
 
 class StartParameters(Parameters):
-    """Where the rover stands at first, seen from the target."""
+    """The rover's start, relative to the target."""
 
-    distance_m: Annotated[
-        float, Field(gt=1.0, le=40.0, description="horizontally from the mast to the designated point, m")
-    ] = 10.0
-    bearing_deg: Annotated[
-        float, Field(ge=-360.0, le=720.0, description="direction from the target to the rover, clockwise from north")
-    ] = 270.0
-    target_azimuth_deg: Annotated[
-        float, Field(ge=-180.0, le=180.0, description="where the target is seen, to the right of straight ahead")
-    ] = 0.0
+    distance_m: float = Field(default=10.0, gt=1.0, le=40.0, description="horizontally, mast to designated point")
+    bearing_deg: Azimuth = Field(default=270.0, description="from the target to the rover, clockwise from north")
+    target_azimuth_deg: Turn = Field(default=0.0, description="of the target, to the right of straight ahead")
 
 
 class LegParameters(Parameters):
-    """A part of a run. After each of its steps the target is tracked.
+    """A part of a run; the target is tracked after each of its steps.
 
     ========== ========================================================================================================
-    stay       stands for `steps` updates
+    stay       does not move for `steps` updates
     approach   drives at the target's latest estimate until it is `goal_m` away
     back-off   drives backwards, away from the target, until it is `goal_m` away
     straight   drives `steps` times `step_m` along its heading (backwards where negative)
@@ -146,40 +137,28 @@ class LegParameters(Parameters):
     """
 
     motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
-    steps: Annotated[int, Field(ge=1, le=200, description="steps; at most so many of an approach or back-off")] = 60
-    step_share: Annotated[
-        float, Field(gt=0.0, le=0.9, description="length of a step over the distance from camera to target")
-    ] = 0.1
+    steps: Annotated[
+        int, Field(ge=1, le=200, description="number of steps; the maximum of an approach or back-off")
+    ] = 60
+    step_share: float = Field(default=0.1, gt=0.0, le=0.9, description="step length over the camera's distance")
     step_m: Annotated[float | None, Field(description="length of a step instead; needed for straight")] = None
-    step_deg: Annotated[float, Field(ge=-180.0, le=180.0, description="of a turn or circle")] = 5.0
-    goal_m: Annotated[
-        Positive, Field(description="horizontal distance of the rover's origin from the target in the end, m")
-    ] = 2.0
-    ends_with_steps: Annotated[
-        bool, Field(description="whether it has come to its end when its steps are done, short of goal_m or not")
-    ] = False
-    offset_right_m: Annotated[
-        float, Field(description="how far to the right of the target's direction the goal lies, m")
-    ] = 0.0
-    shuffle_m: Annotated[
-        NonNegative, Field(description="forth, and back after the next step: saves a steering motor that is stuck, m")
-    ] = 0.0
-    visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
-    visual_odometry_step_m: Annotated[
-        Positive, Field(description="longest drive between two of its pictures, m (60 % overlap)")
-    ] = 0.75
-    autonav: Annotated[bool, Field(description="whether the navigator steers around what wedges of pictures show")] = (
-        False
+    step_deg: Annotated[Turn, Field(description="of a turn or circle")] = 5.0
+    goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
+    ends_with_steps: bool = Field(default=False, description="whether it may end short of goal_m, its steps done")
+    offset_right_m: float = Field(default=0.0, description="offset of the goal to the right of the target's direction")
+    shuffle_m: NonNegative = Field(
+        default=0.0, description="forth, and back after the next step: for a stuck steering motor"
     )
-    maps_first: Annotated[bool, Field(description="whether the navigator's map is begun or added to before it")] = False
+    visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
+    visual_odometry_step_m: Positive = Field(default=0.75, description="longest drive between pictures (60 % overlap)")
+    autonav: bool = Field(default=False, description="whether the navigator avoids rocks in its map")
+    maps_first: Annotated[bool, Field(description="whether the navigator maps before the first step")] = False
     map_by: Annotated[Literal["body", "mast"], Field(description="cameras that map for the navigator")] = "mast"
     wedges: Annotated[int, Field(ge=1, le=4, description="wedges of the mast's pictures at each step")] = 2
-    target_is_no_obstacle: Annotated[
-        bool, Field(description="whether the navigator may come near the target's rock (section 6)")
-    ] = True
+    target_is_no_obstacle: bool = Field(default=True, description="whether the navigator ignores the target's rock")
 
     @model_validator(mode="after")
-    def _has_a_step(self) -> LegParameters:
+    def _check_step(self) -> LegParameters:
         if self.motion == "straight" and self.step_m is None:
             raise ValueError("a straight leg needs step_m")
         if self.autonav and self.motion != "approach":
@@ -188,19 +167,19 @@ class LegParameters(Parameters):
 
 
 class SunParameters(Parameters):
-    """Where the sun stands at the start, and how it moves."""
+    """Position of the sun at the start, and its motion."""
 
-    azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 225.0
+    azimuth_deg: Annotated[Azimuth, Field(description="clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="above the horizon")] = 45.0
-    hour_angle_deg_min: Annotated[
-        float, Field(ge=-1.0, le=1.0, description="its motion about the pole: 16 deg in 66 min (Table IV)")
-    ] = 16.0 / 66.0
+    hour_angle_deg_min: float = Field(
+        default=16.0 / 66.0, ge=-1.0, le=1.0, description="about the pole: 16 deg in 66 min (Table IV)"
+    )
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0
-    held_s: Annotated[Positive, Field(description="time for which it is held in the pictures' light, s")] = 120.0
+    held_s: Annotated[Positive, Field(description="interval over which pictures share one sun")] = 120.0
 
 
 class TimingParameters(Parameters):
-    """How long a run's activities take (Table IV, means)."""
+    """Durations of a run's activities (Table IV, means)."""
 
     track_s: Annotated[NonNegative, Field(description="a tracking update, s")] = 45.0
     visual_odometry_s: Annotated[NonNegative, Field(description="a visual odometry update, s")] = 105.0
@@ -209,17 +188,14 @@ class TimingParameters(Parameters):
 
 
 class ExposureParameters(Parameters):
-    """How the pictures are exposed (section 4.5)."""
+    """Exposure of the pictures (section 4.5)."""
 
-    of: Annotated[
-        Literal["subframe", "full-frame", "fixed"],
-        Field(description="auto-exposure over the subframe, over the full frame with what sky it shows, or none"),
-    ] = "subframe"
+    of: Literal["subframe", "full-frame", "fixed"] = Field(default="subframe", description="region of auto-exposure")
     auto: AutoExposureParameters = AutoExposureParameters()
 
 
 class OwnPair(Parameters):
-    """A stereo pair of one's own on the mast's head: where files put the cameras does not matter."""
+    """A custom stereo pair on the mast's head; the positions in the camera files are ignored."""
 
     left: Annotated[OwnCameraChoice, Field(description="camera file: a path, or a table with file")]
     right: Annotated[OwnCameraChoice | None, Field(description="likewise; by default as the left one")] = None
@@ -227,10 +203,10 @@ class OwnPair(Parameters):
     toe_in_deg: Annotated[float, Field(ge=-30.0, le=30.0, description="turn of each towards the other")] = 0.0
 
     @model_validator(mode="after")
-    def _are_of_a_size(self) -> OwnPair:
+    def _check_sizes(self) -> OwnPair:
         if self.right is not None and self.right.size != self.left.size:
-            sizes = [f"{columns} x {rows}" for columns, rows in (self.left.size, self.right.size)]
-            raise ValueError(f"the left camera has {sizes[0]} pixels, the right one {sizes[1]}; allowed: as many")
+            left, right = (f"{columns} x {rows}" for columns, rows in (self.left.size, self.right.size))
+            raise ValueError(f"the left camera has {left} pixels, the right one {right}; allowed: as many")
         return self
 
     def cameras(self) -> tuple[CameraModel, CameraModel]:
@@ -242,32 +218,31 @@ class OwnPair(Parameters):
 class CameraParameters(Parameters):
     """The stereo pair on the mast."""
 
-    preset: Annotated[
-        str, Field(description="a pair of `marsyard.sim.sensor.mast.MASTS`, with the mast and the rover that carry it")
-    ] = "mer-navcam"
-    own: Annotated[OwnPair | None, Field(description="an own pair, on that mast in place of the preset's")] = None
-    detector: Annotated[
-        DetectorChoice | None, Field(description="of both cameras; by default the preset's, whatever the pair")
-    ] = None
-    detector_noise: Annotated[bool, Field(description="whether pictures have a detector's noise and response")] = True
+    preset: str = Field(
+        default="mer-navcam",
+        description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast and rover",
+    )
+    own: Annotated[OwnPair | None, Field(description="a custom pair on the preset's mast")] = None
+    detector: DetectorChoice | None = Field(default=None, description="of both cameras; by default the preset's")
+    detector_noise: Annotated[bool, Field(description="whether pictures have detector noise and response")] = True
 
     @field_validator("preset")
     @classmethod
-    def _is_a_pair(cls, name: str) -> str:
+    def _check_preset(cls, name: str) -> str:
         if name not in MASTS:
             raise ValueError(f"no mast carries cameras called '{name}'; allowed: {', '.join(MASTS)}")
         return name
 
     @field_validator("detector")
     @classmethod
-    def _sums_no_rows(cls, detector: DetectorParameters | None) -> DetectorParameters | None:
+    def _check_detector(cls, detector: DetectorParameters | None) -> DetectorParameters | None:
         if detector is not None and detector.rows_summed != 1:
             raise ValueError(f"rows_summed is {detector.rows_summed}; allowed for cameras on a mast: 1")
         return detector
 
     @property
     def name(self) -> str:
-        """What the cameras are called: the preset, or the file of the left one."""
+        """The preset, or the file of the left camera."""
         return self.preset if self.own is None else self.own.left.file or "own"
 
     def mast(self) -> MastCalibration:
@@ -279,23 +254,19 @@ class CameraParameters(Parameters):
         return replace(design, left=left, right=right)
 
     def settings(self) -> DetectorParameters:
-        """Of both cameras' detectors."""
+        """The parameters of both detectors."""
         return preset(self.preset).detector if self.detector is None else self.detector
 
 
 class ScoreParameters(Parameters):
-    """What counts as tracked, and what of each update is stored."""
+    """Criterion for a tracked target, and columns per update."""
 
-    tracked_px: Annotated[
-        Positive, Field(description="most distance of a tracked target from the true projection of the point, px")
-    ] = 10.0
-    stored_updates: Annotated[
-        int, Field(ge=0, le=100, description="first updates whose figures are stored in the row, one column each")
-    ] = 0
+    tracked_px: Positive = Field(default=10.0, description="maximum distance of a tracked target from the true pixel")
+    stored_updates: int = Field(default=0, ge=0, le=100, description="first updates with figures as columns")
 
 
 class RoverScenarioParameters(ChosenAlgorithms, OwnScores):
-    """Everything that a campaign of the rover scenario may set or disperse."""
+    """All parameters of the rover scenario."""
 
     task = TRACKING
     scored = ScoredRun
@@ -317,16 +288,10 @@ class RoverScenarioParameters(ChosenAlgorithms, OwnScores):
     clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the run")] = None
     rover_shadow: Annotated[bool, Field(description="whether the rover and its mast cast shadows")] = True
     timing: TimingParameters = TimingParameters()
-    algorithm: Annotated[
-        str, Field(description="tracker under test: vtt, pure-ncc, lucas-kanade, or your own 'module:Class'")
-    ] = "vtt"
-    vtt: Annotated[VttOptions, Field(description="options of the tracker; pure-ncc takes no scale and roll")] = (
-        VttOptions()
-    )
+    algorithm: str = Field(default="vtt", description="vtt, pure-ncc, lucas-kanade, or a custom 'module:Class'")
+    vtt: VttOptions = Field(default=VttOptions(), description="the tracker's; pure-ncc takes no scale and roll")
     score: ScoreParameters = ScoreParameters()
-    backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
-        default_factory=default_backend
-    )
+    backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
 
     @property
     def bearing_rad(self) -> float:

@@ -18,21 +18,21 @@ from marsyard.sim.render import Objects, PixelRays, Scene, process_renderer
 from marsyard.sim.render.backend import Backend
 from marsyard.sim.sensor import Detector, auto_expose, natural_fall_off
 
-#: The full frame is judged for its exposure in a picture so many times smaller.
+#: Full-frame auto-exposure uses a picture this many times smaller.
 _BINNED = 16
 
 
 @lru_cache(maxsize=8)
 def fall_off(camera: CameraModel) -> Float32[np.ndarray, "rows columns"]:
-    """A lens's fall-off; kept, as all runs of a process share cameras as designed."""
+    """A lens's fall-off; cached, as all runs of a process share the designed cameras."""
     return natural_fall_off(camera)
 
 
 @dataclass(frozen=True)
 class Detectors:
-    """The detectors of a pair, their pixels drawn: the left and the right one.
+    """The detectors of a stereo pair, their pixels drawn.
 
-    Without noise, counts are the light in proportion, rounded, at an exposure that suits the subframe's own pixels.
+    Without noise, counts are proportional to light, rounded, at an exposure that suits the subframe's own pixels.
     """
 
     left: Detector
@@ -41,20 +41,20 @@ class Detectors:
 
     @classmethod
     def drawn(cls, p: CameraParameters, rng: np.random.Generator) -> Detectors:
-        """Detectors of a pair as designed."""
+        """Detectors of the designed pair."""
         design, settings = p.mast(), p.settings()
         left, right = (Detector.drawn(fall_off(camera), settings, rng) for camera in (design.left, design.right))
         return cls(left, right, p.detector_noise)
 
     @property
     def sunlight(self) -> float:
-        """Sunlight, over that at 1 AU, for which their responsivity is stated."""
+        """Sunlight, relative to 1 AU, of the stated responsivity."""
         return self.left.parameters.sunlight
 
 
 @dataclass(frozen=True)
 class StereoPictures:
-    """A stereo pair of subframes as delivered, and its exposure time."""
+    """A stereo pair of subframes as delivered."""
 
     left: MastImage
     right: MastImage
@@ -62,7 +62,7 @@ class StereoPictures:
 
     @cached_property
     def digest(self) -> bytes:
-        """Hash of both pictures' counts; kept, as many targets may be tracked over the same pictures."""
+        """Hash of both pictures' counts."""
         digest = hashlib.sha256()
         for image in (self.left, self.right):
             digest.update(np.ascontiguousarray(image.counts).tobytes())
@@ -71,24 +71,12 @@ class StereoPictures:
 
 @dataclass(frozen=True)
 class Photographer:
-    """Takes stereo subframes.
-
-    Attributes
-    ----------
-    backend
-        Of the renderer.
-    detectors
-        Of the pair.
-    exposure
-        How it is set.
-    noise
-        Stream of the detectors' noise.
-    """
+    """Camera pair that takes subframes."""
 
     backend: Backend
     detectors: Detectors
     exposure: ExposureParameters
-    noise: np.random.Generator
+    noise: np.random.Generator  #: stream of the detectors' noise
 
     def take(
         self,
@@ -102,42 +90,29 @@ class Photographer:
     ) -> StereoPictures:
         """Subframes of the true cameras on a head.
 
-        Parameters
-        ----------
-        scene
-            What is there, without the rover.
-        rover
-            The rover, where its shadow may fall on what is shown.
-        world_from_head
-            True pose of the mast's head.
-        cameras
-            The true cameras in the head's frame.
-        boxes
-            Parts of the full frames to deliver.
-        brightness
-            Sunlight over that at 1 AU.
-        time_s
-            When.
+        `scene` is without the rover; `rover` is given where its shadow may fall into a picture. `world_from_head` and
+        `cameras` are true; `boxes` are the parts of the full frames; `brightness` is sunlight relative to 1 AU.
         """
-        shown = [
-            PixelRays.of(camera.cropped(*box.corner, box.size)) for camera, box in zip(cameras, boxes, strict=True)
-        ]
+        pairs = zip(cameras, boxes, strict=True)
+        shown = [PixelRays.of(camera.cropped(*box.corner, box.size)) for camera, box in pairs]
         near = _joined(scene.within([rays.cone(world_from_head) for rays in shown]), rover)
         brightness /= self.detectors.sunlight
         light = [self._light(near, world_from_head, rays, brightness, time_s) for rays in shown]
         if not self.detectors.noise:
-            counts = [_noise_free(one, light[0]) for one in light]
-            return StereoPictures(MastImage(counts[0], boxes[0].corner), MastImage(counts[1], boxes[1].corner), 0.0)
+            left, right = (
+                MastImage(_noise_free(one, light[0]), box.corner) for one, box in zip(light, boxes, strict=True)
+            )
+            return StereoPictures(left, right, 0.0)
         parts = [
             detector.window(*box.corner, box.size)
             for detector, box in zip((self.detectors.left, self.detectors.right), boxes, strict=True)
         ]
         exposure_s = self._exposure_s(scene, rover, world_from_head, cameras[0], parts[0], light[0], brightness, time_s)
-        images = [
+        left, right = (
             MastImage(part.with_exposure(exposure_s).expose(one, self.noise), box.corner)
             for part, one, box in zip(parts, light, boxes, strict=True)
-        ]
-        return StereoPictures(images[0], images[1], exposure_s)
+        )
+        return StereoPictures(left, right, exposure_s)
 
     def _light(
         self, scene: Scene, world_from_head: RigidTransform, rays: PixelRays, brightness: float, time_s: float
@@ -159,15 +134,15 @@ class Photographer:
     ) -> float:
         if self.exposure.of == "fixed":
             return part.parameters.exposure_s
-        if self.exposure.of == "subframe":
-            return auto_expose(part, light, self.exposure.auto, self.noise).detector.parameters.exposure_s
-        # the whole frame, each block of pixels by its mean light, through a detector of as many pixels
-        binned = PixelRays.of(camera.scaled(1.0 / _BINNED))
-        drawn = replace(_joined(scene, rover), edge_rays=1)
-        whole = self._light(drawn, world_from_head, binned, brightness, time_s)
-        block = part.response[: len(whole), : whole.shape[1]]
-        judged = replace(part, response=np.resize(block, whole.shape), hot_e_s=None)
-        return auto_expose(judged, whole, self.exposure.auto, self.noise).detector.parameters.exposure_s
+        if self.exposure.of == "full-frame":
+            # each block of pixels by its mean light, through a detector of as many pixels
+            binned = PixelRays.of(camera.scaled(1.0 / _BINNED))
+            light = self._light(
+                replace(_joined(scene, rover), edge_rays=1), world_from_head, binned, brightness, time_s
+            )
+            block = part.response[: len(light), : light.shape[1]]
+            part = replace(part, response=np.resize(block, light.shape), hot_e_s=None)
+        return auto_expose(part, light, self.exposure.auto, self.noise).detector.parameters.exposure_s
 
 
 def _joined(scene: Scene, rover: Objects | None) -> Scene:

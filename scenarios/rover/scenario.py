@@ -1,4 +1,4 @@
-"""Runs of a rover as cases: one run of the closed loop, or one target tracked over the pictures of a shared drive."""
+"""Rover scenarios: one run of the closed loop, or one target tracked over the pictures of a shared drive."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from marsyard.scenarios.rover.score import (
     run_conditions,
     score,
     scored_run,
-    sighted,
+    sighting_columns,
     stored_updates,
     tracking,
 )
@@ -44,7 +44,7 @@ from marsyard.sim.terrain import TerrainBank
 
 #: Terrains of a bank that are built before its runs; a larger bank's are built by the runs that need them.
 PREPARED_TERRAINS = 64
-#: Grounds, shared drives with their pictures, and targets' sightings along drives that a process keeps.
+#: Maximum number of grounds, shared drives with their pictures, and sightings along drives that a process keeps.
 KEPT_GROUNDS, KEPT_DRIVES, KEPT_SIGHTINGS = 4, 1, 128
 
 
@@ -61,12 +61,12 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
         super().__init__(KEPT_GROUNDS)
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Numbers of the bank's terrains; none of a bank so large that hardly two runs have the same one."""
+        """Numbers of the bank's terrains; none of a large bank, whose terrains few runs share."""
         bank = self.checked(parameters).world.bank
         return tuple(range(bank)) if bank <= PREPARED_TERRAINS else ()
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """The terrain that the rover drives on."""
+        """The run's terrain."""
         return (self.checked(parameters).world.terrain,)
 
     def input_terrain(self, p: RoverScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
@@ -74,7 +74,7 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
         return _bank(p.world), shared_input
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """One run; each algorithm that is compared makes one of its own, with the same draws."""
+        """One run for each algorithm, with the same draws."""
         p = self.checked(parameters)
         started = time.process_time()
         first = prepare_run(p, streams, self.load_ground)
@@ -82,18 +82,18 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
 
         def judge(algorithm: str) -> Judged:
             judged = algorithm == p.algorithm
-            mine = p.model_copy(update={"algorithm": algorithm})
+            own = p.model_copy(update={"algorithm": algorithm})
             began = started if judged else time.process_time()
-            run = first if judged else prepare_run(mine, streams, self.load_ground)
+            run = first if judged else prepare_run(own, streams, self.load_ground)
 
-            def ask() -> Run:
-                track_target(mine, run)
+            def track() -> Run:
+                track_target(own, run)
                 return run
 
-            def further(made: Run) -> dict[str, Scalar]:
-                return {"run_time_s": time.process_time() - began, **(sighted(p, made) if judged else {})}
+            def more_columns(run: Run) -> dict[str, Scalar]:
+                return {"run_time_s": time.process_time() - began, **(sighting_columns(p, run) if judged else {})}
 
-            return _judge(p, ask, known, judged, further)
+            return _judge(p, track, known, judged, more_columns)
 
         return case_result(p.algorithms, judge, known)
 
@@ -132,12 +132,11 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
         p = self.checked(parameters)
         key = DriveKey.of(p, streams)
         drive = self._drive(key)
-        own = {"algorithm": p.drive.algorithm, "vtt": p.drive.vtt}
-        case = key.drive.model_copy(update=own)
+        case = key.drive.model_copy(update={"algorithm": p.drive.algorithm, "vtt": p.drive.vtt})
         seen = self._sightings(key, p.targets[p.target], p.drive.vtt)
         on_face = seen.in_view and (p.face_deg is None or seen.obliquity_max_deg <= p.face_deg)
-        chosen = fixed_conditions(case, prepare_shared_run(p, drive))
-        known = {**chosen, **_case_columns(p), **asdict(seen), "on_face": on_face}
+        conditions = fixed_conditions(case, prepare_shared_run(p, drive))
+        known = {**conditions, **_case_columns(p), **asdict(seen), "on_face": on_face}
 
         def judge(algorithm: str) -> Judged:
             return _judge(case, lambda: track_views(p, drive, algorithm), known, algorithm == p.drive.algorithm)
@@ -147,22 +146,22 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
 
 def _judge(
     p: RoverScenarioParameters,
-    ask: Callable[[], Run],
+    track: Callable[[], Run],
     known: Mapping[str, Scalar],
     judged: bool,
-    further: Callable[[Run], dict[str, Scalar]] = lambda run: {},
+    more_columns: Callable[[Run], dict[str, Scalar]] = lambda run: {},
 ) -> Judged:
     """Score a run; `judged` is the run of the algorithm under test, whose conditions and products are stored."""
-    made: list[Run] = []
 
-    def ask_and_score() -> dict[str, Scalar]:
-        made.append(ask())
-        return {**score(p, made[0]), **tracking(made[0])}
+    def track_and_score() -> tuple[Run, dict[str, Scalar]]:
+        run = track()
+        return run, {**score(p, run), **tracking(run)}
 
-    attempt = attempted(ask_and_score, lambda row: cast(dict[str, Scalar], row))
+    attempt = attempted(track_and_score, lambda answer: cast(tuple[Run, dict[str, Scalar]], answer))
     if attempt.answer is None:
         return Judged(attempt.outcome(str), False, attempt.row, failure=attempt.failure)
-    run, row = made[0], {**attempt.answer, **further(made[0])}
+    run, row = attempt.answer
+    row |= more_columns(run)
     if judged:
         updates = stored_updates(run, p.score.stored_updates)
         row |= {**updates, **run_conditions(p, run), **provenance(p, run)}
@@ -172,14 +171,14 @@ def _judge(
 
 
 def _case_columns(p: SharedDriveParameters) -> dict[str, Scalar]:
-    """What makes a case, for any tracker."""
-    chosen = p.targets[p.target]
+    """Columns that identify a case."""
+    point = p.targets[p.target]
     bands: dict[str, Scalar] = {one.name: bool(one.least <= p.step <= one.most) for one in p.bands}
     return {
         "run": p.run,
         "target": p.target,
-        "point_across": chosen.across,
-        "point_up": chosen.up,
+        "point_across": point.across,
+        "point_up": point.up,
         "skip": p.skip,
         "step": p.step,
         "with_scale": p.drive.algorithm != "pure-ncc" and p.drive.vtt.scale,

@@ -1,9 +1,10 @@
-"""What is stored of a run: errors, conditions as read back from the simulated objects, what figures need."""
+"""Columns and products of a run: tracking errors, conditions read from the simulated objects, arrays for figures."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable
+from dataclasses import asdict
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,29 +14,44 @@ from marsyard.algorithms.vtt.stereo import disparity_px_m
 from marsyard.scenarios.conditions import rendered_as
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
-from marsyard.scenarios.rover.own_shadow import shades, template_patch
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.points import rover_shades_patch, template_patch
 from marsyard.scenarios.rover.run import Run
 from marsyard.scenarios.rover.stops import RunOutcome, Stop
 from marsyard.scenarios.rover.target import sightings
 from marsyard.sim.measurements import RoverMeasurements
 
-_FULL_TURN_DEG = 360.0
+NAN = float("nan")
+#: Figures of each update, in the order of the columns of stored updates.
+FIGURES = (
+    "range_m", "azimuth_deg", "elevation_deg", "magnification", "roll_change_deg", "azimuth_change_deg",
+    "match_score", "stereo_score", "correction_px", "error_px", "position_error_m", "leg", "time_s",
+)  # fmt: skip
+#: Columns of `tracking`: the figure and its reduction over the updates.
+EXTREMES: dict[str, tuple[str, Callable[[np.ndarray], float]]] = {
+    "match_score_min": ("match_score", np.nanmin),
+    "stereo_score_min": ("stereo_score", np.nanmin),
+    "magnification_min": ("magnification", np.nanmin),
+    "magnification_max": ("magnification", np.nanmax),
+    "roll_change_max_deg": ("roll_change_deg", lambda values: np.nanmax(np.abs(values))),
+    "azimuth_change_max_deg": ("azimuth_change_deg", lambda values: np.nanmax(np.abs(values))),
+    "correction_max_px": ("correction_px", np.nanmax),
+}
 
 
 def errors_px(run: Run) -> Float64[np.ndarray, "stops 2"]:
-    """Place found less true projection of the designated point at every stop, (u, v) pixels; NaN where not found."""
-    found = [stop.found_px(run.rig.calibrated) - stop.point_px for stop in run.stops]
-    return np.stack(found) if found else np.empty((0, 2))
+    """Tracked minus true pixel of the designated point at every stop, (u, v); NaN where it was not found."""
+    errors = [stop.found_px(run.rig.calibrated) - stop.point_px for stop in run.stops]
+    return np.stack(errors) if errors else np.empty((0, 2))
 
 
 def score(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """How well the target was tracked, and how well it is known at the goal.
+    """Tracking success and errors at the goal.
 
-    `tracked`: the run is completed and the place found in the last picture is within `tracked_px` of the true
-    projection of the designated point. `position_error_m`: the last reported position less the designated point, in the
-    rover frame; NaN where the run was not completed. `false_track`: an update reported the target further than
-    `tracked_px` from the true projection.
+    `tracked`: the run is completed and the last tracked pixel is within `tracked_px` of the true projection of the
+    designated point. `position_error_m`: the last reported position minus the designated point, in the rover frame; NaN
+    where the run was not completed. `false_updates`: updates that report the target further than `tracked_px` from the
+    true projection.
     """
     errors = errors_px(run)
     sizes = np.hypot(*errors.T)
@@ -43,137 +59,119 @@ def score(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     last = errors[-1] if completed else np.full(2, np.nan)
     stop = run.stops[-1] if run.stops else None
     error = stop.error_m() if completed and stop is not None else np.full(3, np.nan)
-    false = int(np.count_nonzero(sizes > p.score.tracked_px))
-    along, across = _along_sight(run, stop, error)
+    false_updates = int(np.count_nonzero(sizes > p.score.tracked_px))
+    along, across = _sight_components(run, stop, error)
     drift = float(np.hypot(*last))
+    losses = next((one.update.losses for one in run.stops if one.update.losses), ())
     return {
         "tracked": bool(completed and drift <= p.score.tracked_px),
         "not_tracked": not (completed and drift <= p.score.tracked_px),
-        "true_track": false == 0,
-        "false_updates": false,
+        "true_track": false_updates == 0,
+        "false_updates": false_updates,
         "position_error_m": float(np.linalg.norm(error)),
         "range_error_m": along,
         "cross_error_m": across,
         "drift_px": drift,
         "drift_u_px": float(last[0]),
         "drift_v_px": float(last[1]),
-        "worst_error_px": _most(sizes),
-        "losses": ", ".join(_losses(run.stops)) or "none",
-        "lost_range_m": next((one.range_m for one in run.stops if not one.update.found), float("nan")),
+        "worst_error_px": _max(sizes),
+        "losses": ", ".join(loss.name for loss in losses) or "none",
+        "lost_range_m": next((one.range_m for one in run.stops if not one.update.found), NAN),
         "handed_over": run.handed_over,
     }
 
 
-def _along_sight(run: Run, stop: Stop | None, error: Float64[np.ndarray, "3"]) -> tuple[float, float]:
-    """An error's parts along the line of sight (positive: too far) and across it."""
+def _sight_components(run: Run, stop: Stop | None, error: Float64[np.ndarray, "3"]) -> tuple[float, float]:
+    """Components of an error along the line of sight (positive: too far) and across it."""
     if stop is None:
-        return float("nan"), float("nan")
+        return NAN, NAN
     eye = stop.stance.world_from_rover.inv().apply(stop.world_from_head.apply(run.rig.left.c.copy()))
     sight = stop.point_rover - eye
     along = float(error @ sight / np.linalg.norm(sight))
-    return along, float(np.sqrt(max(float(error @ error) - along * along, 0.0))) if np.isfinite(along) else float("nan")
+    return along, float(np.sqrt(max(float(error @ error) - along * along, 0.0))) if np.isfinite(along) else NAN
 
 
-def _losses(stops: Sequence[Stop]) -> list[str]:
-    """Names of what lost the target at the first stop that did."""
-    for stop in stops:
-        if stop.update.losses:
-            return [loss.name for loss in stop.update.losses]
-    return []
-
-
-def _most(values: Float64[np.ndarray, "n"]) -> float:
-    """The largest number; NaN where there is none."""
-    return float(np.nanmax(values)) if np.any(np.isfinite(values)) else float("nan")
-
-
-def _least(values: Float64[np.ndarray, "n"]) -> float:
-    return -_most(-values)
+def _max(values: Float64[np.ndarray, "n"]) -> float:
+    """The maximum; NaN without finite values."""
+    return float(np.nanmax(values)) if np.any(np.isfinite(values)) else NAN
 
 
 def tracking(run: Run) -> dict[str, Scalar]:
-    """What the tracker made of the run: Table III's figures at their extremes, and its corrections."""
+    """Table III's figures at their extremes, and the tracker's corrections."""
     figures = update_figures(run)
-    seed = next((one for one in run.stops if one.update.found), None)
-    last = next((one for one in reversed(run.stops) if one.update.found), None)
-    moved = float("nan")
-    if seed is not None and last is not None:
-        places = [one.estimated.apply(np.asarray(one.update.position_rover).copy()) for one in (seed, last)]
-        moved = float(np.linalg.norm(places[1] - places[0]))
-    seed_error = float("nan") if seed is None else float(np.linalg.norm(seed.error_m()))
-    scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
+    found = [one for one in run.stops if one.update.found]
+    moved = seed_error = seed_3_sigma = NAN
+    if found:
+        seed, last = (
+            one.estimated.apply(np.asarray(one.update.position_rover).copy()) for one in (found[0], found[-1])
+        )
+        moved, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(found[0].error_m()))
+        scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
+        seed_3_sigma = stereo_range_error_m(found[0].range_m, scale, 1.0)
     return {
         "updates": len(run.stops),
-        "lost_updates": sum(not one.update.found for one in run.stops),
+        "lost_updates": len(run.stops) - len(found),
         "visual_odometry_updates": run.visual_odometry_updates,
         "autonav_updates": run.autonav_updates,
-        "match_score_min": _least(figures["match_score"]),
-        "stereo_score_min": _least(figures["stereo_score"]),
-        "magnification_min": _least(figures["magnification"]),
-        "magnification_max": _most(figures["magnification"]),
-        "roll_change_max_deg": _most(np.abs(figures["roll_change_deg"])),
+        **{
+            column: float(reduce(figures[name])) if np.any(np.isfinite(figures[name])) else NAN
+            for column, (name, reduce) in EXTREMES.items()
+        },
         "roll_total_deg": float(np.nansum(figures["roll_change_deg"])),
-        "azimuth_change_max_deg": _most(np.abs(figures["azimuth_change_deg"])),
         "azimuth_total_deg": float(np.nansum(figures["azimuth_change_deg"])),
-        "correction_max_px": _most(figures["correction_px"]),
         "target_moved_m": moved,
         "designation_error_m": seed_error,
-        "designation_3_sigma_m": float("nan") if seed is None else stereo_range_error_m(seed.range_m, scale, 1.0),
-        "update_time_s": float(np.mean([one.track_time_s for one in run.stops])) if run.stops else float("nan"),
+        "designation_3_sigma_m": seed_3_sigma,
+        "update_time_s": float(np.mean([one.track_time_s for one in run.stops])) if run.stops else NAN,
     }
 
 
 def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
-    """Figures of every update, one array each; NaN where a tracker keeps no details or has nothing to say."""
-    errors = errors_px(run)
-    rows = [_figures(stop, error) for stop, error in zip(run.stops, errors, strict=True)]
-    names = (
-        "range_m", "azimuth_deg", "elevation_deg", "magnification", "roll_change_deg", "azimuth_change_deg",
-        "match_score", "stereo_score", "correction_px", "error_px", "position_error_m", "leg", "time_s",
-    )  # fmt: skip
-    return {name: np.array([row[name] for row in rows], dtype=np.float64) for name in names}
+    """Figures of every update, one array each; NaN where a tracker reports no details."""
+    rows = [_figures(stop, error) for stop, error in zip(run.stops, errors_px(run), strict=True)]
+    return {name: np.array([row[name] for row in rows], dtype=np.float64) for name in FIGURES}
 
 
 def _figures(stop: Stop, error_px: Float64[np.ndarray, "2"]) -> dict[str, float]:
-    nan = float("nan")
-    figures = {
+    """The `FIGURES` of one update; those of a match are NaN at the seed."""
+    azimuth, elevation = np.degrees(stop.angles_rad)
+    figures = dict.fromkeys(FIGURES, NAN) | {
         "range_m": stop.range_m,
-        "azimuth_deg": float(np.degrees(stop.angles_rad[0])),
-        "elevation_deg": float(np.degrees(stop.angles_rad[1])),
+        "azimuth_deg": float(azimuth),
+        "elevation_deg": float(elevation),
         "error_px": float(np.hypot(*error_px)),
         "position_error_m": float(np.linalg.norm(stop.error_m())),
         "leg": float(stop.leg),
         "time_s": stop.time_s,
     }
     details = stop.details
-    match, change = (None, None) if details is None else (details.match, details.change)
-    seeded = details is None or details.seeded
-    figures["magnification"] = nan if change is None else change.magnification
-    figures["roll_change_deg"] = nan if change is None else float(np.degrees(change.roll_rad))
-    figures["azimuth_change_deg"] = (
-        nan if details is None or seeded or not stop.update.found else float(np.degrees(details.azimuth_change_rad))
-    )
-    figures["match_score"] = nan if match is None or seeded else match.score
-    figures["stereo_score"] = nan if details is None or details.stereo is None else details.stereo.score
-    corrected = match is not None and not seeded and details is not None and details.predicted_pixel is not None
-    figures["correction_px"] = (
-        float(np.max(np.abs(match.pixel - details.predicted_pixel))) if corrected else nan  # type: ignore[union-attr]
-    )
+    if details is None:
+        return figures
+    if details.change is not None:
+        figures["magnification"] = details.change.magnification
+        figures["roll_change_deg"] = float(np.degrees(details.change.roll_rad))
+    if details.stereo is not None:
+        figures["stereo_score"] = details.stereo.score
+    if not details.seeded and stop.update.found:
+        figures["azimuth_change_deg"] = float(np.degrees(details.azimuth_change_rad))
+    if not details.seeded and details.match is not None:
+        figures["match_score"] = details.match.score
+        if details.predicted_pixel is not None:
+            figures["correction_px"] = float(np.max(np.abs(details.match.pixel - details.predicted_pixel)))
     return figures
 
 
 def stored_updates(run: Run, count: int) -> dict[str, Scalar]:
     """Figures of the first updates, a column each, NaN where there were fewer: for tables such as Table III."""
-    figures = update_figures(run)
-    row: dict[str, Scalar] = {}
-    for number in range(count):
-        for name, values in figures.items():
-            row[f"update_{number + 1}_{name}"] = float(values[number]) if number < len(values) else float("nan")
-    return row
+    return {
+        f"update_{number + 1}_{name}": float(values[number]) if number < len(values) else NAN
+        for number in range(count)
+        for name, values in update_figures(run).items()
+    }
 
 
 def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """What is known of a run before its tracker is asked, read from the simulated objects."""
+    """Conditions that do not depend on the tracker, read from the simulated objects."""
     chosen, rocks, number = run.target, run.world.rocks, run.world.target_number
     return {
         "site": p.world.site,
@@ -193,79 +191,73 @@ def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "selectable": chosen.lit and not chosen.on_edge,
         "incline": p.world.incline.name,
         "slope_deg": p.world.incline.slope_deg,
-        "bearing_deg": float(np.degrees(p.bearing_rad)) % _FULL_TURN_DEG,
+        "bearing_deg": float(np.degrees(p.bearing_rad)) % 360.0,
         "visual_odometry": any(leg.visual_odometry for leg in p.legs),
         "autonav": any(leg.autonav for leg in p.legs),
         "map_by": next((leg.map_by for leg in p.legs if leg.autonav), "none"),
         "roll_compensated": p.vtt.roll and p.algorithm != "pure-ncc",
         "roll_ignored": not p.vtt.roll or p.algorithm == "pure-ncc",
         "clear_sky": p.clouds is None or p.clouds.cover == 0.0,
-        **run.rig.applied(),
+        **run.rig.error_columns(),
     }
 
 
 def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """What the run was like where its tracker led it, read from the simulated objects."""
+    """Conditions along the run that the tracker led to, read from the simulated objects."""
     stops, world = run.stops, run.world
-    first, last = stops[0] if stops else None, stops[-1] if stops else None
-    tilts = np.array([one.stance.tilt_rad for one in stops])
     drives = [drive for one in stops for drive in one.drives]
     lengths = np.array([drive.command.length_m for drive in drives])
-    slips = np.array([drive.slip for drive in drives])
     moving = lengths > 0.0
+    slips = np.array([drive.slip for drive in drives])[moving]
     driven = float(lengths.sum())
-    pose_error = (
-        float("nan")
-        if last is None
-        else float(np.linalg.norm(last.estimated.translation - last.stance.world_from_rover.translation))
-    )
-    sun = [world.sun.direction(0.0 if one is None else one.time_s) for one in (first, last)]
-    shadowed = _own_shadow(p, run)
+    ranges, times, pose_error = (NAN, NAN), (0.0, 0.0), NAN
+    if stops:
+        ranges, times = (stops[0].range_m, stops[-1].range_m), (stops[0].time_s, stops[-1].time_s)
+        position_error = stops[-1].estimated.translation - stops[-1].stance.world_from_rover.translation
+        pose_error = float(np.linalg.norm(position_error))
+    sun = [world.sun.direction(time_s) for time_s in times]
+    exposures = np.array([one.pictures.exposure_s for one in stops], dtype=np.float64)
+    shadowed = _is_rover_shadow_on_target(p, run)
     return {
         "own_shadow": shadowed,
         "no_own_shadow": not shadowed,
-        "range_start_m": float("nan") if first is None else first.range_m,
-        "range_end_m": float("nan") if last is None else last.range_m,
-        "tilt_max_deg": float(np.degrees(_most(tilts))),
+        "range_start_m": ranges[0],
+        "range_end_m": ranges[1],
+        "tilt_max_deg": float(np.degrees(_max(np.array([one.stance.tilt_rad for one in stops])))),
         "driven_m": driven,
-        "slip_mean": float(np.sum(slips[moving] * lengths[moving]) / driven) if driven > 0.0 else 0.0,
-        "slip_max": _most(slips[moving]) if np.any(moving) else 0.0,
+        "slip_mean": float(np.sum(slips * lengths[moving]) / driven) if driven > 0.0 else 0.0,
+        "slip_max": _max(slips) if np.any(moving) else 0.0,
         "pose_error_m": pose_error,
-        "pose_error_share": pose_error / driven if driven > 0.0 else float("nan"),
-        "duration_min": 0.0 if last is None else last.time_s / 60.0,
-        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0][0], sun[0][1])) % _FULL_TURN_DEG),
+        "pose_error_share": pose_error / driven if driven > 0.0 else NAN,
+        "duration_min": times[1] / 60.0,
+        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0][0], sun[0][1])) % 360.0),
         "sun_elevation_deg": float(np.degrees(np.arcsin(sun[0][2]))),
         "sun_moved_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
-        "exposure_min_s": _least(np.array([one.pictures.exposure_s for one in stops], dtype=np.float64)),
-        "exposure_max_s": _most(np.array([one.pictures.exposure_s for one in stops], dtype=np.float64)),
+        "exposure_min_s": -_max(-exposures),
+        "exposure_max_s": _max(exposures),
     }
 
 
-def sighted(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """How the designated point showed itself at the stops of a run (`Sightings`)."""
+def sighting_columns(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
+    """Visibility of the designated point at the stops of a run (`Sightings`)."""
     eyes = [run.rig.eyes(one.world_from_head) for one in run.stops]
     if not eyes:
-        return {"point_in_view": False, "obliquity_start_deg": float("nan"), "obliquity_max_deg": float("nan")}
-    seen = sightings(run.world, run.target.point_world, eyes, run.rig.pixel_rad, p.vtt)
-    return {
-        "point_in_view": seen.in_view,
-        "obliquity_start_deg": seen.obliquity_start_deg,
-        "obliquity_max_deg": seen.obliquity_max_deg,
-    }
+        return {"point_in_view": False, "obliquity_start_deg": NAN, "obliquity_max_deg": NAN}
+    columns = asdict(sightings(run.world, run.target.point_world, eyes, run.rig.pixel_rad, p.vtt))
+    return {"point_in_view": columns.pop("in_view"), **columns}
 
 
-def _own_shadow(p: RoverScenarioParameters, run: Run) -> bool:
-    """Whether the rover's shadow lay on the template about the designated point before the tracker had gone wrong.
+def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
+    """Whether the rover's shadow lay on the template up to the first stop at which the point was lost or mistracked.
 
-    Looked at are the stops up to the first at which the point was lost or reported elsewhere: where a run goes after
-    that is the tracker's doing.
+    The path of the run after that is a consequence of the tracker's error.
     """
     reach, mast = 0.5 * p.vtt.template_px * run.rig.pixel_rad, run.rig.calibrated.geometry
     for stop, error in zip(run.stops, np.hypot(*errors_px(run).T), strict=True):
         eye = run.rig.eyes(stop.world_from_head)[0]
         patch = template_patch(eye, run.target.point_world, reach)
         sun = run.world.sun.direction(stop.time_s)
-        if p.rover_shadow and shades(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):
+        if p.rover_shadow and rover_shades_patch(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):
             return True
         if not error <= p.score.tracked_px:
             return False
@@ -273,9 +265,8 @@ def _own_shadow(p: RoverScenarioParameters, run: Run) -> bool:
 
 
 def provenance(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """Hash of the pictures, and what their last bits depend on."""
-    digest = hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops))
-    return rendered_as(p.backend, digest.hexdigest())
+    """Hash of the pictures, and of the renderer that they depend on."""
+    return rendered_as(p.backend, hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest())
 
 
 def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
@@ -302,23 +293,23 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
     kept: dict[str, object] = {}
     for number, stop in enumerate(stops, start=1):
         left, right, details = stop.pictures.left, stop.pictures.right, stop.details
-        kept[f"stop_{number}_left"] = left.counts
-        kept[f"stop_{number}_right"] = right.counts
-        kept[f"stop_{number}_corners"] = np.array([left.corner, right.corner], dtype=np.float64)
-        window = np.full(4, np.nan)
+        window, found = np.full(4, np.nan), np.full((2, 2), np.nan)
         if details is not None and details.window is not None and details.window_corner is not None:
             window = np.array([*details.window_corner, *details.window.shape[::-1]], dtype=np.float64)
-        kept[f"stop_{number}_window"] = window
-        found = np.full((2, 2), np.nan)
         found[0] = stop.found_px(run.rig.calibrated)
         if details is not None and details.stereo is not None and stop.update.found:
             found[1] = details.stereo.pixel
-        kept[f"stop_{number}_found"] = found
-        kept[f"stop_{number}_point"] = stop.point_px
+        arrays = {
+            "left": left.counts,
+            "right": right.counts,
+            "corners": np.array([left.corner, right.corner], dtype=np.float64),
+            "window": window,
+            "found": found,
+            "point": stop.point_px,
+        }
+        kept |= {f"stop_{number}_{name}": values for name, values in arrays.items()}
     believed = [
-        stop.estimated.apply(np.asarray(stop.update.position_rover).copy())
-        if stop.update.found and stop.update.position_rover is not None
-        else np.full(3, np.nan)
+        np.full(3, np.nan) if stop.reported_rover is None else stop.estimated.apply(stop.reported_rover.copy())
         for stop in stops
     ]
     path = [
@@ -340,15 +331,15 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
 
 
 def scored_run(run: Run) -> ScoredRun:
-    """The run as a user's own scores are handed it."""
-    known = run.rig.calibrated
+    """The run as input of custom scores."""
+    mast = run.rig.calibrated
     return ScoredRun(
         outcome=run.outcome.name,
         target_world=run.target.point_world.copy(),
         world_from_rover=tuple(stop.stance.world_from_rover for stop in run.stops),
         point_px=np.array([stop.point_px for stop in run.stops]).reshape(-1, 2),
         measurements=tuple(
-            RoverMeasurements(stop.pictures.left, stop.pictures.right, known, *stop.angles_rad, stop.estimated)
+            RoverMeasurements(stop.pictures.left, stop.pictures.right, mast, *stop.angles_rad, stop.estimated)
             for stop in run.stops
         ),
         answers=tuple(stop.update for stop in run.stops),

@@ -1,10 +1,8 @@
-"""One drive, many targets: trackers that are run over the same pictures, as in sections 5.1 to 5.3 of the paper.
+"""Open-loop tracking: many targets tracked over the pictures of one drive, as in sections 5.1 to 5.3 of the paper.
 
 The rover is driven by the true position of the point in the middle of all targets, and its mast points there. At every
 stop a part of both frames is taken that holds the rock and the search windows about it. A case then tracks one of the
-targets over every (skip + 1)-th stop: larger steps are made by leaving pictures out. The tracker's answers move
-nothing.
-
+targets over every (skip + 1)-th stop: skipped pictures make larger steps. The tracker's answers do not move the rover.
 A drive is a function of the parameters, the campaign's seed and the run's number.
 """
 
@@ -25,7 +23,7 @@ from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.route import Belief
 from marsyard.scenarios.rover.run import Run, Setup, TrackerGuide, drive_legs
 from marsyard.scenarios.rover.stops import RunOutcome, View
-from marsyard.scenarios.rover.target import Sightings, choose_by_pixel, point_on, sightings
+from marsyard.scenarios.rover.target import Sightings, choose_by_pixel, pick_point, sightings
 from marsyard.scenarios.rover.world import RunWorld
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.camera import CameraModel
@@ -34,7 +32,7 @@ from marsyard.sim.streams import Streams
 
 
 class VariantParameters(Parameters):
-    """What one run has of its own: its rock, its place and its light."""
+    """Rock, terrain and sun of one run."""
 
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
     diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="of the rock")] = 1.4
@@ -46,16 +44,14 @@ class VariantParameters(Parameters):
 
 
 class PointParameters(Parameters):
-    """A target on the rock's face, see `marsyard.scenarios.rover.TargetParameters`; of a circle as seen from its
-    middle.
-    """
+    """A target on the rock's face, as `TargetParameters`; of a circle as seen from its middle."""
 
     across: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
     up: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
 
 
 class BandParameters(Parameters):
-    """A range of steps by which requirements choose their cases: a column of true and false of this name."""
+    """A range of steps: a boolean column of this name, by which requirements choose their cases."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$")]
     least: float = 0.0
@@ -71,20 +67,15 @@ class SharedDriveParameters(Parameters):
     run: Annotated[int, Field(ge=0, description="number of the run")] = 0
     target: Annotated[int, Field(ge=0, description="number of the target")] = 0
     skip: Annotated[int, Field(ge=0, le=100, description="stops left out between two updates")] = 0
-    margin_px: Annotated[float, Field(gt=0.0, description="what of the frame is taken around the rock")] = 110.0
-    bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps that are told apart")] = ()
-    face_deg: Annotated[
-        float | None, Field(gt=0.0, le=90.0, description="most oblique sight at any stop of a target `on_face`")
-    ] = None
+    margin_px: Annotated[float, Field(gt=0.0, description="margin about the rock in the pictures")] = 110.0
+    bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps")] = ()
+    face_deg: float | None = Field(default=None, gt=0.0, le=90.0, description="maximum obliquity of a target `on_face`")
 
     @model_validator(mode="after")
-    def _are_there(self) -> SharedDriveParameters:
-        for name, number, there in (
-            ("run", self.run, len(self.variants)),
-            ("target", self.target, len(self.targets)),
-        ):
-            if number >= there:
-                raise ValueError(f"{name} is {number}; allowed: 0 to {there - 1}")
+    def _check_numbers(self) -> SharedDriveParameters:
+        for name, number, count in (("run", self.run, len(self.variants)), ("target", self.target, len(self.targets))):
+            if number >= count:
+                raise ValueError(f"{name} is {number}; allowed: 0 to {count - 1}")
         if len(self.drive.legs) != 1:
             raise ValueError(f"a shared drive has one leg, not {len(self.drive.legs)}")
         return self
@@ -97,20 +88,17 @@ class SharedDriveParameters(Parameters):
             return abs(leg.step_deg) * (self.skip + 1)
         return float(1.0 - (1.0 - leg.step_share) ** (self.skip + 1))
 
-    def of_run(self) -> RoverScenarioParameters:
-        """The drive of the run, its tracker left out: what its pictures depend on."""
+    def drive_of_run(self) -> RoverScenarioParameters:
+        """The drive of the run without its tracker: all that its pictures depend on."""
         v, p = self.variants[self.run], self.drive
-        target = {"diameter_m": v.diameter_m, "height_m": v.height_m, "shape": v.shape, "yaw_deg": v.yaw_deg}
         # the drive is about the middle of its targets
-        target |= {
-            "across": float(np.mean([one.across for one in self.targets])),
-            "up": float(np.mean([one.up for one in self.targets])),
-        }
+        middle = {name: float(np.mean([getattr(one, name) for one in self.targets])) for name in ("across", "up")}
+        rock = v.model_dump(include={"diameter_m", "height_m", "shape", "yaw_deg"})
         sun = {"azimuth_deg": v.sun_azimuth_deg, "elevation_deg": v.sun_elevation_deg}
         return p.model_copy(
             update={
                 "world": p.world.model_copy(update={"terrain": v.terrain}),
-                "target": p.target.model_copy(update=target),
+                "target": p.target.model_copy(update=rock | middle),
                 "sun": p.sun.model_copy(update=sun),
                 "algorithm": "vtt",
                 "compared": (),
@@ -121,7 +109,7 @@ class SharedDriveParameters(Parameters):
 
 @dataclass(frozen=True)
 class DriveKey:
-    """What the pictures of a drive depend on: the drive, the margin about the rock, the campaign and the run."""
+    """Everything that the pictures of a drive depend on."""
 
     drive: RoverScenarioParameters
     margin_px: float
@@ -132,7 +120,7 @@ class DriveKey:
     @classmethod
     def of(cls, p: SharedDriveParameters, streams: Streams) -> DriveKey:
         """The key of a case's drive."""
-        return cls(p.of_run(), p.margin_px, streams.seed, streams.campaign, p.run)
+        return cls(p.drive_of_run(), p.margin_px, streams.seed, streams.campaign, p.run)
 
 
 @dataclass(frozen=True)
@@ -147,12 +135,12 @@ class SharedDrive:
 def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) -> SharedDrive:
     """Drive a run and take its pictures; its streams are named by the run and belong to no case."""
     p, streams = key.drive, Streams(key.seed, f"{key.campaign}: run {key.run}", 0)
-    setup = Setup.prepared(p, streams, load_ground)
+    setup = Setup.of(p, streams, load_ground)
     world, rig, stance = setup.world, setup.rig, setup.vehicle.stance
     world_from_mast = stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)
-    at = _position_for_choice(p, world, rig.eyes(world_from_mast)[0])
-    place = p.target.across, p.target.up
-    run = Run.at(setup, choose_by_pixel(world, rig, world_from_mast, (0.0, 0.0), place, p.vtt, at))
+    at = _picking_eye(p, world, rig.eyes(world_from_mast)[0])
+    position = p.target.across, p.target.up
+    run = Run.at(setup, choose_by_pixel(world, rig, world_from_mast, (0.0, 0.0), position, p.vtt, at))
     guide = TruthGuide(key.margin_px)
     drive_legs(p, run, guide)
     return SharedDrive(key, run, tuple(guide.views))
@@ -160,7 +148,7 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
 
 @dataclass(frozen=True)
 class TruthGuide:
-    """A run is guided by the true position of its target. See `marsyard.scenarios.rover.run.Guide`."""
+    """The true target position as `marsyard.scenarios.rover.run.Guide`."""
 
     margin_px: float
     views: list[View] = field(default_factory=list)
@@ -181,19 +169,19 @@ class TruthGuide:
         return MastAim(*rig.state.readings_rad, left, right)
 
     def observe(self, run: Run, view: View) -> RunOutcome | None:
-        """Keep the pictures."""
+        """Store the pictures."""
         self.views.append(replace(view, leg=0, drives=()))
         return None
 
     def belief(self, run: Run) -> Belief:
-        """The truth: the drive is the test's, not the tracker's."""
-        return run.truth_belief()
+        """The true target position."""
+        return run.true_belief()
 
 
-def _position_for_choice(
+def _picking_eye(
     p: RoverScenarioParameters, world: RunWorld, eye: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "3"]:
-    """The position from which the targets' places on the rock are meant: the start, or the middle of a circle.
+    """The eye from which targets on the rock are picked: the start, or the middle of a circle.
 
     The paper selected the targets of its circle on the one face that is seen from both of its ends.
     """
@@ -204,7 +192,7 @@ def _position_for_choice(
 
 
 def _box(camera: CameraModel, points: Float64[np.ndarray, "points 3"], margin_px: float) -> PixelBox:
-    """The part of the frame about all points that are in it."""
+    """Bounding box, with a margin, of the points in the frame."""
     pixels = camera.project(points)[0]
     seen = pixels[camera.in_frame(pixels)]
     box = box_around(seen, margin_px, camera) if len(seen) else None
@@ -214,19 +202,18 @@ def _box(camera: CameraModel, points: Float64[np.ndarray, "points 3"], margin_px
 
 
 def prepare_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
-    """A run over the drive's pictures before a tracker is asked, its target chosen."""
-    first, made, chosen = drive.views[0], drive.run, p.targets[p.target]
-    at = _position_for_choice(p.drive, made.world, made.rig.eyes(first.world_from_head)[0])
-    place = chosen.across, chosen.up
-    target = choose_by_pixel(made.world, made.rig, first.world_from_head, first.angles_rad, place, p.drive.vtt, at)
-    return Run.at(made, target)
+    """A run over the drive's pictures, its target chosen, before the tracker is called."""
+    first, run, point = drive.views[0], drive.run, p.targets[p.target]
+    at = _picking_eye(p.drive, run.world, run.rig.eyes(first.world_from_head)[0])
+    position, pose = (point.across, point.up), first.world_from_head
+    return Run.at(run, choose_by_pixel(run.world, run.rig, pose, first.angles_rad, position, p.drive.vtt, at))
 
 
 def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> Run:
     """Run a tracker over the drive's pictures for one of the targets; by default the tracker under test."""
     run = prepare_run(p, drive)
     chosen = p.drive.model_copy(update={"algorithm": algorithm or p.drive.algorithm})
-    guide = TrackerGuide.of(chosen, run, drive.views[0].estimated)
+    guide = TrackerGuide(chosen, run, drive.views[0].estimated)
     for view in drive.views[:: p.skip + 1]:
         guide.observe(run, view)
         if run.stops[-1].update.state is TrackingState.FAILURE:
@@ -239,9 +226,9 @@ def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | N
 
 
 def sightings_along(drive: SharedDrive, chosen: PointParameters, options: VttOptions) -> Sightings:
-    """How a target shows itself along a drive."""
-    made = drive.run
-    eyes = [made.rig.eyes(one.world_from_head) for one in drive.views]
-    at = _position_for_choice(drive.key.drive, made.world, eyes[0][0])
-    point = point_on(made.world, eyes[0], chosen.across, chosen.up, made.rig.pixel_rad, options, at)[0]
-    return sightings(made.world, point, eyes, made.rig.pixel_rad, options)
+    """Visibility of a target along a drive."""
+    world, rig = drive.run.world, drive.run.rig
+    eyes = [rig.eyes(one.world_from_head) for one in drive.views]
+    at = _picking_eye(drive.key.drive, world, eyes[0][0])
+    point = pick_point(world, eyes[0], (chosen.across, chosen.up), rig.pixel_rad, options, at)[0]
+    return sightings(world, point, eyes, rig.pixel_rad, options)

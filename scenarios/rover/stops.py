@@ -1,4 +1,4 @@
-"""What a run leaves behind: its stops, each with truth, estimates and pictures."""
+"""Stops of a run: truth, estimates, pictures and the tracker's answer at each."""
 
 from __future__ import annotations
 
@@ -31,61 +31,27 @@ class RunOutcome(Enum):
 
 @dataclass(frozen=True)
 class View:
-    """The pictures of a stop, and where they were taken.
+    """The pictures of a stop, with the poses at which they were taken."""
 
-    Attributes
-    ----------
-    leg
-        Number of the leg that led here; -1 for the start.
-    time_s
-        Since the start of the run.
-    stance
-        The rover as it stands.
-    estimated
-        World pose of the rover as estimated on board.
-    angles_rad
-        Azimuth and elevation that the mast's encoders read.
-    world_from_head
-        True pose of the mast's head.
-    pictures
-        As delivered.
-    drives
-        The commands driven since the stop before.
-    """
-
-    leg: int
-    time_s: float
-    stance: Stance
-    estimated: RigidTransform
-    angles_rad: tuple[float, float]
-    world_from_head: RigidTransform
+    leg: int  #: number of the leg that led here; -1 for the start
+    time_s: float  #: since the start of the run
+    stance: Stance  #: truth
+    estimated: RigidTransform  #: world pose of the rover as estimated on board
+    angles_rad: tuple[float, float]  #: azimuth and elevation of the mast's encoders
+    world_from_head: RigidTransform  #: true pose of the mast's head
     pictures: StereoPictures
-    drives: tuple[Drive, ...]
+    drives: tuple[Drive, ...]  #: the commands driven since the stop before
 
 
 @dataclass(frozen=True)
 class Stop(View):
-    """A stop at which the target was tracked.
+    """A stop at which the target was tracked."""
 
-    Attributes
-    ----------
-    update
-        The tracker's answer.
-    track_time_s
-        Processor time of the update.
-    point_px
-        Where the left camera truly shows the designated point, full-frame (u, v); NaN where it does not.
-    point_rover
-        The designated point in the rover's true frame, metres.
-    range_m
-        From the left camera's true centre to it.
-    """
-
-    update: TargetUpdate
-    track_time_s: float
-    point_px: Float64[np.ndarray, "2"]
-    point_rover: Float64[np.ndarray, "3"]
-    range_m: float
+    update: TargetUpdate  #: the tracker's answer
+    track_time_s: float  #: processor time of the update
+    point_px: Float64[np.ndarray, "2"]  #: true full-frame (u, v) of the target in the left picture; NaN outside of it
+    point_rover: Float64[np.ndarray, "3"]  #: the designated point in the rover's true frame, metres
+    range_m: float  #: from the left camera's true centre to it
 
     @classmethod
     def of(
@@ -104,29 +70,26 @@ class Stop(View):
 
     @property
     def details(self) -> VttDetails | None:
-        """Those of our own trackers."""
-        found = self.update.details
-        return found if isinstance(found, VttDetails) else None
+        """The details of our own trackers' answers."""
+        return self.update.details if isinstance(self.update.details, VttDetails) else None
+
+    @property
+    def reported_rover(self) -> Float64[np.ndarray, "3"] | None:
+        """The reported position in the rover frame; None where the target was not found."""
+        return self.update.position_rover if self.update.found else None
 
     def found_px(self, mast: MastCalibration) -> Float64[np.ndarray, "2"]:
-        """Where the tracker says that the left picture shows the target; NaN where it found none.
+        """Pixel of the target in the left picture by the tracker; NaN where it was not found.
 
-        A tracker that keeps no details is taken at its word: its position, through the camera as calibrated.
+        Without details of the match the reported position is projected through the calibrated camera.
         """
-        if not self.update.found or self.update.position_rover is None:
+        if self.reported_rover is None:
             return np.full(2, np.nan)
         if self.details is not None and self.details.match is not None:
             return np.asarray(self.details.match.pixel, dtype=np.float64)
-        camera = calibrated_left(mast, self.angles_rad)
-        return np.asarray(camera.project(self.update.position_rover)[0], dtype=np.float64)
+        camera = mast.left.moved(mast.geometry.rover_from_head(*self.angles_rad))
+        return np.asarray(camera.project(self.reported_rover)[0], dtype=np.float64)
 
     def error_m(self) -> Float64[np.ndarray, "3"]:
-        """Reported less true position in the rover frame; NaN where none was reported."""
-        if not self.update.found or self.update.position_rover is None:
-            return np.full(3, np.nan)
-        return np.asarray(self.update.position_rover - self.point_rover)
-
-
-def calibrated_left(mast: MastCalibration, angles_rad: tuple[float, float]) -> CameraModel:
-    """The left camera in the rover frame as the rover believes."""
-    return mast.left.moved(mast.geometry.rover_from_head(*angles_rad))
+        """Reported minus true position in the rover frame; NaN where none was reported."""
+        return np.full(3, np.nan) if self.reported_rover is None else np.asarray(self.reported_rover - self.point_rover)

@@ -19,7 +19,7 @@ from marsyard.sim.streams import Streams
 
 
 class FakeVelocityParameters(ChosenAlgorithms):
-    task: ClassVar[Task] = VELOCITY  # type: ignore[type-arg]
+    task: ClassVar[Task] = VELOCITY
 
     algorithm: str = "homography"
 

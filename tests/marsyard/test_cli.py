@@ -97,7 +97,7 @@ def test_replay_compares_with_what_is_stored(finished: Path, marsyard: Command, 
 def test_replay_fails_where_rows_differ(finished: Path, marsyard: Command, tmp_path: Path) -> None:
     (tmp_path / "campaign.json").write_bytes((finished / "campaign.json").read_bytes())
     frame = pd.read_parquet(finished / "cases.parquet")
-    frame.loc[1, "altitude_m"] += 1.0
+    frame["altitude_m"] += 1.0 * (frame.index == 1)
     frame.to_parquet(tmp_path / "cases.parquet")
     ended = marsyard("replay", tmp_path, 1)
     assert ended.status == 1

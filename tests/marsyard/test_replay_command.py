@@ -127,12 +127,12 @@ def test_a_folder_that_cannot_be_written_to_is_replayed_into_another(
     original = sqlite3.connect
     monkeypatch.setattr("os.access", refused)
 
-    def open_noted(name: str, **options: Any) -> sqlite3.Connection:
+    def record_open(name: str, **options: Any) -> sqlite3.Connection:
         opened.append(str(name))
         connection: sqlite3.Connection = original(name, **options)
         return connection
 
-    monkeypatch.setattr(connect, open_noted)
+    monkeypatch.setattr(connect, record_open)
     status, output = told("replay", copy, 1, "--out", tmp_path / "out")
     assert (status, "the row equals the stored one" in output) == (0, True), output
     assert opened

@@ -18,11 +18,11 @@ import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.crew import Crew
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli import app as cli
-from marsyard.cli.deciding import run_until_decided
+from marsyard.cli.evidence import run_until_decided
 from marsyard.cli.site_server import server
 from marsyard.reports.cases import notable_cases
 from marsyard.reports.evaluation import next_look
@@ -175,7 +175,7 @@ def test_a_campaign_stops_itself_and_says_so(tmp_path: Path) -> None:
     dispersions = '[dispersions]\naltitude_m = {distribution = "normal", mean = 2000, sd = 100}\n'
     path = write_campaign(tmp_path, "error_scale = 1e3", requirement=asked, dispersions=dispersions)
     campaign, watch = load_campaign(str(path), cases=128), Silence()
-    run_until_decided(campaign, tmp_path / "run", Crew(jobs=1), watch)
+    run_until_decided(campaign, tmp_path / "run", ExecutorConfig(jobs=1), watch)
     stored = record.stored_configuration(tmp_path / "run")
     # All cases fail, but on one terrain, and that refutes a rate of half at none of the looks: it runs to its end.
     assert (stored.total_cases, stored.most_cases) == (128, 128)
@@ -185,7 +185,7 @@ def test_a_campaign_stops_itself_and_says_so(tmp_path: Path) -> None:
 def test_the_gallery_runs_its_cases_again(tmp_path: Path, marsyard: Command) -> None:
     dispersions = '[dispersions]\naltitude_m = {distribution = "normal", mean = 2000, sd = 100}\n'
     path, directory = write_campaign(tmp_path, dispersions=dispersions), tmp_path / "run"
-    run_campaign(load_campaign(str(path), cases=12), directory, Crew(jobs=1), Silence())
+    run_campaign(load_campaign(str(path), cases=12), directory, ExecutorConfig(jobs=1), Silence())
     wanted = set(notable_cases(read_run(directory)))
     assert len(wanted) >= 4
     _, out, err = marsyard("report", directory, "--gallery")
@@ -203,7 +203,7 @@ def _record(directory: Path) -> str:
 def test_what_cannot_be_decided_is_refused(tmp_path: Path) -> None:
     campaign = load_campaign(str(write_campaign(tmp_path, requirement="")))
     with pytest.raises(CampaignError, match="no requirement that is decided"):
-        run_until_decided(campaign, tmp_path / "run", Crew(jobs=1), Silence())
+        run_until_decided(campaign, tmp_path / "run", ExecutorConfig(jobs=1), Silence())
     latin = write_campaign(tmp_path, more='[design]\nkind = "latin-hypercube"\n')
     with pytest.raises(CampaignError, match="only independent random draws"):
-        run_until_decided(load_campaign(str(latin)), tmp_path / "run", Crew(jobs=1), Silence())
+        run_until_decided(load_campaign(str(latin)), tmp_path / "run", ExecutorConfig(jobs=1), Silence())

@@ -21,7 +21,7 @@ from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.registry import UnknownScenarioError, scenario, scenario_names, scenario_source
 from marsyard.scenarios.systems import BUILT_IN, problems, registry, stated_columns, system_of, systems, template_paths
 
-CACHED = (registry, stated_columns, shipped_names, requirements.shipped_requirements, requirements._stated)
+CACHED = (registry, stated_columns, shipped_names, requirements.shipped_requirements, requirements._read_shipped)
 HEAD = "from pathlib import Path\nfrom marsyard.scenarios.system import System\nHERE = Path(__file__).parent\n"
 Install = Callable[..., None]
 

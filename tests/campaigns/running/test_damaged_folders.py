@@ -21,7 +21,7 @@ from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.campaigns.store.table import write_table
-from marsyard.cli.campaign import says_what_is_wrong
+from marsyard.cli.options import handle_user_errors
 from tests.campaigns.fake_campaign import Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]
@@ -130,7 +130,7 @@ def test_a_full_folder_for_temporary_files_is_one_message(monkeypatch: pytest.Mo
 
 
 def test_a_full_disk_ends_any_command_with_one_message(capsys: pytest.CaptureFixture[str]) -> None:
-    @says_what_is_wrong
+    @handle_user_errors
     def command() -> None:
         raise OSError(errno.ENOSPC, "No space left on device", "somewhere")
 

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from marsyard.scenarios.landing.helicopter import HelicopterParameters, Touchdown, Transit, land
+from marsyard.scenarios.landing.helicopter import HelicopterParameters, Touchdown, Transit, horizontal_distance_m, land
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.sensor import LaserParameters
 from marsyard.sim.sensor.ranging import RangingUnit
@@ -111,8 +111,8 @@ def test_navigations_error_becomes_the_touchdowns() -> None:
         wander = transit.instruments.receiver.floating_wander.at(np.array([down.time_s]))[0, :2]
         # the filter follows the receiver within some centimetres
         np.testing.assert_allclose(unseen, -wander, atol=0.12)
-        assert down.believed_error_m(SITE) < 1.2
-        assert down.gps_error_m(SITE) < 1.2
+        assert horizontal_distance_m(down.believed_m, SITE) < 1.2
+        assert horizontal_distance_m(down.gps_m, SITE) < 1.2
 
 
 def test_the_touchdown_is_measured_as_the_paper_did() -> None:
@@ -146,7 +146,7 @@ def test_long_after_the_landing_the_receivers_error_is_another_one() -> None:
                 transit={"hover_s": 8.0},
                 averaging_after_s=later,
             )
-            errors.append(_down(transit, streams).gps_error_m(SITE))
+            errors.append(horizontal_distance_m(_down(transit, streams).gps_m, SITE))
     soon, late = (float(np.sqrt(np.mean(np.square(errors)))) for errors in off.values())
     assert soon < 0.6 * late
     # 80 values are known to 8 %; the filter's smoothing takes a little of the first
@@ -157,8 +157,8 @@ def test_without_solutions_there_is_no_measured_touchdown() -> None:
     transit, streams = _flown(0, rtk={"float_share": 0.0, "outages": [{"start_s": 6.0, "duration_s": 200.0}]})
     down = _down(transit, streams)
     assert down.gps_solutions == 0
-    assert np.isnan(down.gps_error_m(SITE))
-    assert np.isfinite(down.believed_error_m(SITE))
+    assert np.isnan(horizontal_distance_m(down.gps_m, SITE))
+    assert np.isfinite(horizontal_distance_m(down.believed_m, SITE))
 
 
 def test_a_stuck_altimeter_makes_a_hard_landing() -> None:

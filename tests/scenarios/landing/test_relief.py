@@ -65,6 +65,7 @@ def test_the_plane_is_that_of_least_absolute_deviations() -> None:
         np.r_[heights[fitted], -heights[fitted]],
         bounds=[(None, None)] * (3 + n),
     )
+    assert solved.x is not None
     plane = solved.x[:3]
     assert under.slope_rad[0] == pytest.approx(np.arctan(np.hypot(*plane[1:])), abs=1e-3)
     assert under.roughness_m[0] == pytest.approx(abs(heights - design @ plane).max(), abs=1e-3)

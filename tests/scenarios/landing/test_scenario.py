@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.pictures import KEPT_GROUNDS
 from marsyard.scenarios.landing.scenario import LandingScenario
-from marsyard.scenarios.landing.world import KEPT_GROUNDS
 
 
 @pytest.mark.parametrize(("bank", "built"), [(1, 1), (KEPT_GROUNDS, KEPT_GROUNDS), (KEPT_GROUNDS + 1, 0), (10_000, 0)])

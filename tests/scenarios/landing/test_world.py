@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.world import World
+from marsyard.scenarios.landing.pictures import World
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import site
 

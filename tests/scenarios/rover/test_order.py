@@ -5,8 +5,8 @@ import re
 import pytest
 
 from marsyard.scenarios.rover import run as loop
-from marsyard.scenarios.rover.mapping import Mapper
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.route import Mapper
 from marsyard.scenarios.rover.run import run_case
 from marsyard.scenarios.rover.vehicle import Vehicle
 from marsyard.sim.streams import Streams

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from marsyard.scenarios.rover.own_shadow import shades, template_patch
+from marsyard.scenarios.rover.points import rover_shades_patch, template_patch
 from marsyard.sim.dynamics import ROCKY_8, settle
 from marsyard.sim.frames import direction
 from marsyard.sim.sensor.mast import RESEARCH_MAST
@@ -23,7 +23,7 @@ def test_the_head_s_shadow_falls_where_the_sun_s_ray_meets_the_ground(elevation_
     def shaded(east_m: float, north_m: float) -> bool:
         place = shadow + np.array([east_m, north_m, 0.0])
         patch = template_patch(head, place, 0.002)
-        return shades(ROCKY_8, stance, RESEARCH_MAST, (0.0, 0.0), patch, sun)
+        return rover_shades_patch(ROCKY_8, stance, RESEARCH_MAST, (0.0, 0.0), patch, sun)
 
     assert shaded(0.0, 0.0)
     # the head is half a metre wide at most; beyond it, and to the side of the mast, there is light

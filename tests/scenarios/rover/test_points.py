@@ -4,14 +4,21 @@ import numpy as np
 import pytest
 import trimesh
 
-from marsyard.scenarios.rover.points import Sight, about_line, distances, facing, hidden, shaded
+from marsyard.scenarios.rover.points import (
+    RockOutline,
+    patch_normal,
+    ray_distances,
+    self_occluded,
+    self_shadowed,
+    triangles_near_line,
+)
 
 
 @pytest.fixture(scope="module")
 def sphere() -> np.ndarray:
     """Triangles of a sphere of radius 0.5 about (5, 0, 0.5)."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
-    return np.asarray(mesh.triangles, dtype=np.float64) + np.array([5.0, 0.0, 0.5])
+    return np.asarray(np.asarray(mesh.triangles, dtype=np.float64) + np.array([5.0, 0.0, 0.5]))
 
 
 def test_distances_are_those_to_a_sphere(sphere: np.ndarray) -> None:
@@ -23,13 +30,13 @@ def test_distances_are_those_to_a_sphere(sphere: np.ndarray) -> None:
     b = directions @ offset
     exact = -b - np.sqrt(b * b - offset @ offset + 0.25)
     # Flat triangles of 512 th of a sphere lie up to 0.1 % of the radius inside; seen obliquely, a few times as much.
-    np.testing.assert_allclose(distances(sphere, eye, directions), exact, atol=4e-3)
-    assert np.isinf(distances(sphere, eye, -directions[:1])[0])
+    np.testing.assert_allclose(ray_distances(sphere, eye, directions), exact, atol=4e-3)
+    assert np.isinf(ray_distances(sphere, eye, -directions[:1])[0])
 
 
 def test_points_lie_on_the_face_that_is_seen(sphere: np.ndarray) -> None:
     eye = np.array([0.0, 0.0, 1.5])
-    sight = Sight.of(sphere, eye, 0.0)
+    sight = RockOutline.of(sphere, eye, 0.0)
     middle = sight.point(0.0, 0.5)
     assert np.linalg.norm(middle - [5.0, 0.0, 0.5]) == pytest.approx(0.5, abs=1e-3)
     assert middle[0] < 4.6
@@ -41,17 +48,17 @@ def test_points_lie_on_the_face_that_is_seen(sphere: np.ndarray) -> None:
 def test_the_far_side_is_hidden_and_the_lee_in_shadow(sphere: np.ndarray) -> None:
     near, far = np.array([4.5, 0.0, 0.5]), np.array([5.5, 0.0, 0.5])
     points, eye = np.stack([near, far]), np.array([0.0, 0.0, 1.5])
-    assert hidden(sphere, points, eye).tolist() == [False, True]
+    assert self_occluded(sphere, points, eye).tolist() == [False, True]
     west = np.array([-np.cos(0.5), 0.0, np.sin(0.5)])
-    assert shaded(sphere, points, west).tolist() == [False, True]
+    assert self_shadowed(sphere, points, west).tolist() == [False, True]
 
 
 def test_the_surface_faces_where_the_sphere_does(sphere: np.ndarray) -> None:
     eye, middle = np.array([0.0, 0.0, 0.5]), np.array([5.0, 0.0, 0.5])
-    sight = Sight.of(sphere, eye, 0.0)
+    sight = RockOutline.of(sphere, eye, 0.0)
     for across in (-0.9, -0.5, 0.0, 0.7):
         point = sight.point(across, 0.5)
-        normal = facing(sphere, eye, point, 0.01)
+        normal = patch_normal(sphere, eye, point, 0.01)
         assert np.linalg.norm(normal) == pytest.approx(1.0)
         # a triangle of the sphere is 3.5 deg wide
         assert normal @ (point - middle) / np.linalg.norm(point - middle) > np.cos(np.radians(3.5))
@@ -60,11 +67,11 @@ def test_the_surface_faces_where_the_sphere_does(sphere: np.ndarray) -> None:
 def test_what_lies_about_a_line_is_all_that_its_rays_can_meet(sphere: np.ndarray) -> None:
     eye, reach = np.array([0.0, 0.0, 0.5]), 0.03
     rng = np.random.default_rng(2)
-    for point in Sight.of(sphere, eye, 0.0).point(0.4, 0.7), np.array([5.0, 0.4, 0.8]):
-        near = about_line(sphere, eye, point, reach)
+    for point in RockOutline.of(sphere, eye, 0.0).point(0.4, 0.7), np.array([5.0, 0.4, 0.8]):
+        near = triangles_near_line(sphere, eye, point, reach)
         assert 0 < len(near) < 0.2 * len(sphere)
         ahead = (point - eye) / np.linalg.norm(point - eye)
         rays = ahead + np.tan(reach) * rng.uniform(-0.7, 0.7, (200, 3))
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         rays = rays[rays @ ahead > np.cos(reach)]
-        np.testing.assert_array_equal(distances(near, eye, rays), distances(sphere, eye, rays))
+        np.testing.assert_array_equal(ray_distances(near, eye, rays), ray_distances(sphere, eye, rays))

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from marsyard.scenarios.rover.parameters import LegParameters
-from marsyard.scenarios.rover.route import GOAL_TOLERANCE_M, Belief, commands, finished, goal, towards
+from marsyard.scenarios.rover.route import (
+    GOAL_TOLERANCE_M,
+    Belief,
+    drive_towards,
+    goal_position,
+    is_finished,
+    step_commands,
+)
 from marsyard.sim.measurements import DriveCommand
 
 
@@ -27,51 +34,51 @@ def driven(told: list[DriveCommand]) -> tuple[np.ndarray, float]:
 def test_steps_lead_to_a_place(angle_deg: float) -> None:
     angle = np.radians(angle_deg)
     place = 3.0 * np.array([np.cos(angle), np.sin(angle)])
-    reached, _ = driven(list(towards(place, 10.0)))
+    reached, _ = driven(list(drive_towards(place, 10.0)))
     np.testing.assert_allclose(reached, place, atol=1e-12)
 
 
 def test_a_step_is_no_longer_than_asked() -> None:
-    told = list(towards(np.array([3.0, 0.4]), 0.5))
+    told = list(drive_towards(np.array([3.0, 0.4]), 0.5))
     assert sum(one.length_m for one in told) == pytest.approx(0.5)
 
 
 def test_an_approach_keeps_its_distance_and_offset() -> None:
     # 10 % of the camera's distance while that is far, and what is left at the end.
     leg = LegParameters(motion="approach", step_share=0.1, goal_m=2.0)
-    (step,) = commands(leg, 0, at(8.0, 0.0))
+    (step,) = step_commands(leg, 0, at(8.0, 0.0))
     assert step.forward_m == pytest.approx(0.1 * np.hypot(8.0, 1.2))
-    (last,) = commands(leg, 0, at(2.1, 0.0))
+    (last,) = step_commands(leg, 0, at(2.1, 0.0))
     assert last.forward_m == pytest.approx(0.1)
-    assert finished(leg, 3, at(2.0 + 0.9 * GOAL_TOLERANCE_M, 0.0))
-    assert not finished(leg, 3, at(2.0 + 1.1 * GOAL_TOLERANCE_M, 0.0))
+    assert is_finished(leg, 3, at(2.0 + 0.9 * GOAL_TOLERANCE_M, 0.0))
+    assert not is_finished(leg, 3, at(2.0 + 1.1 * GOAL_TOLERANCE_M, 0.0))
     aside = LegParameters(motion="approach", goal_m=2.0, offset_right_m=0.5)
-    np.testing.assert_allclose(goal(aside, at(5.0, 0.0)), [3.0, -0.5])
+    np.testing.assert_allclose(goal_position(aside, at(5.0, 0.0)), [3.0, -0.5])
 
 
 def test_a_circle_keeps_target_and_bearing() -> None:
     leg = LegParameters(motion="circle", step_deg=10.0, steps=7)
     belief = at(7.0, 0.5)
-    place, heading = driven(list(commands(leg, 0, belief)))
+    place, heading = driven(list(step_commands(leg, 0, belief)))
     # Seen from above the rover goes clockwise about the target; the target stays where it was in its frame.
     away = belief.target_rover[:2] - place
     sine, cosine = np.sin(-heading), np.cos(-heading)
     np.testing.assert_allclose(np.array([[cosine, -sine], [sine, cosine]]) @ away, belief.target_rover[:2], atol=1e-12)
     assert np.degrees(heading) == pytest.approx(-10.0)
-    assert finished(leg, 7, belief)
+    assert is_finished(leg, 7, belief)
 
 
 def test_turns_backing_and_straight_legs() -> None:
     turn = LegParameters(motion="turn", step_deg=10.0, steps=7, shuffle_m=0.1)
-    first, second = list(commands(turn, 0, at(3.0, 0.0))), list(commands(turn, 1, at(3.0, 0.0)))
+    first, second = list(step_commands(turn, 0, at(3.0, 0.0))), list(step_commands(turn, 1, at(3.0, 0.0)))
     assert np.degrees(first[0].turn_left_rad) == pytest.approx(-10.0)
     assert first[1].forward_m + second[1].forward_m == 0.0
     back = LegParameters(motion="back-off", goal_m=7.0, step_m=0.4)
-    (away,) = commands(back, 0, at(6.8, 0.0))
+    (away,) = step_commands(back, 0, at(6.8, 0.0))
     assert away.forward_m == pytest.approx(-0.2)
-    assert finished(back, 1, at(7.0, 0.0))
+    assert is_finished(back, 1, at(7.0, 0.0))
     straight = LegParameters(motion="straight", step_m=0.425, steps=2)
-    assert [one.forward_m for one in commands(straight, 0, at(1.0, 4.0))] == [0.425]
+    assert [one.forward_m for one in step_commands(straight, 0, at(1.0, 4.0))] == [0.425]
     with pytest.raises(ValueError, match="needs step_m"):
         LegParameters(motion="straight")
     with pytest.raises(ValueError, match="navigator drives to the target"):

@@ -1,6 +1,7 @@
 """Runs of the closed loop: what is driven, seen, tracked, scored and stored."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ def streams(case: int = 0) -> Streams:
 def test_a_run_is_tracked_scored_and_the_same_again() -> None:
     scenario, p = RoverScenario(), parameters(score={"stored_updates": 2})
     result = scenario.run(p, streams())
-    row = dict(result.row)
+    row: dict[str, Any] = dict(result.row)
     assert (result.outcome, result.answered) == ("COMPLETED", True)
     assert row["tracked"]
     assert row["true_track"]
@@ -98,7 +99,7 @@ def test_exact_instruments_leave_the_match_alone() -> None:
         ),
         "pointing": dict.fromkeys(("zero_deg", "backlash_deg", "settling_deg", "count_deg"), 0.0),
     }
-    row = RoverScenario().run(parameters(**exact), streams(2)).row
+    row: Mapping[str, Any] = RoverScenario().run(parameters(**exact), streams(2)).row
     assert row["disparity_error_goal_px"] == 0.0
     # A tenth of a pixel of disparity, and as much across.
     assert row["position_error_m"] < 0.008
@@ -147,7 +148,7 @@ def test_unknown_trackers_and_cameras_are_refused() -> None:
 
 def test_trackers_share_the_pictures_of_a_drive() -> None:
     scenario = SharedDriveScenario()
-    stated = {
+    stated: dict[str, Any] = {
         "drive": {**SHORT, "legs": [{"motion": "circle", "step_deg": 5.0, "steps": 2}]},
         "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
         "targets": [{"across": 0.0, "up": 0.5}, {"across": 0.4, "up": 0.5}],

@@ -1,29 +1,30 @@
-"""`marsyard clean`: what is kept on disk between runs, with its size; removes it where asked to."""
+"""`marsyard clean` and `compile`: cached terrains and compiled kernels on disk."""
 
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
-from marsyard.cli.campaign import JsonOption, console, says_what_is_wrong, size_text
+from marsyard.cli.options import JsonOption, console, handle_user_errors, size_text
 
-#: What is kept, and what it costs to be without it.
+#: Kinds of cached files, and the cost of removing them.
 KINDS = {
     "terrain": "terrains built for campaigns; built again when a case needs one, from seconds to minutes each",
     "kernels": "compiled code; compiled again in the next minute of running",
 }
-
-#: The kind whose size is limited, by MARSYARD_CACHE_GB.
+#: The kind with a size limit (MARSYARD_CACHE_GB).
 LIMITED = "terrain"
 
 
 @dataclass(frozen=True)
-class Kept:
-    """What is kept of one kind: its folder, how many files, how many bytes on disk they take and may take."""
+class CacheUsage:
+    """Folder, number of files and bytes on disk of one kind."""
 
     kind: str
     folder: Path
@@ -32,37 +33,37 @@ class Kept:
     limit_bytes: int | None = None
 
 
-@says_what_is_wrong
+@handle_user_errors
 def clean(
     kinds: Annotated[
-        list[str] | None, typer.Argument(metavar="[KIND]...", help="terrain, kernels; by default all of them.")
+        list[str] | None, Argument(metavar="[KIND]...", help="terrain, kernels; by default all of them.")
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Remove it; without this it is only shown.")] = False,
+    yes: Annotated[bool, Option("--yes", help="Remove the files; by default they are only listed.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what Marsyard keeps on disk beside campaigns, with sizes; with --yes remove it.
+    """List the caches on disk with their sizes; with --yes remove them.
 
-    Campaigns' folders are never touched. Running campaigns go on: what they need is built again.
+    Campaigns' folders are not touched. Running campaigns continue: missing files are built again.
     """
     from marsyard.campaigns.errors import CampaignError, not_allowed
 
     for kind in kinds or []:
         if kind not in KINDS:
             raise CampaignError(not_allowed("kind", kind, KINDS))
-    found = [kept(kind) for kind in kinds or KINDS]
-    freed = sum(_removed(one.folder) for one in found) if yes else 0
+    found = [cache_usage(kind) for kind in kinds or KINDS]
+    freed = sum(_remove_files(one.folder) for one in found) if yes else 0
     if as_json:
         typer.echo(json.dumps({"kept": [asdict(one) for one in found], "removed_bytes": freed}, indent=2, default=str))
         return
-    _print(found)
+    _print_usage(found)
     if yes:
         typer.echo(f"removed {size_text(freed)}")
     else:
         typer.echo("nothing was removed; to remove it: marsyard clean --yes")
 
 
-def kept(kind: str) -> Kept:
-    """What is kept of a kind. Raises CampaignError where MARSYARD_CACHE_GB is not a number of gigabytes."""
+def cache_usage(kind: str) -> CacheUsage:
+    """The cache of a kind. Raises CampaignError where MARSYARD_CACHE_GB is not a number of gigabytes."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.sim.cache import cache_directory, limit_bytes
 
@@ -79,11 +80,11 @@ def kept(kind: str) -> Kept:
         limit = limit_bytes(folder, size) if kind == LIMITED else None
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    return Kept(kind, folder, len(sizes), size, limit)
+    return CacheUsage(kind, folder, len(sizes), size, limit)
 
 
-def _removed(folder: Path) -> int:
-    """Removes all files in a folder; returns their bytes. What another process writes just now stays."""
+def _remove_files(folder: Path) -> int:
+    """Remove all files in a folder except unfinished ones of other processes; return their bytes."""
     from marsyard.sim.cache import UNFINISHED
 
     freed = 0
@@ -100,7 +101,7 @@ def _removed(folder: Path) -> int:
     return freed
 
 
-def _print(found: list[Kept]) -> None:
+def _print_usage(found: list[CacheUsage]) -> None:
     from rich import box
     from rich.table import Table
 
@@ -112,3 +113,27 @@ def _print(found: list[Kept]) -> None:
         limit = "none" if one.limit_bytes is None else size_text(one.limit_bytes)
         table.add_row(one.kind, str(one.files), size_text(one.bytes), limit, str(one.folder), KINDS[one.kind])
     console().print(table)
+
+
+@handle_user_errors
+def compile_kernels() -> None:
+    """Compile the numeric kernels before the first run.
+
+    Each system runs a small case. Compiled code stays on disk until the code changes (`marsyard clean` lists where).
+    """
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.execution.worker_process import limit_threads
+    from marsyard.scenarios.systems import systems
+    from marsyard.sim.kernel_cache import kernels_are_ready, note_ready
+
+    limit_threads()
+    for name, settings in (one for system in systems() for one in system.compiled_by.items()):
+        campaign = load_campaign(name, settings)
+        scenario = campaign.configuration.scenario
+        if kernels_are_ready(scenario):
+            typer.echo(f"{scenario}: compiled before")
+            continue
+        began = time.monotonic()
+        campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
+        note_ready(scenario)
+        typer.echo(f"{scenario}: compiled, {time.monotonic() - began:.0f} s")

@@ -1,0 +1,120 @@
+"""Shared by all commands: options and arguments, exit status, error handling, console."""
+
+from __future__ import annotations
+
+import errno
+import functools
+from collections.abc import Callable
+from enum import IntEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn, ParamSpec
+
+import typer
+from typer import Argument, Option
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+class Exit(IntEnum):
+    """Exit status of the program; of several the order of precedence is 2, 1, 3."""
+
+    MET = 0
+    FAILED = 1
+    WRONG = 2
+    INSUFFICIENT = 3
+    INTERRUPTED = 130
+
+
+CampaignArgument = Annotated[
+    str, Argument(metavar="CAMPAIGN", help="A name from `marsyard list`, or the path of a TOML file.")
+]
+SiteArgument = Annotated[
+    str, Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
+]
+MaxHolesOption = Annotated[
+    float | None,
+    Option("--max-holes", metavar="F", min=0.0, max=0.99, help="Of a DTM: maximum fraction of missing posts."),
+]
+CasesOption = Annotated[int | None, Option("-n", "--cases", metavar="N", help="Number of cases.")]
+SeedOption = Annotated[int | None, Option("--seed", metavar="S", help="Root seed.")]
+JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
+DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign that was run.")]
+SetOption = Annotated[
+    list[str] | None,
+    Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override a value, such as render.backend=egl; the parameter is then not dispersed.",
+    ),
+]
+AlgorithmOption = Annotated[
+    list[str] | None,
+    Option(
+        "--algorithm",
+        metavar="NAME",
+        help="The algorithm under test: a name, module:Class, exec:PROGRAM or serve:PROGRAM. Given several times, all "
+        "run on the same cases and are compared; the first is judged.",
+    ),
+]
+JobsOption = Annotated[int | None, Option("--jobs", metavar="J", help="Worker processes; by default one per core.")]
+ClusterOption = Annotated[
+    str | None,
+    Option(
+        "--cluster", metavar="ADDRESS", help="Run on Dask: a scheduler at tcp://HOST:PORT, or local:N to start one."
+    ),
+]
+CaseTimeOption = Annotated[
+    float | None,
+    Option("--case-time", metavar="S", help="Time limit of a case in seconds (limits.case_time_s)."),
+]
+ChangedOption = Annotated[
+    bool,
+    Option("--allow-changed", help="Continue with changed code or versions; the record notes it."),
+]
+
+OutOption = Annotated[
+    Path | None, Option("--out", metavar="DIR", help="Folder; by default runs/<campaign>-<UTC time>.")
+]
+OverwriteOption = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
+
+Parameters = ParamSpec("Parameters")
+
+
+def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Parameters, None]:
+    """Wrap a command: a user error, a full disk or a read-only one ends it with one message and status 2."""
+
+    @functools.wraps(command)
+    def wrapped(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        # imported here, so that `doctor` can report a foreign package in place of ours
+        from marsyard.campaigns.errors import CampaignError
+
+        try:
+            command(*args, **kwargs)
+        except (CampaignError, OSError) as error:
+            if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+                raise
+            fail(error)
+
+    return wrapped
+
+
+def fail(error: object) -> NoReturn:
+    """End the command with one message and status 2."""
+    typer.echo(f"error: {error}", err=True)
+    raise typer.Exit(Exit.WRONG) from None
+
+
+def console(*, stderr: bool = False) -> Console:
+    """The console of a command's output."""
+    from rich.console import Console
+
+    return Console(stderr=stderr)
+
+
+def size_text(count: float) -> str:
+    """A number of bytes with a unit prefix."""
+    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}"
+    return f"{count:.0f} bytes"
