@@ -69,9 +69,7 @@ def _in_every_way(campaign: str, folder: Path, settings: Sequence[str], kills: i
     cluster = ExecutorConfig(cluster="local:2")
     ways: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "two workers": lambda: _rows_of(campaign, folder / "two", ExecutorConfig(2), settings),
-        "a Dask cluster of two": lambda: _rows_of(
-            campaign, folder / "cluster", ExecutorConfig(cluster="local:2"), settings
-        ),
+        "a Dask cluster of two": lambda: _rows_of(campaign, folder / "cluster", cluster, settings),
         f"a runner killed {kills} times": lambda: _killed(campaign, folder / "killed", settings, kills),
         "single replays": lambda: [dict(replay(folder / "one", case).row) for case in replayed],
     }
