@@ -25,7 +25,7 @@ from marsyard.sim.measurements import MastCalibration
 _ROUNDING = 1e-9
 
 
-def checked_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> VelocityEstimate:
+def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> VelocityEstimate:
     """A copy of a valid `VelocityEstimate` in plain float64 arrays and Python numbers.
 
     `tags_s` are the time tags of the images, between which the span must lie; None if unknown. Raises AlgorithmError
@@ -51,8 +51,8 @@ def checked_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Velo
     return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_pictures)
 
 
-def checked_site(answer: Any) -> SiteEstimate:
-    """A copy of a valid `SiteEstimate` in plain arrays; raises as `checked_velocity`."""
+def check_site(answer: Any) -> SiteEstimate:
+    """A copy of a valid `SiteEstimate` in plain arrays; raises as `check_velocity`."""
     _check_type("the answer", answer, SiteEstimate)
     _check_type("outcome", answer.outcome, SiteOutcome)
     if (answer.outcome is SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
@@ -64,8 +64,8 @@ def checked_site(answer: Any) -> SiteEstimate:
     return SiteEstimate(answer.outcome, site, answer.details)
 
 
-def checked_update(answer: Any) -> TargetUpdate:
-    """A copy of a valid `TargetUpdate` in plain arrays; raises as `checked_velocity`."""
+def check_update(answer: Any) -> TargetUpdate:
+    """A copy of a valid `TargetUpdate` in plain arrays; raises as `check_velocity`."""
     _check_type("the answer", answer, TargetUpdate)
     _check_type("state", answer.state, TrackingState)
     position = None if answer.position_rover is None else _check_numbers("position_rover", answer.position_rover, (3,))
@@ -74,8 +74,8 @@ def checked_update(answer: Any) -> TargetUpdate:
     return TargetUpdate(answer.state, answer.losses, position, answer.details)
 
 
-def checked_aim(answer: Any, mast: MastCalibration) -> MastAim | None:
-    """A copy of a valid `MastAim` for this mast, or None; raises as `checked_velocity`."""
+def check_aim(answer: Any, mast: MastCalibration) -> MastAim | None:
+    """A copy of a valid `MastAim` for this mast, or None; raises as `check_velocity`."""
     if answer is None:
         return None
     if not isinstance(answer, MastAim):

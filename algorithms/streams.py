@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from marsyard.algorithms.answers import checked_velocity
+from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityStream
 from marsyard.sim.measurements import DescentMeasurements
@@ -27,14 +27,14 @@ class StreamedEstimator:
         earlier: list[VelocityEstimate | None] = []
         for number, frame in enumerate(measurements.frames(), start=1):
             answer = self.stream.picture(frame)
-            earlier.append(None if answer is None else spanned(_check_no_history(answer), tags[:number]))
-        final = spanned(_check_no_history(self.stream.finish()), tags)
+            earlier.append(None if answer is None else set_span(_check_no_history(answer), tags[:number]))
+        final = set_span(_check_no_history(self.stream.finish()), tags)
         return replace(final, after_pictures=tuple(earlier))
 
 
-def spanned(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
-    """The valid answer to images of these tags, by default over the last interval; raises as `checked_velocity`."""
-    estimate = checked_velocity(answer, tags_s)
+def set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
+    """The valid answer to images of these tags, by default over the last interval; raises as `check_velocity`."""
+    estimate = check_velocity(answer, tags_s)
     if estimate.span_s is not None or len(tags_s) < 2:
         return estimate
     return replace(estimate, span_s=(tags_s[-2], tags_s[-1]))

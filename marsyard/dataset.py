@@ -23,7 +23,7 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.running.inputs import plan_inputs
-from marsyard.scenarios.exposure import GivesSamples, Sample
+from marsyard.scenarios.exposure import ProvidesSamples, Sample
 from marsyard.scenarios.registry import scenario, scenario_names
 
 MANIFEST = "dataset.json"
@@ -34,9 +34,9 @@ def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: 
 
     Raises CampaignError where the scenario gives no samples, or the folder holds another data set or is not writable.
     """
-    if not isinstance(campaign.scenario, GivesSamples):
+    if not isinstance(campaign.scenario, ProvidesSamples):
         name = campaign.configuration.scenario
-        allowed = ", ".join(name for name in scenario_names() if isinstance(scenario(name), GivesSamples))
+        allowed = ", ".join(name for name in scenario_names() if isinstance(scenario(name), ProvidesSamples))
         raise CampaignError(f"the scenario '{name}' gives no samples to learn from; allowed: {allowed}")
     _write_manifest(campaign, folder, cases_per_shard)
     total = campaign.configuration.total_cases
@@ -100,7 +100,7 @@ def _write_shard(campaign: Campaign, path: Path, cases: range) -> None:
 def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
     """Yield names and contents of a case's files."""
     scenario = campaign.scenario
-    assert isinstance(scenario, GivesSamples)  # noqa: S101  (checked by `write_dataset`)
+    assert isinstance(scenario, ProvidesSamples)  # noqa: S101  (checked by `write_dataset`)
     drawn = campaign.draws(case)
     for number, sample in enumerate(scenario.samples(campaign.parameters(case), campaign.streams(case))):
         key = f"{case:07d}-{number}"

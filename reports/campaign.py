@@ -19,9 +19,9 @@ from marsyard.reports.cases import shown_cases
 from marsyard.reports.columns import label, numbers, primary_metric
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
-from marsyard.reports.evaluation import Judged, Overall, judged
+from marsyard.reports.evaluation import Judged, OverallVerdict, judged
 from marsyard.reports.presentation import presentations
-from marsyard.reports.sampled import sampled
+from marsyard.reports.sampling_design import sampled
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
@@ -56,10 +56,10 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     requirements: in place of the campaign's own
     Raises StoreError if the folder holds no rows, OSError if the report cannot be written.
     """
-    return write_judged(judged(directory, requirements))
+    return write_evaluation(judged(directory, requirements))
 
 
-def write_judged(found: Judged) -> Path:
+def write_evaluation(found: Judged) -> Path:
     """Write the report of an evaluated campaign into its folder."""
     run, how, verdicts, whole = found.run, found.how, found.verdicts, found.whole
     directory = run.directory
@@ -87,7 +87,7 @@ def section_makers() -> list[SectionMaker]:
 
 
 def page_context(
-    run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], whole: Overall, further: Sequence[Section]
+    run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], whole: OverallVerdict, further: Sequence[Section]
 ) -> dict[str, Any]:
     """Context of the page's template: statistics of the subject's cases, all else of the whole run."""
     metric, bound = subject.metric, subject.bound

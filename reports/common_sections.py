@@ -20,7 +20,7 @@ from marsyard.reports.comparison import compared_names, select_algorithm
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.sampled import sampled
+from marsyard.reports.sampling_design import sampled
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
 from marsyard.reports.statistics.changes import holm
 from marsyard.reports.statistics.drivers import Driver, driver

@@ -20,9 +20,9 @@ from jaxtyping import Float
 from marsyard.reports import rates
 from marsyard.reports.columns import label, numbers, primary_metric, split_unit
 from marsyard.reports.rates import CONFIDENCE, succeeded
-from marsyard.reports.sampled import sampled
+from marsyard.reports.sampling_design import sampled
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of
-from marsyard.reports.statistics.changes import Sample, compared_errors, compared_successes, difference_p, holm
+from marsyard.reports.statistics.changes import Sample, compare_errors, compare_successes, difference_p, holm
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.wording import NOTHING, note_text, number, p_text, percent, stated
 
@@ -105,9 +105,9 @@ def difference(first: pd.DataFrame, other: pd.DataFrame, name: str, metric: str,
     both, groups = np.isfinite(mine) & np.isfinite(its), rates.terrain_groups(first)
     split: tuple[int | None, int | None, float] = (None, None, math.nan)
     if bound is not None:
-        split = compared_successes(mine <= bound, its <= bound, groups)
+        split = compare_successes(mine <= bound, its <= bound, groups)
     shared = None if groups is None else groups[both]
-    mean, lower, upper, p = compared_errors((its - mine)[both], shared, CONFIDENCE)
+    mean, lower, upper, p = compare_errors((its - mine)[both], shared, CONFIDENCE)
     return Difference(name, *split, int(both.sum()), mean, lower, upper, p)
 
 
@@ -258,13 +258,13 @@ def figures_of(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
     return frame, list(found.values())
 
 
-def contrasts(first: StoredRun, second: StoredRun) -> tuple[bool, list[Contrast]]:
+def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[Contrast]]:
     """Whether the campaigns' cases are pairs, and the contrasts of the figures that both have."""
     frames, of_each = zip(*(figures_of(run) for run in (first, second)), strict=True)
     paired = same_draws(first, second)
     theirs = {figure.name: figure for figure in of_each[1]}
     both = [(figure, theirs[figure.name]) for figure in of_each[0] if figure.name in theirs]
-    test = _paired_p if paired else _unpaired_p if same_grounds(first, second) else _disjoint_p
+    test = _paired_p if paired else _unpaired_p if have_same_terrains(first, second) else _disjoint_p
     p_values = holm([test(frames[0], mine, frames[1], other) for mine, other in both])
     return paired, [Contrast(mine.name, mine, other, p) for (mine, other), p in zip(both, p_values, strict=True)]
 
@@ -274,7 +274,7 @@ def same_draws(first: StoredRun, second: StoredRun) -> bool:
     return all(first.said(key) == second.said(key) for key in ("name", "scenario", "seed", "dispersions", "design"))
 
 
-def same_grounds(first: StoredRun, second: StoredRun) -> bool:
+def have_same_terrains(first: StoredRun, second: StoredRun) -> bool:
     """Whether equal terrain numbers are the same terrain: all parameters but the algorithm's are equal."""
     worlds = [
         {name: value for name, value in table(run.said("parameters")).items() if name != "algorithm"}
@@ -283,13 +283,13 @@ def same_grounds(first: StoredRun, second: StoredRun) -> bool:
     return worlds[0] == worlds[1] and first.said("scenario") == second.said("scenario")
 
 
-def contrast_grid(names: Sequence[str], found: Sequence[Contrast]) -> Grid:
+def campaign_diff_grid(names: Sequence[str], found: Sequence[Contrast]) -> Grid:
     """Table of the figures side by side."""
     head = ["", *names, "p"]
     return Grid(head, [[one.name, one.first.text, one.second.text, p_text(one.p_value)] for one in found])
 
 
-def contrast_data(found: Sequence[Contrast]) -> list[dict[str, Any]]:
+def campaign_diff_data(found: Sequence[Contrast]) -> list[dict[str, Any]]:
     """The contrasts as plain data: rate or median of each campaign with its cases; None for NaN."""
 
     def level(figure: Figure) -> dict[str, Any]:
@@ -340,5 +340,5 @@ def _paired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Fi
     groups = rates.terrain_groups(first)
     shared = None if groups is None else groups[here][both]
     if mine.larger_is_better:
-        return compared_successes(a[both] > 0.5, b[both] > 0.5, shared)[2]
-    return compared_errors(b[both] - a[both], shared, CONFIDENCE)[3]
+        return compare_successes(a[both] > 0.5, b[both] > 0.5, shared)[2]
+    return compare_errors(b[both] - a[both], shared, CONFIDENCE)[3]

@@ -10,17 +10,17 @@ from typing import Any
 import pandas as pd
 
 from marsyard.reports.rates import engine_failed
-from marsyard.reports.sampled import INDEPENDENT, Sampled, sampled
+from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, sampled
 from marsyard.reports.statistics.clusters import ClusterMethod
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
-from marsyard.reports.statistics.sequential import confidence_at, looks_of
+from marsyard.reports.statistics.sequential import confidence_at, planned_looks
 from marsyard.reports.stored import StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, judge_campaign
 from marsyard.reports.wording import count
 
 
 @dataclass(frozen=True)
-class Overall:
+class OverallVerdict:
     """A campaign's verdict in one word and one sentence; `status` is None without requirements."""
 
     status: Status | None
@@ -33,20 +33,20 @@ class Overall:
         return "NO REQUIREMENT" if self.status is None else str(self.status)
 
 
-def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = INDEPENDENT) -> Overall:
+def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: SamplingDesign = INDEPENDENT) -> OverallVerdict:
     """The verdict of the worst requirement, in the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
     crashed = int(engine_failed(frame).sum())
     statuses = [verdict.status for verdict in verdicts]
     tail = f" {count(crashed, 'case')} crashed." if crashed else ""
     if not statuses:
-        return Overall(None, crashed, "The campaign asks for no requirement." + tail)
+        return OverallVerdict(None, crashed, "The campaign asks for no requirement." + tail)
     order = (Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE)
     worst = next((status for status in order if status in statuses), Status.PASS)
     if not how.independent:
         by_rate = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
         met = f"{by_rate.count(Status.MET_BY_RATE)} of {count(len(by_rate), 'requirement')}"
         head = f"{met} met by the rate of these cases. " if by_rate else ""
-        return Overall(worst, crashed, head + how.no_probability + tail)
+        return OverallVerdict(worst, crashed, head + how.no_probability + tail)
     share = f"{statuses.count(worst)} of {count(len(statuses), 'requirement')}"
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
@@ -54,7 +54,7 @@ def overall(verdicts: Sequence[Verdict], frame: pd.DataFrame, how: Sampled = IND
         Status.FAIL: f"{share} not met.",
         Status.INSUFFICIENT: f"{share} cannot be decided by {count(len(frame), 'case')}.{_further_text(verdicts)}",
     }[worst]
-    return Overall(worst, crashed, sentence + tail)
+    return OverallVerdict(worst, crashed, sentence + tail)
 
 
 def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
@@ -87,9 +87,9 @@ class Judged:
     """A stored campaign with its sampling design and its verdicts."""
 
     run: StoredRun
-    how: Sampled
+    how: SamplingDesign
     verdicts: Sequence[Verdict]
-    whole: Overall
+    whole: OverallVerdict
 
     @property
     def exit_code(self) -> int:
@@ -105,7 +105,7 @@ def judged(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
     return Judged(run, how, verdicts, overall(verdicts, run.whole, how))
 
 
-def next_look(verdicts: Sequence[Verdict], how: Sampled, cases: int) -> int | None:
+def next_look(verdicts: Sequence[Verdict], how: SamplingDesign, cases: int) -> int | None:
     """The number of cases at the next look; None if the campaign may stop.
 
     It may stop if every requirement is decided, or no result of the remaining cases can decide it. Requirements that
@@ -114,10 +114,10 @@ def next_look(verdicts: Sequence[Verdict], how: Sampled, cases: int) -> int | No
     if how.most_cases is None or cases >= how.most_cases:
         return None
     left = how.most_cases - cases
-    share = looks_of(how.most_cases)[-1].share
+    share = planned_looks(how.most_cases)[-1].share
     if not any(_open(verdict, left, share) for verdict in verdicts):
         return None
-    return next(look.cases for look in looks_of(how.most_cases) if look.cases > cases)
+    return next(look.cases for look in planned_looks(how.most_cases) if look.cases > cases)
 
 
 def _open(verdict: Verdict, left: int, share: float) -> bool:

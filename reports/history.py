@@ -262,7 +262,7 @@ def changes(comparisons: Sequence[Comparison]) -> list[Change]:
     ]
 
 
-def comparisons_of(history: History, night: int) -> list[Comparison]:
+def compare_night(history: History, night: int) -> list[Comparison]:
     """Every figure of a night with its samples in earlier nights."""
     return [
         Comparison(campaign.name, figure, history.before(night, campaign, figure.figure))

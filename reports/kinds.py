@@ -33,7 +33,7 @@ from marsyard.reports.rates import (
     varies,
 )
 from marsyard.reports.section import Block, Grid, Section, Subject, plate
-from marsyard.reports.statistics.drivers import FEWEST_CASES, driver
+from marsyard.reports.statistics.drivers import MIN_CASES, driver
 from marsyard.reports.tables import error_summaries, statistics_grid
 from marsyard.reports.wording import NOTHING, coefficient, number, percent, stated
 
@@ -410,7 +410,7 @@ class Scatter:
         head = ["Rank correlation", *(one.title for one in self.y)]
         grid = Grid(head, [[name, *cells] for name, cells in texts.items()])
         figure = scatter_panels(panels, logarithmic=self.logarithmic)
-        note = f"Intervals at {stated(CONFIDENCE)} confidence; a dash for fewer than {FEWEST_CASES} cases or constants."
+        note = f"Intervals at {stated(CONFIDENCE)} confidence; a dash for fewer than {MIN_CASES} cases or constants."
         plates = [plate(figure, key, self.caption, wide=len(effects) > 1)]
         data = {"effects": [asdict(one) for one in effects]}
         return [Block(heading=self.heading, plates=plates, grid=grid, note=note)], data

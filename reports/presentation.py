@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from marsyard.reports.section import Plate, SectionMaker
-from marsyard.scenarios.dotted import found_at
+from marsyard.reports.section import SectionMaker, SvgFigure
+from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.systems import systems
 
 Products = Mapping[str, Any]
@@ -36,7 +36,7 @@ class CaseView:
     """View of a case on the page: facts, figures and a table; `legend` replaces the legend of its kind."""
 
     facts: Sequence[tuple[str, str]]
-    plates: Sequence[Plate]
+    plates: Sequence[SvgFigure]
     head: Sequence[str]
     rows: Sequence[TableRow]
     legend: str | None = None
@@ -78,7 +78,7 @@ def presentations() -> tuple[Presentation, ...]:
             continue
         stated = f"the report '{system.report}' of system '{system.name}'"
         try:
-            presentation = found_at(system.report)
+            presentation = import_object(system.report)
         except ImportError as error:
             _warn(f"{stated} cannot be imported: {error}")
             continue

@@ -31,7 +31,7 @@ def grid_of(records: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> 
 
 
 @dataclass(frozen=True)
-class Plate:
+class SvgFigure:
     """A figure as SVG with its caption; `wide` figures have the full width of the page."""
 
     svg: Markup
@@ -39,10 +39,10 @@ class Plate:
     wide: bool = False
 
 
-def plate(figure: Figure, key: str, caption: str, *, wide: bool = False) -> Plate:
+def plate(figure: Figure, key: str, caption: str, *, wide: bool = False) -> SvgFigure:
     """A figure with its caption; `key` is as in `svg_markup`."""
     # matplotlib escapes the texts inside, svg_markup the description
-    return Plate(Markup(svg_markup(figure, key, caption)), caption, wide)  # noqa: S704
+    return SvgFigure(Markup(svg_markup(figure, key, caption)), caption, wide)  # noqa: S704
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Block:
 
     heading: str = ""
     text: str = ""
-    plates: Sequence[Plate] = ()
+    plates: Sequence[SvgFigure] = ()
     grid: Grid | None = None
     note: str = ""
 

@@ -29,8 +29,8 @@ from marsyard.reports.figures import (
     outcome_bars,
 )
 from marsyard.reports.rates import CONFIDENCE, engine_failed, members, terrain_groups
-from marsyard.reports.sampled import sampled
-from marsyard.reports.section import Grid, Plate, plate
+from marsyard.reports.sampling_design import sampled
+from marsyard.reports.section import Grid, SvgFigure, plate
 from marsyard.reports.statistics.drivers import Driver, driver
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import outcome_counts
@@ -257,7 +257,7 @@ def _only_values(frame: pd.DataFrame, column: str) -> str | None:
     return "; ".join(str(value) for value in frame[column].dropna().unique()[:3])
 
 
-def error_plates(frame: pd.DataFrame, whole: pd.DataFrame, metric: str, bound: float | None) -> list[Plate]:
+def error_plates(frame: pd.DataFrame, whole: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
     """Scatter of a metric over some rows, its histogram and distribution over all."""
     scatter = "Errors of single cases; the dashed circle is the requirement. Hollow: beyond the axes, at their edge."
     histogram = "How often each magnitude of error occurred; hatched: beyond the axis."
@@ -270,7 +270,7 @@ def error_plates(frame: pd.DataFrame, whole: pd.DataFrame, metric: str, bound: f
     return _plates(figures)
 
 
-def driver_plates(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Plate]:
+def driver_plates(frame: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
     """A metric against the conditions that may drive it, with rank correlations."""
     figures, magnitude, groups = [], np.abs(numbers(frame, metric)), terrain_groups(frame)
     for k, column in enumerate(driver_columns(frame, metric)):
@@ -289,13 +289,13 @@ def rank_text(found: Driver) -> str:
     return f"{coefficient(found.correlation)} ({lower} to {upper} at {stated(CONFIDENCE)} confidence)"
 
 
-def outcome_plates(frame: pd.DataFrame) -> list[Plate]:
+def outcome_plates(frame: pd.DataFrame) -> list[SvgFigure]:
     """Number of cases by outcome."""
     caption = "Plain: an answer was given. Hatched: the algorithm gave no answer. Crossed: the case crashed."
     return _plates([("outcomes", outcome_bars(frame), caption)])
 
 
-def _plates(wanted: Sequence[tuple[str, Figure | None, str]]) -> list[Plate]:
+def _plates(wanted: Sequence[tuple[str, Figure | None, str]]) -> list[SvgFigure]:
     return [plate(figure, key, caption) for key, figure, caption in wanted if figure is not None]
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from xml.etree import ElementTree as Xml
 
-from marsyard.reports.evaluation import Overall
+from marsyard.reports.evaluation import OverallVerdict
 from marsyard.reports.stored import table
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count
@@ -67,7 +67,7 @@ def algorithms_of(record: Mapping[str, Any]) -> list[Algorithm]:
     return sorted(found, key=lambda one: not one.judged)
 
 
-def judged_text(algorithms: Sequence[Algorithm]) -> str:
+def format_judged_algorithms(algorithms: Sequence[Algorithm]) -> str:
     """Names and versions of the judged algorithms."""
     return ", ".join(one.title for one in algorithms if one.judged)
 
@@ -143,7 +143,9 @@ def _cell(value: Any) -> str:
     return f"'{text}" if isinstance(value, str) and text[:1] in "=+-@\t\r" and text else text
 
 
-def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall, algorithms: Sequence[Algorithm] = ()) -> str:
+def junit_xml(
+    campaign: str, verdicts: Sequence[Verdict], whole: OverallVerdict, algorithms: Sequence[Algorithm] = ()
+) -> str:
     """JUnit's XML: a test for each requirement, and one for the completion of all cases.
 
     FAIL is a failure; INSUFFICIENT and MET BY RATE are skipped. Properties of the suite name the judged algorithms.
@@ -161,7 +163,7 @@ def junit_xml(campaign: str, verdicts: Sequence[Verdict], whole: Overall, algori
         properties = Xml.SubElement(suite, "properties")
         for name, value in cells.items():
             Xml.SubElement(properties, "property", name=name, value=_text(value))
-    judged = judged_text(algorithms)
+    judged = format_judged_algorithms(algorithms)
     subject = f"Judged: {judged}. " if judged else ""
     for one in verdicts:
         case = Xml.SubElement(suite, "testcase", classname=_text(campaign), name=_text(one.requirement_id))

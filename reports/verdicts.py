@@ -21,7 +21,7 @@ import pandas as pd
 
 from marsyard.reports import rates
 from marsyard.reports.bounds import Looks, compute_bounds
-from marsyard.reports.sampled import INDEPENDENT, Sampled
+from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics.clusters import ClusteredEvidence, ClusterMethod
 from marsyard.reports.statistics.proportions import consumer_risk, minimum_sample_size
 from marsyard.reports.statistics.sequential import LaterLook
@@ -169,7 +169,7 @@ class Verdict:
 
 
 def judge_campaign(
-    frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], how: Sampled = INDEPENDENT
+    frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], how: SamplingDesign = INDEPENDENT
 ) -> list[Verdict]:
     """Judge every requirement on all rows of a campaign; missing columns or numbers give INSUFFICIENT, no exception.
 
@@ -178,7 +178,7 @@ def judge_campaign(
     return [_judge(how.drawn(frame), requirement, how) for requirement in requirements]
 
 
-def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: Sampled) -> Verdict:
+def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: SamplingDesign) -> Verdict:
     verdict = _unjudged(requirement)
     fault = _requirement_fault(frame, verdict)
     if fault:
@@ -211,7 +211,7 @@ def _withhold(verdict: Verdict, suspected: Verdict) -> Verdict:
     return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
 
 
-def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, frame: pd.DataFrame) -> Verdict:
+def _decide(verdict: Verdict, chosen: pd.DataFrame, how: SamplingDesign, frame: pd.DataFrame) -> Verdict:
     """The verdict by the members of its population, at least one, among all cases."""
     _, unknown = rates.members_and_unknown(chosen, verdict.population.split(" and "))
     success = np.asarray(rates.succeeded(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
@@ -241,7 +241,7 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: Sampled, frame: pd.Data
     return _advise(judged, bounds.further_cases, how)
 
 
-def _advise(verdict: Verdict, further: int, how: Sampled) -> Verdict:
+def _advise(verdict: Verdict, further: int, how: SamplingDesign) -> Verdict:
     """Add the number of further cases, or the advice why these cannot help."""
     shared = verdict.clustered
     counted = shared is not None and shared.method is ClusterMethod.TERRAIN_COUNT

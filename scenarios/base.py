@@ -9,8 +9,8 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel
 
+from marsyard.scenarios.algorithm_run import AlgorithmRun, Judged
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.trial import Attempt, Judged
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.terrain import Site, TerrainBank, TerrainParameters
 
@@ -55,8 +55,8 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
         return bank.missing_bytes(number)
 
 
-def judged_attempt(
-    attempt: Attempt[Any], answered: bool, row: Mapping[str, Scalar], products: Mapping[str, Any]
+def algorithm_result(
+    attempt: AlgorithmRun[Any], answered: bool, row: Mapping[str, Scalar], products: Mapping[str, Any]
 ) -> Judged:
     """Combine an algorithm's answer or failure with its columns and products."""
     return Judged(

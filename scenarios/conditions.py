@@ -38,10 +38,10 @@ def rendered(backend: Backend, pictures: Iterable[UInt16[np.ndarray, "rows colum
     digest = hashlib.sha256()
     for counts in pictures:
         digest.update(np.ascontiguousarray(counts).tobytes())
-    return rendered_as(backend, digest.hexdigest())
+    return picture_columns_of_hash(backend, digest.hexdigest())
 
 
-def rendered_as(backend: Backend, image_hash: str) -> dict[str, Scalar]:
+def picture_columns_of_hash(backend: Backend, image_hash: str) -> dict[str, Scalar]:
     """Return the same columns for a given hash of the pictures."""
     return {
         "image_hash": image_hash,

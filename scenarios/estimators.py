@@ -30,8 +30,8 @@ from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlob
 from marsyard.algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
 from marsyard.algorithms.streams import STREAM_METHODS, StreamedEstimator
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
-from marsyard.scenarios.dotted import found_at, sources_at
-from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, OfflineForm, check_offline, is_offline, made_offline
+from marsyard.scenarios.import_path import import_object, source_files
+from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, OfflineForm, check_offline, create_offline, is_offline
 from marsyard.scenarios.systems import systems
 
 #: Entry points of other packages' algorithms.
@@ -68,7 +68,7 @@ class Task(Generic[Algorithm, Options]):
         """Raise ValueError where the task has no algorithm of this name; the message states the allowed ones."""
         if spec in self.shipped:
             return
-        command = exchange.command_of(spec)
+        command = exchange.parse_command(spec)
         if command is not None:
             if self.executable is None:
                 raise ValueError(f"'{spec}': a {self.what} cannot be a program; allowed: a name, module:Class")
@@ -94,8 +94,8 @@ class Task(Generic[Algorithm, Options]):
         if spec in self.shipped:
             return self.shipped[spec](options)
         if is_offline(spec):
-            return cast(Algorithm, made_offline(spec, self._form(spec), case))
-        command = exchange.command_of(spec)
+            return cast(Algorithm, create_offline(spec, self._form(spec), case))
+        command = exchange.parse_command(spec)
         if command is not None and self.executable is not None:
             return self.executable(command, limits)
         algorithm = self._import(spec)()
@@ -107,7 +107,7 @@ class Task(Generic[Algorithm, Options]):
         """Return whether an algorithm takes any number of pictures; None if unknown before its creation."""
         if spec in self.shipped:
             return False
-        command = exchange.command_of(spec)
+        command = exchange.parse_command(spec)
         if command is not None:
             return command.stream
         if is_offline(spec):
@@ -132,7 +132,7 @@ class Task(Generic[Algorithm, Options]):
         """Import the class or function of another package's name, or of a path."""
         if ":" in spec:
             try:
-                return found_at(spec)
+                return import_object(spec)
             except ImportError as error:
                 raise ValueError(f"no algorithm at '{spec}': {error}") from error
         if spec not in installed():
@@ -205,7 +205,7 @@ def shipped_names() -> frozenset[str]:
     names: set[str] = set()
     for path in dict.fromkeys(path for system in systems() for path in system.tasks):
         with suppress(ImportError):  # the system's own campaigns report it
-            names.update(found_at(path).shipped)
+            names.update(import_object(path).shipped)
     return frozenset(names)
 
 
@@ -215,14 +215,14 @@ def installed() -> Mapping[str, EntryPoint]:
     return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
 
 
-def sources_of(spec: str) -> list[tuple[str, Path]]:
+def algorithm_sources(spec: str) -> list[tuple[str, Path]]:
     """Return the source files of a user's algorithm in Python by name; empty for all others."""
     path = installed()[spec].value if spec in installed() else spec
     is_external = is_offline(spec) or spec.startswith(tuple(exchange.PREFIXES))
-    return list(sources_at(path)) if ":" in path and not is_external and spec not in shipped_names() else []
+    return list(source_files(path)) if ":" in path and not is_external and spec not in shipped_names() else []
 
 
-def check_chosen(task: Task[Any, Any], specs: Sequence[str]) -> None:
+def check_algorithms(task: Task[Any, Any], specs: Sequence[str]) -> None:
     """Raise ValueError where an algorithm does not exist or is named twice."""
     for place, spec in enumerate(specs):
         task.check(spec)

@@ -50,7 +50,7 @@ def summed_rows(rows_summed: int) -> slice:
 
 
 @runtime_checkable
-class GivesSamples(Protocol):
+class ProvidesSamples(Protocol):
     """A scenario that provides samples for learning."""
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:

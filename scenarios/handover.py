@@ -20,18 +20,18 @@ class Handover(Generic[Given]):
     """One algorithm's read-only copy `given` of its inputs: data classes, arrays and poses."""
 
     def __init__(self, original: Given) -> None:
-        self.given = handed_copy(original)
-        self._fingerprint = fingerprint(self.given)
+        self.given = copy_inputs(original)
+        self._fingerprint = hash_inputs(self.given)
 
     def check(self) -> None:
         """Raise AlgorithmError (BAD_ANSWER) if the algorithm changed its copy, pictures included."""
-        if fingerprint(self.given) != self._fingerprint:
+        if hash_inputs(self.given) != self._fingerprint:
             raise AlgorithmError(
                 Fault.BAD_ANSWER, "it changed the measurements that it was given; allowed: to read them, or copies"
             )
 
 
-def handed_copy(original: Given, *, writable: bool = False) -> Given:
+def copy_inputs(original: Given, *, writable: bool = False) -> Given:
     """Return a deep copy whose arrays are read-only, or writable to detect changes.
 
     Rotations and transforms are immutable and not copied: a copy would be normalised again, with other last digits.
@@ -44,7 +44,7 @@ def handed_copy(original: Given, *, writable: bool = False) -> Given:
     return copied
 
 
-def fingerprint(value: Any, leave: tuple[str, ...] = ()) -> str:
+def hash_inputs(value: Any, leave: tuple[str, ...] = ()) -> str:
     """Compute the SHA-256 of all values in arrays, poses and data classes, without the fields in `leave`."""
     digest = hashlib.sha256()
     for part in _parts(value, leave):

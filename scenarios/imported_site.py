@@ -7,7 +7,7 @@ from pathlib import Path
 
 from marsyard.scenarios.terrain_files import check_source
 from marsyard.sim.terrain import Site, TerrainParameters, site
-from marsyard.sim.terrain.imported import RealTerrain, grid_for
+from marsyard.sim.terrain.imported import RealTerrain, choose_grid
 
 #: Suffixes of terrain models.
 ENDINGS = (".npz", ".tif", ".tiff")
@@ -39,7 +39,7 @@ def imported_site(path: Path, max_hole_fraction: float = MAX_HOLE_FRACTION) -> S
 
 @lru_cache(maxsize=4)
 def _imported(source: RealTerrain, _changed_ns: int) -> Site:
-    samples, spacing_m = grid_for(source)
+    samples, spacing_m = choose_grid(source)
     terrain = TerrainParameters(samples=samples, spacing_m=spacing_m, craters_per_km2=0.0, source=source)
     changes = {
         "name": source.dtm.name,

@@ -116,8 +116,8 @@ class SelectsInputs(Protocol):
 
 
 @runtime_checkable
-class TakesAlgorithms(Protocol):
-    """A scenario with selectable algorithms; its parameters contain those of `marsyard.scenarios.chosen`."""
+class HasAlgorithms(Protocol):
+    """A scenario with selectable algorithms; its parameters contain an `AlgorithmSelection`."""
 
     @property
     def task(self) -> Task[Any, Any]:
@@ -131,7 +131,7 @@ class TakesAlgorithms(Protocol):
 
 
 @runtime_checkable
-class TakesParts(Protocol):
+class HasParts(Protocol):
     """A scenario whose cases may use parts of a user (`marsyard.scenarios.parts`)."""
 
     @property

@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.own_files import OwnFile
+from marsyard.scenarios.user_files import UserFile
 from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, expanded_bytes
 from marsyard.sim.render import Objects, Scene
 from marsyard.sim.terrain import Surface
@@ -42,7 +42,7 @@ class MeshFileError(ValueError):
     """An unusable mesh; the message names the file, the fault, and the allowed values."""
 
 
-class MeshParameters(OwnFile):
+class MeshParameters(UserFile):
     """A mesh whose lowest point is `sink_m` below the ground."""
 
     kind: Annotated[Literal["rock", "lander", "landmark"], Field(description="what it is: rocks are smooth")] = "rock"
@@ -60,7 +60,7 @@ class MeshParameters(OwnFile):
     albedo: Annotated[float | None, Field(gt=0.0, lt=1.0, description="not stated: that of its kind")] = None
 
     @classmethod
-    def hash_of(cls, file: str) -> str:
+    def file_hash(cls, file: str) -> str:
         """Return the SHA-256 of a valid mesh file."""
         return read_mesh(file).sha256
 
@@ -103,7 +103,7 @@ def standing(meshes: Sequence[MeshParameters], surface: Surface, near: tuple[flo
     return Objects.joined([one.standing(surface, near) for one in meshes]) if meshes else Objects.none()
 
 
-def with_meshes(scene: Scene, meshes: Sequence[MeshParameters], near: tuple[float, float]) -> Scene:
+def add_meshes(scene: Scene, meshes: Sequence[MeshParameters], near: tuple[float, float]) -> Scene:
     """Add meshes to a scene; see `standing`."""
     if not meshes:
         return scene

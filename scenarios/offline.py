@@ -17,11 +17,11 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from marsyard.algorithms.answers import checked_site, checked_velocity
+from marsyard.algorithms.answers import check_site, check_velocity
 from marsyard.algorithms.exchange import write_case
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
-from marsyard.scenarios.own_files import (
+from marsyard.scenarios.user_files import (
     cells_by_column,
     check_together,
     finite_number,
@@ -83,13 +83,13 @@ def _velocity(outcome: Enum, numbers: Mapping[str, float]) -> VelocityEstimate:
         else np.array([[first, mixed], [mixed, second]]),
         span_s=None if start is None or end is None else (start, end),
     )
-    return checked_velocity(stated)
+    return check_velocity(stated)
 
 
 def _site(outcome: Enum, numbers: Mapping[str, float]) -> SiteEstimate:
     position = [numbers[name] for name in SITE_FORM.required if name in numbers]
     stated = SiteEstimate(SiteOutcome(outcome), np.array(position) if position else None)
-    return checked_site(stated) if position or stated.outcome.converged else stated
+    return check_site(stated) if position or stated.outcome.converged else stated
 
 
 def _with_site(estimate: SiteEstimate, measurements: LandingMeasurements) -> SiteEstimate:
@@ -134,15 +134,15 @@ def check_offline(spec: str, form: OfflineForm[Any]) -> None:
     """Raise ValueError where a table cannot be read; the message names lines and columns."""
     file = answers_file(spec)
     if file is not None:
-        answers_of(file, form)
+        read_answers(file, form)
 
 
-def made_offline(spec: str, form: OfflineForm[Any], case: int) -> Any:
+def create_offline(spec: str, form: OfflineForm[Any], case: int) -> Any:
     """Create the replacement of an algorithm in a case."""
     file = answers_file(spec)
     if file is None:
         return Recorder(Path(spec.removeprefix(EXPORT)) / CASES / f"{case:06d}", form)
-    return Answered(answers_of(file, form).get(case), f"{file.name} has no answer to case {case}", form)
+    return RecordedAnswer(read_answers(file, form).get(case), f"{file.name} has no answer to case {case}", form)
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class Recorder:
 
 
 @dataclass(frozen=True)
-class Answered(Generic[Answer]):
+class RecordedAnswer(Generic[Answer]):
     """Returns the answer of a table."""
 
     answer: Answer | None
@@ -178,7 +178,7 @@ class Answered(Generic[Answer]):
         return self.form.completed(self.answer, measurements)
 
 
-def answers_of(file: Path, form: OfflineForm[Answer]) -> Mapping[int, Answer]:
+def read_answers(file: Path, form: OfflineForm[Answer]) -> Mapping[int, Answer]:
     """Return the answers of a table by case. Raises ValueError, which lists all problems by line."""
     try:
         status = check_regular(file)

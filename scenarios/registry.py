@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from typing import cast
 
-from marsyard.scenarios.dotted import found_at
+from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.interface import Scenario
 from marsyard.scenarios.systems import problems, scenario_paths
 
@@ -32,7 +32,7 @@ def scenario(name: str) -> Scenario:
         message = f"unknown scenario '{name}'{hint}; allowed: {allowed}, or your own as 'module:Class'"
         raise UnknownScenarioError("; ".join((message, *problems())))
     try:
-        scenario_type = found_at(path)
+        scenario_type = import_object(path)
     except ImportError as error:
         raise UnknownScenarioError(f"no scenario at '{path}': {error}") from error
     missing = [

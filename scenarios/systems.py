@@ -17,7 +17,7 @@ from fnmatch import fnmatchcase
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
-from marsyard.scenarios.dotted import found_at
+from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.system import System
 
 #: Entry points of other packages' systems.
@@ -44,7 +44,7 @@ class Registry:
 @cache
 def registry() -> Registry:
     """Read the systems of this installation, once per process."""
-    usable: list[System] = [found_at(path) for path in BUILT_IN]
+    usable: list[System] = [import_object(path) for path in BUILT_IN]
     problems: list[str] = []
     for point in sorted(entry_points(group=GROUP), key=lambda one: (one.name, one.value)):
         try:
@@ -82,7 +82,7 @@ def system_of(scenario: str) -> System | None:
 def _load(point: EntryPoint, others: list[System]) -> System:
     """Load the system of an entry point. Raises ValueError where it is unusable or conflicts with the others."""
     try:
-        system = found_at(point.value)
+        system = import_object(point.value)
     except ImportError as error:
         raise ValueError(f"it cannot be imported: {error}") from error
     if not isinstance(system, System):
@@ -110,7 +110,7 @@ def _shared_names(system: System, other: System) -> Iterator[str]:
 
 
 @dataclass(frozen=True)
-class StatedColumns:
+class RowColumns:
     """Columns of a scenario's rows; a star in `flags` and `numbers` matches any text.
 
     - flags: columns of true and false
@@ -133,7 +133,7 @@ class StatedColumns:
 
 
 @cache
-def stated_columns(scenario: str) -> StatedColumns | None:
+def row_columns(scenario: str) -> RowColumns | None:
     """Return the columns of a scenario; None where its system does not state them. Raises ValueError for a bad file."""
     system = system_of(scenario)
     if system is None or system.columns is None:
@@ -142,6 +142,6 @@ def stated_columns(scenario: str) -> StatedColumns | None:
         stated = tomllib.loads(system.columns.read_text(encoding="utf-8")).get(scenario)
         if stated is None:
             return None
-        return StatedColumns(tuple(stated["flags"]), tuple(stated["numbers"]), stated.get("named_flags", ""))
+        return RowColumns(tuple(stated["flags"]), tuple(stated["numbers"]), stated.get("named_flags", ""))
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise ValueError(f"{system.columns}: states no columns: {type(error).__name__}: {error}") from error

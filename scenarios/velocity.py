@@ -10,11 +10,11 @@ from jaxtyping import Float64, UInt16
 from marsyard.algorithms.dimes import DimesDetails, dimes_products
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator
-from marsyard.algorithms.streams import StreamedEstimator, spanned
+from marsyard.algorithms.streams import StreamedEstimator, set_span
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
 from marsyard.scenarios.handover import Handover
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.offline import Answered, Recorder
-from marsyard.scenarios.trial import Attempt, attempted
+from marsyard.scenarios.offline import RecordedAnswer, Recorder
 from marsyard.sim.measurements import DescentMeasurements
 
 Horizontal = Float64[np.ndarray, "2"]
@@ -28,7 +28,7 @@ _THREE: Triple = (0, 1, 2)
 
 def asked(
     make: Callable[[], VelocityEstimator], measurements: DescentMeasurements, triple: Triple | None = _THREE
-) -> Attempt[VelocityEstimate]:
+) -> AlgorithmRun[VelocityEstimate]:
     """Run an estimator on a descent; the answer states its span.
 
     Streams and recorders get all pictures. Other estimators get three of them, and fail without.
@@ -39,7 +39,7 @@ def asked(
     def answer() -> object:
         nonlocal tags
         estimator = make()
-        if isinstance(estimator, StreamedEstimator | Recorder | Answered):
+        if isinstance(estimator, StreamedEstimator | Recorder | RecordedAnswer):
             return estimator.estimate(handover.given)
         if triple is None:
             raise ValueError(f"it takes three pictures, and {len(measurements.images)} are taken")
@@ -49,14 +49,14 @@ def asked(
 
     def check(answer: object) -> VelocityEstimate:
         handover.check()
-        return spanned(answer, tags)
+        return set_span(answer, tags)
 
-    return attempted(answer, check)
+    return run_algorithm(answer, check)
 
 
-def checked_last_interval(answer: object, measurements: DescentMeasurements) -> VelocityEstimate:
+def check_last_interval(answer: object, measurements: DescentMeasurements) -> VelocityEstimate:
     """Validate an answer for the last interval, the only one with known truth. Raises AlgorithmError."""
-    estimate = spanned(answer, measurements.tags_s)
+    estimate = set_span(answer, measurements.tags_s)
     if estimate.span_s not in (None, measurements.last_interval_s):
         raise AlgorithmError(
             Fault.BAD_ANSWER,

@@ -142,7 +142,7 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
         (eye.east_m, eye.north_m),
         sun,
         ground.photometry(sun),
-        objects=rocks_in_sight(ground, eye, reach),
+        objects=select_rocks(ground, eye, reach),
         ground_texture=Texture(ground.site.ground_texture.coarsest_m, ground.site.ground_texture.amplitudes),
         object_texture=Texture(ground.site.rock_texture.coarsest_m, ground.site.rock_texture.amplitudes),
         mesh_finest_m=finest,
@@ -152,7 +152,7 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
     )
 
 
-def rocks_in_sight(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Objects:
+def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Objects:
     """Select the rocks that the eye resolves, and near ones for their shadows; bodies carry the rocks' numbers.
 
     Where rocks of `SMALLEST_ROCK_PX` need more than about `ROCK_TRIANGLES`, only larger ones are taken. Rocks are so

@@ -1,5 +1,5 @@
 """The simulated world and its instruments. Truth lives here and nowhere else."""
 
-from marsyard.sim.kernel_cache import use_own_folder
+from marsyard.sim.kernel_cache import set_cache_folder
 
-use_own_folder()
+set_cache_folder()

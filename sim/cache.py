@@ -64,7 +64,7 @@ def kept_bytes(folder: Path) -> int:
     return total
 
 
-def make_room(folder: Path, wanted_bytes: int, in_use: Collection[Path] = ()) -> None:
+def evict_files(folder: Path, wanted_bytes: int, in_use: Collection[Path] = ()) -> None:
     """Delete the least recently used files of a folder until a file of `wanted_bytes` fits under the limit.
 
     Files `in_use` are never deleted. Unfinished files are deleted once they are a day old. Other processes may delete

@@ -32,7 +32,7 @@ def rigid_from_axes(axes: Float[np.ndarray, "3 3"], translation: Float[np.ndarra
     return RigidTransform(matrix, normalize=False, copy=False)  # ten times faster than with the check
 
 
-def composed(outer: RigidTransform, inner: RigidTransform) -> RigidTransform:
+def compose(outer: RigidTransform, inner: RigidTransform) -> RigidTransform:
     """Compose two single transforms, ``outer * inner``, five times faster than SciPy: without normalisation."""
     return RigidTransform(outer.as_matrix() @ inner.as_matrix(), normalize=False, copy=False)
 

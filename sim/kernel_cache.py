@@ -19,7 +19,7 @@ from marsyard.sim.processor import processor_features
 _FOLDERS = ("sim", "algorithms", "scenarios")
 
 
-def use_own_folder() -> None:
+def set_cache_folder() -> None:
     """Set numba's cache folder by the kernels' sources, without importing numba; the user's own setting is kept."""
     if "NUMBA_CACHE_DIR" in os.environ:
         return
@@ -42,7 +42,7 @@ def kernels_are_ready(user: str) -> bool:
     return mark is not None and mark.exists()
 
 
-def note_ready(user: str) -> None:
+def mark_ready(user: str) -> None:
     """Record that the kernels of this user are compiled."""
     mark = _mark(user)
     if mark is not None:
@@ -51,7 +51,7 @@ def note_ready(user: str) -> None:
             mark.touch()
 
 
-def compiled_functions() -> int:
+def count_compiled_functions() -> int:
     """Count the cached compiled functions; 0 if there is no cache."""
     folder = os.environ.get("NUMBA_CACHE_DIR")
     return 0 if folder is None else sum(1 for _ in Path(folder).rglob("*.nbc"))

@@ -66,7 +66,7 @@ def bin_mean(
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def placed_camera(
+def place_camera(
     camera: CameraModel, world_from_body: Rotation, altitude_m: float
 ) -> tuple[CameraModel, Float[np.ndarray, "3"]]:
     """A body's camera in a view's ground frame by attitude and altitude, and its position there.
@@ -90,7 +90,7 @@ def build_view(
     """
     columns, rows = bin_factors(image.counts.shape, binned_size)
     known = image.calibration
-    camera, centre = placed_camera(image.camera.binned(columns, rows), world_from_body, altitude_m)
+    camera, centre = place_camera(image.camera.binned(columns, rows), world_from_body, altitude_m)
     shared = before if before is not None and before.calibration is known else None
     return View(
         signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(known.offset_dn),

@@ -18,7 +18,7 @@ from marsyard.algorithms.exchange.files import (
     write_case,
     write_frame,
 )
-from marsyard.algorithms.exchange.process import PREFIXES, Command, ExecutableLimits, command_of
+from marsyard.algorithms.exchange.process import PREFIXES, Command, ExecutableLimits, parse_command
 from marsyard.algorithms.exchange.serving import ProgramDetails
 
 __all__ = [
@@ -32,7 +32,7 @@ __all__ = [
     "ExecutableVelocityStream",
     "Pictures",
     "ProgramDetails",
-    "command_of",
+    "parse_command",
     "read_case",
     "read_frame",
     "read_mast",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.answers import checked_aim, checked_site, checked_update, checked_velocity
+from marsyard.algorithms.answers import check_aim, check_site, check_update, check_velocity
 from marsyard.algorithms.exchange.files import (
     encode_pose,
     encode_target,
@@ -62,7 +62,7 @@ class ExecutableVelocityEstimator:
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """The program's answer."""
         answer, details = ask_case(self.command, self.limits, lambda folder: write_case(folder, measurements))
-        return attach_stderr(details.stderr, lambda: checked_velocity(_read_velocity(answer, details)))
+        return attach_stderr(details.stderr, lambda: check_velocity(_read_velocity(answer, details)))
 
 
 class ExecutableVelocityStream:
@@ -111,7 +111,7 @@ class ExecutableSiteEstimator:
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """The program's answer."""
         answer, details = ask_case(self.command, self.limits, lambda folder: write_case(folder, measurements))
-        return attach_stderr(details.stderr, lambda: checked_site(_read_site(answer, details)))
+        return attach_stderr(details.stderr, lambda: check_site(_read_site(answer, details)))
 
 
 class ExecutableTargetTracker:
@@ -142,13 +142,13 @@ class ExecutableTargetTracker:
         """The requested mast angles and image parts."""
         values = {"world_from_rover": encode_pose(world_from_rover), "mast": self._write_mast(mast)}
         answer, details = self._session.ask("aim", values)
-        return attach_stderr(details.stderr, lambda: checked_aim(_read_aim(answer), mast))
+        return attach_stderr(details.stderr, lambda: check_aim(_read_aim(answer), mast))
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """The program's answer to the images of a stop."""
         values = {"mast": self._write_mast(measurements.mast)}
         answer, details = self._session.ask("update", values, {"stop": lambda folder: write_stop(folder, measurements)})
-        update = attach_stderr(details.stderr, lambda: checked_update(_read_update(answer, details)))
+        update = attach_stderr(details.stderr, lambda: check_update(_read_update(answer, details)))
         self._state = update.state
         return update
 
@@ -177,7 +177,7 @@ def _read_stream_answer(answer: Mapping[str, Any], details: ProgramDetails) -> V
     if answer.get("outcome", "") is None:
         check_keys(answer, {"outcome"})
         return None
-    return checked_velocity(_read_velocity(answer, details))
+    return check_velocity(_read_velocity(answer, details))
 
 
 def _read_velocity(answer: Mapping[str, Any], details: ProgramDetails) -> VelocityEstimate:

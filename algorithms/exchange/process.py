@@ -68,7 +68,7 @@ PREFIXES: Mapping[str, tuple[bool, bool]] = {
 }
 
 
-def command_of(text: str) -> Command | None:
+def parse_command(text: str) -> Command | None:
     """Parse a command (`exec:./mine --flag`); None for a text without one of the prefixes.
 
     Raises ValueError if the program does not exist or a quote is not closed.

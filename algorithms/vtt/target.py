@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.frames import SITE_FROM_WORLD, composed
+from marsyard.sim.frames import SITE_FROM_WORLD, compose
 from marsyard.sim.measurements import RoverTarget, SiteTarget
 
 
@@ -22,7 +22,7 @@ def designated_position_world(
 
 def pose_change(old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform) -> RigidTransform:
     """The transform from the old frame into the new frame."""
-    return composed(new_world_from_frame.inv(), old_world_from_frame)
+    return compose(new_world_from_frame.inv(), old_world_from_frame)
 
 
 def predicted_position(

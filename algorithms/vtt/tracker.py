@@ -37,7 +37,7 @@ from marsyard.algorithms.vtt.target import (
     roll_angle,
 )
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.frames import composed
+from marsyard.sim.frames import compose
 from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasurements, TargetDesignation
 
 
@@ -180,7 +180,7 @@ class Stop:
         """The stop of these measurements."""
         angles = (measurements.azimuth_rad, measurements.elevation_rad)
         rover_from_head = measurements.mast.geometry.rover_from_head(*angles)
-        return cls(measurements, rover_from_head, composed(measurements.world_from_rover, rover_from_head))
+        return cls(measurements, rover_from_head, compose(measurements.world_from_rover, rover_from_head))
 
     @property
     def left(self) -> CameraModel:

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from marsyard.reports.history import FINISHED, Comparison, History, NightCampaign, NightFigure, changes, comparisons_of
+from marsyard.reports.history import FINISHED, Comparison, History, NightCampaign, NightFigure, changes, compare_night
 from marsyard.reports.statistics.changes import Sample
 
 #: How a campaign's cases lie on terrains.
@@ -72,7 +72,7 @@ def quiet_nights(nights: int, seed: int) -> int:
             night = history.begin(None)
             for kind in KINDS:
                 history.add(night, NightCampaign(kind, "", "", "PASS", 0, ""), yard.night(kind))
-            found = changes(comparisons_of(history, night))
+            found = changes(compare_night(history, night))
             history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in found])
             alarms += bool(found)
     return alarms

@@ -15,7 +15,7 @@ from marsyard.reports.statistics.clusters import clustered_evidence
 from marsyard.reports.statistics.plane import error_ellipse
 from marsyard.reports.statistics.proportions import Interval, proportion_lower, proportion_upper
 from marsyard.reports.statistics.samples import mean_interval, quantile_bounds, spread_interval
-from marsyard.reports.statistics.sequential import confidence_at, looks_of
+from marsyard.reports.statistics.sequential import confidence_at, planned_looks
 
 CONFIDENCE = 0.9
 #: Cases on a terrain, and what is asked and risked in simulated campaigns.
@@ -153,7 +153,7 @@ def _decided(rng: np.random.Generator, asked: float, most: int, correlation: flo
         success, terrain = _cases(rng, asked, correlation, -(-most // _ON_TERRAIN))
         order = rng.permutation(success.size)
         success, terrain = success[order][:most], terrain[order][:most]
-    for look in looks_of(most):
+    for look in planned_looks(most):
         confidence, first = confidence_at(CONFIDENCE, look.share), success[: look.cases]
         if correlation is None:
             seen = int(first.sum()), look.cases, confidence

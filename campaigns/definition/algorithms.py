@@ -11,12 +11,12 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from marsyard.algorithms.exchange import command_of
+from marsyard.algorithms.exchange import parse_command
 from marsyard.campaigns.definition.campaign import Campaign, value_at
 from marsyard.campaigns.definition.identity import custom_sources, hash_sources, selected_algorithms
-from marsyard.scenarios.dotted import found_at, sources_at
 from marsyard.scenarios.estimators import Task, installed
-from marsyard.scenarios.interface import TakesAlgorithms
+from marsyard.scenarios.import_path import import_object, source_files
+from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.offline import is_offline
 
 
@@ -28,7 +28,7 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
     `version` attribute; None where there is neither), `options` and `source_hash` (SHA-256, 16 digits).
     """
     scenario = campaign.scenario
-    if not isinstance(scenario, TakesAlgorithms):
+    if not isinstance(scenario, HasAlgorithms):
         return []
     path = ".".join((*scenario.algorithm_table, "compared"))
     try:
@@ -57,12 +57,12 @@ def _describe(task: Task[Any, Any], spec: str, parameters: BaseModel) -> dict[st
         kind = type(algorithm)
         path, version = f"{kind.__module__}:{kind.__qualname__}", _distribution_version("marsyard")
         return {"path": path, "version": version, "options": _plain_options(getattr(algorithm, "options", None))}
-    command = command_of(spec)
+    command = parse_command(spec)
     if command is not None or is_offline(spec):
         path = spec.partition(":")[2] if command is None else command.words[0]
         return {"path": path, "version": None, "options": {}}
     point = installed().get(spec)
-    path, target = (spec, found_at(spec)) if point is None else (point.value, point.load())
+    path, target = (spec, import_object(spec)) if point is None else (point.value, point.load())
     options = _plain_options(getattr(target, "options", None))
     return {"path": path, "version": _custom_version(path, target), "options": options}
 
@@ -99,5 +99,5 @@ def _plain_options(options: object) -> dict[str, Any]:
 
 def _source_hash(task: Task[Any, Any], spec: str) -> str | None:
     """Hash of the names and contents of an algorithm's sources; None where no source can be read."""
-    sources = list(sources_at("algorithms:") if spec in task.shipped else custom_sources(spec))
+    sources = list(source_files("algorithms:") if spec in task.shipped else custom_sources(spec))
     return hash_sources((name, Path(path)) for name, path in sources)[:16] if sources else None

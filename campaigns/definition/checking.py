@@ -17,9 +17,9 @@ from marsyard.campaigns.errors import not_allowed
 from marsyard.campaigns.sampling.dispersion import Dispersion
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
 from marsyard.scenarios.estimators import labels
-from marsyard.scenarios.interface import TakesParts
+from marsyard.scenarios.interface import HasParts
 from marsyard.scenarios.parts.named import SCORE
-from marsyard.scenarios.systems import StatedColumns, stated_columns
+from marsyard.scenarios.systems import RowColumns, row_columns
 
 #: Cases whose draws are validated before a campaign starts; the range of each dispersion is checked in full.
 _CHECKED_CASES = 32
@@ -205,14 +205,14 @@ def metric_problems(campaign: Campaign) -> list[tuple[Key, str]]:
     return problems
 
 
-def _stated_columns(campaign: Campaign) -> StatedColumns | None:
+def _stated_columns(campaign: Campaign) -> RowColumns | None:
     """Columns of the scenario and of the campaign's parameters; None where they are not known."""
     configuration = campaign.configuration
-    stated = stated_columns(configuration.scenario)
+    stated = row_columns(configuration.scenario)
     if stated is None:
         return None
     scores: list[str] = []
-    keys = campaign.scenario.part_keys if isinstance(campaign.scenario, TakesParts) else {}
+    keys = campaign.scenario.part_keys if isinstance(campaign.scenario, HasParts) else {}
     for path in (path for path, kind in keys.items() if kind is SCORE):
         if path in configuration.dispersions:
             return None

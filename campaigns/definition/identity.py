@@ -16,17 +16,17 @@ from typing import Any, Self
 
 from pydantic import ValidationError
 
-from marsyard.algorithms.exchange import command_of
+from marsyard.algorithms.exchange import parse_command
 from marsyard.campaigns.definition.campaign import leaves, value_at
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
-from marsyard.scenarios.dotted import relative_to
-from marsyard.scenarios.estimators import sources_of
-from marsyard.scenarios.interface import Scenario, TakesAlgorithms, TakesParts
+from marsyard.scenarios.estimators import algorithm_sources
+from marsyard.scenarios.import_path import relative_to
+from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
 from marsyard.scenarios.offline import answers_file
-from marsyard.scenarios.own_files import input_files
 from marsyard.scenarios.registry import UnknownScenarioError, scenario, scenario_source
+from marsyard.scenarios.user_files import input_files
 
 #: Packages on whose code rows depend; reports and commands change no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")
@@ -121,7 +121,7 @@ def _file_hash(path: Path) -> str:
 def selected_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """Algorithms under test that a configuration or its dispersions name."""
     used = _scenario(configuration)
-    if not isinstance(used, TakesAlgorithms):
+    if not isinstance(used, HasAlgorithms):
         return ()
     table: Any = configuration.parameters
     for part in used.algorithm_table:
@@ -136,7 +136,7 @@ def selected_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]
 def selected_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """Import paths (``module:name``) of the custom parts that a configuration or its dispersions name."""
     used = _scenario(configuration)
-    if not isinstance(used, TakesParts):
+    if not isinstance(used, HasParts):
         return ()
     trees = [configuration.parameters]
     for path, dispersion in configuration.dispersions.items():
@@ -204,7 +204,7 @@ def custom_sources(named: str) -> Iterator[tuple[str, Path]]:
         yield table.name, table
         return
     try:
-        command = command_of(named)
+        command = parse_command(named)
     except ValueError:
         return
     if command is not None:
@@ -213,7 +213,7 @@ def custom_sources(named: str) -> Iterator[tuple[str, Path]]:
         yield from ((path.name, path) for path in words if path.is_file())
         return
 
-    yield from sources_of(named)
+    yield from algorithm_sources(named)
 
 
 def package_versions() -> dict[str, str]:

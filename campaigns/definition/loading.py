@@ -18,7 +18,7 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, K
 from marsyard.campaigns.definition.requirements import completed
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
 from marsyard.campaigns.sampling.correlation import KINDS
-from marsyard.scenarios.interface import Scenario, TakesAlgorithms
+from marsyard.scenarios.interface import HasAlgorithms, Scenario
 from marsyard.scenarios.registry import UnknownScenarioError, scenario
 
 #: Keys of the file that `--set` may name; any other key is one of the parameters.
@@ -130,7 +130,7 @@ def _select_algorithms(
         selected = None
     if selected is None:
         return dict(tables)
-    if not isinstance(selected, TakesAlgorithms):
+    if not isinstance(selected, HasAlgorithms):
         raise ConfigurationError([Problem(options[0], "", f"the scenario of {where} has no choice of algorithms")])
     changed = dict(tables)
     stated: tuple[tuple[str, Any, str], ...] = (

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from marsyard.scenarios.systems import scenario_paths
-from marsyard.sim.kernel_cache import compiled_functions, kernels_are_ready
+from marsyard.sim.kernel_cache import count_compiled_functions, kernels_are_ready
 
 #: Seconds between two reports.
 REPORT_INTERVAL_S = 10.0
@@ -24,11 +24,11 @@ def compilation_reported(scenario: str, note: Callable[[str], None]) -> Iterator
         yield lambda: None
         return
     note("compiling numeric kernels once on this machine, about two minutes (ahead of time: marsyard compile)")
-    ended, began, before = threading.Event(), time.monotonic(), compiled_functions()
+    ended, began, before = threading.Event(), time.monotonic(), count_compiled_functions()
 
     def report() -> None:
         while not ended.wait(REPORT_INTERVAL_S):
-            number = compiled_functions() - before
+            number = count_compiled_functions() - before
             note(f"compiling numeric kernels: {number} functions so far, {time.monotonic() - began:.0f} s")
 
     def finish() -> None:

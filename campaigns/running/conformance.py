@@ -11,7 +11,15 @@ from marsyard.campaigns.execution.work import Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import LOADING_S, TaskResult, accept_process_state, start_clock
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.outcomes import CaseEndedError
-from marsyard.scenarios.conformance import EXAMINED, Finding, Subject, check_names, check_subject, run_check, task_of
+from marsyard.scenarios.conformance import (
+    SUBJECT_KINDS,
+    Finding,
+    Subject,
+    check_names,
+    check_subject,
+    determine_task,
+    run_check,
+)
 
 #: Limits of output and memory of a check.
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
@@ -22,10 +30,10 @@ def subject_of(spec: str, task: str | None, limit_s: float) -> Subject:
 
     Raises CampaignError where the name or the task is unknown.
     """
-    if task is not None and task not in EXAMINED:
-        raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(EXAMINED)}")
+    if task is not None and task not in SUBJECT_KINDS:
+        raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(SUBJECT_KINDS)}")
     try:
-        chosen = task_of(spec) if task is None else task
+        chosen = determine_task(spec) if task is None else task
         check_subject(spec, chosen)
     except ValueError as error:
         raise CampaignError(str(error)) from error

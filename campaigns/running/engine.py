@@ -29,14 +29,14 @@ from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.outcomes import RETRYABLE, UNFINISHED
 from marsyard.campaigns.running.compilation import compilation_reported
 from marsyard.campaigns.running.inputs import plan_inputs
-from marsyard.campaigns.running.replay import loaded_campaign, replay_with
+from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.retention import ProductStore, keep_while_running
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, showcase_case, worst_cases, write_table
-from marsyard.scenarios.systems import StatedColumns, stated_columns
-from marsyard.sim.kernel_cache import note_ready
+from marsyard.scenarios.systems import RowColumns, row_columns
+from marsyard.sim.kernel_cache import mark_ready
 
 
 class Watch(Protocol):
@@ -119,7 +119,7 @@ def resume_campaign(
             except ValidationError as error:
                 raise CampaignError(f"--case-time {case_time_s}: {error.errors()[0]['msg'].lower()}") from error
             configuration = configuration.model_copy(update={"limits": limits})
-        campaign = loaded_campaign(directory, configuration)
+        campaign = load_stored_campaign(directory, configuration)
         _continue_campaign(campaign, directory, executor, watch, "resume", retry=retry, allow_changed=allow_changed)
 
 
@@ -134,18 +134,18 @@ def append_cases(
         state = record.read(directory)["state"]
         if state != "finished":
             raise CampaignError(f"{directory} is not finished ({state}): marsyard resume {directory}")
-        campaign = with_block(directory, cases)
+        campaign = campaign_with_block(directory, cases)
         _continue_campaign(campaign, directory, executor, watch, "append", allow_changed=allow_changed)
 
 
-def with_block(directory: Path, cases: int) -> Campaign:
+def campaign_with_block(directory: Path, cases: int) -> Campaign:
     """Stored campaign with another block of cases, which is not run. Raises CampaignError as `append_cases` does."""
     configuration = record.stored_configuration(directory)
     appended = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
     problems = [message for _, message in appended.sampling_problems()]
     if cases < 1 or problems:
         raise CampaignError(f"{cases} cases cannot be added to {directory}: {'; '.join(problems) or 'at least 1'}")
-    return loaded_campaign(directory, appended)
+    return load_stored_campaign(directory, appended)
 
 
 def _with_record(directory: Path) -> Path:
@@ -265,7 +265,7 @@ def _run_cases(
         finished = next((one.row for one in ended if one.row["outcome"] not in UNFINISHED), None)
         if not checked and finished is not None:
             check_metrics(configuration, finished, run.directory)
-            note_ready(configuration.scenario)
+            mark_ready(configuration.scenario)
             first_case_ended()
             checked = True
         for _ in ended:
@@ -315,7 +315,7 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
     Raises ConfigurationError where a requirement names a missing column, or one of another type: numbers for a metric
     with a bound, true and false for a metric without one and for a population.
     """
-    stated = stated_columns(configuration.scenario) or StatedColumns((), ())
+    stated = row_columns(configuration.scenario) or RowColumns((), ())
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
     flag_kind = "column of true and false"

@@ -21,8 +21,8 @@ from marsyard.campaigns.running.engine import Watch, resume_campaign, run_campai
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import TABLE_FILE, read_rows
 from marsyard.scenarios.estimators import Task
-from marsyard.scenarios.interface import TakesAlgorithms
-from marsyard.scenarios.offline import ANSWERS, CASES, answers_of
+from marsyard.scenarios.interface import HasAlgorithms
+from marsyard.scenarios.offline import ANSWERS, CASES, read_answers
 from marsyard.scenarios.registry import scenario
 
 #: Description of an exported folder for programs, and for the team that answers.
@@ -109,7 +109,7 @@ def scored_campaign(exported: Exported, answers: Path) -> Campaign:
         raise CampaignError(f"{exported.directory} and {exported.truth} belong to different exports")
     exporting = Campaign(stored, scenario(stored.scenario))
     _check_answers(exporting, answers)
-    table = exporting.scenario.algorithm_table if isinstance(exporting.scenario, TakesAlgorithms) else ()
+    table = exporting.scenario.algorithm_table if isinstance(exporting.scenario, HasAlgorithms) else ()
     parameters = replaced(stored.parameters, [*table, "algorithm"], f"{ANSWERS}{answers.resolve()}")
     changed = stored.model_copy(update={"parameters": parameters, "retain": Retain()})
     return Campaign(CampaignConfiguration.model_validate(changed.model_dump()), exporting.scenario)
@@ -134,7 +134,7 @@ def _check_answers(campaign: Campaign, answers: Path) -> None:
     if form is None:
         raise CampaignError(f"{campaign.configuration.name} cannot be answered in a table")
     try:
-        found = answers_of(answers, form)
+        found = read_answers(answers, form)
     except ValueError as error:
         raise CampaignError(str(error)) from error
     total = campaign.configuration.total_cases
@@ -156,12 +156,12 @@ def _some(cases: Sequence[int]) -> str:
 
 
 def _task(campaign: Campaign) -> Task[Any, Any]:
-    if not isinstance(campaign.scenario, TakesAlgorithms):
+    if not isinstance(campaign.scenario, HasAlgorithms):
         raise CampaignError(f"the scenario of {campaign.configuration.name} has no choice of algorithms")
     return campaign.scenario.task
 
 
-def other_pictures(truth: Path, scored: Path) -> list[int]:
+def cases_with_changed_pictures(truth: Path, scored: Path) -> list[int]:
     """Cases whose pictures differed between export and scoring."""
     exported = {row["case"]: row.get("image_hash") for row in read_rows(truth / TABLE_FILE)}
     rows = read_rows(scored / TABLE_FILE)

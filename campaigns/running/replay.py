@@ -59,7 +59,7 @@ def replay(directory: Path, case: int) -> Replay:
     configuration = stored_configuration(directory)
     if not 0 <= case < configuration.total_cases:
         raise CampaignError(f"{directory} has no case {case}; allowed: 0 to {configuration.total_cases - 1}")
-    loaded_campaign(directory, configuration)
+    load_stored_campaign(directory, configuration)
     stored = stored_row(directory, case)
     identity = read(directory).get("identity")
     changed = Identity.read(identity).differences(identity_of(configuration)) if identity else []
@@ -100,7 +100,7 @@ def _is_missing(value: Any) -> bool:
     return value is None or value != value
 
 
-def loaded_campaign(directory: Path, configuration: CampaignConfiguration) -> Campaign:
+def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) -> Campaign:
     """Campaign of a stored configuration, with its scenario and algorithms imported.
 
     Raises ConfigurationError where the scenario or an algorithm cannot be imported, or a parameter is not accepted.

@@ -188,7 +188,7 @@ def grid_probabilities(sizes: Mapping[str, int], point: int) -> dict[str, float]
     return {path: (int(level) + 0.5) / size for (path, size), level in zip(sizes.items(), levels, strict=True)}
 
 
-def said_of(kind: str, grids: Sequence[str], *, nominal: bool) -> str:
+def describe_design(kind: str, grids: Sequence[str], *, nominal: bool) -> str:
     """Sampling design in words."""
     names = {"random": "random draws", "latin-hypercube": "Latin hypercube", "sobol": "scrambled Sobol"}
     text = names.get(kind, kind)

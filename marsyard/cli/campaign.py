@@ -119,12 +119,12 @@ def append(
 ) -> None:
     """Add cases to a finished campaign, run them, and judge all."""
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.campaigns.running.engine import append_cases, with_block
+    from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.record import stored_configuration
 
     if stored_configuration(directory).most_cases is not None:
         raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
-    _print_limits(with_block(directory, cases))
+    _print_limits(campaign_with_block(directory, cases))
     executor = make_executor(jobs, cluster)
     run_and_judge(directory, lambda watch: append_cases(directory, cases, executor, watch, allow_changed=allow_changed))
 

@@ -11,9 +11,9 @@ from marsyard.campaigns.running.engine import Watch, append_cases, run_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli.outcome import read_frame
 from marsyard.reports.evaluation import next_look
-from marsyard.reports.sampled import sampled
+from marsyard.reports.sampling_design import sampled
 from marsyard.reports.statistics.proportions import minimum_sample_size
-from marsyard.reports.statistics.sequential import looks_of
+from marsyard.reports.statistics.sequential import planned_looks
 from marsyard.reports.verdicts import ESTIMATE, judge_campaign
 from marsyard.reports.wording import count, stated
 
@@ -70,7 +70,9 @@ def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorCon
     if all(asked.decide_by == ESTIMATE for asked in configuration.requirements):
         raise CampaignError("--until-decided: the campaign has no requirement that is decided at a confidence")
     limit = configuration.total_cases
-    first = configuration.model_copy(update={"cases": looks_of(limit)[0].cases, "appended": (), "most_cases": limit})
+    first = configuration.model_copy(
+        update={"cases": planned_looks(limit)[0].cases, "appended": (), "most_cases": limit}
+    )
     command = (*campaign.command, "--until-decided")
     run_campaign(Campaign(first, campaign.scenario, command), directory, executor, watch)
     continue_until_decided(directory, executor, watch)

@@ -51,7 +51,7 @@ PLATES: Sequence[tuple[str, str, dict[str, Any]]] = (
 
 
 @dataclass(frozen=True)
-class Plate:
+class SvgFigure:
     """A picture for the page: its shot, its grey levels, and its file of full size next to the page."""
 
     shot: Shot
@@ -83,7 +83,7 @@ def gallery(
         typer.echo(write_gallery(plates, out))
 
 
-def plate(number: int, shot: Shot) -> Plate:
+def plate(number: int, shot: Shot) -> SvgFigure:
     """One picture as its camera's detector delivers it; of a pair the left one."""
     import numpy as np
 
@@ -92,7 +92,7 @@ def plate(number: int, shot: Shot) -> Plate:
         raise ValueError("only what a detector delivered can be displayed")
     signal = np.clip(picture.counts - picture.exposed.detector.parameters.offset_dn, 0.0, None)
     grey = displayed(signal, np.isfinite(picture.frame.range_m))
-    return Plate(shot, grey, f"{number:02d}-{shot.site}-{shot.camera}.jpg")
+    return SvgFigure(shot, grey, f"{number:02d}-{shot.site}-{shot.camera}.jpg")
 
 
 def displayed(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarray, "rows columns"]) -> Grey:
@@ -111,7 +111,7 @@ def displayed(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarr
     return grey
 
 
-def write_gallery(plates: Sequence[Plate], folder: Path) -> Path:
+def write_gallery(plates: Sequence[SvgFigure], folder: Path) -> Path:
     """Write the page, the pictures next to it and the contact sheet; return the page's path."""
     from importlib.metadata import version
 
@@ -137,7 +137,7 @@ def write_gallery(plates: Sequence[Plate], folder: Path) -> Path:
     return folder / PAGE
 
 
-def contact_sheet(plates: Sequence[Plate]) -> bytes:
+def contact_sheet(plates: Sequence[SvgFigure]) -> bytes:
     """All pictures small, as a PNG file of at most `SHEET_BYTES`, with as many greys as fit."""
     import cv2
     import numpy as np
@@ -178,7 +178,7 @@ def _cell(grey: Grey) -> Grey:
     return shrunk
 
 
-def _template_values(one: Plate) -> dict[str, Any]:
+def _template_values(one: SvgFigure) -> dict[str, Any]:
     """A picture's values in the page's template."""
     import base64
 

@@ -124,7 +124,7 @@ def compile_kernels() -> None:
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.execution.worker_process import limit_threads
     from marsyard.scenarios.systems import systems
-    from marsyard.sim.kernel_cache import kernels_are_ready, note_ready
+    from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 
     limit_threads()
     for name, settings in (one for system in systems() for one in system.compiled_by.items()):
@@ -135,5 +135,5 @@ def compile_kernels() -> None:
             continue
         began = time.monotonic()
         campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
-        note_ready(scenario)
+        mark_ready(scenario)
         typer.echo(f"{scenario}: compiled, {time.monotonic() - began:.0f} s")

@@ -55,12 +55,12 @@ def ingest(
 def _ingested(path: str, folder: Path, out: Path) -> Ingested:
     """Write the cases of a folder with the function at ``module:NAME``, and their campaign; all of it or nothing."""
     from marsyard.campaigns.errors import CampaignError, StoreError
-    from marsyard.scenarios.dotted import found_at
+    from marsyard.scenarios.import_path import import_object
 
     unfinished = out.with_name(f"{out.name}.part{os.getpid()}")
     try:
         unfinished.mkdir(parents=True)
-        made: Ingested = found_at(path)(folder, unfinished, out.resolve())
+        made: Ingested = import_object(path)(folder, unfinished, out.resolve())
         (unfinished / CAMPAIGN_FILE).write_text(made.campaign, encoding="utf-8")
         if out.exists():
             out.rmdir()

@@ -48,7 +48,7 @@ def new(
     from marsyard.campaigns.errors import CampaignError, not_allowed
     from marsyard.cli.evidence import evidence_limits
     from marsyard.reports.wording import count
-    from marsyard.scenarios.dotted import found_at
+    from marsyard.scenarios.import_path import import_object
     from marsyard.scenarios.systems import template_paths
     from marsyard.scenarios.template import Choices
 
@@ -61,7 +61,7 @@ def new(
     chosen = system or _answer("System", next(iter(known)), asked, _one_of(list(known)))
     if chosen not in known:
         raise CampaignError(f"--system: {not_allowed('system', chosen, known)}")
-    template: CampaignTemplate = found_at(known[chosen])
+    template: CampaignTemplate = import_object(known[chosen])
     given = Choices(
         name, site or "", camera or "", detector or "", flight or "", axes, math.nan if bound is None else bound, cases
     )

@@ -103,9 +103,9 @@ def _run_one(now: _Night, planned: PlannedCampaign, folder: Path, watch: Watch) 
 
 
 def _changes(history: History, night: int) -> list[Change]:
-    from marsyard.reports.history import changes, comparisons_of
+    from marsyard.reports.history import changes, compare_night
 
-    return changes(comparisons_of(history, night))
+    return changes(compare_night(history, night))
 
 
 def _publish(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
@@ -120,12 +120,12 @@ def _publish(history: History, night: int, out: Path, found: Sequence[Change]) -
 def _write_page(history: History, night: int, out: Path, found: Sequence[Change]) -> str:
     """Write the page of the night so far, and return it."""
     from marsyard.reports.campaign import write_whole
-    from marsyard.reports.history import comparisons_of, night_text
+    from marsyard.reports.history import compare_night, night_text
 
     nights = history.nights()
     now = next(one for one in nights if one.night == night)
     earlier = [one for one in nights if one.night < night]
-    compared = sum(bool(one.before) for one in comparisons_of(history, night))
+    compared = sum(bool(one.before) for one in compare_night(history, night))
     text = night_text(now, earlier, history.campaigns(night), found, compared)
     write_whole(out / PAGE_FILE, text)
     return text

@@ -77,7 +77,7 @@ def score(
 ) -> None:
     """Score external answers: the scores, verdicts and report of a run."""
     from marsyard.campaigns.running.engine import Watch, run_campaign
-    from marsyard.campaigns.running.offline import Exported, other_pictures, scored_campaign, truth_folder
+    from marsyard.campaigns.running.offline import Exported, cases_with_changed_pictures, scored_campaign, truth_folder
     from marsyard.reports.wording import count
 
     exported = Exported(directory, truth if truth is not None else truth_folder(directory))
@@ -87,7 +87,7 @@ def score(
 
     def run(watch: Watch) -> None:
         run_campaign(campaign, target, make_executor(jobs, cluster), watch)
-        other = other_pictures(exported.truth, target)
+        other = cases_with_changed_pictures(exported.truth, target)
         if other:
             watch.note(
                 f"other pictures here than were exported: {count(len(other), 'case')}, the first case {other[0]}"

@@ -58,14 +58,14 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
 
     Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
-    from marsyard.reports.campaign import write_judged
+    from marsyard.reports.campaign import write_evaluation
     from marsyard.reports.evaluation import judged
 
     found = judged(directory, requirements)
     if requirements is None and found.run.said("state") == "finished":
         record.update(directory, {"exit_code": found.exit_code})
     with writing("the report"):
-        return found, write_judged(found)
+        return found, write_evaluation(found)
 
 
 def _comparison_tables(

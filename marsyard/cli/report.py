@@ -70,21 +70,31 @@ def compare(
     Exit status 0 in any case: a difference is not a verdict.
     """
     from marsyard.cli.showing import grid_table
-    from marsyard.reports.comparison import contrast_data, contrast_grid, contrasts, same_grounds
+    from marsyard.reports.comparison import (
+        campaign_diff_data,
+        campaign_diff_grid,
+        compare_campaigns,
+        have_same_terrains,
+    )
     from marsyard.reports.stored import read_run
 
     runs = [read_run(directory) for directory in (first, second)]
-    paired, found = contrasts(*runs)
+    paired, found = compare_campaigns(*runs)
     names = [str(run.directory) for run in runs]
     if as_json:
-        runs_data = {"first": names[0], "second": names[1], "paired": paired, "same_terrains": same_grounds(*runs)}
-        typer.echo(json.dumps({**runs_data, "figures": contrast_data(found)}, indent=2))
+        runs_data = {
+            "first": names[0],
+            "second": names[1],
+            "paired": paired,
+            "same_terrains": have_same_terrains(*runs),
+        }
+        typer.echo(json.dumps({**runs_data, "figures": campaign_diff_data(found)}, indent=2))
         return
     out = console()
-    out.print(grid_table("Side by side", contrast_grid(["first", "second"], found)))
+    out.print(grid_table("Side by side", campaign_diff_grid(["first", "second"], found)))
     for place, name in zip(("first", "second"), names, strict=True):
         out.print(f"{place}: {name}", markup=False, highlight=False, soft_wrap=True)
-    grounds = "terrain by terrain" if same_grounds(*runs) else "terrains of their own against one another"
+    grounds = "terrain by terrain" if have_same_terrains(*runs) else "terrains of their own against one another"
     how = "the same draws, compared in pairs" if paired else f"draws of their own, compared {grounds}"
     out.print(f"Cases: {how}. p: two-sided, corrected for the number of figures (Holm).", soft_wrap=True)
 
@@ -146,7 +156,7 @@ def _rerun_notable_cases(directory: Path) -> None:
     Raises CampaignError where the campaign's scenario or an algorithm cannot be imported.
     """
     from marsyard.campaigns.execution.workers import LocalExecutor
-    from marsyard.campaigns.running.replay import loaded_campaign, replay_with
+    from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
     from marsyard.campaigns.store.products import save_packed
     from marsyard.campaigns.store.record import stored_configuration
     from marsyard.campaigns.store.retention import case_directory
@@ -159,7 +169,7 @@ def _rerun_notable_cases(directory: Path) -> None:
     if not lacking:
         return
     configuration = stored_configuration(directory)
-    loaded_campaign(directory, configuration)
+    load_stored_campaign(directory, configuration)
     with LocalExecutor(1) as workers:
         for case in lacking:
             replayed = replay_with(workers, configuration, case, stored_row(directory, case))

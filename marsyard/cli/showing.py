@@ -16,7 +16,7 @@ from rich.text import Text
 from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, description_at
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.sampling.design import said_of
+from marsyard.campaigns.sampling.design import describe_design
 from marsyard.campaigns.sampling.dispersion import Dispersion
 from marsyard.reports.columns import split_unit
 from marsyard.reports.wording import asked_text, count
@@ -120,7 +120,7 @@ def _print_head(configuration: CampaignConfiguration, console: Console) -> None:
 
 def _sampling_text(configuration: CampaignConfiguration) -> str:
     design = configuration.design
-    return said_of(design.kind, list(configuration.grids), nominal=design.nominal)
+    return describe_design(design.kind, list(configuration.grids), nominal=design.nominal)
 
 
 def _parameters(configuration: CampaignConfiguration) -> Table:

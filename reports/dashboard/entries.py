@@ -15,7 +15,7 @@ from marsyard.campaigns.definition.requirements import StatedRequirement
 from marsyard.campaigns.errors import CampaignError
 from marsyard.reports.campaign import SCHEMA, TWIN_FILE, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
-from marsyard.reports.traceability import Algorithm, algorithms_of, judged_text
+from marsyard.reports.traceability import Algorithm, algorithms_of, format_judged_algorithms
 from marsyard.reports.verdicts import ESTIMATE
 from marsyard.reports.wording import NOTHING, percent
 from marsyard.scenarios.systems import system_of
@@ -73,7 +73,7 @@ class Entry:
     @property
     def judged(self) -> str:
         """Names and versions of the judged algorithms; names from the rows where the record states none."""
-        return judged_text(self.tested) or ", ".join(self.algorithms)
+        return format_judged_algorithms(self.tested) or ", ".join(self.algorithms)
 
     @property
     def finished(self) -> bool:

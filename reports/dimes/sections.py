@@ -19,7 +19,7 @@ from marsyard.reports import kinds, rates
 from marsyard.reports.columns import axis_columns, label, magnitude_label, numbers, split_unit
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Plate, Section, Subject, grid_of, plate
+from marsyard.reports.section import Block, Grid, Section, Subject, SvgFigure, grid_of, plate
 from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.svg import MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.wording import NOTHING, count, note_text, number, percent, stated
@@ -118,7 +118,7 @@ def _field_note(found: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def scatter_plates(subject: Subject) -> list[Plate]:
+def scatter_plates(subject: Subject) -> list[SvgFigure]:
     """Signed errors of each category on equal axes (the paper's Fig. 10)."""
     frame, metric = subject.frame, subject.metric
     parts = axis_columns(metric, [str(name) for name in frame.columns])[:2] if metric else []
@@ -255,7 +255,7 @@ LANDING = kinds.SectionDeclaration(
 #: Drivers that the paper compares, all of which must vary; and further ones.
 ASKED = ("descent_rate_m_s", "altitude_1_m", "attitude_rate_max_deg_s")
 FURTHER = ("off_nadir_max_deg", "horizontal_speed_m_s", "sun_elevation_deg")
-FEWEST_CASES = 50
+MIN_CASES = 50
 #: The same rows give the same page.
 _SEED = 20050815
 
@@ -309,7 +309,7 @@ def rank_effects(subject: Subject, metric: str) -> list[Driver]:
     columns = [name for name in (*ASKED, *FURTHER) if rates.varies(frame, name)]
     conditions = np.column_stack([numbers(frame, name) for name in columns]) if columns else np.zeros((len(frame), 0))
     finite = np.isfinite(magnitude) & np.isfinite(conditions).all(axis=1)
-    if not set(ASKED) <= set(columns) or finite.sum() < FEWEST_CASES:
+    if not set(ASKED) <= set(columns) or finite.sum() < MIN_CASES:
         return []
     x, y = conditions[finite], magnitude[finite]
     if np.ptp(y) == 0.0 or (np.ptp(x, axis=0) == 0.0).any():

@@ -174,7 +174,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return corrected
 
 
-def compared_successes(
+def compare_successes(
     first: Bool[np.ndarray, " n"], other: Bool[np.ndarray, " n"], groups: Groups = None
 ) -> tuple[int, int, float]:
     """Numbers of cases in which only the first and only the other succeeds, and the two-sided p-value."""
@@ -186,7 +186,7 @@ def compared_successes(
     return only_first, only_other, p
 
 
-def compared_errors(
+def compare_errors(
     differences: Float[np.ndarray, " n"], groups: Groups, confidence: float
 ) -> tuple[float, float, float, float]:
     """Mean of paired differences, its interval, and the two-sided p-value of symmetry about zero.

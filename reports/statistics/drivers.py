@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy import optimize, stats
 
 #: Fewest cases that say anything.
-FEWEST_CASES = 20
+MIN_CASES = 20
 #: Cases in a bin of the share of variance, and the most bins.
 _CASES_PER_BIN, _MOST_BINS = 15, 20
 
@@ -62,7 +62,7 @@ def driver(
     """
     known = np.isfinite(condition) & np.isfinite(response)
     n = int(known.sum())
-    if n < FEWEST_CASES or np.ptp(condition[known]) == 0.0 or np.ptp(response[known]) == 0.0:
+    if n < MIN_CASES or np.ptp(condition[known]) == 0.0 or np.ptp(response[known]) == 0.0:
         return None
     x, y = stats.rankdata(condition[known]), stats.rankdata(response[known])
     effective = float(n) if groups is None else n / _design_effect(x, y, groups[known])

@@ -41,7 +41,7 @@ class Look:
     share: float
 
 
-def looks_of(cases: int) -> tuple[Look, ...]:
+def planned_looks(cases: int) -> tuple[Look, ...]:
     """Looks of a campaign of at most `cases` cases: at the last case, at half of them, a quarter, and so on."""
     if cases < 1:
         raise ValueError(f"{cases} cases; a campaign has at least one")
@@ -53,7 +53,7 @@ def looks_of(cases: int) -> tuple[Look, ...]:
     return tuple(Look(place, (place - last) / cases) for place, last in zip(places, before, strict=True))
 
 
-def spent_share(looks: tuple[Look, ...], cases: int) -> float:
+def spent_fraction(looks: tuple[Look, ...], cases: int) -> float:
     """Fraction of the risk for a verdict from a number of cases: that of the first look with at least as many.
 
     For more cases than at the last look it is that look's: cases added to a stopped campaign gain nothing.

@@ -5,6 +5,13 @@
 """
 
 from marsyard.scenarios.conformance.checks import Finding
-from marsyard.scenarios.conformance.suite import EXAMINED, Subject, check_names, check_subject, run_check, task_of
+from marsyard.scenarios.conformance.suite import (
+    SUBJECT_KINDS,
+    Subject,
+    check_names,
+    check_subject,
+    determine_task,
+    run_check,
+)
 
-__all__ = ["EXAMINED", "Finding", "Subject", "check_names", "check_subject", "run_check", "task_of"]
+__all__ = ["SUBJECT_KINDS", "Finding", "Subject", "check_names", "check_subject", "determine_task", "run_check"]

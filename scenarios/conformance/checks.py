@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from marsyard.algorithms.faults import AlgorithmError
-from marsyard.scenarios.estimators import sources_of
-from marsyard.scenarios.handover import fingerprint, handed_copy
+from marsyard.scenarios.estimators import algorithm_sources
+from marsyard.scenarios.handover import copy_inputs, hash_inputs
 
 #: Modules of `marsyard` that an algorithm may import (docs/architecture.md).
 OPEN_MODULES = ("marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements", "marsyard.algorithms")
@@ -125,7 +125,7 @@ class Suite(ABC):
 
     def _answer(self, case: Any, seed: int = 1) -> Any:
         """Checked answer of a new algorithm or part to a copy of a case's input."""
-        return self._check_answer(self._call(self.make(), handed_copy(case, writable=self.writable), seed), case)
+        return self._check_answer(self._call(self.make(), copy_inputs(case, writable=self.writable), seed), case)
 
     def common_checks(self) -> Iterator[Check]:
         """Checks of unchanged inputs, repeatability, time, and imports."""
@@ -142,10 +142,10 @@ class Suite(ABC):
 
     def _leaves_inputs(self) -> str:
         for case in self.cases():
-            copy = handed_copy(case, writable=True)
-            before = fingerprint(copy)
+            copy = copy_inputs(case, writable=True)
+            before = hash_inputs(copy)
             self._call(self.make(), copy, 1)
-            if fingerprint(copy) != before:
+            if hash_inputs(copy) != before:
                 raise BreachError(f"it changed its input, a {type(case).__name__}")
         return ""
 
@@ -158,8 +158,8 @@ class Suite(ABC):
             if answer_print(self._answer(case)) != first:
                 raise BreachError("asked twice, it answers differently to the same case")
             for other in self._other_cases():
-                self._call(used, handed_copy(other, writable=self.writable), 2)
-            again = self._call(used, handed_copy(case, writable=self.writable), 1)
+                self._call(used, copy_inputs(other, writable=self.writable), 2)
+            again = self._call(used, copy_inputs(case, writable=self.writable), 1)
             if answer_print(self._check_answer(again, case)) != first:
                 raise BreachError(self.dependence)
         return ""
@@ -192,7 +192,7 @@ def timed(call: Callable[[], object]) -> float:
 
 def answer_print(answer: Any) -> str:
     """Fingerprint of an answer without its details, which may contain times."""
-    return fingerprint(answer, ("details",))
+    return hash_inputs(answer, ("details",))
 
 
 def _seed_global_generators(seed: int) -> None:
@@ -204,7 +204,7 @@ def _seed_global_generators(seed: int) -> None:
 def closed_imports(spec: str) -> list[str]:
     """Imports in a Python algorithm's sources that give access to the truth: file, line and name."""
     closed = []
-    for name, path in sources_of(spec):
+    for name, path in algorithm_sources(spec):
         try:
             nodes = list(ast.walk(ast.parse(path.read_bytes())))
         except (SyntaxError, ValueError):

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.algorithms.answers import checked_site, checked_velocity
+from marsyard.algorithms.answers import check_site, check_velocity
 from marsyard.algorithms.interface import SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, answer_print
-from marsyard.scenarios.handover import handed_copy
+from marsyard.scenarios.handover import copy_inputs
 from marsyard.sim.measurements import DescentMeasurements
 
 #: Pictures of an ordinary stream; of shortened streams, too short and long enough for an answer; of a long stream.
@@ -46,7 +46,7 @@ def _describe_velocity(estimate: VelocityEstimate) -> str:
 
 VELOCITY = Protocol(
     measurements=inputs.descent,
-    check=checked_velocity,
+    check=check_velocity,
     is_valid=lambda estimate: estimate.outcome is VelocityOutcome.VALID,
     describe=_describe_velocity,
     failures=", ".join(one.name for one in VelocityOutcome if one is not VelocityOutcome.VALID),
@@ -54,7 +54,7 @@ VELOCITY = Protocol(
 STREAM = replace(VELOCITY, measurements=partial(inputs.descent, _PICTURES))
 LANDING = Protocol(
     measurements=inputs.landing,
-    check=checked_site,
+    check=check_site,
     is_valid=lambda estimate: estimate.outcome.converged,
     describe=lambda estimate: str(estimate.outcome.name),
     failures=", ".join(one.name for one in SiteOutcome if not one.converged),
@@ -135,9 +135,9 @@ class EstimatorSuite(Suite):
         expected = answer_print(self._answer(measurements))
         used = self.make()
         used.stream.start()
-        for frame in handed_copy(inputs.noisy(measurements)).frames()[:2]:
+        for frame in copy_inputs(inputs.noisy(measurements)).frames()[:2]:
             used.stream.picture(frame)
-        if answer_print(used.estimate(handed_copy(measurements))) != expected:
+        if answer_print(used.estimate(copy_inputs(measurements))) != expected:
             raise BreachError("started again after two pictures, it answers differently")
         return ""
 

@@ -10,12 +10,12 @@ from typing import Any
 from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
 from marsyard.scenarios.conformance import estimators, parts, trackers
 from marsyard.scenarios.conformance.checks import Finding, Suite
-from marsyard.scenarios.dotted import found_at
 from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
+from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.parts.named import KINDS
 
 #: Tasks and kinds with a suite, words of the command line.
-EXAMINED = (*TASKS, *KINDS)
+SUBJECT_KINDS = (*TASKS, *KINDS)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def run_check(subject: Subject, number: int) -> Finding:
     return list(subject.suite().checks())[number].finding()
 
 
-def task_of(spec: str) -> str:
+def determine_task(spec: str) -> str:
     """Task or kind of a name by its entry point, methods or annotations; velocity if they do not determine it.
 
     Raises ValueError if the algorithm does not exist.
@@ -87,7 +87,7 @@ def task_of(spec: str) -> str:
     if ":" not in path:
         VELOCITY.check(spec)
     try:
-        algorithm = found_at(path)
+        algorithm = import_object(path)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"no algorithm at '{spec}': {error}") from error
     if hasattr(algorithm, "designate"):

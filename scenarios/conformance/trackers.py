@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.answers import checked_aim, checked_update
+from marsyard.algorithms.answers import check_aim, check_update
 from marsyard.algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.pointing import mast_angles
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, timed
 from marsyard.scenarios.conformance.inputs import MEAN, TexturedPlane, texture
-from marsyard.scenarios.handover import fingerprint, handed_copy
+from marsyard.scenarios.handover import copy_inputs, hash_inputs
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements
@@ -112,11 +112,11 @@ class TrackerSuite(Suite):
     def _has_states(self) -> str:
         tracker = self.make()
         _expect_state(tracker, "before a target is designated", TrackingState.NO_TARGET)
-        tracker.designate(handed_copy(designation()), pose(0.0))
+        tracker.designate(copy_inputs(designation()), pose(0.0))
         _expect_state(tracker, "once a target is designated", TrackingState.NORMAL)
         tracker.clear()
         _expect_state(tracker, "once it is cleared", TrackingState.NO_TARGET)
-        update = checked_update(tracker.update(handed_copy(taken(_box_ahead(), pose(0.0)))))
+        update = check_update(tracker.update(copy_inputs(taken(_box_ahead(), pose(0.0)))))
         if update.state is not TrackingState.NO_TARGET:
             raise BreachError(f"asked without a target, it answers {update.state.name}; allowed: NO_TARGET")
         return ""
@@ -137,16 +137,16 @@ class TrackerSuite(Suite):
         tracker = self.make()
         drive(tracker)
         measurements = replace(taken(_box_ahead(), pose(0.0)), world_from_rover=pose(3.0))
-        return checked_update(tracker.update(handed_copy(measurements))).state.name
+        return check_update(tracker.update(copy_inputs(measurements))).state.name
 
     def _leaves_inputs(self) -> str:
-        tracker, target = self.make(), handed_copy(designation(), writable=True)
-        target_before = fingerprint(target)
+        tracker, target = self.make(), copy_inputs(designation(), writable=True)
+        target_before = hash_inputs(target)
         tracker.designate(target, pose(0.0))
-        measurements = handed_copy(taken(_aim_at_target(tracker, pose(0.0)), pose(0.0)), writable=True)
-        before = fingerprint(measurements)
+        measurements = copy_inputs(taken(_aim_at_target(tracker, pose(0.0)), pose(0.0)), writable=True)
+        before = hash_inputs(measurements)
         tracker.update(measurements)
-        if fingerprint(target) != target_before or fingerprint(measurements) != before:
+        if hash_inputs(target) != target_before or hash_inputs(measurements) != before:
             raise BreachError("it changed its input, the designation or the measurements")
         return ""
 
@@ -154,18 +154,18 @@ class TrackerSuite(Suite):
         """Longest time of an update in a drive after a first one, which compiles kernels."""
         drive(self.make())
         tracker = self.make()
-        tracker.designate(handed_copy(designation()), pose(0.0))
+        tracker.designate(copy_inputs(designation()), pose(0.0))
         times = []
         for number in range(_STOPS):
             here = pose(number * _STEP_M)
-            measurements = handed_copy(taken(_aim_at_target(tracker, here), here))
+            measurements = copy_inputs(taken(_aim_at_target(tracker, here), here))
             times.append(timed(partial(tracker.update, measurements)))
         return max(times)
 
 
 def drive(tracker: Any) -> Sequence[TargetUpdate]:
     """Designate the target and drive towards it; returns the updates at the stops, up to a failure."""
-    tracker.designate(handed_copy(designation()), pose(0.0))
+    tracker.designate(copy_inputs(designation()), pose(0.0))
     updates: list[TargetUpdate] = []
     for number in range(_STOPS):
         update = stop(tracker, pose(number * _STEP_M))
@@ -179,17 +179,17 @@ def drive(tracker: Any) -> Sequence[TargetUpdate]:
 
 def stop(tracker: Any, here: RigidTransform, blank: int | None = None) -> TargetUpdate | None:
     """Aim, take pictures and update, checked against the interface; None without an aim."""
-    aim = checked_aim(tracker.aim(here, handed_copy(mast())), mast())
+    aim = check_aim(tracker.aim(here, copy_inputs(mast())), mast())
     if aim is None:
         return None
-    update = checked_update(tracker.update(handed_copy(taken(aim, here, blank))))
+    update = check_update(tracker.update(copy_inputs(taken(aim, here, blank))))
     if tracker.state is not update.state:
         raise BreachError(f"its state is {tracker.state}, but its update says {update.state}")
     return update
 
 
 def _aim_at_target(tracker: Any, here: RigidTransform) -> MastAim:
-    aim = checked_aim(tracker.aim(here, handed_copy(mast())), mast())
+    aim = check_aim(tracker.aim(here, copy_inputs(mast())), mast())
     if aim is None:
         raise BreachError("it finds no aim at a target 8 m ahead, in full view")
     return aim

@@ -12,7 +12,7 @@ from marsyard.scenarios.descent.faults import faulty_times
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.recorded import AFTER_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.parts.motions import DescentPlace, OwnMotion
+from marsyard.scenarios.parts.motions import CustomMotion, DescentPlace
 from marsyard.sim.dynamics import State, SwingDescent, Trajectory
 from marsyard.sim.dynamics.recorded import TrajectoryFileError
 from marsyard.sim.streams import Streams
@@ -56,7 +56,7 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
     """
     ground = float(surface.height(p.place.east_m, p.place.north_m))
     below = np.array([p.place.east_m, p.place.north_m, ground])
-    if isinstance(p.flight, OwnMotion):
+    if isinstance(p.flight, CustomMotion):
         return _own_motion(p, p.flight, below, surface, streams)
     if p.flight is not None:
         recorded = p.flight.motion(below, gravity_m_s2(p))
@@ -77,7 +77,7 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
 
 def _own_motion(
     p: DescentScenarioParameters,
-    flight: OwnMotion,
+    flight: CustomMotion,
     below: Float64[np.ndarray, "3"],
     surface: Surface,
     streams: Streams,

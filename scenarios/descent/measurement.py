@@ -15,7 +15,12 @@ from marsyard.scenarios.descent.optics import calibrated_camera
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.parts.instruments import InstrumentReadings, InstrumentTruth, OwnAltimeter, OwnAttitudeSource
+from marsyard.scenarios.parts.instruments import (
+    CustomAltimeter,
+    CustomAttitudeSource,
+    InstrumentReadings,
+    InstrumentTruth,
+)
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from marsyard.sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter, Readings
@@ -57,7 +62,7 @@ class Instruments:
             imu=imu,
             navigation=_propagate_navigation(p, approach, imu, flight, streams),
             altimeter=own["altimeter"][0]
-            if isinstance(p.altimeter, OwnAltimeter)
+            if isinstance(p.altimeter, CustomAltimeter)
             else RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
             clock=clock,
             attitude_source=own["attitude_source"][0] if "attitude_source" in own else None,
@@ -81,7 +86,7 @@ def _read_own_instruments(
     results: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
     for table, times in (("altimeter", np.array(p.picture_times_s)), ("attitude_source", tags_s)):
         own = getattr(p, table)
-        if isinstance(own, OwnAltimeter | OwnAttitudeSource):
+        if isinstance(own, CustomAltimeter | CustomAttitudeSource):
             truth = InstrumentTruth(
                 times_s=times,
                 motion=motion,

@@ -8,15 +8,15 @@ from typing import Annotated, Any
 from pydantic import Field, Tag, field_validator, model_validator
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.descent.faults import Faults, faulty_times
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.meshes import MeshParameters
-from marsyard.scenarios.parts.instruments import OwnAltimeter, OwnAttitudeSource
-from marsyard.scenarios.parts.motions import OwnMotion
-from marsyard.scenarios.parts.named import usual_or
-from marsyard.scenarios.parts.scores import OwnScores, ScoredDescent
+from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitudeSource
+from marsyard.scenarios.parts.motions import CustomMotion
+from marsyard.scenarios.parts.named import default_or_custom
+from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
 from marsyard.scenarios.terrain_files import check_terrain
 from marsyard.sim.dynamics import SwingParameters
 from marsyard.sim.parameters import Parameters, bounded
@@ -24,11 +24,11 @@ from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
     ApproachParameters,
     ClockParameters,
+    CustomCamera,
+    CustomCameraChoice,
     DetectorChoice,
     DetectorParameters,
     ImuParameters,
-    OwnCamera,
-    OwnCameraChoice,
     RadarParameters,
 )
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
@@ -89,7 +89,7 @@ class CameraParameters(Parameters):
     A user's own `model` replaces focal length, pixels and distortion.
     """
 
-    model: Annotated[OwnCameraChoice | None, Field(description="own camera: path of its file, or table")] = None
+    model: Annotated[CustomCameraChoice | None, Field(description="own camera: path of its file, or table")] = None
     focal_length_mm: Annotated[float, Field(gt=1.0, le=1000.0)] = 14.67
     pixel_pitch_um: Annotated[float, Field(gt=0.5, le=100.0)] = 12.0
     columns: Annotated[int, Field(ge=64, le=4096)] = 1024
@@ -112,15 +112,16 @@ class RenderParameters(Parameters):
 
 
 Flight = Annotated[
-    Annotated[FlightFile, Tag("FlightFile")] | Annotated[OwnMotion, Tag("OwnMotion")], usual_or(FlightFile, OwnMotion)
+    Annotated[FlightFile, Tag("FlightFile")] | Annotated[CustomMotion, Tag("CustomMotion")],
+    default_or_custom(FlightFile, CustomMotion),
 ]
 Altimeter = Annotated[
-    Annotated[RadarParameters, Tag("RadarParameters")] | Annotated[OwnAltimeter, Tag("OwnAltimeter")],
-    usual_or(RadarParameters, OwnAltimeter),
+    Annotated[RadarParameters, Tag("RadarParameters")] | Annotated[CustomAltimeter, Tag("CustomAltimeter")],
+    default_or_custom(RadarParameters, CustomAltimeter),
 ]
 
 
-class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
+class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     """Parameters of a descent campaign.
 
     A `site` sets light, gravity, texture and rocks; keys of the table `terrain` change the site's own terrain. A site
@@ -150,7 +151,7 @@ class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
     imu: ImuParameters = ImuParameters()
     approach: ApproachParameters = ApproachParameters()
     altimeter: Altimeter = RadarParameters()
-    attitude_source: Annotated[OwnAttitudeSource | None, Field(description="own source of attitudes")] = None
+    attitude_source: Annotated[CustomAttitudeSource | None, Field(description="own source of attitudes")] = None
     clock: Annotated[ClockParameters, Field(description="of the pictures' time tags")] = ClockParameters(
         offset_sd_s=0.001, jitter_sd_s=0.0005
     )
@@ -191,7 +192,7 @@ class DescentScenarioParameters(ChosenAlgorithms, OwnScores):
     @model_validator(mode="after")
     def _pictures_can_be_binned(self) -> DescentScenarioParameters:
         """By the detector's rows, and to DIMES' size, as each case reports DIMES' feasible overlap."""
-        camera: CameraParameters | OwnCamera = self.camera if self.camera.model is None else self.camera.model
+        camera: CameraParameters | CustomCamera = self.camera if self.camera.model is None else self.camera.model
         columns, rows = camera.columns, camera.rows
         if rows % self.detector.rows_summed:
             raise ValueError(

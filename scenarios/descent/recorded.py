@@ -10,8 +10,8 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.own_axes import RecordedAxes
-from marsyard.scenarios.own_files import OwnFile
+from marsyard.scenarios.recorded_axes import RecordedAxes
+from marsyard.scenarios.user_files import UserFile
 from marsyard.sim.dynamics.recorded import RecordedMotion, RecordedPoses, TrajectoryFileError, read_poses
 from marsyard.sim.parameters import bounded
 
@@ -19,7 +19,7 @@ from marsyard.sim.parameters import bounded
 AFTER_S = 0.5
 
 
-class FlightFile(OwnFile, RecordedAxes):
+class FlightFile(UserFile, RecordedAxes):
     """A recorded flight: a CSV, Parquet, TUM or EuRoC file of poses, or SPICE kernels.
 
     Positions are the camera's, or with `lever_m` the vehicle's. The first picture is at the file's time
@@ -37,7 +37,7 @@ class FlightFile(OwnFile, RecordedAxes):
     turn_deg: Annotated[float, bounded(-720.0, 720.0, "rotation about the vertical, clockwise from above")] = 0.0
 
     @classmethod
-    def hash_of(cls, file: str) -> str:
+    def file_hash(cls, file: str) -> str:
         """SHA-256 of the file; its poses are checked."""
         return read_poses(file).sha256
 

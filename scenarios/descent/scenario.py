@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from marsyard.scenarios.base import TerrainScenario, judged_attempt
+from marsyard.scenarios.algorithm_run import Judged, case_result
+from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import rendered
 from marsyard.scenarios.descent.exposure import take_exposures
 from marsyard.scenarios.descent.faults import faulty_terrain
@@ -37,7 +38,6 @@ from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.optics import Optics
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredDescent, scored
-from marsyard.scenarios.trial import Judged, case_result
 from marsyard.scenarios.velocity import (
     Horizontal,
     Span,
@@ -206,4 +206,4 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
         row |= scored(p.scores, case, {*row, *shared})
     pictures = pictures_of_figures(descent.pictures, estimate, p.triple_indices)
     products = {**velocity_products(pictures, estimate, true), **stream_products(estimate, descent.truth)}
-    return judged_attempt(attempt, velocity is not None, row, products)
+    return algorithm_result(attempt, velocity is not None, row, products)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 
 from marsyard.algorithms.dimes import DimesDetails, DimesOptions, propagated
-from marsyard.algorithms.dimes.binning import View, altitudes_at_images, bin_factors, placed_camera
+from marsyard.algorithms.dimes.binning import View, altitudes_at_images, bin_factors, place_camera
 from marsyard.algorithms.dimes.overlap import search_geometry, template_candidates
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, sun_columns
@@ -189,7 +189,7 @@ def feasible_overlap_row(
     views = []
     for state in states:
         altitude_m = float(state.position_m[2] - world.surface.height(state.position_m[0], state.position_m[1], level))
-        placed, centre = placed_camera(camera.binned(columns, rows), state.attitude, altitude_m)
+        placed, centre = place_camera(camera.binned(columns, rows), state.attitude, altitude_m)
         views.append(View(blank, blank, placed, centre, state.time_s, calibration, calibration.rows_summed * rows))
     sun = world.sun.direction
     first, second = (

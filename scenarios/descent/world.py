@@ -9,7 +9,7 @@ import numpy as np
 from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.exposure import sunlight_ratio
-from marsyard.scenarios.meshes import MeshParameters, with_meshes
+from marsyard.scenarios.meshes import MeshParameters, add_meshes
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Photometry, Scene, Sun
@@ -76,5 +76,5 @@ class World:
             scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry(), mesh_finest_m=finest)
         else:
             scene = site_scene(self.ground, Eye(east_m, north_m, lowest_m, pixel_rad), self.sun)
-        scene = with_meshes(scene, self.meshes, (east_m, north_m))
+        scene = add_meshes(scene, self.meshes, (east_m, north_m))
         return replace(scene, caster_diameter_m=caster_diameter_m, clouds=clouds)

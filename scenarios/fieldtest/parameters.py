@@ -6,10 +6,10 @@ from typing import Annotated
 
 from pydantic import AwareDatetime, Field, field_validator, model_validator
 
-from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.optics import CalibrationParameters
-from marsyard.scenarios.parts.scores import OwnScores, ScoredFlight
+from marsyard.scenarios.parts.scores import CustomScores, ScoredFlight
 from marsyard.sim.dynamics.helicopter import HelicopterParameters
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.render import CloudParameters
@@ -120,7 +120,7 @@ class TripleParameters(Parameters):
     most_step_m: Annotated[Positive, Field(description="most height between pictures apart, m (assumed)")] = 390.0
 
 
-class FieldTestParameters(ChosenAlgorithms, OwnScores):
+class FieldTestParameters(AlgorithmSelection, CustomScores):
     """A field test: its runs and their common settings. Case i is a triple of one of the runs."""
 
     task = VELOCITY

@@ -11,7 +11,8 @@ from jaxtyping import Float64, UInt16
 from pydantic import BaseModel
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.base import LoadGround, TerrainScenario, judged_attempt
+from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm_on_copy
+from marsyard.scenarios.base import LoadGround, TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, rendered, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import render_state, sunlight_ratio
@@ -22,8 +23,7 @@ from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.optics import camera_optics, draw_calibrated
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredFlight, scored
-from marsyard.scenarios.trial import Judged, attempted_with, case_result
-from marsyard.scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
@@ -103,9 +103,9 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         }
 
         def judge(algorithm: str) -> Judged:
-            attempt = attempted_with(
+            attempt = run_algorithm_on_copy(
                 lambda given: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(given),
-                lambda answer: checked_last_interval(answer, measurements),
+                lambda answer: check_last_interval(answer, measurements),
                 measurements,
             )
             estimate = attempt.answer
@@ -120,7 +120,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
                     motion=run.flight,
                 )
                 row |= scored(p.scores, scored_flight, {*row, *conditions})
-            return judged_attempt(attempt, velocity is not None, row, velocity_products(pictures, estimate, truth))
+            return algorithm_result(attempt, velocity is not None, row, velocity_products(pictures, estimate, truth))
 
         return case_result(p.algorithms, judge, conditions)
 

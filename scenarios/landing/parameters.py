@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.hda import HdaOptions, TrackSeed
-from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.descent.parameters import Place, RenderParameters, SunParameters
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.landing.faults import Faults
@@ -18,17 +18,17 @@ from marsyard.scenarios.landing.pair_choice import PairParameters
 from marsyard.scenarios.landing.relief import Limits
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.optics import CalibrationParameters
-from marsyard.scenarios.parts.scores import OwnScores, ScoredLanding
+from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
 from marsyard.scenarios.terrain_files import check_terrain
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.sensor import (
     PRESETS,
     AutoExposureParameters,
+    CustomCamera,
     DetectorChoice,
     LaserParameters,
-    NamedOrOwnCamera,
-    OwnCamera,
+    NamedOrCustomCamera,
     preset,
 )
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
@@ -84,7 +84,7 @@ class LanderParameters(Parameters):
         return Limits(self.diameter_m, float(np.radians(self.max_slope_deg)), self.max_roughness_m)
 
 
-class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
+class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     """All parameters of the landing scenario; `terrain` holds changes of the site's terrain at the stated scale."""
 
     task = LANDING
@@ -98,7 +98,7 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom meshes on the ground")] = ()
     texture: NonNegative = Field(default=1.0, le=10.0, description="contrast of the fine texture, over the site's own")
     sun: SunParameters = SunParameters()
-    camera: NamedOrOwnCamera = Field(default="xc-55", description="nadir camera preset, or a table with file")
+    camera: NamedOrCustomCamera = Field(default="xc-55", description="nadir camera preset, or a table with file")
     calibration: CalibrationParameters = Field(default=CalibrationParameters(), description="camera calibration errors")
     detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
     exposure: Annotated[AutoExposureParameters, Field(description="how the exposure is set")] = AutoExposureParameters()
@@ -128,8 +128,8 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
 
     @field_validator("camera")
     @classmethod
-    def _check_camera(cls, name: str | OwnCamera) -> str | OwnCamera:
-        if isinstance(name, OwnCamera):
+    def _check_camera(cls, name: str | CustomCamera) -> str | CustomCamera:
+        if isinstance(name, CustomCamera):
             return name
         down = [known for known in PRESETS if preset(known).design.down]
         if name not in down:
@@ -178,7 +178,7 @@ class LandingScenarioParameters(ChosenAlgorithms, OwnScores):
     @property
     def optics(self) -> CameraModel:
         """The camera in the body frame."""
-        return self.camera.camera() if isinstance(self.camera, OwnCamera) else preset(self.camera).cameras()[0]
+        return self.camera.camera() if isinstance(self.camera, CustomCamera) else preset(self.camera).cameras()[0]
 
     @model_validator(mode="after")
     def _check_faults(self) -> LandingScenarioParameters:

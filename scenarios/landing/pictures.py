@@ -13,7 +13,7 @@ from marsyard.scenarios.faults import faulty_detector
 from marsyard.scenarios.landing.faults import delivered, faulty_ranges, faulty_sun_deg
 from marsyard.scenarios.landing.flight import Flight, calibrated_camera
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.meshes import MeshParameters, with_meshes
+from marsyard.scenarios.meshes import MeshParameters, add_meshes
 from marsyard.scenarios.optics import Optics
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.frames import direction
@@ -55,7 +55,7 @@ class World:
     def scene(self, eye: Eye, caster_diameter_m: float) -> Scene:
         """One scene for both pictures, as detailed as the lower one needs."""
         scene = site_scene(self.ground, eye, self.sun)
-        scene = with_meshes(scene, self.meshes, (eye.east_m, eye.north_m))
+        scene = add_meshes(scene, self.meshes, (eye.east_m, eye.north_m))
         return replace(scene, caster_diameter_m=caster_diameter_m)
 
 

@@ -7,9 +7,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from marsyard.algorithms.answers import checked_site
+from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.base import TerrainScenario, judged_attempt
+from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm_on_copy
+from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import rendered
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import Sample, pixel_sample, summed_rows
@@ -29,7 +30,6 @@ from marsyard.scenarios.landing.score import (
 from marsyard.scenarios.landing.truth import RenderedFlight
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredLanding, scored
-from marsyard.scenarios.trial import Judged, attempted_with, case_result
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.streams import Streams
@@ -95,9 +95,9 @@ def _judge(
 ) -> Judged:
     """Run one algorithm, and score its answer and the resulting landing."""
     p, flight, truth = case.p, case.flight, case.truth
-    attempt = attempted_with(
+    attempt = run_algorithm_on_copy(
         lambda given: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(given),
-        checked_site,
+        check_site,
         measurements,
     )
     # without an answer the a-priori site is landed on
@@ -122,4 +122,4 @@ def _judge(
         )
         row |= scored(p.scores, answered, {*row, *known})
     converged = attempt.answer is not None and estimate.outcome.converged
-    return judged_attempt(attempt, converged, row, products(case, estimate))
+    return algorithm_result(attempt, converged, row, products(case, estimate))

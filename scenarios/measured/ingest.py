@@ -27,10 +27,10 @@ from marsyard.scenarios.measured.layout import (
     read_table,
 )
 from marsyard.scenarios.measured.picture_files import file_head, read_counts, read_flat_field
-from marsyard.scenarios.own_files import listed
 from marsyard.scenarios.system import Ingested
 from marsyard.scenarios.template import toml_environment
-from marsyard.sim.camera import CameraModel, Pds3Product, looking_down, read_cameras, read_pds3_product
+from marsyard.scenarios.user_files import listed
+from marsyard.sim.camera import CameraModel, Pds3Product, mount_looking_down, read_cameras, read_pds3_product
 from marsyard.sim.camera.pds3 import is_pds3
 from marsyard.sim.frames import SITE_FROM_WORLD
 
@@ -219,7 +219,7 @@ class _FolderReader:
             raise row.error(f"{path}: holds {len(cameras)} cameras; camera.number is {table.number}")
         camera = cameras[table.number]
         # an attitude in the row is that of a camera that looks down, or of the body in which the file places it
-        return camera if table.placed or row.rotation() is None else looking_down(camera)
+        return camera if table.placed or row.rotation() is None else mount_looking_down(camera)
 
     def _measured_pose(
         self, row: PictureRow, product: Pds3Product | None

@@ -14,8 +14,8 @@ from jaxtyping import Float64
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.own_axes import RecordedAxes
-from marsyard.scenarios.own_files import (
+from marsyard.scenarios.recorded_axes import RecordedAxes
+from marsyard.scenarios.user_files import (
     cells_by_column,
     check_together,
     finite_number,

@@ -12,13 +12,14 @@ from jaxtyping import Float, Float64
 from pydantic import BaseModel, Field, model_validator
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.answers import checked_site
+from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.dimes import DimesDetails, DimesOptions
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
 from marsyard.algorithms.hda.view import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate
-from marsyard.scenarios.base import BaseScenario, judged_attempt
-from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.algorithm_run import AlgorithmRun, Judged, case_result, run_algorithm_on_copy
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.base import BaseScenario, algorithm_result
 from marsyard.scenarios.descent.parameters import check_binning
 from marsyard.scenarios.estimators import LANDING, VELOCITY
 from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
@@ -27,9 +28,8 @@ from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
 from marsyard.scenarios.measured.layout import TaskName
 from marsyard.scenarios.parts.named import SCORE, Kind
-from marsyard.scenarios.parts.scores import OwnScores, ScoredSite, ScoredVelocity, scored
-from marsyard.scenarios.trial import Attempt, Judged, attempted_with, case_result
-from marsyard.scenarios.velocity import checked_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.scenarios.parts.scores import CustomScores, ScoredSite, ScoredVelocity, scored
+from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, DetectorImage, LandingMeasurements
 from marsyard.sim.parameters import Parameters
@@ -74,7 +74,7 @@ class MatchingParameters(MeasuredParameters):
     task_name = "matching"
 
 
-class MeasuredVelocityParameters(ChosenAlgorithms, OwnScores, MeasuredParameters):
+class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParameters):
     """Three pictures of a descent."""
 
     task_name = "velocity"
@@ -94,7 +94,7 @@ class MeasuredVelocityParameters(ChosenAlgorithms, OwnScores, MeasuredParameters
         return self
 
 
-class MeasuredLandingParameters(ChosenAlgorithms, OwnScores, MeasuredParameters):
+class MeasuredLandingParameters(AlgorithmSelection, CustomScores, MeasuredParameters):
     """Two pictures of the ground."""
 
     task_name = "landing"
@@ -156,7 +156,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
         conditions = {**_case_row(p, images), **_descent_conditions(p.case, measurements)}
         record_conditions(conditions)
         attempts = _run_algorithms(
-            p, p.dimes, measurements, lambda answer: checked_last_interval(answer, measurements), streams.case
+            p, p.dimes, measurements, lambda answer: check_last_interval(answer, measurements), streams.case
         )
         true_velocity = p.case.truth.velocity_m_s
         truth = np.array(true_velocity or (np.nan, np.nan), dtype=np.float64)
@@ -180,7 +180,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
                 row |= scored(p.scores, case, {*row, *conditions})
             arrays = velocity_products([image.counts for image in images], attempt.answer, truth)
             products = {**arrays, **agreement_products(images, pairs)}
-            return judged_attempt(attempt, velocity is not None, row, products)
+            return algorithm_result(attempt, velocity is not None, row, products)
 
         return case_result(p.algorithms, judge, conditions)
 
@@ -211,7 +211,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
             **agreement_row(pairs),
         }
         record_conditions(conditions)
-        attempts = _run_algorithms(p, p.hda, measurements, checked_site, streams.case)
+        attempts = _run_algorithms(p, p.hda, measurements, check_site, streams.case)
 
         def judge(algorithm: str) -> Judged:
             attempt = attempts[algorithm]
@@ -225,16 +225,16 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
                 row |= scored(p.scores, case, {*row, *conditions})
             products = hda_products(details) if isinstance(details, HdaDetails) else {}
             converged = attempt.answer is not None and attempt.answer.outcome.converged
-            return judged_attempt(attempt, converged, row, {**products, **agreement_products(images, pairs)})
+            return algorithm_result(attempt, converged, row, {**products, **agreement_products(images, pairs)})
 
         return case_result(p.algorithms, judge, conditions)
 
 
 def _run_algorithms(
-    p: ChosenAlgorithms, options: Any, measurements: Any, check: Callable[[object], Answer], case: int
-) -> Mapping[str, Attempt[Answer]]:
-    def run(spec: str) -> Attempt[Answer]:
-        return attempted_with(
+    p: AlgorithmSelection, options: Any, measurements: Any, check: Callable[[object], Answer], case: int
+) -> Mapping[str, AlgorithmRun[Answer]]:
+    def run(spec: str) -> AlgorithmRun[Answer]:
+        return run_algorithm_on_copy(
             lambda given: p.task.make(spec, options, p.executable, case).estimate(given), check, measurements
         )
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.exchange.files import read_picture
 from marsyard.scenarios.measured.layout import TaskName
-from marsyard.scenarios.own_files import OwnFile
+from marsyard.scenarios.user_files import UserFile
 from marsyard.sim.camera import BODY_FRAME, CameraModel, read_cahvor, write_cahvor
 from marsyard.sim.files import check_regular
 from marsyard.sim.frames import rigid
@@ -110,11 +110,11 @@ class StoredCases(Parameters):
     cases: tuple[StoredCase, ...]
 
 
-class CasesFile(OwnFile):
+class CasesFile(UserFile):
     """The `cases.json` of `marsyard ingest`: all measurements, and the hash of every picture."""
 
     @classmethod
-    def hash_of(cls, file: str) -> str:
+    def file_hash(cls, file: str) -> str:
         """SHA-256 of `cases.json`, which is checked."""
         return _load(file)[1]
 

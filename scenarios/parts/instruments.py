@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import UNIT_TOLERANCE
-from marsyard.scenarios.parts.named import INSTRUMENT, OwnPart
+from marsyard.scenarios.parts.named import INSTRUMENT, CustomPart
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.sensor.ranging import DOWN
 
@@ -72,7 +72,7 @@ class InstrumentReadings:
     columns: Mapping[str, Scalar] = field(default_factory=dict)
 
 
-class _OwnInstrument(OwnPart):
+class _OwnInstrument(CustomPart):
     kind = INSTRUMENT
     named_by = "instrument"
     quantity: ClassVar[str]
@@ -91,13 +91,13 @@ class _OwnInstrument(OwnPart):
         return check_readings(self.spec, self.create().read(truth, rng), self.quantity, truth.times_s.size)
 
 
-class OwnAltimeter(_OwnInstrument):
+class CustomAltimeter(_OwnInstrument):
     """A user-defined altimeter (see `marsyard.scenarios.parts.instruments`)."""
 
     quantity = "altitude"
 
 
-class OwnAttitudeSource(_OwnInstrument):
+class CustomAttitudeSource(_OwnInstrument):
     """A user-defined instrument of attitudes at the pictures, instead of the inertial navigation."""
 
     quantity = "attitude"

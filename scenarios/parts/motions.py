@@ -22,8 +22,8 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.own_axes import RecordedAxes
-from marsyard.scenarios.parts.named import DYNAMICS, OwnPart
+from marsyard.scenarios.parts.named import DYNAMICS, CustomPart
+from marsyard.scenarios.recorded_axes import RecordedAxes
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.parameters import bounded
 
@@ -65,7 +65,7 @@ class Poses:
     columns: Mapping[str, Scalar] = field(default_factory=dict)
 
 
-class OwnMotion(OwnPart, RecordedAxes):
+class CustomMotion(CustomPart, RecordedAxes):
     """A user-defined motion (see `marsyard.scenarios.parts.motions`).
 
     Positions count from the ground at `place`; they are the camera's, or with `lever_m` the vehicle's.

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel, Discriminator, Field, JsonValue, ValidationError, model_validator
 
-from marsyard.scenarios.dotted import found_at
+from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.parameters import Parameters
 
@@ -53,7 +53,7 @@ class Kind:
     def load(self, spec: str) -> Any:
         """Import a part. Raises ValueError if it does not exist."""
         try:
-            return found_at(self.path(spec))
+            return import_object(self.path(spec))
         except ImportError as error:
             raise ValueError(f"no {self.noun} at '{spec}': {error}") from error
 
@@ -108,7 +108,7 @@ def _message(error: Exception) -> str:
     return str(error) if isinstance(error, TypeError | ValueError) else f"{type(error).__name__}: {error}"
 
 
-class OwnPart(Parameters):
+class CustomPart(Parameters):
     """A parameter table with a user-defined class, named in the key `named_by`, and its options.
 
     Missing options are completed with the class's defaults when the campaign is read, so that each is in the campaign's
@@ -140,7 +140,7 @@ class OwnPart(Parameters):
         return {**stated, "options": {**defaults(cls.kind.load(stated[cls.named_by])), **options}}
 
     @model_validator(mode="after")
-    def _options_are_valid(self) -> OwnPart:
+    def _options_are_valid(self) -> CustomPart:
         json.dumps(self.options, allow_nan=False)
         self.create()
         return self
@@ -160,7 +160,7 @@ class OwnPart(Parameters):
         return row
 
 
-def usual_or(usual: type[BaseModel], own: type[OwnPart]) -> Discriminator:
+def default_or_custom(usual: type[BaseModel], own: type[CustomPart]) -> Discriminator:
     """Discriminator between a table with a user-defined part and the usual one; tags are the models' names."""
 
     def model(stated: Any) -> str:

@@ -138,7 +138,7 @@ def load_score(spec: str, kind: type[Any] | None = None) -> Any:
     return score
 
 
-class OwnScores(Parameters):
+class CustomScores(Parameters):
     """Parameters of a scenario with user-defined scores; `scored` is its kind of case."""
 
     scored: ClassVar[type[Any]]

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.vtt import VttOptions
-from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.estimators import TRACKING
-from marsyard.scenarios.parts.scores import OwnScores, ScoredRun
+from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import SlipParameters
 from marsyard.sim.measurements import MastCalibration
@@ -21,13 +21,13 @@ from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
     MASTS,
     AutoExposureParameters,
+    CustomCameraChoice,
     DetectorChoice,
     DetectorParameters,
     OdometryParameters,
-    OwnCameraChoice,
     PointingParameters,
     StereoCalibrationParameters,
-    on_head,
+    mount_on_head,
     preset,
     stereo_mast,
 )
@@ -197,8 +197,8 @@ class ExposureParameters(Parameters):
 class OwnPair(Parameters):
     """A custom stereo pair on the mast's head; the positions in the camera files are ignored."""
 
-    left: Annotated[OwnCameraChoice, Field(description="camera file: a path, or a table with file")]
-    right: Annotated[OwnCameraChoice | None, Field(description="likewise; by default as the left one")] = None
+    left: Annotated[CustomCameraChoice, Field(description="camera file: a path, or a table with file")]
+    right: Annotated[CustomCameraChoice | None, Field(description="likewise; by default as the left one")] = None
     baseline_m: Annotated[float, Field(gt=0.0, le=5.0, description="distance of the two, m")]
     toe_in_deg: Annotated[float, Field(ge=-30.0, le=30.0, description="turn of each towards the other")] = 0.0
 
@@ -212,7 +212,7 @@ class OwnPair(Parameters):
     def cameras(self) -> tuple[CameraModel, CameraModel]:
         """The left and the right camera in the head's frame."""
         right = self.left if self.right is None else self.right
-        return on_head(self.left.camera(), right.camera(), self.baseline_m, self.toe_in_deg)
+        return mount_on_head(self.left.camera(), right.camera(), self.baseline_m, self.toe_in_deg)
 
 
 class CameraParameters(Parameters):
@@ -265,7 +265,7 @@ class ScoreParameters(Parameters):
     stored_updates: int = Field(default=0, ge=0, le=100, description="first updates with figures as columns")
 
 
-class RoverScenarioParameters(ChosenAlgorithms, OwnScores):
+class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     """All parameters of the rover scenario."""
 
     task = TRACKING

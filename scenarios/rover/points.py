@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from marsyard.sim.dynamics import RoverParameters, Stance
 from marsyard.sim.measurements import MastGeometry
-from marsyard.sim.render import may_shade, rover_objects, rover_sphere
+from marsyard.sim.render import may_cast_shadow, rover_objects, rover_sphere
 
 Vector = Float64[np.ndarray, "3"]
 Triangles = Float64[np.ndarray, "triangles 3 3"]
@@ -181,7 +181,7 @@ def rover_shades_patch(
     middle = patch_m.mean(axis=0)
     radius = float(np.linalg.norm(patch_m - middle, axis=1).max())
     # the rover's mesh is built only where its bounding sphere may cast a shadow on the patch
-    if not may_shade(rover_sphere(rover, stance, mast), sun_direction, middle, radius):
+    if not may_cast_shadow(rover_sphere(rover, stance, mast), sun_direction, middle, radius):
         return False
     triangles = rover_objects(rover, stance, mast, *angles_rad).triangles
     return any(np.isfinite(ray_distances(triangles, point, sun_direction[None])[0]) for point in patch_m)

@@ -15,10 +15,11 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.answers import checked_aim, checked_update
+from marsyard.algorithms.answers import check_aim, check_update
 from marsyard.algorithms.interface import MastAim, TargetTracker, TrackingState
 from marsyard.algorithms.navigation import NavigationOutcome
 from marsyard.algorithms.vtt import GoalReached, HandOffOutcome, hand_off
+from marsyard.scenarios.algorithm_run import answer_time_s
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.handover import Handover
@@ -29,10 +30,9 @@ from marsyard.scenarios.rover.stops import RunOutcome, Stop, View
 from marsyard.scenarios.rover.target import ChosenTarget, choose_target
 from marsyard.scenarios.rover.vehicle import Rig, Vehicle
 from marsyard.scenarios.rover.world import RunWorld
-from marsyard.scenarios.trial import answer_time_s
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics.driving import Drive
-from marsyard.sim.frames import composed
+from marsyard.sim.frames import compose
 from marsyard.sim.measurements import DriveCommand, MastCalibration, RoverMeasurements
 from marsyard.sim.streams import Streams
 
@@ -84,7 +84,7 @@ class Run(Setup):
         stop = self.stops[-1]
         if stop.update.position_rover is None:
             raise ValueError("the target was not seen yet")
-        here = composed(self.vehicle.estimated.inv(), stop.estimated)
+        here = compose(self.vehicle.estimated.inv(), stop.estimated)
         return self._belief(here.apply(np.array(stop.update.position_rover)))
 
     def _belief(self, position_rover: Float64[np.ndarray, "3"]) -> Belief:
@@ -118,7 +118,7 @@ class TrackerGuide:
         """See `Guide`. Raises AlgorithmError for a bad answer, and the tracker's own errors."""
         answer = self._tracker.aim(run.vehicle.estimated, self._mast.given)
         self._mast.check()
-        return checked_aim(answer, run.rig.calibrated)
+        return check_aim(answer, run.rig.calibrated)
 
     def observe(self, run: Run, view: View) -> RunOutcome | None:
         """Update the tracker and append the stop to the run; raises as `aim`."""
@@ -129,7 +129,7 @@ class TrackerGuide:
         taken_s = time.process_time() - started
         handover.check()
         self._mast.check()
-        update = checked_update(answer)
+        update = check_update(answer)
         run.stops.append(Stop.of(view, run.target.point_world, run.rig.left, update, answer_time_s(update, taken_s)))
         if update.state is TrackingState.FAILURE:
             return RunOutcome.LOST
@@ -196,7 +196,7 @@ def _take_view(p: RoverScenarioParameters, run: Run, aim: MastAim, leg: int) -> 
     world, rig, vehicle, time_s = run.world, run.rig, run.vehicle, run.time_s
     rig.point(aim.azimuth_rad, aim.elevation_rad)
     stance, point = vehicle.stance, run.target.point_world
-    world_from_head = composed(stance.world_from_rover, rig.rover_from_head)
+    world_from_head = compose(stance.world_from_rover, rig.rover_from_head)
     shadow = None
     if p.rover_shadow:
         shadow = world.shadow_caster(vehicle.rover, stance, rig.calibrated.geometry, rig.state.true_rad, point, time_s)

@@ -10,6 +10,7 @@ from typing import cast
 
 from pydantic import BaseModel
 
+from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm
 from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.interface import CaseResult, Scalar
@@ -38,7 +39,6 @@ from marsyard.scenarios.rover.shared import (
 from marsyard.scenarios.rover.shared import prepare_run as prepare_shared_run
 from marsyard.scenarios.rover.stops import RunOutcome
 from marsyard.scenarios.rover.world import terrain_parameters
-from marsyard.scenarios.trial import Judged, attempted, case_result
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
@@ -157,7 +157,7 @@ def _judge(
         run = track()
         return run, {**score(p, run), **tracking(run)}
 
-    attempt = attempted(track_and_score, lambda answer: cast(tuple[Run, dict[str, Scalar]], answer))
+    attempt = run_algorithm(track_and_score, lambda answer: cast(tuple[Run, dict[str, Scalar]], answer))
     if attempt.answer is None:
         return Judged(attempt.outcome(str), False, attempt.row, failure=attempt.failure)
     run, row = attempt.answer

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
-from marsyard.scenarios.conditions import rendered_as
+from marsyard.scenarios.conditions import picture_columns_of_hash
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
@@ -266,7 +266,9 @@ def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
 
 def provenance(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     """Hash of the pictures, and of the renderer that they depend on."""
-    return rendered_as(p.backend, hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest())
+    return picture_columns_of_hash(
+        p.backend, hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest()
+    )
 
 
 def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:

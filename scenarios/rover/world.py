@@ -15,7 +15,7 @@ from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.dynamics import RoverParameters, Stance
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import MastGeometry
-from marsyard.sim.render import CloudLayer, Objects, Scene, Sun, may_shade, rover_objects, rover_sphere
+from marsyard.sim.render import CloudLayer, Objects, Scene, Sun, may_cast_shadow, rover_objects, rover_sphere
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Site, Surface, TerrainParameters, site
 from marsyard.sim.terrain.landforms import Ramp
@@ -181,10 +181,10 @@ class RunWorld:
         seen_m = SEEN_FRACTION * float(np.linalg.norm(target_m - stance.world_from_rover.translation))
         sun = self.scene(time_s).sun.direction
         # the mesh is built only where its bounding sphere may cast a shadow there
-        if not may_shade(rover_sphere(rover, stance, mast), sun, target_m, seen_m):
+        if not may_cast_shadow(rover_sphere(rover, stance, mast), sun, target_m, seen_m):
             return None
         body = rover_objects(rover, stance, mast, *angles_rad)
-        return body if may_shade(body.spheres, sun, target_m, seen_m) else None
+        return body if may_cast_shadow(body.spheres, sun, target_m, seen_m) else None
 
     def brightness(self, time_s: float) -> float:
         """Direct sunlight on the ground relative to 1 AU."""

@@ -6,7 +6,7 @@ column and row, with the centre of the upper left pixel at (0, 0).
 """
 
 from marsyard.sim.camera.assembly import CameraFileError
-from marsyard.sim.camera.base import CameraModel, looking_down
+from marsyard.sim.camera.base import CameraModel, mount_looking_down
 from marsyard.sim.camera.calibrations import Calibration, read_calibrations
 from marsyard.sim.camera.files import read_camera, read_cameras
 from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
@@ -28,7 +28,7 @@ __all__ = [
     "Residual",
     "from_opencv",
     "from_opencv_fisheye",
-    "looking_down",
+    "mount_looking_down",
     "read_cahvor",
     "read_calibrations",
     "read_camera",

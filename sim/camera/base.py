@@ -304,7 +304,7 @@ class CameraModel(ABC):
         return x, y, z
 
 
-def looking_down(camera: CameraModel) -> CameraModel:
+def mount_looking_down(camera: CameraModel) -> CameraModel:
     """Mount a camera at the origin, A along -z, columns along +x; raises ValueError for mirrored pictures."""
     if not camera.theta < 0:
         raise ValueError("the camera's picture is mirrored: u right, v down and A forward must be right-handed")

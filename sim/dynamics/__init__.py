@@ -1,7 +1,7 @@
 """Dynamics of vehicles: true motion over time of landers, helicopters and rovers."""
 
 from marsyard.sim.dynamics.chain import SwingParameters
-from marsyard.sim.dynamics.driving import Drive, DrivenPart, SlipParameters, Soil, drive
+from marsyard.sim.dynamics.driving import Drive, DriveStep, SlipParameters, Soil, drive
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, Ground, RockyGround, RoverParameters, Stance, settle
 from marsyard.sim.dynamics.swing import SwingDescent
 from marsyard.sim.dynamics.trajectory import Motion, Resting, State, Trajectory
@@ -11,7 +11,7 @@ __all__ = [
     "MER",
     "ROCKY_8",
     "Drive",
-    "DrivenPart",
+    "DriveStep",
     "Ground",
     "Motion",
     "Resting",

@@ -27,7 +27,7 @@ from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.dynamics.rover import Ground, RoverParameters, Stance, settle
-from marsyard.sim.frames import composed, turn_matrix
+from marsyard.sim.frames import compose, turn_matrix
 from marsyard.sim.measurements import DriveCommand
 from marsyard.sim.parameters import Fraction, Parameters, bounded
 
@@ -77,7 +77,7 @@ class Soil:
 
 
 @dataclass(frozen=True)
-class DrivenPart:
+class DriveStep:
     """One step of a drive: the wheels' command, which an odometer integrates, and the rover before and after."""
 
     command: DriveCommand
@@ -87,7 +87,7 @@ class DrivenPart:
     @cached_property
     def motion(self) -> RigidTransform:
         """True motion: the pose after in the axes of the pose before."""
-        return composed(self.before.world_from_rover.inv(), self.after.world_from_rover)
+        return compose(self.before.world_from_rover.inv(), self.after.world_from_rover)
 
     @cached_property
     def length_m(self) -> float:
@@ -115,7 +115,7 @@ class Drive:
     """One executed command; the commands of its parts, at least one, add up to it."""
 
     command: DriveCommand
-    parts: tuple[DrivenPart, ...]
+    parts: tuple[DriveStep, ...]
 
     @property
     def start(self) -> Stance:
@@ -168,7 +168,7 @@ def drive(
     wander_rad = np.radians(p.wander_deg_m) * np.sqrt(command.length_m) * float(wander)
     count = max(1, int(np.ceil(max(command.length_m / STEP_M, abs(command.turn_left_rad) / STEP_RAD) - 1e-9)))
     step_command = command.part(1.0 / count)
-    parts: list[DrivenPart] = []
+    parts: list[DriveStep] = []
     before = start
     for _ in range(count):
         # slope of the ground reduces the path and the turn; then the rover settles at its new position
@@ -181,7 +181,7 @@ def drive(
         forward = rotation @ np.array([np.cos(turn), np.sin(turn), 0.0])
         azimuth = float(np.arctan2(forward[0], forward[1]))
         after = settle(rover, ground, float(position[0]), float(position[1]), azimuth, near=before)
-        parts.append(DrivenPart(step_command, before, after))
+        parts.append(DriveStep(step_command, before, after))
         before = after
     return Drive(command, tuple(parts))
 

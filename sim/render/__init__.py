@@ -5,7 +5,7 @@ from marsyard.sim.render.objects import Objects
 from marsyard.sim.render.photometry import DustySky, Photometry, Sun, Texture
 from marsyard.sim.render.rays import PixelRays
 from marsyard.sim.render.renderer import Frame, Renderer, process_renderer
-from marsyard.sim.render.rover import may_shade, rover_objects, rover_sphere
+from marsyard.sim.render.rover import may_cast_shadow, rover_objects, rover_sphere
 from marsyard.sim.render.scene import Scene
 
 __all__ = [
@@ -20,7 +20,7 @@ __all__ = [
     "Scene",
     "Sun",
     "Texture",
-    "may_shade",
+    "may_cast_shadow",
     "process_renderer",
     "rover_objects",
     "rover_sphere",

@@ -77,7 +77,7 @@ def rover_sphere(
     return np.array([[*stance.world_from_rover.translation, max(legs, top, body)]])
 
 
-def may_shade(
+def may_cast_shadow(
     spheres: Float64[np.ndarray, "bodies 4"],
     sun_direction: Float64[np.ndarray, "3"],
     place_m: Float64[np.ndarray, "3"],

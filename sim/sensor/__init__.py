@@ -11,13 +11,13 @@ from marsyard.sim.sensor.mast import (
     PointingParameters,
     StereoCalibrationParameters,
     StereoHead,
-    on_head,
+    mount_on_head,
     stereo_mast,
 )
 from marsyard.sim.sensor.motion import ImageMotion
 from marsyard.sim.sensor.odometry import OdometryParameters
 from marsyard.sim.sensor.optics import natural_fall_off
-from marsyard.sim.sensor.own_camera import NamedOrOwnCamera, OwnCamera, OwnCameraChoice
+from marsyard.sim.sensor.own_camera import CustomCamera, CustomCameraChoice, NamedOrCustomCamera
 from marsyard.sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, preset, read_datasheet
 from marsyard.sim.sensor.ranging import (
     LaserParameters,
@@ -37,6 +37,8 @@ __all__ = [
     "CameraDesign",
     "Clock",
     "ClockParameters",
+    "CustomCamera",
+    "CustomCameraChoice",
     "Detector",
     "DetectorChoice",
     "DetectorParameters",
@@ -50,11 +52,9 @@ __all__ = [
     "LaserParameters",
     "Mast",
     "MastState",
-    "NamedOrOwnCamera",
+    "NamedOrCustomCamera",
     "NavigationErrors",
     "OdometryParameters",
-    "OwnCamera",
-    "OwnCameraChoice",
     "PointingParameters",
     "RadarAltimeter",
     "RadarParameters",
@@ -65,8 +65,8 @@ __all__ = [
     "WarmUp",
     "auto_expose",
     "height_above_ground",
+    "mount_on_head",
     "natural_fall_off",
-    "on_head",
     "preset",
     "read_datasheet",
     "stereo_mast",

@@ -172,7 +172,7 @@ class StereoHead:
 _HEAD_FROM_DOWN = Rotation.from_matrix(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
 
 
-def on_head(
+def mount_on_head(
     left: CameraModel, right: CameraModel, baseline_m: float, toe_in_deg: float
 ) -> tuple[CameraModel, CameraModel]:
     """Mount two cameras that look down on a head as a stereo pair that looks forwards, turned inwards by the toe-in."""

@@ -14,14 +14,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel, looking_down, read_cameras
+from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel, mount_looking_down, read_cameras
 from marsyard.sim.parameters import Parameters
 
 Vector = tuple[float, float, float]
 _FILES = ("file", "number", "subframe_folded_in", "size")
 
 
-class OwnCamera(Parameters):
+class CustomCamera(Parameters):
     """A camera of the CAHV family in the body frame: at its origin, looking along -z, columns along +x.
 
     Stated as ``{ file = "camera.yaml" }`` (any format of `marsyard.sim.camera.read_cameras`) or the path alone; the
@@ -42,7 +42,7 @@ class OwnCamera(Parameters):
     linearity: Annotated[float | None, Field(description="of CAHVORE")] = None
 
     @model_validator(mode="after")
-    def _check_camera(self) -> OwnCamera:
+    def _check_camera(self) -> CustomCamera:
         self.camera()
         return self
 
@@ -71,9 +71,9 @@ class OwnCamera(Parameters):
         return self.columns, self.rows
 
     @classmethod
-    def of(cls, camera: CameraModel, **origin: Any) -> OwnCamera:
+    def of(cls, camera: CameraModel, **origin: Any) -> CustomCamera:
         """Create the parameters of a camera of any pose, mounted to look down."""
-        mounted = looking_down(camera)
+        mounted = mount_looking_down(camera)
         length = float(np.linalg.norm(mounted.a))  # labels round A
         vectors: dict[str, Any] = {
             letter: tuple((getattr(mounted, letter) / (length if letter in "hv" else 1.0)).tolist())
@@ -108,7 +108,7 @@ def _read(stated: object) -> object:
         raise ValueError(f"{path}: holds {len(cameras)} cameras; number may be 0 to {len(cameras) - 1}, not {number!r}")
     if len(cameras) > 1 and "number" not in stated:
         raise ValueError(f"{path}: holds {len(cameras)} cameras; choose one with number, 0 to {len(cameras) - 1}")
-    return OwnCamera.of(cameras[number], file=path, number=number, subframe_folded_in=bool(folded))
+    return CustomCamera.of(cameras[number], file=path, number=number, subframe_folded_in=bool(folded))
 
 
 def _named_or_read(stated: object) -> object:
@@ -117,5 +117,5 @@ def _named_or_read(stated: object) -> object:
 
 
 #: A user camera in a campaign; and a user camera or a preset's name.
-OwnCameraChoice = Annotated[OwnCamera, BeforeValidator(_read)]
-NamedOrOwnCamera = Annotated[str | OwnCamera, BeforeValidator(_named_or_read)]
+CustomCameraChoice = Annotated[CustomCamera, BeforeValidator(_read)]
+NamedOrCustomCamera = Annotated[str | CustomCamera, BeforeValidator(_named_or_read)]

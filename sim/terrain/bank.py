@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from jaxtyping import Float32
 
-from marsyard.sim.cache import CacheWarning, cache_directory, load_array, make_room, save_array, touch
+from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.terrain.imported import blend_into_ground, detail_below_posting, embed
 from marsyard.sim.terrain.landforms.ground import Ground
 from marsyard.sim.terrain.landforms.kernels import pack, stamp_craters
@@ -75,7 +75,7 @@ class TerrainBank:
     """Numbered terrains of one kind, cached on disk.
 
     Terrain k is a pure function of the parameters, the seed and k. On disk it is one array of all levels, which workers
-    memory-map, so they share its pages. The cache's size is bounded: see `marsyard.sim.cache.make_room`.
+    memory-map, so they share its pages. The cache's size is bounded: see `marsyard.sim.cache.evict_files`.
     """
 
     parameters: TerrainParameters
@@ -127,7 +127,7 @@ class TerrainBank:
         built = synthesise(self.parameters, self._rng(number))
         flat = np.concatenate([level.reshape(-1) for level in built.levels])
         try:
-            make_room(path.parent, 4 * self._size(), set(_IN_USE))
+            evict_files(path.parent, 4 * self._size(), set(_IN_USE))
             return save_array(path, flat)
         except OSError as error:
             warnings.warn(f"terrain {number} is not kept: {path}: {error.strerror}", CacheWarning, stacklevel=2)

@@ -281,7 +281,7 @@ def _tone(
     return tone.astype(np.float32), holes
 
 
-def grid_for(source: RealTerrain) -> tuple[int, float]:
+def choose_grid(source: RealTerrain) -> tuple[int, float]:
     """Choose samples and spacing of a terrain that holds the DTM at its own posting, with a surround.
 
     Raises TerrainFileError for a DTM that is too large.

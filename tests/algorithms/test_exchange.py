@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.answers import checked_site, checked_velocity
+from marsyard.algorithms.answers import check_site, check_velocity
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableVelocityEstimator,
     ProgramDetails,
-    command_of,
+    parse_command,
     read_case,
     write_case,
 )
@@ -50,7 +50,7 @@ def program(folder: Path, body: str) -> str:
 
 
 def ask(spec: str, measured: DescentMeasurements, **limits: float) -> VelocityEstimate:
-    command = command_of(spec)
+    command = parse_command(spec)
     assert command is not None
     return ExecutableVelocityEstimator(command, ExecutableLimits(**{"time_s": 60.0, **limits})).estimate(measured)
 
@@ -295,13 +295,13 @@ def test_a_persistent_program_must_say_that_it_is_ready(measured: DescentMeasure
 )
 def test_programs_that_are_not_there(spec: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        command_of(spec)
+        parse_command(spec)
 
 
 def test_answers_in_python_are_held_against_the_interface() -> None:
     velocity = np.array([1.0, 2.0])
     good = VelocityEstimate(VelocityOutcome.VALID, velocity)
-    assert checked_velocity(good).velocity_m_s is not velocity
+    assert check_velocity(good).velocity_m_s is not velocity
     for wrong in (
         None,
         dataclasses.replace(good, velocity_m_s=None),
@@ -310,10 +310,10 @@ def test_answers_in_python_are_held_against_the_interface() -> None:
         dataclasses.replace(good, covariance_m2_s2=np.array([[1.0, 0.5], [0.4, 1.0]])),
     ):
         with pytest.raises(AlgorithmError) as caught:
-            checked_velocity(wrong)
+            check_velocity(wrong)
         assert caught.value.fault is Fault.BAD_ANSWER
     with pytest.raises(AlgorithmError, match="NO_SAFE_SITE"):
-        checked_site(SiteEstimate(SiteOutcome.NO_SAFE_SITE, np.zeros(3)))
+        check_site(SiteEstimate(SiteOutcome.NO_SAFE_SITE, np.zeros(3)))
 
 
 def test_the_example_in_c(measured: DescentMeasurements, tmp_path: Path) -> None:
@@ -342,7 +342,7 @@ def test_the_example_in_python(measured: DescentMeasurements, monkeypatch: pytes
 
     monkeypatch.chdir(EXAMPLES)
     estimator = VELOCITY.make("velocity_estimator:MedianShift", DimesOptions(), ExecutableLimits())
-    found = checked_velocity(estimator.estimate(measured))
+    found = check_velocity(estimator.estimate(measured))
     assert found.velocity_m_s is not None
     assert np.hypot(*(found.velocity_m_s - TRUE)) < 1.0
     assert found.covariance_m2_s2 is not None

@@ -14,7 +14,7 @@ from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableTargetTracker,
     ProgramDetails,
-    command_of,
+    parse_command,
     read_mast,
     read_stop,
     read_target,
@@ -64,7 +64,7 @@ for line in sys.stdin:
 
 
 def tracker(spec: str, time_s: float = 60.0) -> ExecutableTargetTracker:
-    command = command_of(spec)
+    command = parse_command(spec)
     assert command is not None
     return ExecutableTargetTracker(command, ExecutableLimits(time_s=time_s))
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.algorithms.answers import checked_velocity
+from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableVelocityStream,
     ProgramDetails,
-    command_of,
+    parse_command,
     read_case,
     read_frame,
     write_case,
@@ -24,9 +24,9 @@ from marsyard.algorithms.exchange import (
 from marsyard.algorithms.exchange.serving import end_persistent
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
-from marsyard.algorithms.streams import StreamedEstimator, spanned
+from marsyard.algorithms.streams import StreamedEstimator, set_span
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.handover import fingerprint
+from marsyard.scenarios.handover import hash_inputs
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
@@ -112,16 +112,16 @@ def test_spans_that_are_none(span: object, said: str) -> None:
     answer = valid()
     object.__setattr__(answer, "span_s", span)
     with pytest.raises(AlgorithmError, match=said) as caught:
-        checked_velocity(answer, (0.0, 1.0, 2.0))
+        check_velocity(answer, (0.0, 1.0, 2.0))
     assert caught.value.fault is Fault.BAD_ANSWER
 
 
 def test_what_an_answer_leaves_out_is_the_last_interval() -> None:
-    assert spanned(valid(), (0.0, 1.0, 3.0)).span_s == (1.0, 3.0)
-    assert spanned(valid(2.0, 2.0), (0.0, 3.0)).span_s == (2.0, 2.0)
-    assert spanned(NOTHING, (0.0,)).span_s is None
+    assert set_span(valid(), (0.0, 1.0, 3.0)).span_s == (1.0, 3.0)
+    assert set_span(valid(2.0, 2.0), (0.0, 3.0)).span_s == (2.0, 2.0)
+    assert set_span(NOTHING, (0.0,)).span_s is None
     with pytest.raises(AlgorithmError, match="of one picture there is no last interval"):
-        spanned(valid(), (0.0,))
+        set_span(valid(), (0.0,))
 
 
 def test_a_stream_does_not_write_its_own_history() -> None:
@@ -163,13 +163,13 @@ def test_a_case_of_any_number_of_pictures_comes_back(tmp_path: Path, number: int
     write_case(tmp_path, given)
     back = read_case(tmp_path)
     assert isinstance(back, DescentMeasurements)
-    assert fingerprint([one.counts for one in back.images]) == fingerprint([one.counts for one in given.images])
+    assert hash_inputs([one.counts for one in back.images]) == hash_inputs([one.counts for one in given.images])
     np.testing.assert_array_equal(back.interval_velocities_m_s, given.interval_velocities_m_s)
     np.testing.assert_array_equal(back.inertial_velocities_m_s, given.inertial_velocities_m_s)
 
 
 def program(spec: str, time_s: float = 60.0) -> StreamedEstimator:
-    command = command_of(spec)
+    command = parse_command(spec)
     assert command is not None
     assert command.stream
     return StreamedEstimator(ExecutableVelocityStream(command, ExecutableLimits(time_s=time_s)))

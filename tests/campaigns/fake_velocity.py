@@ -7,18 +7,18 @@ from typing import ClassVar
 
 from pydantic import BaseModel
 
-from marsyard.algorithms.answers import checked_velocity
+from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.chosen import ChosenAlgorithms
+from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.estimators import VELOCITY, Task
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.trial import Judged, attempted, case_result
 from marsyard.scenarios.velocity import velocity_row
 from marsyard.sim.streams import Streams
 
 
-class FakeVelocityParameters(ChosenAlgorithms):
+class FakeVelocityParameters(AlgorithmSelection):
     task: ClassVar[Task] = VELOCITY
 
     algorithm: str = "homography"
@@ -42,9 +42,9 @@ class FakeVelocityScenario:
         measurements = replace(given, interval_velocities_m_s=given.interval_velocities_m_s + common)
 
         def judge(algorithm: str) -> Judged:
-            attempt = attempted(
+            attempt = run_algorithm(
                 lambda: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(measurements),
-                checked_velocity,
+                check_velocity,
             )
             velocity = None if attempt.answer is None else attempt.answer.velocity_m_s
             return Judged(

@@ -9,7 +9,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
 from marsyard.scenarios.registry import scenario_names
 from marsyard.scenarios.systems import systems
-from marsyard.sim.kernel_cache import note_ready
+from marsyard.sim.kernel_cache import mark_ready
 
 
 def test_every_system_has_a_small_case_that_the_catalogue_takes() -> None:
@@ -23,7 +23,7 @@ def test_every_system_has_a_small_case_that_the_catalogue_takes() -> None:
 def test_what_is_compiled_is_not_compiled_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     for scenario in ("descent", "rover", "landing"):
-        note_ready(scenario)
+        mark_ready(scenario)
     done = CliRunner().invoke(app, ["compile"])
     assert (done.exit_code, done.output) == (
         0,

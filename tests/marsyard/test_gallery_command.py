@@ -13,7 +13,7 @@ import pytest
 
 from marsyard.cli import app as cli
 from marsyard.cli import gallery as gallery_command
-from marsyard.cli.gallery import PAGE, PLATES, SHEET, SHEET_BYTES, Plate, contact_sheet, displayed, write_gallery
+from marsyard.cli.gallery import PAGE, PLATES, SHEET, SHEET_BYTES, SvgFigure, contact_sheet, displayed, write_gallery
 from marsyard.cli.render import Shot
 from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
@@ -31,11 +31,11 @@ class _Links(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def plates() -> list[Plate]:
+def plates() -> list[SvgFigure]:
     """Plates of noise, as hard to compress as pictures can be."""
     rng = np.random.default_rng(1)
     return [
-        Plate(
+        SvgFigure(
             Shot.usual(site, camera, **settings),
             rng.integers(0, 256, (480, 640), dtype=np.uint8),
             f"{number}-{site}.jpg",
@@ -44,7 +44,7 @@ def plates() -> list[Plate]:
     ]
 
 
-def test_every_site_and_every_kind_of_camera_is_shown(plates: list[Plate]) -> None:
+def test_every_site_and_every_kind_of_camera_is_shown(plates: list[SvgFigure]) -> None:
     assert {plate.shot.site for plate in plates} == set(sites())
     assert {plate.shot.camera for plate in plates} == set(PRESETS)
     for plate in plates:
@@ -52,7 +52,7 @@ def test_every_site_and_every_kind_of_camera_is_shown(plates: list[Plate]) -> No
         assert site.descent is None or any(p.shot.scale == "descent" for p in plates if p.shot.site == site.name)
 
 
-def test_page_needs_only_the_pictures_beside_it(plates: list[Plate], tmp_path: Path) -> None:
+def test_page_needs_only_the_pictures_beside_it(plates: list[SvgFigure], tmp_path: Path) -> None:
     page = write_gallery(plates, tmp_path / "new" / "gallery")
     links = _Links()
     text = page.read_text()
@@ -69,11 +69,11 @@ def test_page_needs_only_the_pictures_beside_it(plates: list[Plate], tmp_path: P
         assert "--camera" in command
 
 
-def test_contact_sheet_is_small(plates: list[Plate]) -> None:
+def test_contact_sheet_is_small(plates: list[SvgFigure]) -> None:
     smooth = np.linspace(0.0, 255.0, 640 * 480).reshape(480, 640)
     rng = np.random.default_rng(2)
     pictures = [
-        Plate(one.shot, np.clip(smooth + rng.normal(0.0, 6.0, smooth.shape), 0, 255).astype(np.uint8), one.file)
+        SvgFigure(one.shot, np.clip(smooth + rng.normal(0.0, 6.0, smooth.shape), 0, 255).astype(np.uint8), one.file)
         for one in plates
     ]
     sheet = contact_sheet(pictures)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
 from marsyard.cli.evidence import evidence_limits
-from marsyard.reports.sampled import sampled
+from marsyard.reports.sampling_design import sampled
 from marsyard.reports.verdicts import Status, judge_campaign
 
 #: EuRoC's first camera (its sensor.yaml), of the fields that are read.

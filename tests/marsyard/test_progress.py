@@ -14,7 +14,7 @@ from rich.console import Console
 from marsyard.campaigns.running import compilation
 from marsyard.campaigns.running.compilation import compilation_reported
 from marsyard.cli.progress import BarProgress, LineProgress
-from marsyard.sim.kernel_cache import note_ready
+from marsyard.sim.kernel_cache import mark_ready
 from tests.campaigns.fake_campaign import Silence
 
 
@@ -103,7 +103,7 @@ def test_compilation_is_reported_until_the_first_case_has_ended(
     assert any("3 functions so far" in note for note in watch.notes)
     assert re.fullmatch(r"numeric kernels are compiled, \d+ s", next(itertools.islice(reversed(watch.notes), 1)))
     # the next run finds them
-    note_ready("descent")
+    mark_ready("descent")
     again = Silence()
     with compilation_reported("descent", again.note) as first_case_ended:
         first_case_ended()

@@ -26,7 +26,7 @@ from marsyard.cli.evidence import run_until_decided
 from marsyard.cli.site_server import server
 from marsyard.reports.cases import notable_cases
 from marsyard.reports.evaluation import next_look
-from marsyard.reports.sampled import Sampled
+from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.stored import read_run
 from marsyard.reports.verdicts import judge_campaign
 from tests.campaigns.fake_campaign import REQUIREMENT, Silence, write_campaign
@@ -149,7 +149,7 @@ def _rows(n: int, failures: int) -> pd.DataFrame:
 
 def _next(n: int, failures: int, most: int, **changes: Any) -> int | None:
     asked = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9, **changes}
-    how = Sampled(most_cases=most)
+    how = SamplingDesign(most_cases=most)
     return next_look(judge_campaign(_rows(n, failures), [asked], how), how, n)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.reports.comparison import Contrast, Figure, contrast_grid, contrasts, figures_of, sample_of
+from marsyard.reports.comparison import Contrast, Figure, campaign_diff_grid, compare_campaigns, figures_of, sample_of
 from marsyard.reports.statistics.changes import difference_p
 from marsyard.reports.stored import StoredRun, read_run
 
@@ -16,7 +16,7 @@ MakeRun = Callable[..., Path]
 
 
 def _contrasts(first: Path, second: Path) -> tuple[bool, dict[str, Contrast]]:
-    paired, found = contrasts(read_run(first), read_run(second))
+    paired, found = compare_campaigns(read_run(first), read_run(second))
     return paired, {one.name: one for one in found}
 
 
@@ -45,7 +45,7 @@ def test_draws_of_their_own_are_compared_as_two_samples(make_rows: Rows, make_ru
     assert changed["answered"].p_value < 1e-6
     # of 10,000 permutations none goes as far
     assert changed["velocity error (m/s)"].p_value < 1e-3
-    grid = contrast_grid(["a", "b"], list(changed.values()))
+    grid = campaign_diff_grid(["a", "b"], list(changed.values()))
     assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
 
 
@@ -60,7 +60,7 @@ def test_terrains_of_other_sites_are_other_terrains(make_rows: Rows, make_run: M
         return make_run(frame, name=name, seed=seed, configuration=configuration)
 
     here, there = read_run(run("gusev", 1)), read_run(run("meridiani", 6))
-    assert min(one.p_value for one in contrasts(here, there)[1]) > 0.05
+    assert min(one.p_value for one in compare_campaigns(here, there)[1]) > 0.05
     mine, its = (sample_of(*_errors(one)) for one in (here, there))
     assert difference_p(mine, its) < 1e-3
 

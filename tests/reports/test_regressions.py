@@ -17,7 +17,7 @@ from marsyard.reports.history import (
     NightCampaign,
     NightFigure,
     changes,
-    comparisons_of,
+    compare_night,
     night_text,
 )
 from marsyard.reports.statistics.changes import Sample
@@ -102,7 +102,7 @@ def test_nights_are_held_against_whole_nights_of_the_same_campaign(tmp_path: Pat
         night = _add(history, 4)
         states = {one.night: one.state for one in history.nights()}
         assert states == {1: FINISHED, 2: FINISHED, 3: FINISHED, 4: INTERRUPTED, 5: FINISHED, night: RUNNING}
-        comparisons = comparisons_of(history, night)
+        comparisons = compare_night(history, night)
         assert {len(one.before) for one in comparisons} == {3}
         assert changes(comparisons) == []
 
@@ -112,14 +112,14 @@ def test_a_change_begins_a_new_history(tmp_path: Path) -> None:
         for seed in range(4):
             history.finish(_add(history, seed), FINISHED)
         night = _add(history, 5, worse=3.0)
-        found = changes(comparisons_of(history, night))
+        found = changes(compare_night(history, night))
         assert "error (m)" in {one.figure for one in found}
         history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in found])
         # The same again is no news; held against the night that was reported, and no other.
         again = _add(history, 6, worse=3.0)
-        held = {one.figure.figure: len(one.before) for one in comparisons_of(history, again)}
+        held = {one.figure.figure: len(one.before) for one in compare_night(history, again)}
         assert held["error (m)"] == 1
-        assert changes(comparisons_of(history, again)) == []
+        assert changes(compare_night(history, again)) == []
 
 
 def test_a_night_is_whole_or_not_there(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marsyard.reports.evaluation import exit_code, overall
-from marsyard.reports.sampled import Sampled, sampled
+from marsyard.reports.sampling_design import SamplingDesign, sampled
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 from marsyard.reports.verdicts import Status, Verdict, judge_campaign
 
@@ -79,9 +79,9 @@ def test_status_follows_from_the_bounds(counts: tuple[int, int], probability: fl
         assert verdict.further_cases
         more = pd.concat([_rows(n, failures), _rows(verdict.further_cases, 0)], ignore_index=True)
         more = more.drop(columns="terrain").assign(case=np.arange(len(more)))
-        (later,) = judge_campaign(more, [requirement], Sampled(first_look=n))
+        (later,) = judge_campaign(more, [requirement], SamplingDesign(first_look=n))
         assert later.status is Status.PASS
-        (too_few,) = judge_campaign(more[:-1], [requirement], Sampled(first_look=n))
+        (too_few,) = judge_campaign(more[:-1], [requirement], SamplingDesign(first_look=n))
         assert too_few.status is Status.INSUFFICIENT
 
 
@@ -272,7 +272,7 @@ def test_cases_appended_after_a_verdict_pay_for_the_first_look(velocity: dict[st
 
 
 def test_terrains_appended_after_a_verdict_pay_for_the_first_look(velocity: dict[str, Any]) -> None:
-    how = Sampled(first_look=460)
+    how = SamplingDesign(first_look=460)
     frame = _rows(776, 0).assign(terrain=np.arange(776) // 2)
     frame.loc[0, "velocity_error_m_s"] = 6.0
     (first,) = judge_campaign(frame[:460], [velocity], how)
@@ -325,11 +325,11 @@ def test_further_cases_of_correlated_cases_count_what_they_are_worth(velocity: d
         [frame, _rows(verdict.further_cases, 0).assign(terrain=1000 + np.arange(verdict.further_cases) // 5)]
     )
     more["case"] = np.arange(len(more))
-    (later,) = judge_campaign(more, [{**velocity, "probability": 0.82}], Sampled(first_look=1000))
+    (later,) = judge_campaign(more, [{**velocity, "probability": 0.82}], SamplingDesign(first_look=1000))
     assert later.status is Status.PASS
 
 
-def _drawn_from(bank: int, **drawn: Any) -> Sampled:
+def _drawn_from(bank: int, **drawn: Any) -> SamplingDesign:
     return sampled({"parameters": {"place": {"bank": bank}}, "dispersions": {"place.terrain": drawn} if drawn else {}})
 
 
@@ -361,7 +361,7 @@ def test_the_advice_names_the_terrains_that_limit_a_verdict(velocity: dict[str, 
 
 def test_looks_of_a_campaign_that_stops_itself_share_the_risk(velocity: dict[str, Any]) -> None:
     # Of 640 cases the looks are at 20, 40, 80, 160, 320 and 640; the last adds half of them and has half of 10 %.
-    how = Sampled(most_cases=640)
+    how = SamplingDesign(most_cases=640)
     (early,) = judge_campaign(_rows(320, 0), [velocity], how)
     assert early.bounds_confidence == pytest.approx(1.0 - 0.1 * 160 / 640)
     assert early.lower == proportion_lower(320, 320, early.bounds_confidence)

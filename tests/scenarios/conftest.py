@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from marsyard.scenarios.dotted import found_at
+from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.systems import StatedColumns, scenario_paths, stated_columns
+from marsyard.scenarios.systems import RowColumns, row_columns, scenario_paths
 
 
-def _unstated(row: Any, stated: StatedColumns, own: tuple[str, ...]) -> list[str]:
+def _unstated(row: Any, stated: RowColumns, own: tuple[str, ...]) -> list[str]:
     """Columns of numbers and truth values that are stated nowhere; those of further algorithms are the judged one's."""
     found = []
     for name, value in row.items():
@@ -24,7 +24,7 @@ def _unstated(row: Any, stated: StatedColumns, own: tuple[str, ...]) -> list[str
     return found
 
 
-def _checked(run: Callable[..., CaseResult], stated: StatedColumns) -> Callable[..., CaseResult]:
+def _checked(run: Callable[..., CaseResult], stated: RowColumns) -> Callable[..., CaseResult]:
     def checked(self: Any, parameters: Any, streams: Any) -> CaseResult:
         result = run(self, parameters, streams)
         named = [one.name for one in getattr(parameters, stated.named_flags, ())] if stated.named_flags else []
@@ -43,8 +43,8 @@ def _checked(run: Callable[..., CaseResult], stated: StatedColumns) -> Callable[
 def _rows_have_the_columns_that_are_stated() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name, path in scenario_paths().items():
-            kind = found_at(path)
-            stated = stated_columns(name)
+            kind = import_object(path)
+            stated = row_columns(name)
             assert stated is not None
             patch.setattr(kind, "run", _checked(kind.run, stated))
         yield

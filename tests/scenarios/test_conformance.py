@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.running.conformance import examine
-from marsyard.scenarios.conformance import Finding, Subject, check_names, inputs, run_check, task_of, trackers
+from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, inputs, run_check, trackers
 from marsyard.scenarios.conformance.inputs import TexturedPlane
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY
 from marsyard.sim.camera import Cahv
@@ -26,7 +26,7 @@ def seen(m):
 
 
 def findings(spec: str, *only: str) -> dict[str, Finding]:
-    subject = Subject(spec, task_of(spec), 60.0)
+    subject = Subject(spec, determine_task(spec), 60.0)
     names = [name for name, _ in check_names(subject)]
     return {name: run_check(subject, names.index(name)) for name in (only or names)}
 
@@ -219,19 +219,19 @@ def test_state_left_behind_is_found_by_the_process(
 
 
 def test_the_task_is_told_by_name_and_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert [task_of(name) for name in ("homography", "semi-global", "pure-ncc", "exec:cat")] == [
+    assert [determine_task(name) for name in ("homography", "semi-global", "pure-ncc", "exec:cat")] == [
         "velocity",
         "landing",
         "tracking",
         "velocity",
     ]
-    assert task_of("marsyard.algorithms.hda:HdaEstimator") == "landing"
-    assert task_of("marsyard.algorithms.vtt:VisualTargetTracker") == "tracking"
-    assert task_of(bad(tmp_path, monkeypatch, estimator("return NOTHING"))) == "velocity"
+    assert determine_task("marsyard.algorithms.hda:HdaEstimator") == "landing"
+    assert determine_task("marsyard.algorithms.vtt:VisualTargetTracker") == "tracking"
+    assert determine_task(bad(tmp_path, monkeypatch, estimator("return NOTHING"))) == "velocity"
     with pytest.raises(ValueError, match="unknown algorithm 'vt'"):
-        task_of("vt")
+        determine_task("vt")
     with pytest.raises(ValueError, match="no algorithm at 'nowhere:Nothing'"):
-        task_of("nowhere:Nothing")
+        determine_task("nowhere:Nothing")
 
 
 def test_a_plane_is_seen_where_it_lies() -> None:

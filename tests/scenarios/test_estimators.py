@@ -13,9 +13,9 @@ from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.streams import StreamedEstimator
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios import estimators
+from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, check_chosen, labels
-from marsyard.scenarios.trial import Judged, attempted, case_result
+from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, check_algorithms, labels
 from marsyard.scenarios.velocity import consistency_row
 
 LIMITS = ExecutableLimits()
@@ -65,7 +65,7 @@ def test_labels_tell_algorithms_apart_and_are_names_of_columns() -> None:
 
 def test_the_same_algorithm_twice_is_refused() -> None:
     with pytest.raises(ValueError, match="'dimes' is named twice"):
-        check_chosen(VELOCITY, ["dimes", "dimes"])
+        check_algorithms(VELOCITY, ["dimes", "dimes"])
     with pytest.raises(ValueError, match="'dimes' is named twice"):
         DescentScenarioParameters.model_validate({"compared": ["dimes"]})
 
@@ -75,7 +75,7 @@ def test_what_one_algorithm_does_wrong_does_not_touch_the_others() -> None:
         def ask() -> float:
             return 1.0 / float(spec)
 
-        tried = attempted(ask, lambda answer: answer)
+        tried = run_algorithm(ask, lambda answer: answer)
         return Judged(
             tried.outcome(lambda _: "VALID"), tried.answer is not None, {"error_m": 0.5}, failure=tried.failure
         )

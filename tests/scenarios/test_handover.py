@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.algorithms.answers import checked_site, checked_update, checked_velocity
+from marsyard.algorithms.answers import check_site, check_update, check_velocity
 from marsyard.algorithms.interface import (
     SiteEstimate,
     SiteOutcome,
@@ -140,12 +140,12 @@ def test_answers_are_plain_numbers_before_they_are_scored() -> None:
         VelocityOutcome.VALID, np.zeros(2), covariance_m2_s2=plane, span_s=(np.float64(0.0), 1.0)
     )
     checked = (
-        checked_velocity(velocity).covariance_m2_s2,
-        checked_site(SiteEstimate(SiteOutcome.SAFE_SITE, place)).site_world,
-        checked_update(TargetUpdate(TrackingState.NORMAL, (), place)).position_rover,
+        check_velocity(velocity).covariance_m2_s2,
+        check_site(SiteEstimate(SiteOutcome.SAFE_SITE, place)).site_world,
+        check_update(TargetUpdate(TrackingState.NORMAL, (), place)).position_rover,
     )
     assert len([one for one in checked if type(one) is np.ndarray and one.dtype == np.float64]) == 3
-    assert [type(one) for one in checked_velocity(velocity).span_s or ()] == [float, float]
+    assert [type(one) for one in check_velocity(velocity).span_s or ()] == [float, float]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from marsyard.scenarios.measured.layout import VELOCITY, IngestError, read_inges
 from marsyard.scenarios.measured.picture_files import read_counts, read_flat_field
 from marsyard.scenarios.measured.store import CasesFile
 from marsyard.scenarios.meshes import MOST_BYTES, MeshFileError, read_mesh
-from marsyard.scenarios.offline import VELOCITY_FORM, answers_of
+from marsyard.scenarios.offline import VELOCITY_FORM, read_answers
 from marsyard.sim.camera import read_cameras
 from marsyard.sim.dynamics.recorded import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
 from marsyard.sim.sensor import read_datasheet
@@ -116,10 +116,10 @@ READERS: dict[str, Callable[[Path], object]] = {
     "flight.csv": read_poses,
     "flight.spice.toml": read_poses,
     "rock.stl": lambda path: read_mesh(str(path)),
-    "answers.csv": lambda path: answers_of(path, VELOCITY_FORM),
+    "answers.csv": lambda path: read_answers(path, VELOCITY_FORM),
     "ingest.toml": lambda path: read_ingest_file(path.parent),
     "pictures.csv": lambda path: read_table(path, VELOCITY),
-    "cases.json": lambda path: CasesFile.hash_of(str(path)),
+    "cases.json": lambda path: CasesFile.file_hash(str(path)),
 }
 
 

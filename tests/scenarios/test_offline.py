@@ -13,9 +13,9 @@ from marsyard.algorithms.faults import AlgorithmError
 from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, labels, sources_of
-from marsyard.scenarios.handover import fingerprint
-from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, answers_of
+from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, algorithm_sources, labels
+from marsyard.scenarios.handover import hash_inputs
+from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, read_answers
 
 LIMITS = ExecutableLimits()
 HEAD = "case,outcome,velocity_east_m_s,velocity_north_m_s\n"
@@ -32,7 +32,7 @@ def test_answers_of_velocity(tmp_path: Path) -> None:
     path = table(
         tmp_path, HEAD.strip() + f",{COVARIANCE}\n7,,1.5,-2,4,1,9\n\n 0 , NO_VALID_TRACK ,,,,,\n1,VALID,3,4,,,\n"
     )
-    answers = answers_of(path, VELOCITY_FORM)
+    answers = read_answers(path, VELOCITY_FORM)
     assert sorted(answers) == [0, 1, 7]
     assert (answers[0].outcome, answers[0].velocity_m_s) == (VelocityOutcome.NO_VALID_TRACK, None)
     assert answers[7].outcome is VelocityOutcome.VALID
@@ -66,14 +66,14 @@ def test_answers_of_velocity(tmp_path: Path) -> None:
 def test_tables_that_are_none(tmp_path: Path, text: str, said: str) -> None:
     path = table(tmp_path, text)
     with pytest.raises(ValueError, match=r"answers\.csv") as caught:
-        answers_of(path, VELOCITY_FORM)
+        read_answers(path, VELOCITY_FORM)
     assert said in str(caught.value)
 
 
 def test_all_that_is_wrong_is_told_but_not_without_end(tmp_path: Path) -> None:
     path = table(tmp_path, HEAD + "".join(f"{case},VALID,x,1\n" for case in range(30)))
     with pytest.raises(ValueError, match=r"(?s)line 2:.*line 21:.*\.\.\. and 10 more"):
-        answers_of(path, VELOCITY_FORM)
+        read_answers(path, VELOCITY_FORM)
     with pytest.raises(ValueError, match="No such file"):
         VELOCITY.check(f"answers:{tmp_path}/nothing.csv")
 
@@ -82,7 +82,7 @@ def test_answers_stand_in_for_an_algorithm(tmp_path: Path) -> None:
     spec = f"answers:{table(tmp_path, HEAD + '3,,1,2')}"
     VELOCITY.check(spec)
     assert labels(["dimes", spec]) == ("dimes", "answers")
-    assert sources_of(spec) == []
+    assert algorithm_sources(spec) == []
     answer = VELOCITY.make(spec, DimesOptions(), LIMITS, 3).estimate(inputs.descent())
     assert np.array_equal(answer.velocity_m_s, [1.0, 2.0])  # type: ignore[arg-type]
     with pytest.raises(AlgorithmError, match=r"answers\.csv has no answer to case 4"):
@@ -96,7 +96,7 @@ def test_answers_of_landing_sites(tmp_path: Path) -> None:
         tmp_path,
         "case,outcome,site_east_m,site_north_m,site_up_m\n0,SAFE_SITE,1,2,3\n1,NO_SAFE_SITE,,,\n2,NO_MOTION,,,\n",
     )
-    assert [one.outcome for one in answers_of(path, SITE_FORM).values()] == [
+    assert [one.outcome for one in read_answers(path, SITE_FORM).values()] == [
         SiteOutcome.SAFE_SITE,
         SiteOutcome.NO_SAFE_SITE,
         SiteOutcome.NO_MOTION,
@@ -118,7 +118,7 @@ def test_what_is_exported_is_what_was_measured(tmp_path: Path, task: str) -> Non
         answer = VELOCITY.make(f"export:{tmp_path}", DimesOptions(), LIMITS, 12).estimate(given)
         assert answer.velocity_m_s is None
         read = read_case(tmp_path / "cases" / "000012")
-        assert [fingerprint(one.counts) for one in read.images] == [fingerprint(one.counts) for one in given.images]
+        assert [hash_inputs(one.counts) for one in read.images] == [hash_inputs(one.counts) for one in given.images]
     else:
         site = LANDING.make(f"export:{tmp_path}", HdaOptions(), LIMITS, 12).estimate(inputs.landing())
         assert not site.outcome.converged

@@ -19,9 +19,9 @@ from marsyard.cli.app import app
 from marsyard.doctor import Verdict, check_systems
 from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.registry import UnknownScenarioError, scenario, scenario_names, scenario_source
-from marsyard.scenarios.systems import BUILT_IN, problems, registry, stated_columns, system_of, systems, template_paths
+from marsyard.scenarios.systems import BUILT_IN, problems, registry, row_columns, system_of, systems, template_paths
 
-CACHED = (registry, stated_columns, shipped_names, requirements.shipped_requirements, requirements._read_shipped)
+CACHED = (registry, row_columns, shipped_names, requirements.shipped_requirements, requirements._read_shipped)
 HEAD = "from pathlib import Path\nfrom marsyard.scenarios.system import System\nHERE = Path(__file__).parent\n"
 Install = Callable[..., None]
 
@@ -69,7 +69,7 @@ def test_the_systems_of_marsyard_are_whole() -> None:
         for name in system.scenarios:
             assert scenario(name).name == name
             assert system_of(name) is system
-            assert stated_columns(name) is not None
+            assert row_columns(name) is not None
         for name, path in system.campaigns.items():
             assert catalogue()[name] == path
         assert set(system.compiled_by) <= set(system.campaigns)
@@ -94,7 +94,7 @@ def test_a_system_of_another_package_is_found_everywhere(install: Install) -> No
     assert "mine-case" in scenario_names()
     assert catalogue()["mine-one"].name == "mine-one.toml"
     assert requirements.shipped_requirements()["MINE"].bound == 1.0
-    columns = stated_columns("mine-case")
+    columns = row_columns("mine-case")
     assert columns is not None
     assert columns.has_number("metres")
     listed = json.loads(CliRunner().invoke(app, ["list", "--json"]).stdout)
@@ -161,5 +161,5 @@ def test_columns_that_cannot_be_read_stop_the_systems_own_campaigns_alone(instal
     scenario_path = "marsyard.scenarios.measured.scenarios:MatchingScenario"
     install("mine", _system("mine", ", columns=HERE / 'columns.toml'").replace("x:Y", scenario_path), columns="x = [")
     with pytest.raises(ValueError, match=r"columns\.toml: states no columns: TOMLDecodeError"):
-        stated_columns("mine-case")
-    assert stated_columns("descent") is not None
+        row_columns("mine-case")
+    assert row_columns("descent") is not None

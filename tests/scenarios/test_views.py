@@ -17,7 +17,7 @@ from marsyard.scenarios.views import (
     camera_pose,
     mast_pose,
     nadir_pose,
-    rocks_in_sight,
+    select_rocks,
     site_scene,
 )
 from marsyard.sim.camera import Cahv
@@ -102,7 +102,7 @@ def test_rocks_shrink_with_distance_and_keep_their_numbers(ground: SiteGround) -
     assert field is not None
     # within half a period, so that no rock is there twice
     eye = Eye(2.0, 3.0, 1.5, pixel_rad=5e-3, reach_m=12.0)
-    seen = rocks_in_sight(ground, eye)
+    seen = select_rocks(ground, eye)
     assert len(seen) > 100
     # each body lies over its rock's place, in some period
     apart = seen.spheres[:, :2] - field.position_m[seen.names, :2]
@@ -124,13 +124,13 @@ def test_triangles_stay_within_their_budget() -> None:
     crowded = SiteGround.of(_small("pisgah", 1024), "ground")
     eye = Eye(0.0, 0.0, 1.5, pixel_rad=3e-4, half_width_rad=np.radians(30.0))
     most = ROCK_TRIANGLES + DETAIL_TRIANGLES
-    assert 0.25 * most < len(rocks_in_sight(crowded, eye).triangles) < 1.7 * most
+    assert 0.25 * most < len(select_rocks(crowded, eye).triangles) < 1.7 * most
 
 
 def test_ground_without_rocks_has_no_objects() -> None:
     bare = SiteGround.of(_small("ivanpah"), "ground")
     assert bare.rocks is None
-    assert len(rocks_in_sight(bare, Eye(0.0, 0.0, 1.5, 1e-3))) == 0
+    assert len(select_rocks(bare, Eye(0.0, 0.0, 1.5, 1e-3))) == 0
 
 
 def test_sky_is_as_bright_as_its_light(ground: SiteGround) -> None:
@@ -164,7 +164,7 @@ def test_a_sector_s_rocks_are_those_of_the_whole_circle_that_lie_in_it(azimuth: 
     ground = SiteGround.of(_small("gusev", 512), "ground", seed=3)
     all_round = Eye(0.4, 1.0, 1.2, 4e-3, reach_m=1.4 * ground.surface.period_m)
     eye = replace(all_round, azimuth_rad=azimuth, half_width_rad=0.3)
-    whole, some = (rocks_in_sight(ground, one) for one in (all_round, eye))
+    whole, some = (select_rocks(ground, one) for one in (all_round, eye))
     away = whole.triangles[:, 0, :2] - (0.4, 1.0)
     turned = np.abs((np.arctan2(away[:, 0], away[:, 1]) - azimuth + np.pi) % (2.0 * np.pi) - np.pi)
     inside = (turned <= 0.3) | (np.hypot(*away.T) <= 5.0)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from marsyard.sim.cache import GIGA, limit_bytes, make_room, touch
+from marsyard.sim.cache import GIGA, evict_files, limit_bytes, touch
 
 
 @pytest.fixture
@@ -26,23 +26,23 @@ def _left(folder: Path) -> set[str]:
 
 
 def test_what_was_used_least_recently_makes_room(folder: Path) -> None:
-    make_room(folder, 150)
+    evict_files(folder, 150)
     assert _left(folder) == {"2", "3", "4"}
 
 
 def test_use_keeps_a_file(folder: Path) -> None:
     touch(folder / "0")
-    make_room(folder, 150)
+    evict_files(folder, 150)
     assert _left(folder) == {"0", "3", "4"}
 
 
 def test_files_in_use_stay_even_beyond_the_limit(folder: Path) -> None:
-    make_room(folder, 10_000, {folder / "1"})
+    evict_files(folder, 10_000, {folder / "1"})
     assert _left(folder) == {"1"}
 
 
 def test_nothing_goes_while_there_is_room(folder: Path) -> None:
-    make_room(folder, 0)
+    evict_files(folder, 0)
     assert len(_left(folder)) == 5
 
 
@@ -51,7 +51,7 @@ def test_leftovers_go_after_a_day_and_files_being_written_never(folder: Path) ->
         path = folder / name
         path.write_bytes(bytes(1000))
         os.utime(path, (time.time() - 3600.0 * age_h,) * 2)
-    make_room(folder, 0)
+    evict_files(folder, 0)
     assert _left(folder) == {"0", "1", "2", "3", "4", "new.part"}
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.frames import SITE_FROM_WORLD, composed, direction, rigid, rigid_from_axes
+from marsyard.sim.frames import SITE_FROM_WORLD, compose, direction, rigid, rigid_from_axes
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_transforms_made_without_checks_are_scipys() -> None:
         np.testing.assert_allclose(
             rigid_from_axes(turn.as_matrix(), place).as_matrix(), checked.as_matrix(), atol=1e-15
         )
-        twice = composed(checked, rigid(turns[0], places[0]))
+        twice = compose(checked, rigid(turns[0], places[0]))
         np.testing.assert_allclose(
             twice.as_matrix(), (checked * rigid(turns[0], places[0])).as_matrix(), rtol=0.0, atol=4e-15
         )

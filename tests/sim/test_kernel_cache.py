@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.sim.kernel_cache import kernels_are_ready, note_ready
+from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,7 +45,7 @@ def test_who_has_run_with_the_kernels_is_noted_until_they_change(
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "one"))
     assert not kernels_are_ready("descent")
-    note_ready("descent")
+    mark_ready("descent")
     assert kernels_are_ready("descent")
     assert not kernels_are_ready("landing")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "two"))
@@ -54,5 +54,5 @@ def test_who_has_run_with_the_kernels_is_noted_until_they_change(
 
 def test_where_nothing_can_be_kept_nobody_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR")
-    note_ready("descent")
+    mark_ready("descent")
     assert not kernels_are_ready("descent")

@@ -16,8 +16,8 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.offline import (
     Exported,
+    cases_with_changed_pictures,
     export_campaign,
-    other_pictures,
     scored_campaign,
     truth_folder,
 )
@@ -85,7 +85,7 @@ def test_answers_made_elsewhere_score_as_a_run(exported: Exported, tmp_path: Pat
         assert differing_columns(row, other) == ("algorithm",)
         assert row["algorithm"] == "theirs"
         assert row["velocity_error_m_s"] < 1.0
-    assert other_pictures(exported.truth, tmp_path / "scored") == []
+    assert cases_with_changed_pictures(exported.truth, tmp_path / "scored") == []
     assert watch.notes == []
 
 

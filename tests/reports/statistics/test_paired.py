@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from marsyard.reports.statistics.changes import compared_errors, compared_successes
+from marsyard.reports.statistics.changes import compare_errors, compare_successes
 
 TERRAINS = np.repeat(np.arange(25), 8)
 
@@ -15,10 +15,10 @@ TERRAINS = np.repeat(np.arange(25), 8)
 def test_mcnemar_is_exact() -> None:
     first = np.array([True] * 9 + [False] * 1 + [True] * 5)
     other = np.array([False] * 9 + [True] * 1 + [True] * 5)
-    only_first, only_other, p = compared_successes(first, other)
+    only_first, only_other, p = compare_successes(first, other)
     assert (only_first, only_other) == (9, 1)
     assert p == pytest.approx(2 * (1 + 10) / 2**10)  # two tails of ten fair coins
-    assert compared_successes(first, first)[2] == 1.0
+    assert compare_successes(first, first)[2] == 1.0
 
 
 def test_alike_algorithms_differ_as_seldom_as_stated_on_shared_terrains() -> None:
@@ -28,9 +28,9 @@ def test_alike_algorithms_differ_as_seldom_as_stated_on_shared_terrains() -> Non
     for _ in range(150):
         moved = rng.normal(size=25)[TERRAINS]
         differences = moved + 0.1 * rng.normal(size=TERRAINS.size)
-        split += compared_successes(moved < 0.5, moved > -0.5, TERRAINS)[2] < 0.05
-        naive += compared_successes(moved < 0.5, moved > -0.5)[2] < 0.05
-        errors += compared_errors(differences, TERRAINS, 0.9)[3] < 0.05
+        split += compare_successes(moved < 0.5, moved > -0.5, TERRAINS)[2] < 0.05
+        naive += compare_successes(moved < 0.5, moved > -0.5)[2] < 0.05
+        errors += compare_errors(differences, TERRAINS, 0.9)[3] < 0.05
     assert max(split, errors) / 150 <= 0.05 + 3 * 0.018
     assert naive / 150 > 0.3
 
@@ -39,13 +39,13 @@ def test_the_interval_of_a_paired_mean_covers_it_on_shared_terrains() -> None:
     # 200 repetitions at 90 %: sd 2.1 %.
     rng = np.random.default_rng(2)
     draws = (0.3 + rng.normal(size=25)[TERRAINS] + 0.3 * rng.normal(size=TERRAINS.size) for _ in range(200))
-    found = np.array([compared_errors(one, TERRAINS, 0.9) for one in draws])
+    found = np.array([compare_errors(one, TERRAINS, 0.9) for one in draws])
     assert np.mean((found[:, 1] <= 0.3) & (found[:, 2] >= 0.3)) >= 0.9 - 3 * 0.021
 
 
 def test_no_pairs_say_nothing() -> None:
-    assert all(math.isnan(one) for one in compared_errors(np.zeros(0), None, 0.9))
-    mean, lower, upper, p = compared_errors(np.zeros(1), None, 0.9)
+    assert all(math.isnan(one) for one in compare_errors(np.zeros(0), None, 0.9))
+    mean, lower, upper, p = compare_errors(np.zeros(1), None, 0.9)
     assert (mean, p) == (0.0, 1.0)
     assert math.isnan(lower)
     assert math.isnan(upper)

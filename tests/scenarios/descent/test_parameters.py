@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from marsyard.scenarios.descent.optics import calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters, binned_size_for
 from marsyard.scenarios.descent.world import World
-from marsyard.sim.sensor import OwnCamera
+from marsyard.sim.sensor import CustomCamera
 from marsyard.sim.terrain import site
 
 #: A site on Mars and one on Earth.
@@ -108,7 +108,7 @@ def test_own_cameras_stand_in_the_campaign(tmp_path: Path) -> None:
 
 def test_distortion_errors_of_own_cameras_are_the_corners() -> None:
     p = CameraParameters(focal_error=0.0, centre_error_px=0.0, distortion_error_px=2.0)
-    own = p.model_copy(update={"model": OwnCamera.of(camera_optics(p).camera)})
+    own = p.model_copy(update={"model": CustomCamera.of(camera_optics(p).camera)})
     for one in (p, own):
         rng = np.random.default_rng(3)
         drawn = np.random.default_rng(3).standard_normal(4)[3]

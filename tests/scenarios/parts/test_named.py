@@ -12,7 +12,7 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, p
 from marsyard.campaigns.definition.identity import custom_sources, selected_parts
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.parts import named
-from marsyard.scenarios.parts.motions import OwnMotion
+from marsyard.scenarios.parts.motions import CustomMotion
 from marsyard.scenarios.parts.named import DYNAMICS, SCORE, check_columns
 from marsyard.scenarios.parts.scores import (
     SCORED,
@@ -90,7 +90,7 @@ def test_options_are_filled_in_and_can_be_dispersed() -> None:
     p = DescentScenarioParameters.model_validate(
         {"flight": {"motion": "own_parts:Glider", "options": {"glide_ratio": 0.25}}}
     )
-    assert isinstance(p.flight, OwnMotion)
+    assert isinstance(p.flight, CustomMotion)
     assert p.flight.options == {"height_m": 1800.0, "speed_m_s": 60.0, "glide_ratio": 0.25, "rocking_deg": 8.0}
     assert p.flight.create().glide_ratio == 0.25
     assert DescentScenarioParameters.model_validate(p.model_dump(mode="json")) == p

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.scenarios.conformance import Finding, Subject, check_names, run_check, task_of
+from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, run_check
 from marsyard.scenarios.conformance import parts as suite
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
@@ -25,7 +25,7 @@ def poses(place, east=0.0):
 
 
 def findings(spec: str, *only: str) -> dict[str, Finding]:
-    subject = Subject(spec, task_of(spec), 60.0)
+    subject = Subject(spec, determine_task(spec), 60.0)
     names = [name for name, _ in check_names(subject)]
     return {name: run_check(subject, names.index(name)) for name in (only or names)}
 
@@ -36,7 +36,7 @@ def findings(spec: str, *only: str) -> dict[str, Finding]:
 )
 def test_the_examples_conform(name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    assert task_of(f"own_parts:{name}") == kind
+    assert determine_task(f"own_parts:{name}") == kind
     found = findings(f"own_parts:{name}")
     assert {check: one.problem for check, one in found.items() if not one.passed} == {}
     assert ("random" in found) == (kind != "score")

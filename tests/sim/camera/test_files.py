@@ -25,7 +25,7 @@ from marsyard.sim.camera import (
     read_pds3,
     write_cahvor,
 )
-from marsyard.sim.sensor import OwnCamera, OwnCameraChoice
+from marsyard.sim.sensor import CustomCamera, CustomCameraChoice
 
 LABEL = """PDS_VERSION_ID                    = PDS3
 RECORD_TYPE                       = FIXED_LENGTH
@@ -356,7 +356,7 @@ def test_text_files_without_dimensions_take_the_size_that_is_given(tmp_path: Pat
     assert read_cameras(unstated, size=(1024, 1024)) == read_cameras(stated)
     with pytest.raises(CameraFileError, match="Dimensions: 1024 1024; allowed: the given size, 512 512"):
         read_cameras(stated, size=(512, 512))
-    campaign: TypeAdapter[OwnCamera] = TypeAdapter(OwnCameraChoice)
+    campaign: TypeAdapter[CustomCamera] = TypeAdapter(CustomCameraChoice)
     assert campaign.validate_python({"file": str(unstated), "size": [1024, 1024]}).size == (1024, 1024)
     with pytest.raises(ValueError, match=r"size is \[1024\]; allowed: \[columns, rows\]"):
         campaign.validate_python({"file": str(unstated), "size": [1024]})

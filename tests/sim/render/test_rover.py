@@ -11,7 +11,16 @@ from marsyard.sim.camera import Cahv
 from marsyard.sim.dynamics import MER, ROCKY_8, RoverParameters, settle
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import MastGeometry
-from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun, may_shade, rover_objects, rover_sphere
+from marsyard.sim.render import (
+    Photometry,
+    PixelRays,
+    Renderer,
+    Scene,
+    Sun,
+    may_cast_shadow,
+    rover_objects,
+    rover_sphere,
+)
 from marsyard.sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
 from marsyard.sim.terrain import Surface
 from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
@@ -128,8 +137,8 @@ def test_what_a_rover_cannot_shade() -> None:
     corners = objects.triangles.reshape(-1, 3)
     shadow = corners - corners[:, 2:] / low[2] * low
     for place in shadow[:: len(shadow) // 50]:
-        assert may_shade(objects.spheres, low, place, 0.0)
-    assert not may_shade(objects.spheres, low, np.array([2.5, 0.0, 0.0]), 0.3)
-    assert may_shade(objects.spheres, low, np.array([2.5, 0.0, 0.0]), 2.0)
-    assert not may_shade(objects.spheres, low, np.array([-8.0, 0.0, 0.0]), 0.3)
-    assert not may_shade(objects.spheres, low, np.array([-2.0, 4.0, 0.0]), 0.3)
+        assert may_cast_shadow(objects.spheres, low, place, 0.0)
+    assert not may_cast_shadow(objects.spheres, low, np.array([2.5, 0.0, 0.0]), 0.3)
+    assert may_cast_shadow(objects.spheres, low, np.array([2.5, 0.0, 0.0]), 2.0)
+    assert not may_cast_shadow(objects.spheres, low, np.array([-8.0, 0.0, 0.0]), 0.3)
+    assert not may_cast_shadow(objects.spheres, low, np.array([-2.0, 4.0, 0.0]), 0.3)

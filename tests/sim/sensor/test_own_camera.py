@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from marsyard.sim.camera import Cahvor, looking_down, read_camera
-from marsyard.sim.sensor import NamedOrOwnCamera, OwnCamera, OwnCameraChoice
+from marsyard.sim.camera import Cahvor, mount_looking_down, read_camera
+from marsyard.sim.sensor import CustomCamera, CustomCameraChoice, NamedOrCustomCamera
 
-CHOICE: TypeAdapter[OwnCamera] = TypeAdapter(OwnCameraChoice)
-EITHER: TypeAdapter[str | OwnCamera] = TypeAdapter(NamedOrOwnCamera)
+CHOICE: TypeAdapter[CustomCamera] = TypeAdapter(CustomCameraChoice)
+EITHER: TypeAdapter[str | CustomCamera] = TypeAdapter(NamedOrCustomCamera)
 #: EuRoC's first camera (its sensor.yaml), of the fields that are read.
 EUROC = """resolution: [752, 480]
 camera_model: pinhole
@@ -75,15 +75,15 @@ def test_what_was_read_stands_for_the_file(euroc: Path) -> None:
 
 def test_names_stay_names(euroc: Path) -> None:
     assert EITHER.validate_python("xc-55") == "xc-55"
-    assert isinstance(EITHER.validate_python(str(euroc)), OwnCamera)
-    assert isinstance(EITHER.validate_python({"file": str(euroc)}), OwnCamera)
+    assert isinstance(EITHER.validate_python(str(euroc)), CustomCamera)
+    assert isinstance(EITHER.validate_python({"file": str(euroc)}), CustomCamera)
 
 
 def test_mirrored_pictures_are_refused(euroc: Path) -> None:
     camera = read_camera(euroc)
     mirrored = camera._with(h=-camera.h)
     with pytest.raises(ValueError, match="mirrored"):
-        looking_down(mirrored)
+        mount_looking_down(mirrored)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, embed, filled, grid_for, read_rasters
+from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, choose_grid, embed, filled, read_rasters
 from marsyard.sim.terrain.statistics import terrain_statistics
 
 ROWS, COLUMNS = 90, 110
@@ -116,7 +116,7 @@ def test_the_hirise_tile_works(shared_data: Path) -> None:
     source = RealTerrain(
         dtm=shared_data / "gale_hirise" / "gale_1m_dem_0p5m_ortho.npz", ortho_east_m=2.0, ortho_north_m=-1.0
     )
-    assert grid_for(source) == (1024, 1.0)
+    assert choose_grid(source) == (1024, 1.0)
     surface = made(around(source, samples=512))
     extent = embed(source, 512, 1.0).extent
     assert (extent.east_m - extent.west_m, extent.north_m - extent.south_m) == (347.0, 336.0)

@@ -7,10 +7,10 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from marsyard.algorithms.exchange import ExecutableLimits
-from marsyard.scenarios.estimators import Task, check_chosen
+from marsyard.scenarios.estimators import Task, check_algorithms
 
 
-class ChosenAlgorithms(BaseModel):
+class AlgorithmSelection(BaseModel):
     """Parameters of scenarios with selectable algorithms; subclasses define the field `algorithm`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -39,11 +39,11 @@ class ChosenAlgorithms(BaseModel):
     @field_validator("compared")
     @classmethod
     def _check_compared(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        check_chosen(cls.task, names)
+        check_algorithms(cls.task, names)
         return names
 
     @model_validator(mode="after")
-    def _check_distinct(self) -> ChosenAlgorithms:
+    def _check_distinct(self) -> AlgorithmSelection:
         if self.algorithm in self.compared:
             raise ValueError(f"the algorithm '{self.algorithm}' is named twice")
         return self

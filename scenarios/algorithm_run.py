@@ -25,7 +25,7 @@ ALGORITHM, STDERR = "algorithm", "stderr"
 
 
 @dataclass(frozen=True)
-class Attempt(Generic[Answer]):
+class AlgorithmRun(Generic[Answer]):
     """The answer or failure of an algorithm.
 
     - answer: valid answer; None for a failure
@@ -44,7 +44,7 @@ class Attempt(Generic[Answer]):
         return self.failure.outcome if self.failure is not None else Fault.CRASHED.name
 
 
-def attempted(ask: Callable[[], object], check: Callable[[object], Answer]) -> Attempt[Answer]:
+def run_algorithm(ask: Callable[[], object], check: Callable[[object], Answer]) -> AlgorithmRun[Answer]:
     """Run an algorithm and validate its answer; all exceptions become failures of the algorithm."""
     started = time.process_time()
     try:
@@ -55,29 +55,29 @@ def attempted(ask: Callable[[], object], check: Callable[[object], Answer]) -> A
         columns: dict[str, Scalar] = {"estimation_time_s": time.process_time() - started}
         if error.stderr:
             columns[STDERR] = error.stderr
-        return Attempt(None, Failure(error.fault.name, str(error), ""), columns)
+        return AlgorithmRun(None, Failure(error.fault.name, str(error), ""), columns)
     except Exception as error:
         fault = Fault.OUT_OF_MEMORY if isinstance(error, MemoryError) else Fault.CRASHED
         failure = Failure(fault.name, describe_error(error), traceback.format_exc())
-        return Attempt(None, failure, {"estimation_time_s": time.process_time() - started})
+        return AlgorithmRun(None, failure, {"estimation_time_s": time.process_time() - started})
     row: dict[str, Scalar] = {"estimation_time_s": answer_time_s(answer, taken)}
     details = getattr(answer, "details", None)
     if isinstance(details, ProgramDetails):
         row[STDERR] = details.stderr
-    return Attempt(answer, None, row)
+    return AlgorithmRun(answer, None, row)
 
 
-def attempted_with(
+def run_algorithm_on_copy(
     ask: Callable[[Given], object], check: Callable[[object], Answer], measurements: Given
-) -> Attempt[Answer]:
-    """Run an algorithm on its own copy of the measurements, which it may not change; see `attempted`."""
+) -> AlgorithmRun[Answer]:
+    """Run an algorithm on its own copy of the measurements, which it may not change; see `run_algorithm`."""
     handover = Handover(measurements)
 
     def check_both(answer: object) -> Answer:
         handover.check()
         return check(answer)
 
-    return attempted(lambda: ask(handover.given), check_both)
+    return run_algorithm(lambda: ask(handover.given), check_both)
 
 
 def answer_time_s(answer: object, taken_s: float) -> float:

@@ -47,7 +47,7 @@ def _files_in(value: Any) -> Iterator[str]:
             yield from _files_in(inner)
 
 
-class OwnFile(Parameters):
+class UserFile(Parameters):
     """A file with its hash, which is added when the campaign is read and checked in each case."""
 
     file: Annotated[str, Field(description="path of the file")]
@@ -59,19 +59,19 @@ class OwnFile(Parameters):
 
     @classmethod
     @abstractmethod
-    def hash_of(cls, file: str) -> str:
+    def file_hash(cls, file: str) -> str:
         """Return the SHA-256 of a usable file. Raises ValueError, which names the file."""
 
     @model_validator(mode="before")
     @classmethod
     def _add_hash(cls, stated: Any) -> Any:
         if isinstance(stated, Mapping) and isinstance(stated.get("file"), str) and stated.get("sha256") is None:
-            return {**stated, "sha256": cls.hash_of(stated["file"])}
+            return {**stated, "sha256": cls.file_hash(stated["file"])}
         return stated
 
     @model_validator(mode="after")
-    def _check_hash(self) -> OwnFile:
-        if self.sha256 != self.hash_of(self.file):
+    def _check_hash(self) -> UserFile:
+        if self.sha256 != self.file_hash(self.file):
             raise ValueError(f"{self.file}: has changed since the campaign was made from it")
         return self
 

@@ -27,7 +27,7 @@ def current_module(module: str) -> str:
     return f"marsyard.{module}" if exists else module
 
 
-def found_at(path: str) -> Any:
+def import_object(path: str) -> Any:
     """Import the object at ``module:name``. Raises ImportError with the reason.
 
     The current folder is searched last: a file in it never shadows an installed package.
@@ -44,7 +44,7 @@ def found_at(path: str) -> Any:
         raise ImportError(f"{type(error).__name__}: {error}") from error
 
 
-def sources_at(path: str) -> Iterator[tuple[str, Path]]:
+def source_files(path: str) -> Iterator[tuple[str, Path]]:
     """Yield names and files of the sources of the package or module that contains ``module:name``."""
     parts = current_module(path.partition(":")[0]).split(".")
     top = ".".join(parts[:2] if parts[0] == "marsyard" else parts[:1])

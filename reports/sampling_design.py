@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
-from marsyard.campaigns.sampling.design import said_of
-from marsyard.reports.statistics.sequential import looks_of, spent_share
+from marsyard.campaigns.sampling.design import describe_design
+from marsyard.reports.statistics.sequential import planned_looks, spent_fraction
 from marsyard.reports.stored import table
 from marsyard.reports.wording import count, stated
 
@@ -44,7 +44,7 @@ class TerrainSupply:
 
 
 @dataclass(frozen=True)
-class Sampled:
+class SamplingDesign:
     """The sampling design of a campaign.
 
     design: `random`, `latin-hypercube` or `sobol`
@@ -70,7 +70,7 @@ class Sampled:
     @property
     def text(self) -> str:
         """The design in words."""
-        return said_of(self.design, self.grids, nominal=self.nominal)
+        return describe_design(self.design, self.grids, nominal=self.nominal)
 
     @property
     def no_probability(self) -> str:
@@ -80,13 +80,13 @@ class Sampled:
         changes = [] if self.design == RANDOM else ['set design.kind = "random"']
         remedy = " and ".join([*changes, *(f"give '{path}' a distribution that is drawn" for path in self.grids)])
         return (
-            f"No probability statement: the design is {said_of(self.design, self.grids, nominal=False)}, and only "
-            f"independent random draws carry one. {remedy[:1].upper()}{remedy[1:]}, and run it again."
+            f"No probability statement: the design is {describe_design(self.design, self.grids, nominal=False)}, and "
+            f"only independent random draws carry one. {remedy[:1].upper()}{remedy[1:]}, and run it again."
         )
 
     def risk_share(self, cases: int) -> float:
         """Fraction of the risk that a look at so many cases may spend."""
-        return 1.0 if self.most_cases is None else spent_share(looks_of(self.most_cases), cases)
+        return 1.0 if self.most_cases is None else spent_fraction(planned_looks(self.most_cases), cases)
 
     def mask_first_look(self, frame: pd.DataFrame, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
         """Mask of the chosen rows of an earlier first look; None at the first look."""
@@ -104,10 +104,10 @@ class Sampled:
 
 
 #: Independent random draws, the default design.
-INDEPENDENT = Sampled()
+INDEPENDENT = SamplingDesign()
 
 
-def sampled(configuration: Mapping[str, Any]) -> Sampled:
+def sampled(configuration: Mapping[str, Any]) -> SamplingDesign:
     """Read the sampling design from a configuration; invalid values count as missing."""
     design = table(configuration.get("design"))
     dispersions = table(configuration.get("dispersions"))
@@ -115,7 +115,7 @@ def sampled(configuration: Mapping[str, Any]) -> Sampled:
     most = configuration.get("most_cases")
     most_cases = most if isinstance(most, int) and not isinstance(most, bool) and most > 0 else None
     first = configuration.get("cases") if configuration.get("appended") else None
-    return Sampled(
+    return SamplingDesign(
         str(design.get("kind") or RANDOM),
         grids,
         design.get("nominal") is True,

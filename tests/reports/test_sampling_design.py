@@ -16,7 +16,7 @@ from rich.console import Console
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.evaluation import exit_code, overall
-from marsyard.reports.sampled import INDEPENDENT, Sampled, sampled
+from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, sampled
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Status, judge_campaign
 
@@ -89,7 +89,7 @@ def test_the_rate_of_a_design_decides_where_the_estimate_is_to(
 
 def test_a_design_without_requirements_has_no_verdict(make_rows: Rows) -> None:
     frame = make_rows(5)
-    assert overall([], frame, Sampled("sobol")).status is None
+    assert overall([], frame, SamplingDesign("sobol")).status is None
     assert exit_code([], crashed=False) == 0
 
 
@@ -99,7 +99,7 @@ def test_the_nominal_case_counts_in_no_verdict(make_rows: Rows, velocity: dict[s
     frame["answered"] = True
     frame["terrain"] = range(231)
     frame.loc[0, "velocity_error_m_s"] = 9.0
-    (without,) = judge_campaign(frame, [velocity], Sampled(nominal=True))
+    (without,) = judge_campaign(frame, [velocity], SamplingDesign(nominal=True))
     assert (without.status, without.n, without.failures) == (Status.PASS, 230, 0)
     (among,) = judge_campaign(frame, [velocity])
     assert (among.n, among.failures) == (231, 1)
