@@ -7,6 +7,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,6 +30,7 @@ from marsyard.cli.options import (
     console,
     handle_user_errors,
     size_text,
+    with_options,
 )
 
 if TYPE_CHECKING:
@@ -38,44 +40,52 @@ if TYPE_CHECKING:
     from marsyard.campaigns.running.replay import Replay
 
 
-@handle_user_errors
-def run(
-    campaign: CampaignArgument,
-    cases: CasesOption = None,
-    seed: SeedOption = None,
-    jobs: JobsOption = None,
-    cluster: ClusterOption = None,
-    case_time: CaseTimeOption = None,
-    out: OutOption = None,
-    dry_run: Annotated[
-        bool, Option("--dry-run", help="Only estimate time and disk space from a few trial cases.")
-    ] = False,
+@dataclass(frozen=True)
+class RunOptions:
+    """Arguments and options of `marsyard run`."""
+
+    campaign: CampaignArgument
+    cases: CasesOption = None
+    seed: SeedOption = None
+    jobs: JobsOption = None
+    cluster: ClusterOption = None
+    case_time: CaseTimeOption = None
+    out: OutOption = None
+    dry_run: Annotated[bool, Option("--dry-run", help="Only estimate time and disk space from a few trial cases.")] = (
+        False
+    )
     until_decided: Annotated[
         bool,
         Option(
             "--until-decided",
             help="Stop early once the verdicts are decided; the number of cases is the maximum.",
         ),
-    ] = False,
-    override: SetOption = None,
-    algorithm: AlgorithmOption = None,
-) -> None:
+    ] = False
+    override: SetOption = None
+    algorithm: AlgorithmOption = None
+
+
+@handle_user_errors
+@with_options(RunOptions)
+def run(given: RunOptions) -> None:
     """Run a campaign, judge its requirements, and write its report."""
     from marsyard.campaigns.definition.loading import load_campaign
 
-    limits = [] if case_time is None else [f"limits.case_time_s={case_time}"]
-    loaded = load_campaign(campaign, [*(override or []), *limits], cases, seed, algorithm or [])
+    changes = list(given.override or [])
+    if given.case_time is not None:
+        changes.append(f"limits.case_time_s={given.case_time}")
+    loaded = load_campaign(given.campaign, changes, given.cases, given.seed, given.algorithm or [])
     # imported after loading, so that an error in the file is reported at once
     from marsyard.campaigns.running.engine import run_campaign
     from marsyard.cli.evidence import run_until_decided
 
-    executor = make_executor(jobs, cluster)
-    if dry_run:
+    executor = make_executor(given.jobs, given.cluster)
+    if given.dry_run:
         _print_estimate(loaded, executor)
         _print_limits(loaded)
         return
-    directory = out if out is not None else default_directory(loaded.configuration.name)
-    start = run_until_decided if until_decided else run_campaign
+    directory = given.out if given.out is not None else default_directory(loaded.configuration.name)
+    start = run_until_decided if given.until_decided else run_campaign
     run_and_judge(directory, lambda watch: start(loaded, directory, executor, watch))
 
 

@@ -5,45 +5,51 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
 
-from marsyard.cli.options import OverwriteOption, handle_user_errors
+from marsyard.cli.options import OverwriteOption, handle_user_errors, with_options
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
     from marsyard.scenarios.template import CampaignTemplate, Choices
 
 
-@handle_user_errors
-def new(
-    name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")],
+@dataclass(frozen=True)
+class NewOptions:
+    """Arguments and options of `marsyard new`."""
+
+    name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")]
     system: Annotated[
         str | None,
         Option("--system", help="System under test, such as velocity; a wrong name lists all."),
-    ] = None,
-    site: Annotated[str | None, Option("--site", help="One of `marsyard terrain list`.")] = None,
+    ] = None
+    site: Annotated[str | None, Option("--site", help="One of `marsyard terrain list`.")] = None
     camera: Annotated[
         str | None, Option("--camera", metavar="FILE", help="Custom camera file (docs/own-worlds.md).")
-    ] = None,
-    detector: Annotated[
-        str | None, Option("--detector", metavar="FILE", help="Custom detector datasheet in TOML.")
-    ] = None,
+    ] = None
+    detector: Annotated[str | None, Option("--detector", metavar="FILE", help="Custom detector datasheet in TOML.")] = (
+        None
+    )
     flight: Annotated[
         str | None, Option("--flight", metavar="FILE", help="Trajectory file in place of the dynamics.")
-    ] = None,
-    axes: Annotated[str, Option("--axes", help="World axes of the trajectory: enu or ned.")] = "enu",
+    ] = None
+    axes: Annotated[str, Option("--axes", help="World axes of the trajectory: enu or ned.")] = "enu"
     bound: Annotated[
         float | None, Option("--bound", metavar="X", help="Requirement: maximum error or minimum fraction.")
-    ] = None,
-    cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24,
-    out: Annotated[Path | None, Option("--out", metavar="FILE", help="Instead of NAME.toml.")] = None,
-    overwrite: OverwriteOption = False,
-) -> None:
+    ] = None
+    cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
+    out: Annotated[Path | None, Option("--out", metavar="FILE", help="Instead of NAME.toml.")] = None
+    overwrite: OverwriteOption = False
+
+
+@handle_user_errors
+@with_options(NewOptions)
+def new(given: NewOptions) -> None:
     """Write a commented campaign of your own; at a terminal asks for what is not given."""
     from marsyard.campaigns.errors import CampaignError, not_allowed
     from marsyard.cli.evidence import evidence_limits
@@ -52,22 +58,30 @@ def new(
     from marsyard.scenarios.systems import template_paths
     from marsyard.scenarios.template import Choices
 
-    path = Path(f"{name}.toml") if out is None else out
-    if path.exists() and not overwrite:
+    name = given.name
+    path = Path(f"{name}.toml") if given.out is None else given.out
+    if path.exists() and not given.overwrite:
         raise CampaignError(f"{path}: there already; --overwrite replaces it, --out writes another")
     if not name or any(letter in name for letter in '/\\"\n'):
         raise CampaignError(f"'{name}' is no name for a campaign: without slashes and quotes")
-    asked, known = system is None and _is_terminal(), template_paths()
-    chosen = system or _answer("System", next(iter(known)), asked, _one_of(list(known)))
+    asked, known = given.system is None and _is_terminal(), template_paths()
+    chosen = given.system or _answer("System", next(iter(known)), asked, _one_of(list(known)))
     if chosen not in known:
         raise CampaignError(f"--system: {not_allowed('system', chosen, known)}")
     template: CampaignTemplate = import_object(known[chosen])
-    given = Choices(
-        name, site or "", camera or "", detector or "", flight or "", axes, math.nan if bound is None else bound, cases
+    stated = Choices(
+        name=name,
+        site=given.site or "",
+        camera=given.camera or "",
+        detector=given.detector or "",
+        flight=given.flight or "",
+        axes=given.axes,
+        bound=math.nan if given.bound is None else given.bound,
+        cases=given.cases,
     )
-    choices = _completed(template, given, asked)
+    choices = _completed(template, stated, asked)
     loaded = _written(path, template, choices)
-    where = f"{path}: {chosen} over {choices.site}, {count(cases, 'case')}"
+    where = f"{path}: {chosen} over {choices.site}, {count(given.cases, 'case')}"
     typer.echo(f"{where}. See it with `marsyard show {path}`, run it with\n  marsyard run {path}")
     for limit in evidence_limits(loaded):
         typer.echo(f"note: {limit}")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import errno
 import functools
+import inspect
 from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn, ParamSpec
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec, TypeVar, get_type_hints
 
 import typer
 from typer import Argument, Option
@@ -79,6 +80,24 @@ OutOption = Annotated[
 OverwriteOption = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 
 Parameters = ParamSpec("Parameters")
+Options = TypeVar("Options")
+
+
+def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
+    """Make the fields of a dataclass the arguments and options of a command, which receives one object."""
+    hints = get_type_hints(kind, include_extras=True)
+    fields = [one.replace(annotation=hints[name]) for name, one in inspect.signature(kind).parameters.items()]
+
+    def decorate(command: Callable[[Options], None]) -> Callable[..., None]:
+        def wrapped(**given: Any) -> None:
+            command(kind(**given))
+
+        wrapped.__name__, wrapped.__doc__ = command.__name__, command.__doc__
+        wrapped.__annotations__ = hints
+        wrapped.__signature__ = inspect.Signature(fields)  # type: ignore[attr-defined]
+        return wrapped
+
+    return decorate
 
 
 def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Parameters, None]:

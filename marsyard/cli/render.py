@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
-from marsyard.cli.options import MaxHolesOption, OverwriteOption, SiteArgument, fail
+from marsyard.cli.options import MaxHolesOption, OverwriteOption, SiteArgument, fail, with_options
 
 if TYPE_CHECKING:
     import numpy as np
@@ -144,57 +144,61 @@ class Picture:
         return 1 if self.exposed is None else int(2 ** (16 - self.exposed.detector.parameters.bits))
 
 
-def render(
-    site: SiteArgument,
-    camera: Annotated[str, Option("--camera", metavar="NAME", help="Such as mer-navcam; a wrong name lists all.")],
-    out: Annotated[Path, Option("--out", metavar="PREFIX", help="Path of the files without extension.")],
+@dataclass(frozen=True)
+class RenderOptions:
+    """Arguments and options of `marsyard render`."""
+
+    site: SiteArgument
+    camera: Annotated[str, Option("--camera", metavar="NAME", help="Such as mer-navcam; a wrong name lists all.")]
+    out: Annotated[Path, Option("--out", metavar="PREFIX", help="Path of the files without extension.")]
     scale: Annotated[
         str | None, Option("--scale", metavar="SCALE", help="descent or ground; by default the camera's.")
-    ] = None,
+    ] = None
     altitude: Annotated[
         float | None, Option("--altitude", metavar="M", help="Height above the ground; by default the camera's.")
-    ] = None,
+    ] = None
     east: Annotated[
         float | None, Option("--east", metavar="M", help="By default 0, or the middle of a DTM; periodic.")
-    ] = None,
+    ] = None
     north: Annotated[
         float | None, Option("--north", metavar="M", help="By default 0, or the middle of a DTM; periodic.")
-    ] = None,
-    azimuth: Annotated[
-        float, Option("--azimuth", metavar="DEG", help="Viewing direction, clockwise from north.")
-    ] = 0.0,
-    elevation: Annotated[
-        float | None, Option("--elevation", metavar="DEG", help="Of the optical axis; -90: down.")
-    ] = None,
-    sun_azimuth: Annotated[float, Option("--sun-azimuth", metavar="DEG", help="Clockwise from north.")] = 250.0,
-    sun_elevation: Annotated[float, Option("--sun-elevation", metavar="DEG", help="Above the horizon.")] = 35.0,
-    detector: Annotated[bool, Option("--detector/--radiance", help="Detector counts, or radiance factor.")] = True,
-    seed: Annotated[int, Option("--seed", metavar="S", min=0, help="Of the terrain and the noise.")] = 1,
-    overwrite: OverwriteOption = False,
-    max_holes: MaxHolesOption = None,
-) -> None:
+    ] = None
+    azimuth: Annotated[float, Option("--azimuth", metavar="DEG", help="Viewing direction, clockwise from north.")] = 0.0
+    elevation: Annotated[float | None, Option("--elevation", metavar="DEG", help="Of the optical axis; -90: down.")] = (
+        None
+    )
+    sun_azimuth: Annotated[float, Option("--sun-azimuth", metavar="DEG", help="Clockwise from north.")] = 250.0
+    sun_elevation: Annotated[float, Option("--sun-elevation", metavar="DEG", help="Above the horizon.")] = 35.0
+    detector: Annotated[bool, Option("--detector/--radiance", help="Detector counts, or radiance factor.")] = True
+    seed: Annotated[int, Option("--seed", metavar="S", min=0, help="Of the terrain and the noise.")] = 1
+    overwrite: OverwriteOption = False
+    max_holes: MaxHolesOption = None
+
+
+@with_options(RenderOptions)
+def render(given: RenderOptions) -> None:
     """Render a site or DTM: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; -left, -right of a pair."""
-    with report_picture_errors(out):
+    with report_picture_errors(given.out):
         shot = Shot.usual(
-            site,
-            camera,
-            scale=scale,
-            altitude_m=altitude,
-            east_m=east,
-            north_m=north,
-            azimuth_deg=azimuth,
-            elevation_deg=elevation,
-            sun_azimuth_deg=sun_azimuth,
-            sun_elevation_deg=sun_elevation,
-            seed=seed,
-            max_hole_fraction=max_holes,
+            given.site,
+            given.camera,
+            scale=given.scale,
+            altitude_m=given.altitude,
+            east_m=given.east,
+            north_m=given.north,
+            azimuth_deg=given.azimuth,
+            elevation_deg=given.elevation,
+            sun_azimuth_deg=given.sun_azimuth,
+            sun_elevation_deg=given.sun_elevation,
+            seed=given.seed,
+            max_hole_fraction=given.max_holes,
         )
-        _check_files(out, camera, overwrite)
-        for picture in take(shot, detector=detector):
+        _check_files(given.out, given.camera, given.overwrite)
+        for picture in take(shot, detector=given.detector):
             if picture.filled is not None and picture.filled.any():
                 share = f"{picture.filled.mean():.1%} of the pixels{picture.suffix and f' ({picture.suffix[1:]})'}"
                 typer.echo(f"note: {share} see filled holes of the DTM (`filled` in the .npz)", err=True)
-            typer.echo(", ".join(str(path) for path in write(picture, shot, out)))
+            typer.echo(", ".join(str(path) for path in write(picture, shot, given.out)))
 
 
 @contextmanager
