@@ -4,7 +4,7 @@ An algorithm is named by
 
 - a name of Marsyard (`dimes`) or, if it has none, of the entry point group `marsyard.algorithms` of other packages;
 - ``module:Class`` or ``module:function``, called without arguments; the module may lie in the current folder;
-- ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: an external program (docs/own-algorithms.md);
+- ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: an external program (docs/custom-algorithms.md);
   ``exec-stream:`` or ``serve-stream:`` one that takes pictures one by one;
 - ``answers:FILE.csv``: answers computed outside of Marsyard (`marsyard.scenarios.offline`).
 """

@@ -1,4 +1,4 @@
-"""Algorithms that are programs of their own: cases as files, answers as JSON (docs/own-algorithms.md)."""
+"""Algorithms that are programs of their own: cases as files, answers as JSON (docs/custom-algorithms.md)."""
 
 from marsyard.algorithms.exchange.executable import (
     ExecutableSiteEstimator,

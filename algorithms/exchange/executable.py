@@ -66,7 +66,7 @@ class ExecutableVelocityEstimator:
 
 
 class ExecutableVelocityStream:
-    """A program as velocity stream, one JSON line per call (docs/own-algorithms.md).
+    """A program as velocity stream, one JSON line per call (docs/custom-algorithms.md).
 
     Methods raise AlgorithmError if the program fails to answer. A `serve-stream:` program may have answered earlier
     descents.
@@ -115,7 +115,7 @@ class ExecutableSiteEstimator:
 
 
 class ExecutableTargetTracker:
-    """A program as target tracker (docs/own-algorithms.md).
+    """A program as target tracker (docs/custom-algorithms.md).
 
     Methods raise AlgorithmError if the program fails to answer. An `exec:` program ends with this tracker. A `serve:`
     program may have tracked earlier targets; a designation resets it.

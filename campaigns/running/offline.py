@@ -79,7 +79,7 @@ def _write_manifest(campaign: Campaign, directory: Path) -> None:
             f"# {campaign.configuration.total_cases} cases of {campaign.configuration.name}",
             "",
             f"Each folder of `{CASES}/` is one case (task: {_task(campaign).name}): `case.json`, 16-bit pictures and",
-            "cameras, in the exchange of docs/own-algorithms.md. Nothing here is the truth.",
+            "cameras, in the exchange of docs/custom-algorithms.md. Nothing here is the truth.",
             "",
             "Answer in a table with commas, one line for each case, with a first line of these columns:",
             "",

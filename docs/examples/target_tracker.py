@@ -5,7 +5,7 @@
 
 The template of the last stop is looked for in the left picture as it is, neither magnified nor rolled, then its patch
 in the right picture; the target is where the two lines of sight come nearest to each other. Marsyard's readers are used
-for files; a program in another language reads them itself (docs/own-algorithms.md).
+for files; a program in another language reads them itself (docs/custom-algorithms.md).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-/* A velocity estimator in C for Marsyard's exchange, version 2 (docs/own-algorithms.md).
+/* A velocity estimator in C for Marsyard's exchange, version 2 (docs/custom-algorithms.md).
  *
  *   cc -O2 -std=c11 -o velocity_estimator docs/examples/velocity_estimator.c -lm
  *   marsyard run dimes-gusev --algorithm "exec:./velocity_estimator"            one process a case

@@ -30,7 +30,7 @@ class NewOptions:
     ] = None
     site: Annotated[str | None, Option("--site", help="One of `marsyard terrain list`.")] = None
     camera: Annotated[
-        str | None, Option("--camera", metavar="FILE", help="Custom camera file (docs/own-worlds.md).")
+        str | None, Option("--camera", metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")
     ] = None
     detector: Annotated[str | None, Option("--detector", metavar="FILE", help="Custom detector datasheet in TOML.")] = (
         None

@@ -75,7 +75,7 @@ class PartSuite(Suite):
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
-        form = "see docs/own-parts.md for inputs and outputs"
+        form = "see docs/custom-parts.md for inputs and outputs"
         asked = "returns the output of its kind: right shapes, finite and in order"
         yield Check("answer", asked, form, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases()))
         asked = "reports the same columns in every case: identifiers, with numbers or truth values"

@@ -1,5 +1,6 @@
 """Instruments: measurements of the true state, with errors."""
 
+from marsyard.sim.sensor.custom_camera import CustomCamera, CustomCameraChoice, NamedOrCustomCamera
 from marsyard.sim.sensor.detector import AutoExposure, AutoExposureParameters, Detector, DetectorParameters, auto_expose
 from marsyard.sim.sensor.imu import Imu, ImuIncrements, ImuParameters, WarmUp
 from marsyard.sim.sensor.inertial import Approach, ApproachParameters, InertialSolution, NavigationErrors
@@ -17,7 +18,6 @@ from marsyard.sim.sensor.mast import (
 from marsyard.sim.sensor.motion import ImageMotion
 from marsyard.sim.sensor.odometry import OdometryParameters
 from marsyard.sim.sensor.optics import natural_fall_off
-from marsyard.sim.sensor.own_camera import CustomCamera, CustomCameraChoice, NamedOrCustomCamera
 from marsyard.sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, preset, read_datasheet
 from marsyard.sim.sensor.ranging import (
     LaserParameters,

@@ -25,10 +25,10 @@ PROMISED = {
         "first/cases/3/dimes.png",
     ),
     "measured-data": ("checked/report.html",),
-    "own-dynamics": ("powered/report.html",),
-    "own-instrument": ("lidar/report.html",),
-    "own-score": ("airbags/report.html",),
-    "own-system": ("fallen/report.html", "fallen/cases/2/altitude.png"),
+    "custom-dynamics": ("powered/report.html",),
+    "custom-instrument": ("lidar/report.html",),
+    "custom-score": ("airbags/report.html",),
+    "custom-system": ("fallen/report.html", "fallen/cases/2/altitude.png"),
 }
 #: Folder of the packages that a tutorial installs.
 INSTALLED = "installed"

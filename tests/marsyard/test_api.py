@@ -18,7 +18,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 SCRIPTS = {
     "draw_and_plan.py": "descent.altitude_first_m: 19",
     "run_one_case.py": "products: ",
-    "own_camera.py": "Cahvor: 0.03 px off (RMS)",
+    "custom_camera.py": "Cahvor: 0.03 px off (RMS)",
 }
 
 

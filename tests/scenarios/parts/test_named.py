@@ -43,35 +43,35 @@ def problem(**parts: Any) -> tuple[str, str]:
     ("parts", "key", "said"),
     [
         ({"flight": {"motion": "nowhere:X"}}, "flight", "no motion at 'nowhere:X': No module named 'nowhere'"),
-        ({"flight": {"motion": "own_parts:Glidr"}}, "flight", "has no attribute 'Glidr'"),
+        ({"flight": {"motion": "custom_parts:Glidr"}}, "flight", "has no attribute 'Glidr'"),
         ({"flight": {"motion": "glidr"}}, "flight", "unknown motion 'glidr'; allowed: your own as module:name"),
-        ({"flight": {"motion": "own_parts:sideways"}}, "flight", "is no motion: it is a function, not a class"),
-        ({"flight": {"motion": "own_parts:StarTracker"}}, "flight", "is no motion: it has no fly"),
+        ({"flight": {"motion": "custom_parts:sideways"}}, "flight", "is no motion: it is a function, not a class"),
+        ({"flight": {"motion": "custom_parts:StarTracker"}}, "flight", "is no motion: it has no fly"),
         (
-            {"flight": {"motion": "own_parts:Glider", "options": {"glide": 1.0}}},
+            {"flight": {"motion": "custom_parts:Glider", "options": {"glide": 1.0}}},
             "flight",
             "unexpected keyword argument 'glide'; it has: height_m, speed_m_s, glide_ratio, rocking_deg",
         ),
         (
-            {"flight": {"motion": "own_parts:Glider", "options": {"glide_ratio": 9.0}}},
+            {"flight": {"motion": "custom_parts:Glider", "options": {"glide_ratio": 9.0}}},
             "flight",
             "refuses its options: glide_ratio is 9.0; allowed: 0 to 5",
         ),
-        ({"flight": {"motion": "own_parts:Glider", "turn_deg": 1.0}}, "flight.turn_deg", "unknown key"),
+        ({"flight": {"motion": "custom_parts:Glider", "turn_deg": 1.0}}, "flight.turn_deg", "unknown key"),
         (
-            {"altimeter": {"instrument": "own_parts:StarTracker"}},
+            {"altimeter": {"instrument": "custom_parts:StarTracker"}},
             "altimeter",
-            "'own_parts:StarTracker' measures 'attitude'; allowed here: 'altitude'",
+            "'custom_parts:StarTracker' measures 'attitude'; allowed here: 'altitude'",
         ),
         (
-            {"attitude_source": {"instrument": "own_parts:StarTracker", "options": {"noise_deg": float("nan")}}},
+            {"attitude_source": {"instrument": "custom_parts:StarTracker", "options": {"noise_deg": float("nan")}}},
             "attitude_source",
             "not JSON compliant",
         ),
         ({"altimeter": {"beam": 2.0}}, "altimeter.beam", "did you mean 'beam_deg'?"),
-        ({"scores": ["own_parts:Glider"]}, "scores", "is no score: it is a class, not a function"),
-        ({"scores": ["own_parts:MASS_KG"]}, "scores", "is no score: it is a float, not a function"),
-        ({"scores": ["own_parts:sideways"] * 2}, "scores", "the score 'own_parts:sideways' is named twice"),
+        ({"scores": ["custom_parts:Glider"]}, "scores", "is no score: it is a class, not a function"),
+        ({"scores": ["custom_parts:MASS_KG"]}, "scores", "is no score: it is a float, not a function"),
+        ({"scores": ["custom_parts:sideways"] * 2}, "scores", "the score 'custom_parts:sideways' is named twice"),
     ],
 )
 def test_what_is_wrong_is_told_where_it_stands(parts: dict[str, Any], key: str, said: str) -> None:
@@ -88,7 +88,7 @@ def test_a_module_that_raises_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_options_are_filled_in_and_can_be_dispersed() -> None:
     p = DescentScenarioParameters.model_validate(
-        {"flight": {"motion": "own_parts:Glider", "options": {"glide_ratio": 0.25}}}
+        {"flight": {"motion": "custom_parts:Glider", "options": {"glide_ratio": 0.25}}}
     )
     assert isinstance(p.flight, CustomMotion)
     assert p.flight.options == {"height_m": 1800.0, "speed_m_s": 60.0, "glide_ratio": 0.25, "rocking_deg": 8.0}
@@ -98,7 +98,7 @@ def test_options_are_filled_in_and_can_be_dispersed() -> None:
 
 def test_an_entry_point_names_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        named, "installed", lambda group: {"glider": "own_parts:Glider"} if group in DYNAMICS.group else {}
+        named, "installed", lambda group: {"glider": "custom_parts:Glider"} if group in DYNAMICS.group else {}
     )
     assert type(DYNAMICS.create("glider", {})).__name__ == "Glider"
     with pytest.raises(ValueError, match=r"unknown motion 'glidr' \(did you mean 'glider'\?\)"):
@@ -154,25 +154,29 @@ def test_the_identity_covers_the_modules_of_parts() -> None:
             "name": "parts",
             "scenario": "descent",
             "cases": 1,
-            "parameters": {"scores": ["mine.scores:energy"], "flight": {"motion": "own_parts:Glider"}, "altimeter": {}},
+            "parameters": {
+                "scores": ["mine.scores:energy"],
+                "flight": {"motion": "custom_parts:Glider"},
+                "altimeter": {},
+            },
             "dispersions": {
                 "flight.motion": {
                     "distribution": "choice",
-                    "values": ["own_parts:Glider", "other:Falling"],
+                    "values": ["custom_parts:Glider", "other:Falling"],
                     "source": "-",
                 },
                 "altimeter": {
                     "distribution": "choice",
-                    "values": [{"beam_deg": 3.0}, {"instrument": "own_parts:PulsedLidar"}],
+                    "values": [{"beam_deg": 3.0}, {"instrument": "custom_parts:PulsedLidar"}],
                     "source": "-",
                 },
             },
         }
     )
     assert selected_parts(configuration) == (
-        "own_parts:Glider",
+        "custom_parts:Glider",
         "mine.scores:energy",
         "other:Falling",
-        "own_parts:PulsedLidar",
+        "custom_parts:PulsedLidar",
     )
-    assert list(custom_sources("own_parts:Glider")) == [("own_parts.py", EXAMPLES / "own_parts.py")]
+    assert list(custom_sources("custom_parts:Glider")) == [("custom_parts.py", EXAMPLES / "custom_parts.py")]

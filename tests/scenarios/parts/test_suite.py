@@ -36,8 +36,8 @@ def findings(spec: str, *only: str) -> dict[str, Finding]:
 )
 def test_the_examples_conform(name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    assert determine_task(f"own_parts:{name}") == kind
-    found = findings(f"own_parts:{name}")
+    assert determine_task(f"custom_parts:{name}") == kind
+    found = findings(f"custom_parts:{name}")
     assert {check: one.problem for check, one in found.items() if not one.passed} == {}
     assert ("random" in found) == (kind != "score")
 

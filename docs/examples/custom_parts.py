@@ -1,11 +1,11 @@
 """A motion, an altimeter, a source of attitudes and a score of one's own: copy, rename, replace.
 
-    marsyard conformance own_parts:Glider
-    marsyard conformance own_parts:PulsedLidar
-    marsyard conformance own_parts:StarTracker
-    marsyard conformance own_parts:sideways
+    marsyard conformance custom_parts:Glider
+    marsyard conformance custom_parts:PulsedLidar
+    marsyard conformance custom_parts:StarTracker
+    marsyard conformance custom_parts:sideways
 
-What a class is handed, and what it gives: docs/own-parts.md.
+What a class is handed, and what it gives: docs/custom-parts.md.
 """
 
 from __future__ import annotations
