@@ -155,6 +155,18 @@ def test_each_metric_has_its_check(change: dict[str, Any], check: ValidityCheck)
     assert failed_checks(replace(METRICS, **change), DimesOptions()) == (check,)
 
 
+def test_a_track_exactly_at_every_limit_is_valid() -> None:
+    options = DimesOptions()
+    limit = TrackMetrics(
+        contrast=options.min_contrast,
+        peak=options.min_peak,
+        peak_width_px=options.max_peak_width_px,
+        second_peak_ratio=options.max_second_peak_ratio,
+        on_border=False,
+    )
+    assert failed_checks(limit, options) == ()
+
+
 @pytest.mark.parametrize(
     "wrong",
     [{"template_px": 30}, {"template_px": 3}, {"search_margin_px": 0}, {"grid_step_px": 0}, {"max_off_nadir_rad": 2.0}],

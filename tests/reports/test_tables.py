@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
@@ -18,6 +19,7 @@ from marsyard.reports.columns import (
     magnitude_label,
     primary_metric,
 )
+from marsyard.reports.rates import share_of
 from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
 from marsyard.reports.verdicts import judge_campaign
 from marsyard.reports.wording import interval, number, percent, stated
@@ -124,3 +126,10 @@ def test_numbers() -> None:
     assert [number(value) for value in (0.0, -1.5, 12.345, 123.45)] == ["0.000", "−1.500", "12.35", "123.5"]  # noqa: RUF100
     assert (number(math.nan), number(math.inf), stated(0.9973)) == ("–", "∞", "99.73 %")
     assert (interval(1.0, math.inf), interval(-math.inf, math.inf)) == ("≥ 1.000", "–")
+
+
+def test_no_cases_have_no_rate_and_the_widest_interval() -> None:
+    empty = share_of(np.zeros(0, dtype=np.bool_), pd.DataFrame())
+    assert (empty.hits, empty.n) == (0, 0)
+    assert math.isnan(empty.share)
+    assert empty.sound == (0.0, 1.0)
