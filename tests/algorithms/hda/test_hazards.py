@@ -163,6 +163,18 @@ def test_near_borders_and_holes_nothing_is_known() -> None:
     np.testing.assert_array_equal(safety, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
 
 
+def test_unknown_ground_grows_with_the_lander() -> None:
+    slope = np.zeros((80, 100))
+    slope[40, 50] = np.nan
+    options = replace(OPTIONS, lander_diameter_m=1.5, unknown_growth=0.6)
+    safety = safe_landing_map(slope, np.zeros((80, 100)), CELL_M, options)
+    rows, columns = np.indices((80, 100))
+    distance = np.hypot(rows - 40, columns - 50)
+    inner = (slice(15, 65), slice(15, 85))
+    sure = (np.abs(distance - 9.0) > 1e-6)[inner]  # 0.6 of 1.5 m are 9 cells
+    np.testing.assert_array_equal((safety == Safety.UNKNOWN)[inner][sure], (distance < 9.0)[inner][sure])
+
+
 def test_what_is_hazard_and_unknown_is_hazard() -> None:
     slope = np.zeros((80, 100))
     slope[:, 0] = 1.0

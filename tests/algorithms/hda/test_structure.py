@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import Fate, HdaDetails, HdaEstimator, HdaOptions
 from marsyard.algorithms.hda.kernels import matching
+from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.structure import (
     clip_to_image,
     dense_structure,
@@ -18,6 +19,7 @@ from marsyard.algorithms.hda.structure import (
     match_pixels,
     pixel_lattice,
     return_distance,
+    scale_factor,
     triangulate,
 )
 from marsyard.algorithms.hda.view import LandingScene, build_scene, undistort
@@ -109,6 +111,25 @@ def test_matches_and_depths_are_those_of_the_exact_scene(scene: Pass, seen: Land
     misses = (matches.depths - true_depths(scene, matches.first))[matches.accepted]
     # That over a parallax of 32 px: half a percent of the height (issue 6, bar 1).
     assert np.sqrt(np.mean(misses**2)) < 0.005 * 10.0
+
+
+def test_the_grid_keeps_search_windows_inside_the_picture(scene: Pass, seen: LandingScene) -> None:
+    matches = dense_structure(seen.views, scene.second_from_first, (9.0, 11.0), replace(OPTIONS, grid_px=1))
+    border = OPTIONS.search_half_px + 1
+    assert matches.first.min() >= border
+    assert np.all(matches.first <= np.array([320, 240]) - 1 - border)
+
+
+def test_without_matches_at_the_spot_the_features_plane_gives_the_scale(scene: Pass, seen: LandingScene) -> None:
+    rng = np.random.default_rng(8)
+    places = rng.uniform(-0.3, 0.3, (30, 2))
+    depths = 1.0 / (0.1 + places @ np.array([0.02, -0.03]))  # a plane, 10 m away on the axis
+    inliers = np.arange(30) != 4
+    depths[4] = 3.0
+    motion = Motion(scene.second_from_first, depths, np.zeros(30), inliers, 20.0, converged=True)
+    blank = np.full((240, 320), 1000, dtype=np.uint16)
+    views = (replace(seen.views[0], counts=blank), replace(seen.views[1], counts=blank))
+    assert scale_factor(views, motion, places, 12.0, OPTIONS) == pytest.approx(1.2, rel=1e-9)
 
 
 def test_a_wrong_picture_gives_few_matches(scene: Pass, seen: LandingScene) -> None:

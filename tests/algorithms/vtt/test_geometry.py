@@ -264,3 +264,10 @@ def test_lines_of_sight_that_do_not_meet_give_no_range() -> None:
     assert triangulated(left, right, a, b) is not None
     assert triangulated(left, right, a, b + np.array([3.0, 0.0])) is None  # they diverge
     assert triangulated(left, left, a, a) is None
+
+
+def test_points_of_the_epipolar_curve_are_half_a_pixel_apart() -> None:
+    left, right = navcam().left, navcam().right
+    pixels = epipolar_pixels(left, right, np.array([500.0, 500.0]), (4.0, 8.0))
+    steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
+    assert np.all((steps > 0.25) & (steps < 0.6))

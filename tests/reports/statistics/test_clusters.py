@@ -112,3 +112,11 @@ def test_terrains_are_counted_without_gaps() -> None:
     for terrain in ([7, 3, 7, 5], [-2, 10**15, -2], [4]):
         numbered = np.array(terrain, dtype=np.int64)
         np.testing.assert_array_equal(terrain_index(numbered), np.unique(numbered, return_inverse=True)[1])
+
+
+@pytest.mark.parametrize(("terrains", "failing", "estimated"), [(50, 10, True), (49, 10, False), (50, 9, False)])
+def test_correlation_is_estimated_from_enough_terrains(terrains: int, failing: int, estimated: bool) -> None:
+    terrain = np.repeat(np.arange(terrains), 4)
+    success = ~((terrain < failing) & (np.arange(terrain.size) % 4 == 0))
+    method = ClusterMethod.KORN_GRAUBARD if estimated else ClusterMethod.TERRAIN_COUNT
+    assert clustered_evidence(success, terrain, 0.9).method is method
