@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -140,18 +141,27 @@ def _twin(pattern: Path, site: str) -> dict[str, Any]:
 
 
 def marsyard(*arguments: str) -> Cost:
-    """Cost of a `marsyard` command in a separate process."""
+    """Cost of a `marsyard` command in a separate process.
+
+    A small process starts it: at `exec` Linux counts the memory of the starting process as the program's own.
+    """
     began = time.perf_counter()
-    child = os.posix_spawn(
-        sys.executable, [sys.executable, "-m", "marsyard", *arguments], os.environ, file_actions=_QUIETLY
+    done = subprocess.run(
+        [sys.executable, "-c", _MEASURING, *arguments], stdout=subprocess.PIPE, text=True, check=True, timeout=3600
     )
-    _, status, used = os.wait4(child, 0)
-    if os.waitstatus_to_exitcode(status) not in (0, 1, 3):
-        raise RuntimeError(f"marsyard {' '.join(arguments)} ended with {os.waitstatus_to_exitcode(status)}")
-    return Cost(used.ru_utime + used.ru_stime, time.perf_counter() - began, used.ru_maxrss * 1024 / 1e9)
+    status, core_s, memory_gb = json.loads(done.stdout)
+    if status not in (0, 1, 3):
+        raise RuntimeError(f"marsyard {' '.join(arguments)} ended with {status}")
+    return Cost(core_s, time.perf_counter() - began, memory_gb)
 
 
-_QUIETLY = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+_MEASURING = """
+import json, os, sys
+quietly = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+words = [sys.executable, "-m", "marsyard", *sys.argv[1:]]
+_, status, used = os.wait4(os.posix_spawn(sys.executable, words, os.environ, file_actions=quietly), 0)
+print(json.dumps([os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9]))
+"""
 
 
 def opened(path: Path, done: Callable[[Page], None], repeats: int = 5) -> list[float]:
