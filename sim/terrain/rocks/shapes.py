@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, Int32
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
+
+from marsyard.sim.cache import cache_directory, evict_files, load_array, save_array, touch
+from marsyard.sim.processor import processor_features
 
 #: Shapes of each form; the first blocks are angular, the last rounded.
 SHAPES_OF_FORM = 16
@@ -53,10 +60,8 @@ class ShapeSet:
 def rock_shapes(detail: int) -> ShapeSet:
     """Return the shapes at a level of detail, 0 (`COARSE`) to 3 (`FINEST`); coarser ones are fitted to the finest."""
     directions, faces = _icosphere(detail)
-    vertices = _vertices(detail)
-    normals = np.stack([block.normals(directions) for block in _blocks()])
-    normals.setflags(write=False)
-    return ShapeSet(vertices, normals, faces, _reach())
+    normals = _stored(f"normals-{detail}", lambda: np.stack([block.normals(directions) for block in _blocks()]))
+    return ShapeSet(_vertices(detail), normals, faces, _reach())
 
 
 @cache
@@ -65,6 +70,10 @@ def max_pixels(bound_px: float = DEVIATION_PX) -> Float64[np.ndarray, "shapes le
 
     The deviation is the distance from the finest shape along its normals, RMS over the part above the ground.
     """
+    return bound_px * _stored("pixels", _max_pixels_per_deviation)
+
+
+def _max_pixels_per_deviation() -> Float64[np.ndarray, "shapes levels"]:
     shapes = rock_shapes(FINEST)
     limits = np.empty((SHAPES, FINEST))
     for number, block in enumerate(_blocks()):
@@ -73,8 +82,7 @@ def max_pixels(bound_px: float = DEVIATION_PX) -> Float64[np.ndarray, "shapes le
             inverse = _corner_weights(detail) @ _fitted_inverse_radii(number, detail)
             flat = block.to_unit_shape(_icosphere(FINEST)[0] / inverse[:, None])
             deviation = np.sum((flat - finest) * normals, axis=1)[finest[:, 2] > 0.0]
-            limits[number, detail] = bound_px / np.sqrt(np.mean(deviation**2))
-    limits.setflags(write=False)
+            limits[number, detail] = 1.0 / np.sqrt(np.mean(deviation**2))
     return limits
 
 
@@ -88,8 +96,30 @@ def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarra
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), np.ascontiguousarray(sphere.faces, np.int32)
 
 
+def _stored(name: str, build: Callable[[], Float64[np.ndarray, "..."]]) -> Float64[np.ndarray, "..."]:
+    """An array from the cache of terrains, built where it is missing: all shapes take seconds in every process."""
+    identity = f"{Path(__file__).read_text()} {np.__version__} {processor_features()}"
+    version = hashlib.sha256(identity.encode()).hexdigest()[:16]
+    with suppress(OSError):
+        path = cache_directory("terrain") / f"rocks-{name}-{version}.npy"
+        stored = load_array(path)
+        if stored is None:
+            built = build()
+            evict_files(path.parent, built.nbytes)
+            return save_array(path, built)
+        touch(path)
+        return stored
+    built = build()
+    built.setflags(write=False)
+    return built
+
+
 @cache
 def _vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
+    return _stored(f"vertices-{detail}", lambda: _built_vertices(detail))
+
+
+def _built_vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
     directions, _ = _icosphere(detail)
     vertices = []
     for number, block in enumerate(_blocks()):
@@ -98,9 +128,7 @@ def _vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
         else:
             points = directions / _fitted_inverse_radii(number, detail)[:, None]
         vertices.append(block.to_unit_shape(points))
-    stacked = np.stack(vertices)
-    stacked.setflags(write=False)
-    return stacked
+    return np.stack(vertices)
 
 
 @cache

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -6,6 +8,7 @@ from scipy.integrate import quad
 from scipy.spatial import cKDTree
 
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
+from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.population import decay_per_m, draw_diameters
 from marsyard.sim.terrain.rocks.shapes import (
     COARSE,
@@ -263,3 +266,20 @@ def test_rocks_are_drawn_as_finely_as_the_camera_sees(field: RockField) -> None:
             across_px = field.diameter_m[rock] / (away - 0.5 * field.diameter_m[rock]) / pixel_rad
             held = np.concatenate([[0.0], max_pixels()[field.shape[rock]], [np.inf]])
             assert held[detail] < across_px <= held[detail + 1]
+
+
+def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
+    clear = [function.cache_clear for function in (rock_shapes, max_pixels, shapes._vertices, shapes._reach)]
+    results = []
+    for _ in range(2):
+        for clear_one in clear:
+            clear_one()
+        one = rock_shapes(COARSE)
+        results.append([one.vertices, one.normals, one.reach, max_pixels()])
+        files = sorted((tmp_path / "terrain").glob("rocks-*.npy"))
+    # vertices of four levels, normals of the coarsest and the finest, sizes in pixels
+    assert len(files) == 7
+    for built, stored in zip(*results, strict=True):
+        np.testing.assert_array_equal(built, stored)
+    assert not any(array.flags.writeable for array in results[1][:2])
