@@ -41,8 +41,8 @@ def prepared(given: Mapping[str, Any]) -> Callable[[], object]:
     sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
     sun.data.energy, sun.rotation_mode = 3.0, "QUATERNION"
     sun.rotation_quaternion = mathutils.Vector(given["sun"].tolist()).to_track_quat("Z", "Y")
-    for thing in (bpy.data.objects.new("ground", ground), eye, sun):
-        scene.collection.objects.link(thing)
+    for placed in (bpy.data.objects.new("ground", ground), eye, sun):
+        scene.collection.objects.link(placed)
     scene.camera = eye
     scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
     scene.cycles.samples, scene.cycles.use_denoising = SAMPLES, False

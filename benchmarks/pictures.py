@@ -142,14 +142,14 @@ def on_all_cores(repeats: int) -> list[Figure]:
     """Wall-clock time of a descent frame with detector in a separate process with all cores."""
     limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "LP_NUM_THREADS")
     free = os.environ | dict.fromkeys(limits, str(os.cpu_count()))
-    told = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-m", "benchmarks.pictures", str(repeats)],
         env=free,
         capture_output=True,
         text=True,
         check=True,
     )
-    return [Figure("the same on all cores (wall s)", json.loads(told.stdout), bar=0.12)]
+    return [Figure("the same on all cores (wall s)", json.loads(done.stdout), bar=0.12)]
 
 
 def _wall_seconds(repeats: int) -> list[float]:

@@ -1,8 +1,7 @@
-"""Bars that are three times what was measured when they were set, for figures of which no paper asks anything.
+"""Bars of figures without a requirement: three times the value measured when the bar was set.
 
-A bar that is far looser than what is reached notices no fault before that is gross. These figures repeat to a few per
-cent on one machine; three times leaves room for other processors and OpenGL libraries. Whoever betters a figure lowers
-its entry; one is raised only with a reason next to it.
+A much looser bar would detect only gross faults. These figures repeat to a few per cent on one machine; the factor of
+three allows for other processors and OpenGL libraries. A raised entry needs a reason next to it.
 """
 
 from __future__ import annotations

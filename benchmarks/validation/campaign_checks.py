@@ -82,7 +82,7 @@ def _in_every_way(campaign: str, folder: Path, settings: Sequence[str], kills: i
 
 
 def survival(quick: bool) -> Iterator[Measure]:
-    """An algorithm that does its worst at random, beside one that does nothing wrong."""
+    """An algorithm that misbehaves at random, next to one that does not."""
     cases, share = (60, 0.15) if quick else (400, 0.03)
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -100,8 +100,8 @@ def survival(quick: bool) -> Iterator[Measure]:
         healthy = [k for k, done in enumerate(deeds) if not done]
         changed = sum(bool(differing_columns(rows[share][k], rows[0.0][k])) for k in healthy)
         loops = deeds.count("loop")
-        said = ", ".join(f"{deeds.count(done)} {done}" for done in DEEDS)
-        how = f"{cases} cases of 0.4 s on two workers; {said}"
+        counts = ", ".join(f"{deeds.count(done)} {done}" for done in DEEDS)
+        how = f"{cases} cases of 0.4 s on two workers; {counts}"
         yield Measure("outcomes that are not those of the deed", wrong, "", 0, how)
         yield Measure("healthy cases whose rows changed", changed, "", 0, f"{how}; {len(healthy)} healthy")
         limits_s = loops * campaign.configuration.limits.case_time_s

@@ -1,4 +1,4 @@
-"""The bars on DIMES' IMU check, and DIMES beside ready-made registration on the same descents."""
+"""The bars on DIMES' IMU check, and DIMES next to ready-made registration on the same descents."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def imu_check(quick: bool) -> Iterator[Measure]:
     tail = float(np.quantile(single, inputs.kept)) / threshold - 1.0
     bar = 7.0 / math.sqrt(descents)
     yield Measure("right tracks' discrepancy, 99.5 % quantile, from the threshold", abs(tail), "", bar, how)
-    least = inputs.kept - 3.0 * math.sqrt(inputs.kept * (1.0 - inputs.kept) / descents)
+    bound = inputs.kept - 3.0 * math.sqrt(inputs.kept * (1.0 - inputs.kept) / descents)
     kept = float(np.mean(single < threshold))
     claim = "descents with one right track a pair that pass the IMU check"
-    yield Measure(claim, kept, "", least, f"{how}; bar: 99.5 % less three deviations of the simulation", "at least")
+    yield Measure(claim, kept, "", bound, f"{how}; bar: 99.5 % less three deviations of the simulation", "at least")
     kept = float(np.mean(reference.best() < threshold))
     yield Measure("descents with two right tracks a pair that pass the IMU check", kept, "", 0.995, how, "at least")
     for tracks in (1, 2):

@@ -76,15 +76,18 @@ def _row(measure: Measure) -> str:
 
 
 def _environments(checks: Sequence[Check], kept: dict[str, dict]) -> str:
-    """Where the figures are from; one line where all are from one machine."""
-    where: dict[str, list[str]] = {}
-    for check in checks:
-        if check.name in kept:
-            one = kept[check.name]["environment"]
-            text = f"{one['machine']}; OpenGL {one['gl']}; {one['versions']}; samples: {one['samples']}"
-            where.setdefault(text, []).append(check.name)
-    if not where:
+    """Machine and versions of the figures: the common ones once, then each difference with its checks."""
+    stored = {check.name: kept[check.name]["environment"] for check in checks if check.name in kept}
+    if not stored:
         return "Nothing has been measured yet."
-    if len(where) == 1:
-        return f"Measured on {next(iter(where))}."
-    return "\n".join(f"- {', '.join(names)}: measured on {text}." for text, names in where.items())
+    labels = {"machine": "", "gl": "OpenGL ", "versions": "", "samples": "samples: "}
+    common, different = [], []
+    for key, label in labels.items():
+        groups: dict[str, list[str]] = {}
+        for name, environment in stored.items():
+            groups.setdefault(environment[key], []).append(name)
+        most = max(groups, key=lambda value: len(groups[value]))
+        common.append(f"{label}{most}")
+        different += [f"{', '.join(names)}: {label}{value}" for value, names in groups.items() if value != most]
+    exceptions = "".join(f" Except {one}." for one in different)
+    return f"Measured on {'; '.join(common)}.{exceptions}"

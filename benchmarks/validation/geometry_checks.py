@@ -68,7 +68,9 @@ def run_markers(quick: bool) -> Iterator[Measure]:
         if not _available(backend):
             continue
         result = _marker_errors(backend, count)
-        how = f"{count} markers on rolling ground, {backend} ({result['gl']})"
+        how = f"{count} markers on rolling ground, {backend}"
+        if result["gl"] != renderer().description():
+            how += f" ({result['gl']})"
         for camera, error in result["errors"].items():
             for figure in ("rms", "worst"):
                 claim = f"markers, {figure}: {camera}"
@@ -121,9 +123,9 @@ class Ranges:
 def cast_ranges(view: View, count: int, farthest: float, step: float) -> Ranges:
     """Ranges at random pixels nearer than `farthest`.
 
-    Silhouettes are found by the independent cast too: where its ranges to a pixel and to opposite neighbours do not lie
-    nearly on a line, or some see a thing and some the ground. Left out are also pixels so oblique that each takes in
-    many samples along its line of sight: the renderer smooths the ground there, on purpose.
+    The independent cast also finds silhouettes: the ranges of a pixel and of opposite neighbours are not nearly on a
+    line, or some rays meet an object and some the ground. Pixels so oblique that each covers many samples along its
+    line of sight are left out as well: the renderer smooths the ground there on purpose.
     """
     frame = render(renderer(), view)
     columns, rows = view.camera.size
@@ -134,20 +136,20 @@ def cast_ranges(view: View, count: int, farthest: float, step: float) -> Ranges:
     camera, ground = view.camera.moved(view.world_from_body), Ground(view.scene.surface)
 
     def cast(right: float, down: float) -> tuple[np.ndarray, np.ndarray]:
-        """Ranges there, and whether a thing is seen rather than the ground."""
+        """Ranges at shifted pixels, and whether an object is seen rather than the ground."""
         origins, directions = camera.rays(pixels + np.array([right, down]))
         origins = np.array(origins)
         found = ground.cast(origins, directions, 1.3 * farthest, step)
-        things = meet_triangles(view.scene.objects, origins, directions)
-        return np.minimum(found, things), things < found
+        objects = meet_triangles(view.scene.objects, origins, directions)
+        return np.minimum(found, objects), objects < found
 
-    here, thing = cast(0.0, 0.0)
+    here, is_object = cast(0.0, 0.0)
     away = np.ones(len(here), dtype=bool)
     for right, down in ((1.0, 0.0), (0.0, 1.0), (0.5, 0.5), (0.5, -0.5)):
-        (ahead, thing_ahead), (back, thing_back) = cast(right, down), cast(-right, -down)
+        (ahead, object_ahead), (back, object_back) = cast(right, down), cast(-right, -down)
         with np.errstate(invalid="ignore"):
             away &= np.abs(ahead + back - 2.0 * here) < BEND * here
-        away &= (thing_ahead == thing) & (thing_back == thing)
+        away &= (object_ahead == is_object) & (object_back == is_object)
     descending = -camera.rays(pixels.astype(np.float64))[1][:, 2]
     angle = 1.0 / np.sqrt(np.prod(view.camera.focal_lengths))
     fine = picture * angle / np.maximum(descending, 0.01) < FINE_UNTIL * view.scene.surface.spacing_m
@@ -158,7 +160,7 @@ def _range_row(name: str, view: View, count: int, farthest: float, step: float) 
     ranges = cast_ranges(view, count, farthest, step)
     how = (
         f"{ranges.cast.size} random pixels; left out: {ranges.near_silhouettes:.1%} near silhouettes, "
-        f"{ranges.smoothed:.1%} that take in several samples"
+        f"{ranges.smoothed:.1%} that cover several samples"
     )
     return Measure(
         f"ranges within 1e-4 of an independent ray cast: {name}", ranges.agreeing, "", 0.999, how, "at least"

@@ -26,12 +26,12 @@ from marsyard.sim.terrain import Surface
 SIDE = 2048
 #: Size of a marker's picture: the geometric mean of its ellipse's sigmas, pixels.
 SPOT_PX = 2.7
-#: Half a side of the window in which a marker's light is gathered, and least distance of markers, pixels.
+#: Half a side of the window in which a marker's light is summed, and minimum distance of markers, pixels.
 WINDOW, APART = 14, 46
 #: Most oblique view of a marker, from the vertical.
-MOST_OBLIQUE_RAD = np.radians(68.0)
-#: Farthest that a camera's middle is tilted from straight down.
-MOST_TILT_RAD = np.radians(30.0)
+MAX_OBLIQUITY_RAD = np.radians(68.0)
+#: Maximum off-nadir angle of a camera's axis.
+MAX_TILT_RAD = np.radians(30.0)
 MARKERS = 1000
 
 
@@ -46,8 +46,8 @@ class Marked:
 
 
 def _looking_down(camera: CameraModel, rng: np.random.Generator) -> Rotation:
-    """A random attitude in which the camera's middle looks down, tilted by up to `MOST_TILT_RAD`."""
-    tilt, about, spin = rng.uniform(0.2, 1.0) * MOST_TILT_RAD, *rng.uniform(0.0, 2.0 * np.pi, 2)
+    """A random attitude in which the camera's middle looks down, tilted by up to `MAX_TILT_RAD`."""
+    tilt, about, spin = rng.uniform(0.2, 1.0) * MAX_TILT_RAD, *rng.uniform(0.0, 2.0 * np.pi, 2)
     target = np.array([np.sin(tilt) * np.cos(about), np.sin(tilt) * np.sin(about), -np.cos(tilt)])
     turned = Rotation.align_vectors(target[None], camera.boresight()[None])[0]
     return Rotation.from_rotvec(spin * target) * turned
@@ -71,7 +71,7 @@ def marked_view(camera: CameraModel, height_m: float, rng: np.random.Generator) 
     world_camera = camera.moved(pose)
     pixels = _scattered(camera.size, rng)
     origins, rays = world_camera.rays(pixels)
-    steep = rays[:, 2] < -np.cos(MOST_OBLIQUE_RAD)
+    steep = rays[:, 2] < -np.cos(MAX_OBLIQUITY_RAD)
     pixels, origins, rays = pixels[steep], np.array(origins[steep]), rays[steep]
     reach = np.abs((origins - rays * (origins[:, 2:] / rays[:, 2:]))[:, :2]).max() * 1.15
     spacing = 2.0 * reach / SIDE

@@ -19,8 +19,8 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.render import Frame, PixelRays, Renderer, Scene
 
 STEPS_PX = np.linspace(0.0, 1.0, 11)
-#: Motions within a patch may differ by this share of the motion: more, and it holds an edge.
-MOST_SPREAD = 0.1
+#: Motions within a patch may differ by this fraction of the motion; otherwise it contains an edge.
+MAX_SPREAD = 0.1
 #: Patches that show more than one body.
 MIXED = -3
 
@@ -29,8 +29,8 @@ MIXED = -3
 class View:
     """A scene, a camera in the body frame, and where the body is.
 
-    `footprint` is the part of a pixel over which the renderer is told to average ground and texture: 1, or next to
-    nothing for raw point samples.
+    `footprint` is the part of a pixel over which the renderer averages ground and texture: 1, or almost 0
+    for point samples.
     """
 
     scene: Scene
@@ -136,7 +136,7 @@ def _whole_patches(motion: np.ndarray, centres: np.ndarray) -> np.ndarray:
     """The patches all of whose pixels move nearly alike."""
     windows = _windows(motion, centres)
     spread = np.ptp(windows, axis=(1, 2)).max(axis=-1)
-    alike = spread <= MOST_SPREAD * np.linalg.norm(windows, axis=-1).max(axis=(1, 2))
+    alike = spread <= MAX_SPREAD * np.linalg.norm(windows, axis=-1).max(axis=(1, 2))
     return centres[alike]
 
 

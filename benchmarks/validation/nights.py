@@ -1,4 +1,4 @@
-"""Simulated nights: campaigns whose cases share terrains in every way that the nightly's comparison tells apart."""
+"""Simulated nights: campaigns whose cases share terrains in the ways that the nightly comparison distinguishes."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class Check:
     section
         Heading in the document under which its rows stand.
     run
-        Makes the measurements; told whether to be quick (fewer samples, the same bars).
+        Makes the measurements; its argument selects few samples (with the same bars).
     """
 
     name: str

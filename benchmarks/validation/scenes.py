@@ -184,7 +184,7 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
         name="target", east_m=ROCK_PLACE[0], north_m=ROCK_PLACE[1], diameter_m=ROCK_DIAMETER_M, shape=3, yaw_deg=20.0
     )
     parameters = (where.terrain("ground").rocks or RockParameters()).model_copy(update={"placed": (target,)})
-    things = rocks(surface, parameters, (eye[0], eye[1]), away + 6.0, MAST_M, where.photometry.rock_albedo)
+    objects = rocks(surface, parameters, (eye[0], eye[1]), away + 6.0, MAST_M, where.photometry.rock_albedo)
     whole = forward(preset("research-pancam").cameras()[0])
     if size is None:
         size = whole.size
@@ -194,7 +194,7 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
         (eye[0], eye[1]),
         Sun(direction(np.radians(200.0), np.radians(40.0))),
         law_of(where),
-        things,
+        objects,
         texture_of(where.ground_texture),
         texture_of(where.rock_texture),
         mesh_finest_m=0.04,

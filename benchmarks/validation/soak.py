@@ -41,7 +41,7 @@ confidence = 0.9
 population = "all"
 """
 
-#: Variable in the environment of the runner, by which whatever it starts is found.
+#: Variable in the environment of the runner, by which the processes that it starts are found.
 _MARK = "MARSYARD_SOAK"
 
 #: Seconds that the whole may take for each case; it takes a tenth of that where nothing waits for ever.

@@ -22,12 +22,12 @@ CONFIDENCE = 0.9
 _ON_TERRAIN = 8
 
 
-def _least(nominal: float, trials: int) -> float:
-    """The least coverage seen that goes with a nominal one: three standard deviations of the simulation below."""
+def _min_coverage(nominal: float, trials: int) -> float:
+    """Bound on a simulated coverage: the nominal one less three standard deviations of the simulation."""
     return nominal - 3.0 * math.sqrt(nominal * (1.0 - nominal) / trials)
 
 
-def _share(hits: Iterator[bool], trials: int) -> float:
+def _fraction(hits: Iterator[bool], trials: int) -> float:
     return sum(bool(hit) for hit in hits) / trials
 
 
@@ -47,14 +47,16 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
         for what, interval in intervals:
             truth = mean if what == "mean" else spread
             found = (interval(draw(30), 0.95) for _ in range(trials))
-            covered = _share((low <= truth <= high for low, high in found), trials)
+            covered = _fraction((low <= truth <= high for low, high in found), trials)
             how = f"{trials} samples of 30; BCa, widened; bar: nominal less three deviations of the simulation"
-            yield Measure(f"95 % interval of the {what}, {name}", covered, "", _least(0.95, trials), how, "at least")
+            yield Measure(
+                f"95 % interval of the {what}, {name}", covered, "", _min_coverage(0.95, trials), how, "at least"
+            )
     truth = float(stats.norm.ppf(0.95))
     bounds = [quantile_bounds(rng.normal(size=80), 0.95, CONFIDENCE) for _ in range(20 * trials)]
     worst = min(np.mean([low <= truth for low, _ in bounds]), np.mean([high >= truth for _, high in bounds]))
     how = f"{20 * trials} samples of 80; the worse of the lower and the upper bound"
-    yield Measure("90 % bounds of a 95 % quantile", float(worst), "", _least(0.9, 20 * trials), how, "at least")
+    yield Measure("90 % bounds of a 95 % quantile", float(worst), "", _min_coverage(0.9, 20 * trials), how, "at least")
     inside = 0
     for _ in range(4 * trials):
         points = rng.normal(size=(21, 2)) @ np.array([[2.0, 0.0], [0.9, 0.4]])
@@ -66,7 +68,12 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
         inside += (along / ellipse.semi_major) ** 2 + (across / ellipse.semi_minor) ** 2 <= 1.0
     how = f"{4 * trials} samples of 20, and one error more each"
     yield Measure(
-        "95 % ellipse holds the next error", inside / (4 * trials), "", _least(0.95, 4 * trials), how, "at least"
+        "95 % ellipse holds the next error",
+        inside / (4 * trials),
+        "",
+        _min_coverage(0.95, 4 * trials),
+        how,
+        "at least",
     )
 
 
@@ -92,7 +99,7 @@ def run_clustered(quick: bool) -> Iterator[Measure]:
                 upper = float(np.mean([one.upper >= rate for one in shown]))
                 claim = f"90 % bounds, rate {rate}, correlation {correlation}, {terrains} terrains"
                 how = f"{trials} campaigns, {_ON_TERRAIN} cases a terrain; the worse of both bounds"
-                yield Measure(claim, min(lower, upper), "", _least(CONFIDENCE, trials), how, "at least")
+                yield Measure(claim, min(lower, upper), "", _min_coverage(CONFIDENCE, trials), how, "at least")
 
 
 def run_shared(quick: bool) -> Iterator[Measure]:
@@ -109,7 +116,7 @@ def run_shared(quick: bool) -> Iterator[Measure]:
                 claim = f"{100 * nominal:.0f} % {interval} of the {what}, "
                 claim += f"correlation {correlation}, {terrains} terrains"
                 how = f"{trials} campaigns, 1 to 14 normal errors a terrain"
-                yield Measure(claim, covered, "", _least(nominal, trials), how, "at least")
+                yield Measure(claim, covered, "", _min_coverage(nominal, trials), how, "at least")
 
 
 def _errors(rng: np.random.Generator, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
@@ -135,25 +142,25 @@ def run_sequential(quick: bool) -> Iterator[Measure]:
     """Error rates of campaigns that stop themselves, at the rate asked, where every verdict is wrong one way."""
     trials = 300 if quick else 2000
     rng = np.random.default_rng(3)
-    for asked, most in ((0.9, 512), (0.99, 1000)):
+    for asked, max_cases in ((0.9, 512), (0.99, 1000)):
         for correlation in (None, 0.2):
-            wrong = np.mean([_decided(rng, asked, most, correlation) for _ in range(trials)], axis=0)
+            wrong = np.mean([_decided(rng, asked, max_cases, correlation) for _ in range(trials)], axis=0)
             kind = "independent cases" if correlation is None else f"cases on terrains, correlation {correlation}"
-            how = f"{trials} campaigns of at most {most} cases at a true rate of {asked}; Monte Carlo error allowed"
-            bar = 1.0 - _least(CONFIDENCE, trials)
+            how = f"{trials} campaigns of up to {max_cases} cases at a true rate of {asked}; Monte Carlo error allowed"
+            bar = 1.0 - _min_coverage(CONFIDENCE, trials)
             for word, share in zip(("PASS", "FAIL"), wrong.tolist(), strict=True):
                 yield Measure(f"false {word} of {asked} at 90 %, {kind}", share, "", bar, how)
 
 
-def _decided(rng: np.random.Generator, asked: float, most: int, correlation: float | None) -> tuple[bool, bool]:
+def _decided(rng: np.random.Generator, asked: float, max_cases: int, correlation: float | None) -> tuple[bool, bool]:
     """Whether the first look at a campaign that decides its requirement finds it met, and whether not met."""
     if correlation is None:
-        success, terrain = rng.random(most) < asked, np.arange(most)
+        success, terrain = rng.random(max_cases) < asked, np.arange(max_cases)
     else:
-        success, terrain = _cases(rng, asked, correlation, -(-most // _ON_TERRAIN))
+        success, terrain = _cases(rng, asked, correlation, -(-max_cases // _ON_TERRAIN))
         order = rng.permutation(success.size)
-        success, terrain = success[order][:most], terrain[order][:most]
-    for look in planned_looks(most):
+        success, terrain = success[order][:max_cases], terrain[order][:max_cases]
+    for look in planned_looks(max_cases):
         confidence, first = confidence_at(CONFIDENCE, look.share), success[: look.cases]
         if correlation is None:
             seen = int(first.sum()), look.cases, confidence
