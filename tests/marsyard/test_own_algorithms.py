@@ -46,12 +46,12 @@ confidence = 0.5
 def test_the_suite_outlives_what_it_examines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "hostile_here.py").write_text(HOSTILE)
     monkeypatch.chdir(tmp_path)
-    ended = CliRunner().invoke(app, ["conformance", "hostile_here:Hostile", "--time-limit", "5"])
+    ended = CliRunner().invoke(app, ["conformance", "hostile_here:Hostile", "--time-limit", "3"])
     assert ended.exit_code == 1
     assert "FAIL dark" in ended.output
     assert "CRASHED: the worker process died: SIGABRT (-6)" in ended.output
     assert "FAIL saturated" in ended.output
-    assert "TIMED_OUT: took longer than its limit of 15 s" in ended.output
+    assert "TIMED_OUT: took longer than its limit of 11 s" in ended.output
     assert "next: no picture may make it hang" in ended.output
     assert "7 of 9 checks passed" in ended.output
 
