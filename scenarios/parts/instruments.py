@@ -77,7 +77,7 @@ class _CustomInstrument(CustomPart):
     named_by = "instrument"
     quantity: ClassVar[str]
 
-    instrument: Annotated[str, Field(description="own instrument's class: module:Class, or an entry point's name")]
+    instrument: Annotated[str, Field(description="custom instrument's class: module:Class, or an entry point's name")]
 
     @model_validator(mode="after")
     def _check_quantity(self) -> _CustomInstrument:

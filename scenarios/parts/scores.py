@@ -143,7 +143,9 @@ class CustomScores(Parameters):
 
     scored: ClassVar[type[Any]]
 
-    scores: Annotated[tuple[str, ...], Field(description="own scores: module:function, or names of entry points")] = ()
+    scores: Annotated[
+        tuple[str, ...], Field(description="custom scores: module:function, or names of entry points")
+    ] = ()
 
     @field_validator("scores")
     @classmethod

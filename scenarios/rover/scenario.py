@@ -234,11 +234,10 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
 
         def judge(algorithm: str) -> Judged:
             judged = algorithm == p.algorithm
-            own = p.model_copy(update={"algorithm": algorithm})
-            began = started if judged else time.process_time()
-            run = first if judged else prepare_run(own, streams, self.load_ground)
-
-            return _judge(p, lambda: track_target(own, run), known, judged, began)
+            candidate = p.model_copy(update={"algorithm": algorithm})
+            run_started = started if judged else time.process_time()
+            run = first if judged else prepare_run(candidate, streams, self.load_ground)
+            return _judge(p, lambda: track_target(candidate, run), known, judged, run_started)
 
         return case_result(p.algorithms, judge, known)
 

@@ -94,12 +94,12 @@ def tracking(run: Run) -> dict[str, Scalar]:
     """Table III's figures at their extremes, and the tracker's corrections."""
     figures = update_figures(run)
     found = [one for one in run.stops if one.update.found]
-    moved = seed_error = seed_3_sigma = NAN
+    drift_m = seed_error = seed_3_sigma = NAN
     if found:
         seed, last = (
             one.estimated.apply(np.asarray(one.update.position_rover).copy()) for one in (found[0], found[-1])
         )
-        moved, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(found[0].error_m()))
+        drift_m, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(found[0].error_m()))
         scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
         seed_3_sigma = stereo_range_error_m(found[0].range_m, scale, 1.0)
     return {
@@ -113,7 +113,7 @@ def tracking(run: Run) -> dict[str, Scalar]:
         },
         "roll_total_deg": float(np.nansum(figures["roll_change_deg"])),
         "azimuth_total_deg": float(np.nansum(figures["azimuth_change_deg"])),
-        "target_moved_m": moved,
+        "target_moved_m": drift_m,
         "designation_error_m": seed_error,
         "designation_3_sigma_m": seed_3_sigma,
         "update_time_s": float(np.mean([one.track_time_s for one in run.stops])) if run.stops else NAN,
@@ -259,7 +259,7 @@ def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
 
 
 def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
-    """Arrays from which a run's figures are drawn (Figs. 15, 16b and 17 of the paper).
+    """Collect the arrays for a run's figures (Figs. 15, 16b and 17 of the paper).
 
     ================== ================================================================================================
     stop_N_left        counts of the left subframe of stop N, from 1, and `stop_N_right` of the right one
@@ -278,8 +278,8 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
     rocks_m            east, north and diameter of the target's rock and the obstacles, (rocks, 3)
     ================== ================================================================================================
     """
-    stops, rocks, placed = run.stops, run.world.rocks, list(run.world.rocks.names.values())
-    kept: dict[str, object] = {}
+    stops, rocks, named = run.stops, run.world.rocks, list(run.world.rocks.names.values())
+    arrays: dict[str, object] = {}
     for number, stop in enumerate(stops, start=1):
         left, right, details = stop.pictures.left, stop.pictures.right, stop.details
         window, found = np.full(4, np.nan), np.full((2, 2), np.nan)
@@ -288,7 +288,7 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
         found[0] = stop.found_px(run.rig.calibrated)
         if details is not None and details.stereo is not None and stop.update.found:
             found[1] = details.stereo.pixel
-        arrays = {
+        of_stop = {
             "left": left.counts,
             "right": right.counts,
             "corners": np.array([left.corner, right.corner], dtype=np.float64),
@@ -296,15 +296,15 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
             "found": found,
             "point": stop.point_px,
         }
-        kept |= {f"stop_{number}_{name}": values for name, values in arrays.items()}
-    believed = [
+        arrays |= {f"stop_{number}_{name}": values for name, values in of_stop.items()}
+    estimated = [
         np.full(3, np.nan) if stop.reported_rover is None else stop.estimated.apply(stop.reported_rover.copy())
         for stop in stops
     ]
     path = [
         stance.world_from_rover.translation[:2] for stop in stops for drive in stop.drives for stance in drive.stances
     ]
-    kept |= {
+    arrays |= {
         "template_px": p.vtt.template_px,
         "figures": update_figures(run),
         "states": [stop.update.state.name for stop in stops],
@@ -312,11 +312,11 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
         "rover_believed_m": np.array([stop.estimated.translation for stop in stops]).reshape(-1, 3),
         "heading_deg": np.degrees(np.array([stop.stance.azimuth_rad for stop in stops])),
         "target_m": run.target.point_world,
-        "target_believed_m": np.array(believed).reshape(-1, 3),
+        "target_believed_m": np.array(estimated).reshape(-1, 3),
         "path_true_m": np.array(path).reshape(-1, 2),
-        "rocks_m": np.column_stack([rocks.position_m[placed, :2], rocks.diameter_m[placed]]),
+        "rocks_m": np.column_stack([rocks.position_m[named, :2], rocks.diameter_m[named]]),
     }
-    return kept
+    return arrays
 
 
 def scored_run(run: Run) -> ScoredRun:

@@ -79,11 +79,11 @@ class StereoCamera:
         """
         p, scale = self.parameters, np.float32(brightness / self.detectors[0].parameters.sunlight)
 
-        def add_rover(seen: Scene) -> Scene:
-            return seen if rover is None else seen.with_objects(Objects.joined([seen.objects, rover]))
+        def add_rover(shown: Scene) -> Scene:
+            return shown if rover is None else shown.with_objects(Objects.joined([shown.objects, rover]))
 
-        def render(seen: Scene, rays: PixelRays) -> Float32[np.ndarray, "rows columns"]:
-            frame = process_renderer(p.backend).render(seen, rays, world_from_head, time_s)
+        def render(shown: Scene, rays: PixelRays) -> Float32[np.ndarray, "rows columns"]:
+            frame = process_renderer(p.backend).render(shown, rays, world_from_head, time_s)
             return np.asarray(frame.radiance * scale)
 
         pairs = zip(cameras, boxes, strict=True)
@@ -142,6 +142,8 @@ class Stop(View):
     """A stop at which the target was tracked."""
 
     update: TargetUpdate  #: the tracker's answer
+    details: VttDetails | None  #: details of the answer of one of the project's trackers
+    reported_rover: Float64[np.ndarray, "3"] | None  #: in the rover frame; None where the target was not found
     track_time_s: float  #: processor time of the update
     point_px: Float64[np.ndarray, "2"]  #: true full-frame (u, v) of the target in the left picture; NaN outside of it
     point_rover: Float64[np.ndarray, "3"]  #: the designated point in the rover's true frame, metres
@@ -156,21 +158,13 @@ class Stop(View):
         return cls(
             **{one.name: getattr(view, one.name) for one in fields(View)},
             update=update,
+            details=update.details if isinstance(update.details, VttDetails) else None,
+            reported_rover=update.position_rover if update.found else None,
             track_time_s=track_time_s,
             point_px=np.asarray(left.project(in_head)[0]),
             point_rover=np.asarray(view.stance.world_from_rover.inv().apply(point_m.copy())),
             range_m=float(np.linalg.norm(in_head - left.c)),
         )
-
-    @property
-    def details(self) -> VttDetails | None:
-        """The details of our own trackers' answers."""
-        return self.update.details if isinstance(self.update.details, VttDetails) else None
-
-    @property
-    def reported_rover(self) -> Float64[np.ndarray, "3"] | None:
-        """The reported position in the rover frame; None where the target was not found."""
-        return self.update.position_rover if self.update.found else None
 
     def found_px(self, mast: MastCalibration) -> Float64[np.ndarray, "2"]:
         """Pixel of the target in the left picture by the tracker; NaN where it was not found.

@@ -65,6 +65,7 @@ class RunWorld:
     rocks: RockField  #: of the ground; the target's is named `TARGET`, obstacles `obstacle-1`, `obstacle-2`, ...
     base: Scene  #: the scene at the start, without the rover
     sun: SunParameters
+    target_number: int  #: number of the target's rock
     target_triangles: Float64[np.ndarray, "triangles 3 3"]  #: the target's rock as rendered, which is the truth
     _latest: tuple[int, Scene] | None = field(default=None, repr=False)
 
@@ -94,12 +95,7 @@ class RunWorld:
         offsets = objects.spheres[bodies, :2] - rocks.position_m[number][:2]
         nearest = bodies[np.argmin(np.linalg.norm(offsets, axis=1))]
         first, end = objects.first_triangle[nearest : nearest + 2]
-        return cls(ground, rocks, scene, p.sun, objects.triangles[first:end])
-
-    @property
-    def target_number(self) -> int:
-        """Number of the target's rock."""
-        return self.rocks.by_name(TARGET)
+        return cls(ground, rocks, scene, p.sun, number, objects.triangles[first:end])
 
     def face_m(self, p: RoverScenarioParameters) -> float:
         """Distance of the designated point from the rock's middle along the horizontal line to the start, metres.
@@ -163,6 +159,9 @@ class Rig:
     """A mast and its stereo pair, with their errors."""
 
     head: StereoHead  #: the pair, true and calibrated
+    calibrated: MastCalibration  #: the calibration that flight software is given
+    left: CameraModel  #: the true left camera in the head's frame
+    right: CameraModel  #: the true right camera in the head's frame
     mast: Mast
     state: MastState  #: present angles
     motors: np.random.Generator  #: stream of the motors' stopping errors
@@ -173,22 +172,8 @@ class Rig:
         design = p.camera.mast()
         head = StereoHead.drawn(design, p.stereo, streams.generator("stereo calibration"))
         mast = Mast.drawn(p.pointing, design.geometry, streams.generator("mast zeros"))
-        return cls(head, mast, mast.rest, streams.generator("mast motors"))
-
-    @property
-    def calibrated(self) -> MastCalibration:
-        """The calibration that flight software is given."""
-        return self.head.calibrated
-
-    @property
-    def left(self) -> CameraModel:
-        """The true left camera in the head's frame."""
-        return self.head.true.left
-
-    @property
-    def right(self) -> CameraModel:
-        """The true right camera in the head's frame."""
-        return self.head.true.right
+        left, right, motors = head.true.left, head.true.right, streams.generator("mast motors")
+        return cls(head, head.calibrated, left, right, mast, mast.rest, motors)
 
     @property
     def pixel_rad(self) -> float:

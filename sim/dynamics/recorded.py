@@ -41,7 +41,7 @@ from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
 from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters
 
-#: Fewest poses that determine an acceleration.
+#: Minimum number of poses that determine an acceleration.
 MIN_POSES = 4
 #: Largest rotation from one pose to the next: the interpolation between larger ones is ambiguous.
 MAX_ROTATION_DEG = 90.0
@@ -54,7 +54,7 @@ UNIT_TOLERANCE = 5e-3
 MAX_BYTES = 1 << 29
 #: Longest table that is read, independent of compression.
 MAX_ROWS = 5_000_000
-#: Most poses sampled from SPICE kernels: five hours at 50 Hz.
+#: Maximum number of poses sampled from SPICE kernels: five hours at 50 Hz.
 MAX_SPICE_POSES = 1_000_000
 #: End of the name of a file of SPICE kernels.
 SUFFIX = ".spice.toml"
@@ -187,9 +187,9 @@ def _read_table(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
     first = head.decode("utf-8", errors="replace").lstrip("\ufeff").split("\n", 1)[0].strip()
     if head.startswith(b"PAR1"):
         return _read_parquet(path)
-    if first.startswith("#timestamp") and "," in first:
-        import pandas as pd  # imported here: slow, and few campaigns use such a file
+    import pandas as pd  # imported here: slow, and few campaigns use such a file
 
+    if first.startswith("#timestamp") and "," in first:
         frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
         values = frame.to_numpy(dtype=np.float64)
         # nanoseconds since 1970 exceed the precision of a float: differences are taken first
@@ -199,7 +199,17 @@ def _read_table(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # empty files are reported below; cells without a column name are ignored
         if "," in first and not first.startswith("#"):
-            return _read_csv(path)
+            frame = pd.read_csv(
+                path,
+                usecols=lambda name: name.strip() in COLUMNS,
+                dtype=np.float64,
+                index_col=False,
+                skipinitialspace=True,
+                na_values=list(_MISSING),
+                float_precision="round_trip",
+            )
+            names = [name.strip() for name in frame.columns]
+            return np.asarray(frame.to_numpy()[:, _column_indices(path, names)])
         values = np.loadtxt(path, comments="#", ndmin=2)
     if values.size and values.shape[1] != 8:
         raise TrajectoryFileError(f"{path}: has {values.shape[1]} numbers in a line; allowed: {_ALLOWED}")
@@ -230,22 +240,6 @@ def _read_parquet(path: str) -> Float64[np.ndarray, "n 8"]:
             values[read : read + batch.num_rows, column] = numbers.to_numpy(zero_copy_only=False)
         read += batch.num_rows
     return values[:read]
-
-
-def _read_csv(path: str) -> Float64[np.ndarray, "n 8"]:
-    """A text table with a header; cells without a number become NaN."""
-    import pandas as pd  # imported here: slow, and few campaigns use such a file
-
-    frame = pd.read_csv(
-        path,
-        usecols=lambda name: name.strip() in COLUMNS,
-        dtype=np.float64,
-        index_col=False,
-        skipinitialspace=True,
-        na_values=list(_MISSING),
-        float_precision="round_trip",
-    )
-    return np.asarray(frame.to_numpy()[:, _column_indices(path, [name.strip() for name in frame.columns])])
 
 
 def _column_indices(path: str, names: Sequence[str]) -> list[int]:

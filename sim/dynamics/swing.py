@@ -97,7 +97,7 @@ class SwingParameters(WindParameters):
     spin_rate_deg_s: Annotated[float, bounded(-30.0, 30.0, "rate of this rotation at that time")] = 0.0
     line_length_m: Annotated[float, bounded(10.0, 200.0, "canopy to hinge; bridle 20 m, rest assumed")] = 47.0
     bridle_length_m: Annotated[float, bounded(1.0, 100.0, "from the backshell to the hinge")] = 20.0
-    canopy_mass_kg: Annotated[float, bounded(1.0, 1000.0, "with lines and moved air (assumed)")] = 30.0
+    canopy_mass_kg: Annotated[float, bounded(1.0, 1000.0, "with lines and entrained air (assumed)")] = 30.0
     backshell_mass_kg: Annotated[float, bounded(0.0, 5000.0, "backshell without canopy")] = 179.0
     lander_mass_kg: Annotated[float, bounded(1.0, 5000.0, "lander with rover")] = 533.0
     mass_centre_m: Annotated[float, bounded(0.1, 10.0, "hinge to the lander's centre of mass (assumed)")] = 1.5

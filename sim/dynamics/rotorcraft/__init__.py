@@ -215,11 +215,11 @@ class Air:
     def draw(cls, parameters: AirParameters, step_s: float, duration_s: float, rng: np.random.Generator) -> Air:
         """Draw stationary gusts for a duration."""
         p = parameters
-        kept = np.exp(-step_s / p.correlation_s)
+        correlation = np.exp(-step_s / p.correlation_s)
         shocks = rng.standard_normal((int(np.ceil(duration_s / step_s)) + 2, 3))
-        shocks[1:] *= np.sqrt(1.0 - kept**2)
+        shocks[1:] *= np.sqrt(1.0 - correlation**2)
         deviations = np.array([p.gust_m_s, p.gust_m_s, p.vertical_gust_m_s])
-        gusts = deviations * scipy.signal.lfilter([1.0], [1.0, -kept], shocks, axis=0)
+        gusts = deviations * scipy.signal.lfilter([1.0], [1.0, -correlation], shocks, axis=0)
         return cls(np.array([p.east_m_s, p.north_m_s, 0.0]), gusts)
 
     def check_lasts(self, knots: int) -> None:
@@ -368,19 +368,19 @@ def landing_flight(
         raise ValueError(f"the laser's noise is known for {len(laser.noise_m)} knots; the flight may take {count}")
     rows = np.concatenate([flown.path.rows, np.zeros((count - before, kernels.SIZE))])
     phases = np.concatenate([flown.phases, np.full(count - before, Phase.WAIT.value)])
-    held = np.concatenate([errors, np.repeat(errors[-1:], max(count - len(errors), 0), axis=0)])
+    padded_errors = np.concatenate([errors, np.repeat(errors[-1:], max(count - len(errors), 0), axis=0)])
     commands = kernels.Landing(
         **guidance.model_dump(include=set(kernels.Landing._fields)),
         site_east_m=float(site_m[0]),
         site_north_m=float(site_m[1]),
-        hover_m=float(rows[before - 1, 2] + held[before - 1, 2]),
+        hover_m=float(rows[before - 1, 2] + padded_errors[before - 1, 2]),
         wait_until=before - 1 + round((guidance.wait_s - TAIL_S) / step),
         laser_scale=laser.scale,
         laser_stuck_m=np.nan if laser.stuck_m is None else laser.stuck_m,
     )
     flight = kernels.Flight(rows, flown.autopilot.copy(), flown.heading_rad, air.mean_m_s, air.gusts_m_s, step)
     craft = flown.craft.craft(flown.path.gravity_m_s2)
-    kernels.land(flight, phases, before - 1, held, laser.noise_m, ground.as_kernel(), commands, craft)
+    kernels.land(flight, phases, before - 1, padded_errors, laser.noise_m, ground.as_kernel(), commands, craft)
     landed = np.flatnonzero(phases == Phase.ON_GROUND.value)
     if end_s is not None:
         count = min(count, round((end_s - flown.path.start_s) / step) + 1)
